@@ -1,0 +1,61 @@
+"""Files that appear whole under their final name, or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from .errors import DeepDetectError
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """Give a temporary path beside the final one, and rename it when the block ends well.
+
+    Args:
+        path: the final path. Missing folders are made. The temporary name keeps the
+            suffix, since many writers choose the format by it.
+
+    Yields:
+        The temporary path, which the block writes.
+
+    Raises:
+        DeepDetectError: the folder cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> target = Path(tempfile.mkdtemp()) / "out.txt"
+        >>> with atomic_path(target) as temporary:
+        ...     _ = temporary.write_text("whole")
+        >>> target.read_text()
+        'whole'
+    """
+    final = Path(path)
+    try:
+        final.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{final.stem}.", suffix=f".part{final.suffix}", dir=final.parent
+        )
+        os.close(handle)
+    except OSError as error:
+        raise DeepDetectError(
+            f"cannot write {final}: {error.strerror or error}; choose another place with -o"
+        ) from error
+    temporary = Path(name)
+    try:
+        yield temporary
+        # mkstemp makes the file private; give it the mode any new file would have.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        try:
+            temporary.replace(final)
+        except OSError as error:
+            raise DeepDetectError(
+                f"cannot write {final}: {error.strerror or error}; choose another place with -o"
+            ) from error
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,17 @@
+"""Labels for training: classical detectors, and their fusion into one binary mask."""
+
+from .fusion import Label, LabelOptions, fuse
+from .registry import DETECTOR_NAMES, DETECTORS, LabelDetector
+from .visibility import LOW_VISIBILITY_RANGE, luma_range, visibility_of
+
+__all__ = [
+    "DETECTORS",
+    "DETECTOR_NAMES",
+    "LOW_VISIBILITY_RANGE",
+    "Label",
+    "LabelDetector",
+    "LabelOptions",
+    "fuse",
+    "luma_range",
+    "visibility_of",
+]

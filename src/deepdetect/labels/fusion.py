@@ -1,0 +1,80 @@
+"""Keypoint-edge fusion: the pixelwise OR of the label detectors (paper, Section III-A)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .registry import DETECTOR_NAMES, select_detectors
+from .visibility import Visibility, VisibilityChoice, visibility_of
+
+
+@dataclass(frozen=True)
+class LabelOptions:
+    """How a label is made.
+
+    Attributes:
+        detectors: names of the detectors to fuse (default: all nine).
+        visibility: "auto" decides by `visibility_of`; "normal" and "low" override it.
+
+    Raises:
+        OptionError: a name is unknown.
+    """
+
+    detectors: tuple[str, ...] = DETECTOR_NAMES
+    visibility: VisibilityChoice = "auto"
+
+    def __post_init__(self) -> None:
+        chosen = select_detectors(self.detectors)
+        object.__setattr__(self, "detectors", tuple(detector.name for detector in chosen))
+        visibility_of(np.zeros((1, 1), np.uint8), self.visibility)
+
+
+@dataclass(frozen=True)
+class Label:
+    """A fusion label.
+
+    Attributes:
+        keypoints: (H, W) bool, pixels marked by a keypoint detector.
+        edges: (H, W) bool, pixels marked by an edge detector.
+        visibility: the settings that were used, "normal" or "low".
+    """
+
+    keypoints: np.ndarray
+    edges: np.ndarray
+    visibility: Visibility
+    mask: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mask", self.keypoints | self.edges)
+
+    @property
+    def density(self) -> float:
+        """Share of the pixels that are marked."""
+        return float(self.mask.mean())
+
+
+def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
+    """Run the chosen detectors on a grey image and fuse what they mark.
+
+    Args:
+        gray: (H, W) uint8 luma.
+        options: which detectors, and which of their settings.
+
+    Returns:
+        The label, whose `mask` is the pixelwise OR.
+
+    Example:
+        >>> square = np.zeros((32, 32), np.uint8)
+        >>> square[8:24, 8:24] = 255
+        >>> label = fuse(square, LabelOptions(detectors=("harris", "sobel")))
+        >>> bool(label.mask[8, 8]), bool(label.mask[0, 0])
+        (True, False)
+    """
+    visibility = visibility_of(gray, options.visibility)
+    marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
+    for detector in select_detectors(options.detectors):
+        settings = detector.normal if visibility == "normal" else detector.low_visibility
+        marked[detector.kind] |= detector.mask(gray, settings)
+    return Label(marked["keypoint"], marked["edge"], visibility)

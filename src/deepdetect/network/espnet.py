@@ -1,0 +1,202 @@
+"""ESPNet: the efficient spatial pyramid network (Mehta et al., ECCV 2018), in torch.
+
+The paper trains it to predict the fusion mask (Section III-B). Module names
+follow the published state dict, so that its weights load unchanged.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+EPSILON = 1e-3  # of every batch normalisation, as published
+DILATIONS = (1, 2, 4, 8, 16)
+
+
+class Convolution(nn.Module):
+    """A convolution without bias that keeps the size (stride 1) or halves it (stride 2)."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(
+            inputs, outputs, kernel, stride=stride, padding=kernel // 2, bias=False
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv(x)
+
+
+class DilatedConvolution(nn.Module):
+    """A 3x3 convolution with holes, kept in float32 under autocast.
+
+    In bfloat16 with channels_last the CPU gradients of dilated convolutions
+    are NaN (torch 2.13), so autocast is switched off around them.
+    """
+
+    def __init__(self, inputs: int, outputs: int, dilation: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(
+            inputs, outputs, 3, padding=dilation, dilation=dilation, bias=False
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        if torch.is_autocast_enabled(x.device.type) and x.device.type == "cpu":
+            with torch.autocast(x.device.type, enabled=False):
+                return self.conv(x.float())
+        return self.conv(x)
+
+
+class NormActivation(nn.Module):
+    """Batch normalisation, then PReLU with one slope a channel."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.bn = nn.BatchNorm2d(channels, eps=EPSILON)
+        self.act = nn.PReLU(channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.act(self.bn(x))
+
+
+class ConvolutionNormActivation(nn.Module):
+    """Convolution, batch normalisation, PReLU."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(
+            inputs, outputs, kernel, stride=stride, padding=kernel // 2, bias=False
+        )
+        self.bn = nn.BatchNorm2d(outputs, eps=EPSILON)
+        self.act = nn.PReLU(outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.act(self.bn(self.conv(x)))
+
+
+class SpatialPyramid(nn.Module):
+    """Reduce, then five dilated branches, fused by running sums and joined.
+
+    Args:
+        inputs, outputs: channels.
+        reduce: kernel of the reducing convolution: 1, or 3 with stride 2 to halve the size.
+    """
+
+    def __init__(self, inputs: int, outputs: int, reduce: int) -> None:
+        super().__init__()
+        narrow = outputs // len(DILATIONS)
+        first = outputs - narrow * (len(DILATIONS) - 1)
+        self.c1 = Convolution(inputs, narrow, reduce, stride=2 if reduce == 3 else 1)
+        for dilation in DILATIONS:
+            width = first if dilation == 1 else narrow
+            setattr(self, f"d{dilation}", DilatedConvolution(narrow, width, dilation))
+
+    def branches(self, x: Tensor) -> Tensor:
+        """Return the joined branches: each is the sum of its own and the smaller dilations."""
+        reduced = self.c1(x)
+        parts = [self.d1(reduced)]
+        running = self.d2(reduced)
+        parts.append(running)
+        for dilation in DILATIONS[2:]:
+            running = running + getattr(self, f"d{dilation}")(reduced)
+            parts.append(running)
+        return torch.cat(parts, 1)
+
+
+class DownsamplingPyramid(SpatialPyramid):
+    """A spatial pyramid that halves the size."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__(inputs, outputs, reduce=3)
+        self.bn = nn.BatchNorm2d(outputs, eps=EPSILON)
+        self.act = nn.PReLU(outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.act(self.bn(self.branches(x)))
+
+
+class ResidualPyramid(SpatialPyramid):
+    """A spatial pyramid that keeps the size, with or without a residual connection."""
+
+    def __init__(self, inputs: int, outputs: int, residual: bool = True) -> None:
+        super().__init__(inputs, outputs, reduce=1)
+        self.residual = residual
+        self.bn = NormActivation(outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        joined = self.branches(x)
+        return self.bn(x + joined if self.residual else joined)
+
+
+class Encoder(nn.Module):
+    """ESPNet's encoder: features at 1/2, 1/4 and 1/8 of the image's size."""
+
+    def __init__(self, decoder_channels: int, p: int, q: int) -> None:
+        super().__init__()
+        self.level1 = ConvolutionNormActivation(3, 16, 3, stride=2)
+        self.b1 = NormActivation(16 + 3)
+        self.level2_0 = DownsamplingPyramid(16 + 3, 64)
+        self.level2 = nn.ModuleList(ResidualPyramid(64, 64) for _ in range(p))
+        self.b2 = NormActivation(128 + 3)
+        self.level3_0 = DownsamplingPyramid(128 + 3, 128)
+        self.level3 = nn.ModuleList(ResidualPyramid(128, 128) for _ in range(q))
+        self.b3 = NormActivation(256)
+        self.classifier = Convolution(256, decoder_channels, 1)
+        self.halve = nn.AvgPool2d(3, stride=2, padding=1)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        half = self.halve(image)
+        quarter = self.halve(half)
+        level1 = self.b1(torch.cat([self.level1(image), half], 1))
+        start = level2 = self.level2_0(level1)
+        for block in self.level2:
+            level2 = block(level2)
+        level2 = self.b2(torch.cat([level2, start, quarter], 1))
+        start = level3 = self.level3_0(level2)
+        for block in self.level3:
+            level3 = block(level3)
+        level3 = self.b3(torch.cat([start, level3], 1))
+        return level1, level2, level3
+
+
+class ESPNet(nn.Module):
+    """The whole network: a logit for each pixel of the image.
+
+    Args:
+        p: pyramids at 1/4 of the size (paper: 5).
+        q: pyramids at 1/8 of the size (paper: 9).
+        decoder_channels: channels of the decoder (paper: 10).
+
+    The default has 408,039 parameters. Height and width of the input must be
+    multiples of 8; channels are RGB in [0, 1], without further normalisation.
+
+    Example:
+        >>> ESPNet()(torch.zeros(1, 3, 16, 24)).shape
+        torch.Size([1, 1, 16, 24])
+    """
+
+    def __init__(self, p: int = 5, q: int = 9, decoder_channels: int = 10) -> None:
+        super().__init__()
+        width = decoder_channels
+        self.encoder = Encoder(width, p, q)
+        self.level3_C = Convolution(128 + 3, width, 1)
+        self.br = nn.BatchNorm2d(width, eps=EPSILON)
+        self.conv = ConvolutionNormActivation(16 + 3 + width, width, 3)
+        self.up_l3 = nn.Sequential(_double(width, width))
+        self.combine_l2_l3 = nn.Sequential(
+            NormActivation(2 * width), ResidualPyramid(2 * width, width, residual=False)
+        )
+        self.up_l2 = nn.Sequential(_double(width, width), NormActivation(width))
+        self.classifier = _double(width, 1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits."""
+        level1, level2, level3 = self.encoder(image)
+        eighth = self.up_l3(self.br(self.encoder.classifier(level3)))
+        quarter = self.combine_l2_l3(torch.cat([self.level3_C(level2), eighth], 1))
+        half = self.conv(torch.cat([self.up_l2(quarter), level1], 1))
+        return self.classifier(half)
+
+
+def _double(inputs: int, outputs: int) -> nn.ConvTranspose2d:
+    """Make the learned upsampling by two."""
+    return nn.ConvTranspose2d(inputs, outputs, 2, stride=2, bias=False)
