@@ -1,0 +1,147 @@
+"""Reading images: whatever the user has, as 8-bit RGB or as luma.
+
+Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from .errors import ImageError
+
+MINIMUM_SIDE = 16
+"""Smallest width and height of an image, in pixels."""
+
+IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
+"""File name endings that are taken for images when a folder is searched."""
+
+
+def load_image(image: Any) -> np.ndarray:
+    """Read an image of any usual kind as 8-bit RGB.
+
+    Args:
+        image: a path; a PIL image; or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4)
+            in the order RGB(A): uint8, uint16 (full range 0..65535) or float in [0, 1].
+            The alpha channel is dropped. Files are turned upright by their EXIF tag.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+
+    Raises:
+        ImageError: the file is missing, truncated or no image, the array has a wrong
+            shape, type or range or holds NaN, or a side is shorter than 16 pixels.
+
+    Example:
+        >>> load_image(np.zeros((20, 30), np.uint16)).shape
+        (20, 30, 3)
+    """
+    if isinstance(image, (str, Path)):
+        rgb, name = _read_file(Path(image)), str(image)
+    elif hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
+        rgb, name = _from_pil(image), "the image"
+    else:
+        rgb, name = _from_array(image), "the image"
+    if min(rgb.shape[:2]) < MINIMUM_SIDE:
+        height, width = rgb.shape[:2]
+        raise ImageError(
+            f"{name} is {width}x{height} pixels: "
+            f"both sides must be at least {MINIMUM_SIDE}, use a larger image"
+        )
+    return rgb
+
+
+def luma(rgb: np.ndarray) -> np.ndarray:
+    """Return the 8-bit luma (ITU-R BT.601) of a (H, W, 3) uint8 RGB image as (H, W) uint8."""
+    return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+
+
+def find_images(folder: str | Path) -> list[Path]:
+    """List the image files below a folder, sorted by path.
+
+    Raises:
+        ImageError: the folder is missing, or holds no image.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise ImageError(f"there is no folder {root}: check the path")
+    found = sorted(
+        path
+        for path in root.rglob("*")
+        if path.suffix.lower() in IMAGE_SUFFIXES
+        and path.is_file()
+        and not any(part.startswith(".") for part in path.relative_to(root).parts)
+    )
+    if not found:
+        raise ImageError(
+            f"there is no image in {root}: put files ending in "
+            f"{', '.join(suffix[1:] for suffix in IMAGE_SUFFIXES)} there"
+        )
+    return found
+
+
+def _read_file(path: Path) -> np.ndarray:
+    from PIL import Image, ImageOps, UnidentifiedImageError
+
+    if not path.exists():
+        raise ImageError(f"there is no file {path}: check the path")
+    if path.is_dir():
+        raise ImageError(f"{path} is a folder: name an image file")
+    try:
+        with Image.open(path) as opened:
+            return _from_pil(ImageOps.exif_transpose(opened))
+    except UnidentifiedImageError:
+        raise ImageError(f"{path} is not an image that can be read: use PNG or JPEG") from None
+    except Image.DecompressionBombError:
+        raise ImageError(f"{path} is too large to be a photograph: make it smaller") from None
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        raise ImageError(f"{path} is damaged or truncated ({error}): get it anew") from None
+
+
+def _from_pil(image: Any) -> np.ndarray:
+    if image.mode.startswith("I") or image.mode == "F":  # 16 or 32 bits a pixel
+        values = np.asarray(image)
+        if image.mode != "F":
+            values = np.clip(values, 0, 65535).astype(np.uint16)
+        return _from_array(values)
+    return np.asarray(image.convert("RGB"))
+
+
+def _from_array(image: Any) -> np.ndarray:
+    array = np.asarray(image)
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[:, :, 0]
+    if not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] in (3, 4))):
+        raise ImageError(
+            f"an image array has shape {array.shape}: "
+            "it must be (height, width), or (height, width, channels) with 1, 3 or 4 channels"
+        )
+    values = _to_uint8(array)
+    if values.ndim == 2:
+        return np.repeat(values[:, :, None], 3, axis=2)
+    return np.ascontiguousarray(values[:, :, :3])
+
+
+def _to_uint8(array: np.ndarray) -> np.ndarray:
+    if array.dtype == np.uint8:
+        return array
+    if array.dtype == np.bool_:
+        return array.astype(np.uint8) * 255
+    if array.dtype == np.uint16:
+        # Divide by 257 with rounding, so that 65535 becomes 255.
+        return ((array.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if np.issubdtype(array.dtype, np.floating):
+        if not np.isfinite(array).all():
+            raise ImageError("the image holds NaN or infinite values: replace them first")
+        if array.size and (array.min() < 0 or array.max() > 1):
+            raise ImageError(
+                f"a float image must lie in [0, 1], this one spans "
+                f"[{array.min():g}, {array.max():g}]: scale it first"
+            )
+        return np.rint(array * 255).astype(np.uint8)
+    raise ImageError(
+        f"an image array of type {array.dtype} is not understood: use uint8, uint16 or float"
+    )

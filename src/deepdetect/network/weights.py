@@ -1,0 +1,49 @@
+"""Weights as safetensors files: a plain state dict, with notes in the header."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+
+from ..atomic import atomic_path
+from ..errors import WeightsError
+from .espnet import ESPNet
+
+
+def save_weights(network: nn.Module, path: str | Path, notes: dict[str, str]) -> None:
+    """Write a network's state dict, whole or not at all.
+
+    Args:
+        network: the network.
+        path: file ending in .safetensors.
+        notes: text to be kept in the file's header.
+    """
+    tensors = {
+        name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
+    }
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata=notes)
+
+
+def load_network(path: str | Path) -> ESPNet:
+    """Make the network from a weights file, in evaluation mode.
+
+    Raises:
+        WeightsError: the file is missing, damaged or does not fit the network.
+    """
+    if not Path(path).is_file():
+        raise WeightsError(f"there is no weights file {path}: check the path")
+    network = ESPNet()
+    try:
+        with safe_open(path, framework="pt") as file:
+            network.load_state_dict({name: file.get_tensor(name) for name in file.keys()})
+    except (SafetensorError, OSError, RuntimeError, KeyError) as error:
+        reason = str(error).strip().splitlines()[0].rstrip(":")
+        raise WeightsError(
+            f"{path} does not fit the network ({reason}): "
+            "use weights that deepdetect has trained, or the published ones"
+        ) from None
+    return network.eval()

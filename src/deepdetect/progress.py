@@ -1,0 +1,33 @@
+"""The progress bar of all long work: done, rate, time left."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+
+def progress(total: int, title: str, unit: str, quiet: bool = False, done: int = 0) -> Any:
+    """Make a progress bar on standard error.
+
+    Args:
+        total: number of units in all.
+        title: the word before the bar.
+        unit: name of one unit, as "image".
+        quiet: show nothing.
+        done: units that were done before.
+
+    Returns:
+        A tqdm bar: a context manager with `update(n)` and `set_postfix_str(text)`.
+    """
+    from tqdm import tqdm
+
+    return tqdm(
+        total=total,
+        initial=done,
+        desc=title,
+        unit=unit,
+        disable=quiet or total == 0,
+        file=sys.stderr,
+        dynamic_ncols=True,
+        mininterval=0.2 if sys.stderr.isatty() else 10,
+    )

@@ -1,0 +1,111 @@
+"""Batches of random crops: a pure function of the seed and the step.
+
+Nothing is remembered from one step to the next, so a run that was broken off
+goes on with exactly the batches it would have seen.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+
+from .photos import Photo, ViewStore
+from .recipe import Schedule
+from .views import View
+
+
+class Batches:
+    """The batches of a run.
+
+    Args:
+        photos: the photographs.
+        store: their views.
+        schedule: the steps.
+    """
+
+    def __init__(self, photos: list[Photo], store: ViewStore, schedule: Schedule) -> None:
+        self.photos = photos
+        self.store = store
+        self.schedule = schedule
+
+    def batch(self, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """Make a step's batch.
+
+        Returns:
+            (B, crop, crop, 3) uint8 RGB and (B, crop, crop) bool labels.
+        """
+        position = self.schedule.position(step)
+        crops = [
+            self._crop(position.epoch_offset, position.sample + k, position.stage.crop)
+            for k in range(position.stage.batch)
+        ]
+        images, masks = zip(*crops, strict=True)
+        return np.stack(images), np.stack(masks)
+
+    def stream(self, first: int, ahead: int = 4) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield the batches from a step to the last, made ahead by a thread."""
+        ready: queue.Queue = queue.Queue(maxsize=ahead)
+        stopped = threading.Event()
+
+        def hand_over(item: object) -> None:
+            while not stopped.is_set():
+                try:
+                    return ready.put(item, timeout=0.5)
+                except queue.Full:
+                    continue
+
+        def make() -> None:
+            try:
+                for step in range(first, self.schedule.steps):
+                    if stopped.is_set():
+                        return
+                    hand_over(self.batch(step))
+            except BaseException as error:  # handed to the thread that trains
+                hand_over(error)
+
+        threading.Thread(target=make, daemon=True, name="batches").start()
+        try:
+            for _ in range(first, self.schedule.steps):
+                item = ready.get()
+                if isinstance(item, BaseException):
+                    raise item
+                yield item
+        finally:
+            stopped.set()
+
+    def _crop(self, epoch_offset: int, sample: int, side: int) -> tuple[np.ndarray, np.ndarray]:
+        """Cut the crop of one sample, flipped by chance."""
+        seed = self.schedule.options.seed
+        epoch, place = divmod(sample, len(self.photos))
+        epoch += epoch_offset
+        order = self._order(epoch)
+        generator = np.random.default_rng([seed, 2, epoch, place])
+        photo = self.photos[order[place]]
+        image, mask = self.store.load(photo, self._choose_view(photo, side, generator))
+        top = int(generator.integers(image.shape[0] - side + 1))
+        left = int(generator.integers(image.shape[1] - side + 1))
+        image = image[top : top + side, left : left + side]
+        mask = mask[top : top + side, left : left + side]
+        if generator.random() < 0.5:
+            image, mask = image[:, ::-1], mask[:, ::-1]
+        if generator.random() < 0.5:
+            image, mask = image[::-1], mask[::-1]
+        return image, mask
+
+    def _choose_view(self, photo: Photo, side: int, generator: np.random.Generator) -> View:
+        """Choose the light by the dark fraction, then a size that holds the crop."""
+        dark = generator.random() < self.schedule.options.dark_fraction
+        views = photo.dark if dark else photo.normal
+        fitting = [view for view in views if view.short_side >= side]
+        return fitting[int(generator.integers(len(fitting)))]
+
+    def _order(self, epoch: int) -> np.ndarray:
+        """Return the epoch's order of the photographs (the latest is kept)."""
+        kept = getattr(self, "_kept_order", None)
+        if kept is None or kept[0] != epoch:
+            generator = np.random.default_rng([self.schedule.options.seed, 1, epoch])
+            kept = self._kept_order = (epoch, generator.permutation(len(self.photos)))
+        return kept[1]

@@ -1,0 +1,154 @@
+"""What a training run does: all its options, and the schedule that follows from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass, field
+
+from ..errors import OptionError
+from ..labels import DETECTOR_NAMES, LabelOptions
+from .darkening import DarkeningRange
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A stretch of training with one crop size and one batch size.
+
+    Attributes:
+        crop: side of the square crops, in pixels, a multiple of 8.
+        batch: crops in a batch.
+        epochs: how often each photograph is seen.
+    """
+
+    crop: int
+    batch: int
+    epochs: int
+
+    def __post_init__(self) -> None:
+        if self.crop < 16 or self.crop % 8:
+            raise OptionError(f"crop must be a multiple of 8 from 16 on, not {self.crop}")
+        if self.batch < 1 or self.epochs < 1:
+            raise OptionError("a stage needs a batch and a number of epochs of at least 1")
+
+    @classmethod
+    def parse(cls, text: str) -> Stage:
+        """Read a stage from its text CROPxBATCHxEPOCHS.
+
+        Example:
+            >>> Stage.parse("240x16x40")
+            Stage(crop=240, batch=16, epochs=40)
+        """
+        try:
+            crop, batch, epochs = (int(part) for part in text.lower().split("x"))
+        except ValueError:
+            raise OptionError(
+                f"a stage is written CROPxBATCHxEPOCHS, as 240x16x40, not {text!r}"
+            ) from None
+        return cls(crop, batch, epochs)
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Everything that decides which weights come out, given the photographs.
+
+    Attributes:
+        stages: what is trained on, one after the other. Small crops give many cheap
+            steps first; whole images last teach what depends on the whole image
+            (Harris and Sobel labels are relative to the image's largest response).
+        short_sides: sizes in pixels that the photographs' shorter side is scaled to;
+            a crop is taken from those that are large enough.
+        dark_fraction: share of darkened images (paper: a quarter).
+        dark_variants: darkened versions of each photograph at each size.
+        darkening: ranges of the darkening.
+        learning_rate, final_learning_rate: ends of the cosine annealing of Adam.
+        detectors: label detectors to fuse.
+        validations: how often the validation loss is taken.
+        seed: decides the start weights, the order, the crops and the flips.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    stages: tuple[Stage, ...] = (Stage(240, 16, 40), Stage(480, 8, 10))
+    short_sides: tuple[int, ...] = (480, 360, 240)
+    dark_fraction: float = 0.25
+    dark_variants: int = 1
+    darkening: DarkeningRange = field(default_factory=DarkeningRange)
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 1e-6
+    detectors: tuple[str, ...] = DETECTOR_NAMES
+    validations: int = 12
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "detectors", LabelOptions(self.detectors).detectors)
+        if not self.stages:
+            raise OptionError("a training run needs at least one stage")
+        if not self.short_sides or min(self.short_sides) < 16:
+            raise OptionError("the short sides must be at least 16 pixels")
+        largest = max(stage.crop for stage in self.stages)
+        if largest > max(self.short_sides):
+            raise OptionError(
+                f"a crop of {largest} pixels does not fit into images of "
+                f"{max(self.short_sides)}: raise the sizes or make the crops smaller"
+            )
+        if not 0 <= self.dark_fraction <= 1:
+            raise OptionError(f"the dark fraction must lie in [0, 1], not {self.dark_fraction}")
+        if self.dark_variants < 1 or self.validations < 1:
+            raise OptionError("dark variants and validations must be at least 1")
+        if not 0 <= self.final_learning_rate <= self.learning_rate:
+            raise OptionError("the learning rate must not be under the final one, nor negative")
+
+    def to_json(self) -> str:
+        """Return the options as JSON text, to be kept beside the weights."""
+        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where a step lies: its stage, its first crop's number in the stage, the epochs before it."""
+
+    stage: Stage
+    sample: int
+    epoch_offset: int
+
+
+class Schedule:
+    """The steps of a run over a number of photographs.
+
+    Args:
+        options: the recipe.
+        photos: number of photographs.
+    """
+
+    def __init__(self, options: TrainingOptions, photos: int) -> None:
+        self.options = options
+        self.photos = photos
+        self.steps_of_stage = [
+            max(1, stage.epochs * photos // stage.batch) for stage in options.stages
+        ]
+        self.steps = sum(self.steps_of_stage)
+
+    def position(self, step: int) -> Position:
+        """Find a step's stage and place in it."""
+        epochs = 0
+        for stage, steps in zip(self.options.stages, self.steps_of_stage, strict=True):
+            if step < steps:
+                return Position(stage, step * stage.batch, epochs)
+            step -= steps
+            epochs += stage.epochs
+        raise IndexError("the step lies behind the last one")
+
+    def learning_rate(self, step: int) -> float:
+        """Return Adam's rate at a step: cosine annealing from the first to the final rate."""
+        options = self.options
+        share = (1 + math.cos(math.pi * step / self.steps)) / 2
+        return options.final_learning_rate + share * (
+            options.learning_rate - options.final_learning_rate
+        )
+
+    def milestones(self, count: int) -> set[int]:
+        """Return the numbers of steps done at `count` evenly spaced points, the end among them."""
+        return {round(self.steps * part / count) for part in range(1, count + 1)} - {0}

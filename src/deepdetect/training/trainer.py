@@ -1,0 +1,277 @@
+"""The training loop (paper, Section III-B)."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import platform
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.nn.functional import binary_cross_entropy_with_logits
+
+from ..errors import OptionError
+from ..network.espnet import ESPNet
+from ..network.weights import save_weights
+from ..progress import progress
+from .batches import Batches
+from .checkpoint import load_checkpoint, save_checkpoint
+from .curves import CurvePoint, save_curves
+from .device import DeviceOptions, Engine
+from .label_cache import LabelCache
+from .photos import Photo, ViewStore, hold_out, list_photos
+from .recipe import Schedule, TrainingOptions
+from .validation import MaskScore, score_masks
+
+CHECKPOINT = "checkpoint.safetensors"
+BEST = "best.safetensors"
+CHECKPOINT_SECONDS = 60.0  # a killed run loses at most so much
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a run has made.
+
+    Attributes:
+        weights: file of the weights with the lowest validation loss.
+        points: the loss curves.
+        best: the point of those weights.
+        images_per_second: mean rate of this process, in 480x480 images' worth of pixels.
+    """
+
+    weights: Path
+    points: list[CurvePoint]
+    best: CurvePoint
+    images_per_second: float
+
+
+def train(
+    photos: str | Path,
+    output: str | Path,
+    options: TrainingOptions = TrainingOptions(),
+    *,
+    validation: str | Path | None = None,
+    labels: str | Path | None = None,
+    device: DeviceOptions = DeviceOptions(),
+    workers: int | None = None,
+    quiet: bool = False,
+) -> TrainingResult:
+    """Train the network on a folder of photographs.
+
+    A run that was killed goes on from its last checkpoint when it is started again
+    with the same options, with the same result as an unbroken one.
+
+    Args:
+        photos: folder of photographs.
+        output: folder for checkpoint.safetensors, best.safetensors, curves.csv and .png.
+        options: the recipe.
+        validation: folder of other photographs; default: every twentieth is held out.
+        labels: folder for the label cache; default: in `output`.
+        device: how the network is run.
+        workers: processes that make labels; default one for each processor.
+        quiet: show no progress bar.
+
+    Returns:
+        The weights' file and the curves.
+
+    Raises:
+        ImageError: a folder is missing or empty, or a photograph cannot be read.
+        OptionError: the folder holds a run with other options.
+
+    Example:
+        >>> train("photographs", "run")  # doctest: +SKIP
+    """
+    root, folder = Path(photos), Path(output)
+    training = list_photos(root, options)
+    if validation is None:
+        training, held = hold_out(training)
+        held_root = root
+    else:
+        held_root = Path(validation)
+        held = list_photos(held_root, options)
+    cache = Path(labels) if labels is not None else folder / "labels"
+    stores = []
+    for part, part_root in ((training, root), (held, held_root)):
+        store = ViewStore(LabelCache(cache, part_root, options.detectors))
+        wanted = [(p.path, view) for p in part for view in _views(p, part is held)]
+        store.labels.make(wanted, workers, quiet)
+        stores.append(store)
+    run = _Run(training, held, stores, folder, options, device, quiet)
+    return run.finish()
+
+
+def _views(photo: Photo, validation: bool) -> tuple:
+    """Return the views of a photograph that are needed: validation takes the largest size only."""
+    views = photo.normal + photo.dark
+    if validation:
+        return _largest(photo.normal)[:1] + _largest(photo.dark)[:1]
+    return views
+
+
+def _largest(views: tuple) -> tuple:
+    side = max(view.short_side for view in views)
+    return tuple(view for view in views if view.short_side == side)
+
+
+class _Run:
+    """The state of one run."""
+
+    def __init__(
+        self,
+        training: list[Photo],
+        held: list[Photo],
+        stores: list[ViewStore],
+        folder: Path,
+        options: TrainingOptions,
+        device: DeviceOptions,
+        quiet: bool,
+    ) -> None:
+        self.held, self.held_store = held, stores[1]
+        self.folder, self.options, self.quiet = folder, options, quiet
+        self.schedule = Schedule(options, len(training))
+        self.batches = Batches(training, stores[0], self.schedule)
+        torch.manual_seed(options.seed)
+        network = ESPNet()
+        self.engine = Engine(network, device)
+        self.network = self.engine.network
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(), lr=options.learning_rate, fused=True
+        )
+        self.step = 0
+        self.images = 0
+        self.loss_sum, self.loss_count = 0.0, 0
+        self.points: list[CurvePoint] = []
+        self._resume()
+
+    def finish(self) -> TrainingResult:
+        """Train to the last step."""
+        milestones = self.schedule.milestones(self.options.validations)
+        started, pixels = time.monotonic(), 0
+        saved = started
+        if self.step < self.schedule.steps and not self.quiet:
+            print(f"training on {self.engine.describe()}", flush=True)
+        bar = progress(self.schedule.steps, "training", "step", self.quiet, done=self.step)
+        with bar:
+            for rgb, masks in self.batches.stream(self.step):
+                loss = self._learn(rgb, masks)
+                pixels += masks.size
+                self.loss_sum += loss
+                self.loss_count += 1
+                self.step += 1
+                self.images += len(masks)
+                bar.update(1)
+                rate = pixels / (480 * 480) / (time.monotonic() - started)
+                bar.set_postfix_str(
+                    f"loss {self.loss_sum / self.loss_count:.4f}, {rate:.1f} images/s", False
+                )
+                if self.step in milestones:
+                    self._validate()
+                if self.step in milestones or time.monotonic() - saved > CHECKPOINT_SECONDS:
+                    self._save()
+                    saved = time.monotonic()
+        seconds = max(time.monotonic() - started, 1e-9)
+        best = min(self.points, key=lambda point: point.validation_loss)
+        return TrainingResult(
+            self.folder / BEST, self.points, best, pixels / (480 * 480) / seconds
+        )
+
+    def _learn(self, rgb: np.ndarray, masks: np.ndarray) -> float:
+        """Make one optimiser step; return the loss."""
+        self.network.train()
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.schedule.learning_rate(self.step)
+        images = self.engine.images(torch.from_numpy(rgb))
+        truth = torch.from_numpy(masks).to(self.engine.device)[:, None].float()
+        self.optimizer.zero_grad(set_to_none=True)
+        loss = binary_cross_entropy_with_logits(self.engine.logits(images), truth)
+        loss.backward()
+        self.optimizer.step()
+        value = loss.item()
+        if not np.isfinite(value):
+            raise OptionError(
+                f"the loss is {value} at step {self.step}: "
+                "lower the learning rate, or use --precision float32"
+            )
+        return value
+
+    def _validate(self) -> None:
+        """Take the validation losses; keep the weights when they are the best so far."""
+        normal = self._score([_largest(photo.normal)[0] for photo in self.held])
+        dark = self._score([_largest(photo.dark)[0] for photo in self.held])
+        share = self.options.dark_fraction
+        point = CurvePoint(
+            step=self.step,
+            epoch=self.images / self.schedule.photos,
+            images=self.images,
+            learning_rate=self.schedule.learning_rate(self.step - 1),
+            training_loss=self.loss_sum / self.loss_count,
+            validation_loss=(1 - share) * normal.loss + share * dark.loss,
+            normal_loss=normal.loss,
+            normal_iou=normal.iou,
+            dark_loss=dark.loss,
+            dark_iou=dark.iou,
+        )
+        self.loss_sum, self.loss_count = 0.0, 0
+        best = min((p.validation_loss for p in self.points), default=float("inf"))
+        self.points.append(point)
+        if point.validation_loss < best:
+            save_weights(self.network, self.folder / BEST, self._provenance(point))
+        save_curves(self.points, self.folder)
+
+    def _score(self, views: list) -> MaskScore:
+        pairs = (
+            self.held_store.load(photo, view)
+            for photo, view in zip(self.held, views, strict=True)
+        )
+        return score_masks(self.network, pairs, self.engine.device)
+
+    def _provenance(self, point: CurvePoint) -> dict[str, str]:
+        """Return what is written into the weights' file."""
+        return {
+            "options": self.options.to_json(),
+            "photographs": str(self.schedule.photos),
+            "point": json.dumps(dataclasses.asdict(point)),
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        }
+
+    def _save(self) -> None:
+        state = {
+            "options": self.options.to_json(),
+            "photographs": self.schedule.photos,
+            "step": self.step,
+            "images": self.images,
+            "loss_sum": self.loss_sum,
+            "loss_count": self.loss_count,
+            "points": [dataclasses.asdict(point) for point in self.points],
+        }
+        save_checkpoint(self.folder / CHECKPOINT, self.network, self.optimizer, state)
+
+    def _resume(self) -> None:
+        path = self.folder / CHECKPOINT
+        if not path.exists():
+            return
+        state = load_checkpoint(path, self.network, self.optimizer)
+        if state["options"] != self.options.to_json():
+            raise OptionError(
+                f"{self.folder} holds a run with other options ({_difference(state, self.options)}): "
+                "use the same options to continue it, or another folder with -o"
+            )
+        if state["photographs"] != self.schedule.photos:
+            raise OptionError(
+                f"{self.folder} holds a run over {state['photographs']} photographs, "
+                f"now there are {self.schedule.photos}: use another folder with -o"
+            )
+        self.step, self.images = state["step"], state["images"]
+        self.loss_sum, self.loss_count = state["loss_sum"], state["loss_count"]
+        self.points = [CurvePoint(**point) for point in state["points"]]
+
+
+def _difference(state: dict, options: TrainingOptions) -> str:
+    """Name the options that differ between a checkpoint and this run."""
+    before, now = json.loads(state["options"]), json.loads(options.to_json())
+    names = [name for name in now if before.get(name) != now[name]]
+    return ", ".join(names) or "an older version"

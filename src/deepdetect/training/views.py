@@ -1,0 +1,81 @@
+"""Views of a photograph for training: a size, and normal or darkened light."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..image import load_image
+from .darkening import Darkening, DarkeningRange, darken
+
+
+@dataclass(frozen=True)
+class View:
+    """How a photograph is shown to the network.
+
+    Attributes:
+        short_side: length in pixels that the shorter side is scaled to.
+        darkening: the darkening, or None for the photograph as it is.
+    """
+
+    short_side: int
+    darkening: Darkening | None = None
+
+    @property
+    def name(self) -> str:
+        """A short text that tells views of one photograph apart, fit for a file name."""
+        light = "normal"
+        if self.darkening is not None:
+            light = f"b{self.darkening.brightness:.3f}c{self.darkening.contrast:.3f}"
+        return f"{self.short_side}_{light}"
+
+
+def views_of(
+    name: str, short_sides: tuple[int, ...], darkening: DarkeningRange, variants: int
+) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """List the normal and the dark views of a photograph, the same on every call.
+
+    Args:
+        name: the photograph's relative path; its dark views are drawn from it.
+        short_sides: sizes of the views, in pixels.
+        darkening: ranges of the factors.
+        variants: dark views of each size.
+
+    Returns:
+        The normal views and the dark ones, of each size in turn.
+    """
+    generator = np.random.default_rng(zlib.crc32(name.encode()))
+    normal = tuple(View(side) for side in short_sides)
+    dark = tuple(
+        View(side, darkening.draw(generator)) for side in short_sides for _ in range(variants)
+    )
+    return normal, dark
+
+
+def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
+    """Scale an image so that its shorter side has the given length in pixels."""
+    height, width = rgb.shape[:2]
+    factor = short_side / min(height, width)
+    if factor == 1:
+        return rgb
+    size = (max(round(width * factor), short_side), max(round(height * factor), short_side))
+    # Area averaging does not alias when shrinking; cubic keeps edges when enlarging.
+    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    return cv2.resize(rgb, size, interpolation=method)
+
+
+def render(photo: object, view: View) -> np.ndarray:
+    """Make a view of a photograph.
+
+    Args:
+        photo: anything `load_image` takes.
+        view: the view.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+    """
+    rgb = scale_short_side(load_image(photo), view.short_side)
+    return rgb if view.darkening is None else darken(rgb, view.darkening)
