@@ -32,7 +32,5 @@ def agast_mask(gray: np.ndarray, settings: AgastSettings) -> np.ndarray:
     # OpenCV 5 keeps AGAST in its contrib module; OpenCV 4 has it in the main one.
     home = cv2 if hasattr(cv2, "AgastFeatureDetector_create") else cv2.xfeatures2d
     oast_9_16 = 3  # AgastFeatureDetector::OAST_9_16
-    detector = home.AgastFeatureDetector_create(
-        settings.threshold, settings.suppression, oast_9_16
-    )
+    detector = home.AgastFeatureDetector_create(settings.threshold, settings.suppression, oast_9_16)
     return keypoints_mask(gray, detector.detect(gray, None))

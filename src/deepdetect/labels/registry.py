@@ -78,5 +78,7 @@ def select_detectors(names: Iterable[str]) -> tuple[LabelDetector, ...]:
             raise unknown_name("label detector", name, DETECTOR_NAMES)
         wanted.add(name)
     if not wanted:
-        raise OptionError(f"no label detector was chosen: name at least one of {', '.join(DETECTOR_NAMES)}")
+        raise OptionError(
+            f"no label detector was chosen: name at least one of {', '.join(DETECTOR_NAMES)}"
+        )
     return tuple(detector for detector in DETECTORS if detector.name in wanted)

@@ -35,9 +35,7 @@ class DilatedConvolution(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, dilation: int) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(
-            inputs, outputs, 3, padding=dilation, dilation=dilation, bias=False
-        )
+        self.conv = nn.Conv2d(inputs, outputs, 3, padding=dilation, dilation=dilation, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         if torch.is_autocast_enabled(x.device.type) and x.device.type == "cpu":

@@ -38,9 +38,7 @@ def save_checkpoint(
         save_file(contiguous, temporary, metadata={"state": json.dumps(state)})
 
 
-def load_checkpoint(
-    path: Path, network: nn.Module, optimizer: torch.optim.Adam
-) -> dict[str, Any]:
+def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam) -> dict[str, Any]:
     """Read a checkpoint into the network and the optimiser.
 
     Returns:

@@ -174,9 +174,7 @@ class _Run:
                     saved = time.monotonic()
         seconds = max(time.monotonic() - started, 1e-9)
         best = min(self.points, key=lambda point: point.validation_loss)
-        return TrainingResult(
-            self.folder / BEST, self.points, best, pixels / (480 * 480) / seconds
-        )
+        return TrainingResult(self.folder / BEST, self.points, best, pixels / (480 * 480) / seconds)
 
     def _learn(self, rgb: np.ndarray, masks: np.ndarray) -> float:
         """Make one optimiser step; return the loss."""
@@ -223,8 +221,7 @@ class _Run:
 
     def _score(self, views: list) -> MaskScore:
         pairs = (
-            self.held_store.load(photo, view)
-            for photo, view in zip(self.held, views, strict=True)
+            self.held_store.load(photo, view) for photo, view in zip(self.held, views, strict=True)
         )
         return score_masks(self.network, pairs, self.engine.device)
 

@@ -1,0 +1,32 @@
+"""The descriptors: one line each.
+
+To add a descriptor, write its module beside this one, with a function
+`(gray, xy, size, angle) -> (N, D) float32`, and add its line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ..errors import unknown_name
+from .sift import root_sift_descriptors, sift_descriptors
+
+Descriptor = Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]
+
+DESCRIPTORS: dict[str, Descriptor] = {
+    "sift": sift_descriptors,
+    "rootsift": root_sift_descriptors,
+}
+
+
+def get_descriptor(name: str) -> Descriptor:
+    """Look a descriptor up.
+
+    Raises:
+        OptionError: the name is unknown.
+    """
+    if name not in DESCRIPTORS:
+        raise unknown_name("descriptor", name, DESCRIPTORS)
+    return DESCRIPTORS[name]

@@ -1,0 +1,75 @@
+"""Distances between matched points and a model, in pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Map points by a homography.
+
+    Args:
+        points: (N, 2) positions, centre of the first pixel (0, 0).
+        homography: (3, 3), acting on columns (x, y, 1).
+
+    Returns:
+        (N, 2) float64. Points that go to infinity become infinite.
+
+    Example:
+        >>> transform_points([[1, 2]], np.diag([2, 2, 1])).tolist()
+        [[2.0, 4.0]]
+    """
+    points = np.asarray(points, np.float64).reshape(-1, 2)
+    mapped = points @ homography[:, :2].T + homography[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        result = mapped[:, :2] / mapped[:, 2:]
+    return np.where(mapped[:, 2:] == 0, np.inf, result)
+
+
+def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Return how far a homography takes each point from its match, (N,) float64 in pixels.
+
+    This is the paper's measure: one way only, from the first image to the second.
+    """
+    return np.linalg.norm(transform_points(points0, homography) - points1, axis=1)
+
+
+def epipolar_errors(
+    points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
+) -> np.ndarray:
+    """Return Sampson's distance of each match from a fundamental matrix, in pixels.
+
+    Args:
+        points0, points1: (N, 2) matched positions.
+        fundamental: (3, 3) with x1^T F x0 = 0.
+
+    Returns:
+        (N,) float64.
+    """
+    first = np.column_stack([np.asarray(points0, np.float64), np.ones(len(points0))])
+    second = np.column_stack([np.asarray(points1, np.float64), np.ones(len(points1))])
+    lines1 = first @ fundamental.T
+    lines0 = second @ fundamental
+    algebraic = np.einsum("ij,ij->i", second, lines1)
+    gradient = (lines1[:, :2] ** 2).sum(1) + (lines0[:, :2] ** 2).sum(1)
+    return np.abs(algebraic) / np.sqrt(np.maximum(gradient, 1e-300))
+
+
+def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Return how far matches of a rectified pair are from the true disparity.
+
+    Args:
+        points0: (N, 2) positions in the left image; the disparity is read at the
+            nearest pixel.
+        points1: (N, 2) matched positions in the right image.
+        disparity: (H, W) true disparity of the left image in pixels: the true match of
+            (x, y) is (x - d, y). Not finite where it is unknown.
+
+    Returns:
+        (N,) float64 distances in pixels, NaN where the truth is unknown.
+    """
+    points0 = np.asarray(points0, np.float64)
+    column, row = np.rint(points0).astype(int).T
+    true = np.where(np.isfinite(disparity), disparity, np.nan)[row, column]
+    expected = np.column_stack([points0[:, 0] - true, points0[:, 1]])
+    return np.linalg.norm(expected - points1, axis=1)

@@ -1,0 +1,197 @@
+"""Robust estimation of the geometry between two images: RANSAC or MAGSAC."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from ..errors import OptionError, unknown_name
+from .errors import epipolar_errors, transfer_errors
+
+ESTIMATORS = ("magsac", "ransac")
+MODEL_NAMES = ("homography", "fundamental", "essential", "none")
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryOptions:
+    """Which geometry is estimated, and how.
+
+    Attributes:
+        model: "homography" (planes, pure rotation), "fundamental" (any static scene),
+            "essential" (known cameras), or "none".
+        estimator: "magsac" or "ransac".
+        inlier_threshold: largest distance of an inlier from the model, in pixels.
+        homography: a given (3, 3) homography: nothing is estimated, the inliers are
+            the matches that it takes to less than the threshold.
+        camera0, camera1: (3, 3) camera matrices, for "essential".
+        confidence: wanted probability that the model is the best one.
+        iterations: at the most.
+        seed: of the random samples.
+
+    Raises:
+        OptionError: a value is unknown, missing or out of its range.
+    """
+
+    model: str = "fundamental"
+    estimator: str = "magsac"
+    inlier_threshold: float = 1.0
+    homography: np.ndarray | None = field(default=None, repr=False)
+    camera0: np.ndarray | None = field(default=None, repr=False)
+    camera1: np.ndarray | None = field(default=None, repr=False)
+    confidence: float = 0.999
+    iterations: int = 10_000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.model not in MODEL_NAMES:
+            raise unknown_name("model", self.model, MODEL_NAMES)
+        if self.estimator not in ESTIMATORS:
+            raise unknown_name("estimator", self.estimator, ESTIMATORS)
+        if not self.inlier_threshold > 0:
+            raise OptionError(
+                f"the inlier threshold must be above 0 pixels, not {self.inlier_threshold}"
+            )
+        if not 0 < self.confidence < 1:
+            raise OptionError(f"the confidence must lie between 0 and 1, not {self.confidence}")
+        if self.iterations < 1:
+            raise OptionError(f"iterations must be at least 1, not {self.iterations}")
+        for name in ("homography", "camera0", "camera1"):
+            value = getattr(self, name)
+            if value is not None:
+                matrix = np.asarray(value, np.float64)
+                if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+                    raise OptionError(f"{name} must be a (3, 3) matrix of finite numbers")
+                object.__setattr__(self, name, matrix)
+        if self.model == "essential" and (self.camera0 is None or self.camera1 is None):
+            raise OptionError(
+                "an essential matrix needs both cameras: give camera0 and camera1, "
+                "or choose the fundamental matrix"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """An estimated geometry.
+
+    Attributes:
+        kind: "homography", "fundamental", "essential" or "none".
+        matrix: (3, 3) float64, or None when nothing could be estimated. A homography
+            maps the first image to the second; for the others x1^T M x0 = 0 (essential:
+            in normalised coordinates).
+        inliers: (M,) bool, the matches that agree with it.
+    """
+
+    kind: str
+    matrix: np.ndarray | None
+    inliers: np.ndarray
+
+
+@dataclass(frozen=True)
+class Model:
+    """A kind of geometry: fewest matches, function that fits it, and its error in pixels."""
+
+    fewest: int
+    fit: Callable[[np.ndarray, np.ndarray, GeometryOptions, int], np.ndarray | None]
+    errors: Callable[[np.ndarray, np.ndarray, np.ndarray, GeometryOptions], np.ndarray]
+
+
+def estimate_geometry(
+    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions = GeometryOptions()
+) -> Geometry:
+    """Estimate the geometry between two images from matches, some of which are wrong.
+
+    Args:
+        points0, points1: (M, 2) matched positions, centre of the first pixel (0, 0).
+        options: what to estimate and how.
+
+    Returns:
+        The geometry; its inliers are the matches nearer to it than the threshold. With
+        too few matches, or when estimation fails, the matrix is None and nothing an inlier.
+
+    Example:
+        >>> a = np.array([[0, 0], [9, 0], [9, 9], [0, 9], [4, 5]], float)
+        >>> geometry = estimate_geometry(a, a + 3, GeometryOptions(model="homography"))
+        >>> geometry.inliers.all(), np.round(geometry.matrix[:2, 2]).tolist()
+        (np.True_, [3.0, 3.0])
+    """
+    points0 = np.asarray(points0, np.float64).reshape(-1, 2)
+    points1 = np.asarray(points1, np.float64).reshape(-1, 2)
+    if options.homography is not None:
+        errors = transfer_errors(points0, points1, options.homography)
+        return Geometry("homography", options.homography, errors < options.inlier_threshold)
+    if options.model == "none":
+        return Geometry("none", None, np.ones(len(points0), bool))
+    model = MODELS[options.model]
+    nothing = Geometry(options.model, None, np.zeros(len(points0), bool))
+    if len(points0) < model.fewest:
+        return nothing
+    cv2.setRNGSeed(options.seed)
+    method = cv2.USAC_MAGSAC if options.estimator == "magsac" else cv2.RANSAC
+    try:
+        matrix = model.fit(points0, points1, options, method)
+    except cv2.error:  # degenerate input, as all points in one place
+        return nothing
+    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return nothing
+    errors = model.errors(points0, points1, matrix, options)
+    return Geometry(options.model, matrix, errors < options.inlier_threshold)
+
+
+def _fit_homography(
+    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, method: int
+) -> np.ndarray | None:
+    return cv2.findHomography(
+        points0,
+        points1,
+        method,
+        options.inlier_threshold,
+        maxIters=options.iterations,
+        confidence=options.confidence,
+    )[0]
+
+
+def _fit_fundamental(
+    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, method: int
+) -> np.ndarray | None:
+    return cv2.findFundamentalMat(
+        points0, points1, method, options.inlier_threshold, options.confidence, options.iterations
+    )[0]
+
+
+def _fit_essential(
+    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, method: int
+) -> np.ndarray | None:
+    # Both images in normalised coordinates; the threshold shrinks with the focal length.
+    focal = (options.camera0[0, 0] + options.camera1[0, 0]) / 2
+    matrix, _ = cv2.findEssentialMat(
+        _normalised(points0, options.camera0),
+        _normalised(points1, options.camera1),
+        np.eye(3),
+        method=method,
+        prob=options.confidence,
+        threshold=options.inlier_threshold / focal,
+        maxIters=options.iterations,
+    )
+    return None if matrix is None else matrix[:3]
+
+
+def _essential_errors(
+    points0: np.ndarray, points1: np.ndarray, matrix: np.ndarray, options: GeometryOptions
+) -> np.ndarray:
+    fundamental = np.linalg.inv(options.camera1).T @ matrix @ np.linalg.inv(options.camera0)
+    return epipolar_errors(points0, points1, fundamental)
+
+
+def _normalised(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    homogeneous = np.column_stack([points, np.ones(len(points))])
+    return np.ascontiguousarray((homogeneous @ np.linalg.inv(camera).T)[:, :2])
+
+
+MODELS: dict[str, Model] = {
+    "homography": Model(4, _fit_homography, lambda a, b, m, _: transfer_errors(a, b, m)),
+    "fundamental": Model(8, _fit_fundamental, lambda a, b, m, _: epipolar_errors(a, b, m)),
+    "essential": Model(6, _fit_essential, _essential_errors),
+}

@@ -1,0 +1,6 @@
+"""Matchers: which descriptor of one image is like which of the other."""
+
+from .ratio import DescriptorMatches, match_descriptors
+from .registry import MATCHERS, Matcher, get_matcher
+
+__all__ = ["MATCHERS", "DescriptorMatches", "Matcher", "get_matcher", "match_descriptors"]

@@ -1,0 +1,31 @@
+"""FLANN: approximate search in randomised kd-trees, as the paper's code does it."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+KD_TREE = 1
+TREES = 5
+CHECKS = 50
+
+
+def flann_neighbours(
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the nearest neighbours with 5 kd-trees and 50 checks.
+
+    Args:
+        queries: (N, D) float32 descriptors.
+        base: (M, D) float32 descriptors, M >= count.
+        count: neighbours of each query.
+        seed: of the random trees; the result is the same for the same seed.
+
+    Returns:
+        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances,
+        the nearest first. The search is approximate: it misses some neighbours.
+    """
+    cv2.setRNGSeed(seed)
+    index = cv2.flann_Index(base, {"algorithm": KD_TREE, "trees": TREES})
+    rows, squared = index.knnSearch(queries, count, params={"checks": CHECKS})
+    return rows, np.sqrt(squared)

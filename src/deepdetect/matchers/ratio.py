@@ -1,0 +1,80 @@
+"""The ratio test: a match counts when the second-best one is clearly worse (Lowe, 2004)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .registry import Matcher
+
+
+@dataclass(frozen=True, eq=False)
+class DescriptorMatches:
+    """Matches between two sets of descriptors.
+
+    Attributes:
+        rows0, rows1: (M,) int, matched rows of the first and of the second set.
+        ratios: (M,) float32, distance of the best over that of the second-best.
+    """
+
+    rows0: np.ndarray
+    rows1: np.ndarray
+    ratios: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rows0)
+
+
+def match_descriptors(
+    descriptors0: np.ndarray,
+    descriptors1: np.ndarray,
+    matcher: Matcher,
+    *,
+    ratio: float = 0.99,
+    mutual: bool = False,
+    seed: int = 0,
+) -> DescriptorMatches:
+    """Match by nearest neighbour and ratio test.
+
+    Args:
+        descriptors0, descriptors1: (N, D) and (M, D) float32.
+        matcher: finds the neighbours.
+        ratio: a match needs a ratio strictly under it (paper's code: 0.99).
+        mutual: keep only pairs that are each other's nearest.
+        seed: of a matcher that is random.
+
+    Returns:
+        The matches, by ascending row of the first set. None are found when a set has
+        fewer than two descriptors: there is no second-best then.
+
+    Example:
+        >>> from deepdetect.matchers import get_matcher
+        >>> a = np.eye(3, 128, dtype=np.float32)
+        >>> match_descriptors(a, a[::-1].copy(), get_matcher("exact")).rows1.tolist()
+        [2, 1, 0]
+    """
+    if len(descriptors0) == 0 or len(descriptors1) < 2:
+        none = np.empty(0, np.int32)
+        return DescriptorMatches(none, none, np.empty(0, np.float32))
+    rows, distances = matcher(descriptors0, descriptors1, 2, seed)
+    best, second = distances[:, 0], distances[:, 1]
+    # Two neighbours at distance 0 are equally good: their ratio is 1.
+    ratios = np.divide(best, second, out=np.ones_like(best), where=second > 0)
+    kept = ratios < ratio
+    if mutual:
+        kept &= _mutual(descriptors0, descriptors1, rows[:, 0], matcher, seed)
+    rows0 = np.flatnonzero(kept).astype(np.int32)
+    return DescriptorMatches(rows0, rows[rows0, 0].astype(np.int32), ratios[rows0])
+
+
+def _mutual(
+    descriptors0: np.ndarray,
+    descriptors1: np.ndarray,
+    nearest: np.ndarray,
+    matcher: Matcher,
+    seed: int,
+) -> np.ndarray:
+    """Tell which rows of the first set are the nearest of their own nearest."""
+    back = matcher(descriptors1, descriptors0, 1, seed)[0][:, 0]
+    return back[nearest] == np.arange(len(nearest))

@@ -1,0 +1,156 @@
+"""Matching two images: keypoints, descriptors, ratio test, geometry (paper, Section III-C)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from .descriptors import get_descriptor
+from .detector import DeepDetect
+from .errors import OptionError
+from .geometry import estimate_geometry
+from .heatmap import HeatmapOptions
+from .image import load_image, luma
+from .keypoints import Keypoints, select_keypoints
+from .matchers import get_matcher, match_descriptors
+from .options import changed
+from .presets import MatchingOptions, get_preset
+
+
+class HeatmapDetector(Protocol):
+    """What `match_images` asks of a detector."""
+
+    def heatmap(self, image: Any) -> np.ndarray:
+        """Map an image to a (H, W) float32 probability of a keypoint."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """Matched keypoints of two images.
+
+    Attributes:
+        points0, points1: (M, 2) float32 positions in the first and in the second
+            image, matched row by row; centre of the first pixel (0, 0).
+        ratios: (M,) float32, distance to the best over that to the second-best
+            descriptor: small is distinctive.
+        model: (3, 3) float64 geometry between the images, or None.
+        inliers: (M,) bool, the matches that agree with the model.
+        kind: what `model` is: "homography", "fundamental", "essential" or "none".
+        keypoints0, keypoints1: all keypoints of the two images.
+        seconds: time of each stage, both images together.
+    """
+
+    points0: np.ndarray
+    points1: np.ndarray
+    ratios: np.ndarray
+    model: np.ndarray | None
+    inliers: np.ndarray
+    kind: str
+    keypoints0: Keypoints
+    keypoints1: Keypoints
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.points0)
+
+
+def match_images(
+    image0: Any,
+    image1: Any,
+    detector: HeatmapDetector | None = None,
+    *,
+    preset: str = "default",
+    options: MatchingOptions | None = None,
+    **changes: Any,
+) -> Matches:
+    """Detect and match the keypoints of two images.
+
+    Args:
+        image0, image1: anything `DeepDetect.heatmap` takes.
+        detector: a `DeepDetect`, or anything with its `heatmap` method; default
+            `DeepDetect()` with the bundled weights.
+        preset: name of the options to start from: "default", or "published" for exactly
+            what the paper's published code does.
+        options: all options at once, instead of a preset.
+        **changes: single options by name: those of `MatchingOptions`, `SelectionOptions`
+            and `GeometryOptions`, as `ratio=0.9, density=0.1, model="homography"`.
+
+    Returns:
+        The matches that pass the ratio test, the geometry, and which agree with it.
+
+    Raises:
+        ImageError: an image cannot be read or is not fit.
+        OptionError: an option is unknown or out of its range.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> image = rng.integers(0, 256, (64, 64), np.uint8).repeat(2, 0).repeat(2, 1)
+        >>> matches = match_images(image, image, model="homography", matcher="exact")
+        >>> bool((matches.points0 == matches.points1).all())
+        True
+    """
+    chosen = changed(options if options is not None else get_preset(preset), **changes)
+    seconds: dict[str, float] = {}
+    rgb = load_image(image0), load_image(image1)
+    detector = _configured(detector, chosen.heatmap)
+    with _timed(seconds, "heat map"):
+        heatmaps = [detector.heatmap(image) for image in rgb]
+    with _timed(seconds, "keypoints"):
+        keypoints = [select_keypoints(heatmap, chosen.selection) for heatmap in heatmaps]
+    with _timed(seconds, "descriptors"):
+        describe = get_descriptor(chosen.descriptor)
+        descriptors = [
+            describe(luma(image), points.xy, chosen.keypoint_size, chosen.angle)
+            for image, points in zip(rgb, keypoints, strict=True)
+        ]
+    with _timed(seconds, "matching"):
+        found = match_descriptors(
+            *descriptors,
+            get_matcher(chosen.matcher),
+            ratio=chosen.ratio,
+            mutual=chosen.mutual,
+            seed=chosen.geometry.seed,
+        )
+    points0 = keypoints[0].xy[found.rows0]
+    points1 = keypoints[1].xy[found.rows1]
+    with _timed(seconds, "geometry"):
+        geometry = estimate_geometry(points0, points1, chosen.geometry)
+    return Matches(
+        points0,
+        points1,
+        found.ratios,
+        geometry.matrix,
+        geometry.inliers,
+        geometry.kind,
+        *keypoints,
+        seconds,
+    )
+
+
+def _configured(
+    detector: HeatmapDetector | None, heatmap: HeatmapOptions | None
+) -> HeatmapDetector:
+    """Return the detector that sees images the way the options ask for."""
+    if detector is None:
+        detector = DeepDetect()
+    if heatmap is None:
+        return detector
+    if not isinstance(detector, DeepDetect):
+        raise OptionError(
+            "these options fix how the network sees the image, which only a DeepDetect "
+            "detector can follow: use it, or set heatmap to None"
+        )
+    return detector.configured(heatmap)
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
+    started = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - started

@@ -1,0 +1,83 @@
+"""Named sets of matching options: one line each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from .descriptors import get_descriptor
+from .errors import OptionError, unknown_name
+from .geometry import GeometryOptions
+from .heatmap import HeatmapOptions
+from .keypoints import SelectionOptions
+from .matchers import get_matcher
+
+
+@dataclass(frozen=True)
+class MatchingOptions:
+    """How two images are matched.
+
+    Attributes:
+        heatmap: how the network sees the images; None leaves the detector's own way.
+        selection: which pixels become keypoints.
+        descriptor: "sift" or "rootsift".
+        keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3).
+        angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
+        matcher: "flann" or "exact".
+        ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
+        mutual: keep only pairs that are each other's nearest.
+        geometry: which geometry is estimated, and how.
+
+    Raises:
+        OptionError: a name is unknown or a value out of its range.
+    """
+
+    heatmap: HeatmapOptions | None = None
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    descriptor: str = "sift"
+    keypoint_size: float = 3.0
+    angle: float = 0.0
+    matcher: str = "flann"
+    ratio: float = 0.99
+    mutual: bool = False
+    geometry: GeometryOptions = field(default_factory=GeometryOptions)
+
+    def __post_init__(self) -> None:
+        get_descriptor(self.descriptor)
+        get_matcher(self.matcher)
+        if not 0 < self.keypoint_size <= 100:
+            raise OptionError(
+                f"the keypoint size must be above 0 and at most 100 pixels, "
+                f"not {self.keypoint_size}"
+            )
+        if self.angle != -1 and not 0 <= self.angle < 360:
+            raise OptionError(f"the angle must lie in [0, 360) or be -1, not {self.angle}")
+        if not 0 < self.ratio <= 1:
+            raise OptionError(f"the ratio must be above 0 and at most 1, not {self.ratio}")
+
+
+PRESETS: dict[str, MatchingOptions] = {
+    "default": MatchingOptions(),
+    # What the authors' published code runs: BGR although the weights were trained on
+    # RGB, the angle unset, and every match judged by the true homography.
+    "published": MatchingOptions(
+        heatmap=HeatmapOptions(resolution=480, channels="bgr"),
+        selection=SelectionOptions(threshold=0.5),
+        descriptor="sift",
+        keypoint_size=3.0,
+        angle=-1.0,
+        matcher="flann",
+        ratio=0.99,
+        geometry=GeometryOptions(model="none"),
+    ),
+}
+
+
+def get_preset(name: str) -> MatchingOptions:
+    """Look a preset up.
+
+    Raises:
+        OptionError: the name is unknown.
+    """
+    if name not in PRESETS:
+        raise unknown_name("preset", name, PRESETS)
+    return PRESETS[name]

@@ -1,0 +1,60 @@
+"""ONNX Runtime: the backend that is always installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import OptionError, WeightsError, unknown_name
+from .shapes import check_shapes
+
+if TYPE_CHECKING:
+    from .registry import RuntimeOptions
+
+
+class OnnxRuntimeNetwork:
+    """A network run by ONNX Runtime."""
+
+    def __init__(self, session: object, input_name: str) -> None:
+        self._session = session
+        self._input_name = input_name
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        return self._session.run(None, {self._input_name: image})[0]
+
+
+def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
+    """Load an ONNX file.
+
+    Raises:
+        WeightsError: the file is damaged or is another network.
+        OptionError: an execution provider is unknown or not available.
+    """
+    import onnxruntime
+
+    providers = list(options.providers) or ["CPUExecutionProvider"]
+    for provider in providers:
+        if provider not in onnxruntime.get_all_providers():
+            raise unknown_name("provider", provider, onnxruntime.get_all_providers())
+        if provider not in onnxruntime.get_available_providers():
+            raise OptionError(
+                f"the provider {provider} is not in the installed onnxruntime: "
+                f"install the build that has it, or use one of "
+                f"{', '.join(onnxruntime.get_available_providers())}"
+            )
+    settings = onnxruntime.SessionOptions()
+    settings.log_severity_level = 3
+    if options.threads is not None:
+        settings.intra_op_num_threads = options.threads
+    try:
+        session = onnxruntime.InferenceSession(str(path), settings, providers=providers)
+    except Exception as error:  # its exceptions share no base class
+        raise WeightsError(
+            f"{path} is not an ONNX file that can be read ({str(error).splitlines()[0]}): "
+            "get it anew"
+        ) from None
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    check_shapes(path, [value.shape for value in inputs], [value.shape for value in outputs])
+    return OnnxRuntimeNetwork(session, inputs[0].name)

@@ -1,0 +1,57 @@
+"""OpenVINO: twice as fast as ONNX Runtime on CPUs, an extra."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import WeightsError
+from .shapes import check_shapes
+
+if TYPE_CHECKING:
+    from .registry import RuntimeOptions
+
+
+class OpenVinoNetwork:
+    """A network run by OpenVINO on the CPU."""
+
+    def __init__(self, model: object) -> None:
+        self._model = model
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        return self._model(image)[0]
+
+
+def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
+    """Load an ONNX file.
+
+    Raises:
+        WeightsError: the file is damaged or is another network.
+    """
+    import openvino
+
+    # Its default on newer CPUs is bfloat16, which moves keypoints.
+    settings: dict[str, object] = {"INFERENCE_PRECISION_HINT": "f32"}
+    if options.threads is not None:
+        settings["INFERENCE_NUM_THREADS"] = options.threads
+    try:
+        model = openvino.Core().compile_model(str(path), "CPU", settings)
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise WeightsError(
+            f"{path} is not an ONNX file that can be read ({reason}): get it anew"
+        ) from None
+    check_shapes(
+        path, [_shape(value) for value in model.inputs], [_shape(v) for v in model.outputs]
+    )
+    return OpenVinoNetwork(model)
+
+
+def _shape(value: object) -> list[int | str]:
+    """Return a shape with the free dimensions as text, as ONNX Runtime gives it."""
+    return [
+        "free" if dimension.is_dynamic else dimension.get_length()
+        for dimension in value.get_partial_shape()
+    ]
