@@ -23,7 +23,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         The temporary path, which the block writes.
 
     Raises:
-        DeepDetectError: the folder cannot be written.
+        DeepDetectError: the file cannot be written (no right, no room, not a folder).
 
     Example:
         >>> import tempfile
@@ -34,28 +34,24 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         'whole'
     """
     final = Path(path)
+    temporary: Path | None = None
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(
             prefix=f".{final.stem}.", suffix=f".part{final.suffix}", dir=final.parent
         )
         os.close(handle)
-    except OSError as error:
-        raise DeepDetectError(
-            f"cannot write {final}: {error.strerror or error}; choose another place with -o"
-        ) from error
-    temporary = Path(name)
-    try:
+        temporary = Path(name)
         yield temporary
         # mkstemp makes the file private; give it the mode any new file would have.
         umask = os.umask(0)
         os.umask(umask)
         temporary.chmod(0o666 & ~umask)
-        try:
-            temporary.replace(final)
-        except OSError as error:
-            raise DeepDetectError(
-                f"cannot write {final}: {error.strerror or error}; choose another place with -o"
-            ) from error
+        temporary.replace(final)
+    except OSError as error:
+        raise DeepDetectError(
+            f"cannot write {final} ({error.strerror or error}): make room or choose another place"
+        ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)

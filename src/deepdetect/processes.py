@@ -51,13 +51,18 @@ def map_in_processes(
         pool = ProcessPoolExecutor(count, mp_context=context, initializer=_single_thread)
         remaining = iter(tasks)
         # The first submissions start the processes, inside the environment above.
-        pending = {pool.submit(function, task) for _, task in zip(range(4 * count), remaining)}
+        pending = {
+            pool.submit(function, task)
+            for _, task in zip(range(4 * count), remaining, strict=False)
+        }
     try:
         while pending:
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
-            pending |= {pool.submit(function, task) for _, task in zip(done, remaining)}
+            pending |= {
+                pool.submit(function, task) for _, task in zip(done, remaining, strict=False)
+            }
     finally:
         pool.shutdown(cancel_futures=True)
 

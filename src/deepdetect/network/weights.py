@@ -39,7 +39,8 @@ def load_network(path: str | Path) -> ESPNet:
     network = ESPNet()
     try:
         with safe_open(path, framework="pt") as file:
-            network.load_state_dict({name: file.get_tensor(name) for name in file.keys()})
+            names = list(file.keys())
+            network.load_state_dict({name: file.get_tensor(name) for name in names})
     except (SafetensorError, OSError, RuntimeError, KeyError) as error:
         reason = str(error).strip().splitlines()[0].rstrip(":")
         raise WeightsError(

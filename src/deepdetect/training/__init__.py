@@ -1,0 +1,1 @@
+"""Training: photographs -> views -> labels -> batches -> weights."""

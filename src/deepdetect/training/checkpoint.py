@@ -49,7 +49,8 @@ def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam)
     """
     try:
         with safe_open(path, framework="pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            names = list(file.keys())
+            tensors = {name: file.get_tensor(name) for name in names}
             state = json.loads((file.metadata() or {})["state"])
         prefix = "network."
         network.load_state_dict(
@@ -58,11 +59,12 @@ def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam)
         for name, parameter in network.named_parameters():
             if f"adam.step.{name}" in tensors:
                 optimizer.state[parameter] = {
-                    moment: tensors[f"adam.{moment}.{name}"].to(
-                        # Adam counts its steps on the CPU, in float32.
-                        device="cpu" if moment == "step" else parameter.device
-                    )
-                    for moment in MOMENTS
+                    "step": tensors[f"adam.step.{name}"].to(parameter.device),
+                    # Laid out in memory as the parameter is: fused Adam walks them in parallel.
+                    **{
+                        moment: torch.empty_like(parameter).copy_(tensors[f"adam.{moment}.{name}"])
+                        for moment in MOMENTS[1:]
+                    },
                 }
     except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]

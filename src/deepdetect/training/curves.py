@@ -37,14 +37,13 @@ class CurvePoint:
 
 def save_curves(points: list[CurvePoint], folder: Path) -> None:
     """Write curves.csv, and curves.png where matplotlib is installed."""
-    with atomic_path(folder / "curves.csv") as temporary:
-        with temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, [field.name for field in fields(CurvePoint)])
-            writer.writeheader()
-            for point in points:
-                writer.writerow(
-                    {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(point).items()}
-                )
+    with atomic_path(folder / "curves.csv") as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(CurvePoint)])
+        writer.writeheader()
+        for point in points:
+            writer.writerow(
+                {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(point).items()}
+            )
     try:
         from matplotlib.figure import Figure
     except ImportError:

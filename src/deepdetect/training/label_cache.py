@@ -84,7 +84,8 @@ class LabelCache:
                     failures.append(failure)
         if failures:
             raise DeepDetectError(
-                f"{len(failures)} of {len(tasks)} labels could not be made; the first: {failures[0]}"
+                f"{len(failures)} of {len(tasks)} labels could not be made, the others are kept; "
+                f"the first: {failures[0]}"
             )
         return len(tasks)
 

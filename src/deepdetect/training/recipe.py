@@ -71,7 +71,7 @@ class TrainingOptions:
         OptionError: a value is out of its range.
     """
 
-    stages: tuple[Stage, ...] = (Stage(240, 16, 40), Stage(480, 8, 10))
+    stages: tuple[Stage, ...] = (Stage(240, 16, 44), Stage(480, 8, 10))
     short_sides: tuple[int, ...] = (480, 360, 240)
     dark_fraction: float = 0.25
     dark_variants: int = 1

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import platform
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +15,10 @@ import torch
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ..errors import OptionError
+from ..mask_scores import MaskScore
 from ..network.espnet import ESPNet
-from ..network.weights import save_weights
+from ..network.onnx_export import export_onnx
+from ..network.weights import load_network, save_weights
 from ..progress import progress
 from .batches import Batches
 from .checkpoint import load_checkpoint, save_checkpoint
@@ -24,10 +27,11 @@ from .device import DeviceOptions, Engine
 from .label_cache import LabelCache
 from .photos import Photo, ViewStore, hold_out, list_photos
 from .recipe import Schedule, TrainingOptions
-from .validation import MaskScore, score_masks
+from .validation import score_network
 
 CHECKPOINT = "checkpoint.safetensors"
 BEST = "best.safetensors"
+ONNX = "deepdetect.onnx"
 CHECKPOINT_SECONDS = 60.0  # a killed run loses at most so much
 
 
@@ -36,13 +40,15 @@ class TrainingResult:
     """What a run has made.
 
     Attributes:
-        weights: file of the weights with the lowest validation loss.
+        weights: safetensors file of the weights with the lowest validation loss.
+        onnx: the same weights as ONNX, fit for `DeepDetect(weights=...)`.
         points: the loss curves.
         best: the point of those weights.
         images_per_second: mean rate of this process, in 480x480 images' worth of pixels.
     """
 
     weights: Path
+    onnx: Path
     points: list[CurvePoint]
     best: CurvePoint
     images_per_second: float
@@ -57,7 +63,7 @@ def train(
     labels: str | Path | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
-    quiet: bool = False,
+    say: Callable[[str], None] | None = None,
 ) -> TrainingResult:
     """Train the network on a folder of photographs.
 
@@ -66,16 +72,18 @@ def train(
 
     Args:
         photos: folder of photographs.
-        output: folder for checkpoint.safetensors, best.safetensors, curves.csv and .png.
+        output: folder for checkpoint.safetensors, best.safetensors, deepdetect.onnx
+            and the loss curves.
         options: the recipe.
         validation: folder of other photographs; default: every twentieth is held out.
         labels: folder for the label cache; default: in `output`.
         device: how the network is run.
         workers: processes that make labels; default one for each processor.
-        quiet: show no progress bar.
+        say: takes the one line that says how the network is run; without it there is
+            no progress bar either.
 
     Returns:
-        The weights' file and the curves.
+        The weights' files and the curves.
 
     Raises:
         ImageError: a folder is missing or empty, or a photograph cannot be read.
@@ -97,9 +105,9 @@ def train(
     for part, part_root in ((training, root), (held, held_root)):
         store = ViewStore(LabelCache(cache, part_root, options.detectors))
         wanted = [(p.path, view) for p in part for view in _views(p, part is held)]
-        store.labels.make(wanted, workers, quiet)
+        store.labels.make(wanted, workers, quiet=say is None)
         stores.append(store)
-    run = _Run(training, held, stores, folder, options, device, quiet)
+    run = _Run(training, held, stores, folder, options, device, say)
     return run.finish()
 
 
@@ -127,10 +135,10 @@ class _Run:
         folder: Path,
         options: TrainingOptions,
         device: DeviceOptions,
-        quiet: bool,
+        say: Callable[[str], None] | None,
     ) -> None:
         self.held, self.held_store = held, stores[1]
-        self.folder, self.options, self.quiet = folder, options, quiet
+        self.folder, self.options, self.say = folder, options, say
         self.schedule = Schedule(options, len(training))
         self.batches = Batches(training, stores[0], self.schedule)
         torch.manual_seed(options.seed)
@@ -151,9 +159,9 @@ class _Run:
         milestones = self.schedule.milestones(self.options.validations)
         started, pixels = time.monotonic(), 0
         saved = started
-        if self.step < self.schedule.steps and not self.quiet:
-            print(f"training on {self.engine.describe()}", flush=True)
-        bar = progress(self.schedule.steps, "training", "step", self.quiet, done=self.step)
+        if self.step < self.schedule.steps and self.say is not None:
+            self.say(f"training on {self.engine.describe()}")
+        bar = progress(self.schedule.steps, "training", "step", self.say is None, self.step)
         with bar:
             for rgb, masks in self.batches.stream(self.step):
                 loss = self._learn(rgb, masks)
@@ -174,7 +182,9 @@ class _Run:
                     saved = time.monotonic()
         seconds = max(time.monotonic() - started, 1e-9)
         best = min(self.points, key=lambda point: point.validation_loss)
-        return TrainingResult(self.folder / BEST, self.points, best, pixels / (480 * 480) / seconds)
+        export_onnx(load_network(self.folder / BEST), self.folder / ONNX)
+        rate = pixels / (480 * 480) / seconds
+        return TrainingResult(self.folder / BEST, self.folder / ONNX, self.points, best, rate)
 
     def _learn(self, rgb: np.ndarray, masks: np.ndarray) -> float:
         """Make one optimiser step; return the loss."""
@@ -223,7 +233,7 @@ class _Run:
         pairs = (
             self.held_store.load(photo, view) for photo, view in zip(self.held, views, strict=True)
         )
-        return score_masks(self.network, pairs, self.engine.device)
+        return score_network(self.network, pairs, self.engine.device)
 
     def _provenance(self, point: CurvePoint) -> dict[str, str]:
         """Return what is written into the weights' file."""
@@ -254,7 +264,8 @@ class _Run:
         state = load_checkpoint(path, self.network, self.optimizer)
         if state["options"] != self.options.to_json():
             raise OptionError(
-                f"{self.folder} holds a run with other options ({_difference(state, self.options)}): "
+                f"{self.folder} holds a run with other options "
+                f"({_difference(state, self.options)}): "
                 "use the same options to continue it, or another folder with -o"
             )
         if state["photographs"] != self.schedule.photos:

@@ -1,32 +1,18 @@
-"""The loss and the overlap of predicted and true masks."""
+"""Scoring the network that is being trained."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import nn
-from torch.nn.functional import binary_cross_entropy_with_logits, pad
+from torch.nn.functional import pad
+
+from ..mask_scores import MaskScore, mean_score, score_heatmap
 
 
-@dataclass(frozen=True)
-class MaskScore:
-    """Means over images.
-
-    Attributes:
-        loss: binary cross-entropy a pixel.
-        iou: intersection over union of the masks at threshold 0.5.
-        images: number of images.
-    """
-
-    loss: float
-    iou: float
-    images: int
-
-
-def score_masks(
+def score_network(
     network: nn.Module, pairs: Iterable[tuple[np.ndarray, np.ndarray]], device: torch.device
 ) -> MaskScore:
     """Score a network on images with known masks, one image at a time, in float32.
@@ -37,28 +23,21 @@ def score_masks(
         device: where the network is.
 
     Returns:
-        Means over the images; an image whose two masks are empty has IoU 1.
+        Means over the images.
     """
     was_training = network.training
     network.eval()
-    losses, overlaps = [], []
-    with torch.inference_mode():
-        for rgb, mask in pairs:
-            image = torch.from_numpy(np.ascontiguousarray(rgb)).to(device)
-            truth = torch.from_numpy(np.ascontiguousarray(mask)).to(device)
-            logits = padded_logits(network, image)
-            losses.append(binary_cross_entropy_with_logits(logits, truth.float()).item())
-            union = ((logits > 0) | truth).sum().item()
-            shared = ((logits > 0) & truth).sum().item()
-            overlaps.append(shared / union if union else 1.0)
+    scores = [score_heatmap(_probability(network, rgb, device), mask) for rgb, mask in pairs]
     network.train(was_training)
-    return MaskScore(float(np.mean(losses)), float(np.mean(overlaps)), len(losses))
+    return mean_score(scores)
 
 
-def padded_logits(network: nn.Module, rgb: torch.Tensor) -> torch.Tensor:
-    """Run the network on a (H, W, 3) uint8 image of any size; return (H, W) logits."""
+@torch.inference_mode()
+def _probability(network: nn.Module, rgb: np.ndarray, device: torch.device) -> np.ndarray:
+    """Run the network on a (H, W, 3) uint8 image of any size."""
     height, width = rgb.shape[:2]
-    image = rgb.permute(2, 0, 1)[None].float().div_(255)
+    image = torch.from_numpy(np.ascontiguousarray(rgb)).to(device)
+    image = image.permute(2, 0, 1)[None].float().div_(255)
     image = pad(image, (0, -width % 8, 0, -height % 8), mode="replicate")
     image = image.contiguous(memory_format=torch.channels_last)
-    return network(image)[0, 0, :height, :width].float()
+    return torch.sigmoid(network(image)[0, 0, :height, :width].float()).cpu().numpy()

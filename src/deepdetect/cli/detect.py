@@ -1,0 +1,127 @@
+"""`deepdetect detect`: keypoints of photographs."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .shared import (
+    PATH,
+    detector_options,
+    expand_images,
+    format_option,
+    json_option,
+    make_detector,
+    output_option,
+    pictures_option,
+    print_json,
+    report_failures,
+    selection_options,
+)
+
+
+@click.command(short_help="Keypoints of photographs.")
+@click.argument("images", type=PATH, nargs=-1, required=True)
+@output_option
+@selection_options
+@click.option(
+    "--ignore",
+    type=PATH,
+    help="Mask image of the same size: no keypoints where it is bright.",
+)
+@detector_options
+@format_option
+@pictures_option
+@json_option
+def detect(
+    images: tuple[Path, ...],
+    output: Path,
+    threshold: float,
+    density: float | None,
+    max_keypoints: int | None,
+    nms_radius: int,
+    ignore: Path | None,
+    file_format: str,
+    pictures: bool,
+    as_json: bool,
+    **values: Any,
+) -> None:
+    r"""Detect the keypoints of IMAGES (files or folders).
+
+    Writes for each image STEM.npz (or .csv) with the positions and probabilities, and
+    the pictures STEM_keypoints.png and STEM_heatmap.png.
+
+    \b
+    deepdetect detect photo.jpg
+    deepdetect detect photos/ -o keypoints --max-keypoints 2048 --nms-radius 2
+    deepdetect detect photo.jpg --density 0.1 --format csv
+    """
+    from ..errors import DeepDetectError
+    from ..keypoints import SelectionOptions
+    from ..labels.files import load_mask
+    from ..progress import progress
+
+    paths = expand_images(images)
+    mask = load_mask(ignore) if ignore is not None else None
+    selection = SelectionOptions(threshold, density, max_keypoints, nms_radius, mask)
+    detector = make_detector(values)
+    results: list[dict[str, Any]] = []
+    failures = []
+    with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:
+        for path in paths:
+            try:
+                results.append(
+                    _detect_one(path, detector, selection, output, file_format, pictures)
+                )
+            except DeepDetectError as error:
+                failures.append(str(error))
+            bar.update(1)
+    if as_json:
+        print_json({"backend": detector.backend, "images": results, "failures": failures})
+    else:
+        for result in results:
+            click.echo(
+                f"{result['image']}: {result['keypoints']:,} keypoints, "
+                f"density {result['density']:.3f}, {result['seconds']:.2f} s -> {result['file']}"
+            )
+    report_failures(failures, len(paths))
+
+
+def _detect_one(
+    path: Path, detector: Any, selection: Any, output: Path, file_format: str, pictures: bool
+) -> dict[str, Any]:
+    """Detect, save and draw the keypoints of one image; return its numbers."""
+    from ..image import load_image
+    from ..keypoints import select_keypoints
+    from ..pictures import draw_heatmap, draw_keypoints, save_picture, with_caption
+    from ..storage import save_keypoints
+
+    rgb = load_image(path)
+    started = time.perf_counter()
+    heatmap = detector.heatmap(rgb)
+    keypoints = select_keypoints(heatmap, selection)
+    seconds = time.perf_counter() - started
+    file = output / f"{path.stem}.{file_format}"
+    save_keypoints(keypoints, file)
+    drawn = {}
+    if pictures:
+        caption = f"{len(keypoints):,} keypoints, density {keypoints.density:.3f}"
+        for name, picture in (
+            ("keypoints", with_caption(draw_keypoints(rgb, keypoints), caption)),
+            ("heatmap", draw_heatmap(heatmap)),
+        ):
+            drawn[name] = output / f"{path.stem}_{name}.png"
+            save_picture(picture, drawn[name])
+    return {
+        "image": path,
+        "width": rgb.shape[1],
+        "height": rgb.shape[0],
+        "keypoints": len(keypoints),
+        "density": round(keypoints.density, 6),
+        "seconds": round(seconds, 4),
+        "file": file,
+        "pictures": drawn,
+    }

@@ -1,0 +1,62 @@
+"""The command `deepdetect`: its subcommands, and how errors are told."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from typing import Any
+
+import click
+
+from ..errors import DeepDetectError
+from .demo import demo
+from .detect import detect
+from .evaluate import evaluate
+from .label import label
+from .match import match
+from .train import train
+
+
+class Commands(click.Group):
+    """A group that names the nearest right command, and ends with exit code 2 on user errors."""
+
+    def resolve_command(self, context: click.Context, args: list[str]) -> Any:
+        name = args[0]
+        if self.get_command(context, name) is None and not name.startswith("-"):
+            nearest = difflib.get_close_matches(name, self.commands, n=1)
+            hint = f" Did you mean '{nearest[0]}'?" if nearest else ""
+            raise click.UsageError(f"There is no command '{name}'.{hint}", context)
+        return super().resolve_command(context, args)
+
+    def invoke(self, context: click.Context) -> Any:
+        try:
+            return super().invoke(context)
+        except DeepDetectError as error:
+            click.echo(f"deepdetect: {error}", err=True)
+            context.exit(2)
+        except KeyboardInterrupt:
+            click.echo("deepdetect: stopped; what was written stays", err=True)
+            context.exit(130)
+        except BrokenPipeError:
+            sys.stderr.close()
+            context.exit(1)
+
+
+@click.group(
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(package_name="deepdetect", prog_name="deepdetect")
+def main() -> None:
+    r"""Dense keypoints from a tiny network, and their matches.
+
+    \b
+    deepdetect detect photo.jpg            keypoints of a photograph
+    deepdetect match left.jpg right.jpg    matches between two photographs
+
+    Each command has its own --help.
+    """
+
+
+for command in (detect, match, label, train, evaluate, demo):
+    main.add_command(command)

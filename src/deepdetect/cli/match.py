@@ -1,0 +1,158 @@
+"""`deepdetect match`: matches between two photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .shared import (
+    PATH,
+    detector_options,
+    format_option,
+    json_option,
+    make_detector,
+    output_option,
+    pictures_option,
+    print_json,
+    print_table,
+    seconds_rows,
+    selection_options,
+)
+
+
+@click.command(short_help="Matches between two photographs.")
+@click.argument("image0", type=PATH)
+@click.argument("image1", type=PATH)
+@output_option
+@click.option(
+    "--preset",
+    default="default",
+    show_default=True,
+    help="Options to start from: default, or published (exactly the paper's code).",
+)
+@selection_options
+@click.option("--descriptor", help="sift or rootsift.  [default: sift]")
+@click.option("--keypoint-size", type=float, help="Size for the descriptor, pixels.  [default: 3]")
+@click.option("--matcher", help="flann or exact.  [default: flann]")
+@click.option("--ratio", type=float, help="Ratio test: keep matches under it.  [default: 0.99]")
+@click.option("--mutual/--no-mutual", default=None, help="Keep mutual nearest neighbours only.")
+@click.option(
+    "--model",
+    help="fundamental (any static scene), homography (planes, pure rotation) or none.  "
+    "[default: fundamental]",
+)
+@click.option("--estimator", help="magsac or ransac.  [default: magsac]")
+@click.option("--inlier-threshold", type=float, help="Pixels.  [default: 1]")
+@click.option(
+    "--homography", type=PATH, help="Text file of a known 3x3 homography to judge matches by."
+)
+@click.option("--seed", type=int, help="Of the random choices.  [default: 0]")
+@detector_options
+@format_option
+@pictures_option
+@json_option
+@click.pass_context
+def match(
+    context: click.Context,
+    image0: Path,
+    image1: Path,
+    output: Path,
+    preset: str,
+    homography: Path | None,
+    file_format: str,
+    pictures: bool,
+    as_json: bool,
+    **values: Any,
+) -> None:
+    r"""Match the keypoints of IMAGE0 and IMAGE1.
+
+    Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their ratios,
+    the estimated geometry and which matches agree with it, and a picture of them.
+
+    \b
+    deepdetect match left.jpg right.jpg
+    deepdetect match page1.jpg page2.jpg --model homography --ratio 0.9
+    deepdetect match a.png b.png --preset published --homography H1to2p
+    """
+    from ..image import load_image
+    from ..matching import match_images
+    from ..storage import save_matches
+
+    rgb0, rgb1 = load_image(image0), load_image(image1)
+    detector = make_detector(values)
+    # Only what was given on the command line changes the preset.
+    given = {
+        name: value
+        for name, value in values.items()
+        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+    }
+    if homography is not None:
+        given["homography"] = _read_homography(homography)
+    matches = match_images(rgb0, rgb1, detector, preset=preset, **given)
+    stem = f"{image0.stem}_{image1.stem}_matches"
+    file = output / f"{stem}.{file_format}"
+    save_matches(matches, file)
+    picture = None
+    if pictures:
+        picture = output / f"{stem}.png"
+        _draw(rgb0, rgb1, matches, picture)
+    numbers = {
+        "image0": image0,
+        "image1": image1,
+        "keypoints0": len(matches.keypoints0),
+        "keypoints1": len(matches.keypoints1),
+        "density0": round(matches.keypoints0.density, 6),
+        "density1": round(matches.keypoints1.density, 6),
+        "matches": len(matches),
+        "inliers": int(matches.inliers.sum()),
+        "kind": matches.kind,
+        "model": None if matches.model is None else matches.model.tolist(),
+        "backend": detector.backend,
+        "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
+        "file": file,
+        "picture": picture,
+    }
+    if as_json:
+        print_json(numbers)
+        return
+    print_table(
+        [
+            ("keypoints", f"{numbers['keypoints0']:,} and {numbers['keypoints1']:,}"),
+            ("density", f"{numbers['density0']:.3f} and {numbers['density1']:.3f}"),
+            ("matches", f"{len(matches):,}"),
+            (f"inliers ({matches.kind})", f"{numbers['inliers']:,}"),
+            *seconds_rows(matches.seconds),
+            ("written", ", ".join(str(path) for path in (file, picture) if path)),
+        ],
+        f"{image0} and {image1}",
+    )
+    if matches.model is None and matches.kind != "none":
+        click.echo(f"no {matches.kind} could be estimated from these matches", err=True)
+
+
+def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
+    from ..pictures import draw_matches, save_picture, with_caption
+
+    picture = draw_matches(rgb0, rgb1, matches.points0, matches.points1, matches.inliers)
+    caption = (
+        f"{len(matches):,} matches, {int(matches.inliers.sum()):,} of them inliers "
+        f"({matches.kind}); a random sample is drawn: green inliers, red others"
+    )
+    save_picture(with_caption(picture, caption), path)
+
+
+def _read_homography(path: Path) -> Any:
+    import numpy as np
+
+    from ..errors import OptionError
+
+    try:
+        return np.loadtxt(path, ndmin=2)
+    except FileNotFoundError:
+        raise OptionError(f"there is no file {path}: check the path") from None
+    except (OSError, ValueError, UnicodeDecodeError):
+        raise OptionError(
+            f"{path} holds no homography: it must be three rows of three numbers"
+        ) from None

@@ -1,0 +1,186 @@
+"""Options and outputs that several commands have in common."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..errors import DeepDetectError, OptionError
+
+if TYPE_CHECKING:
+    from ..detector import DeepDetect
+
+PATH = click.Path(path_type=Path)
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+class Resolution(click.ParamType):
+    """The word "native", or a number of pixels."""
+
+    name = "native|PIXELS"
+
+    def convert(self, value: Any, param: Any, context: Any) -> str | int:
+        if value == "native" or isinstance(value, int):
+            return value
+        try:
+            return int(value)
+        except ValueError:
+            self.fail(f"{value!r} is neither 'native' nor a number of pixels", param, context)
+
+
+def combined(*options: Decorator) -> Decorator:
+    """Make one decorator of several, which appear in this order in the help."""
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return decorate
+
+
+detector_options = combined(
+    click.option(
+        "--weights", type=PATH, help="ONNX or safetensors file.  [default: the bundled weights]"
+    ),
+    click.option(
+        "--resolution",
+        type=Resolution(),
+        default="native",
+        show_default=True,
+        help="Show the network the image as it is, or squashed to a square (paper: 480).",
+    ),
+    click.option(
+        "--backend",
+        default="auto",
+        show_default=True,
+        help="onnxruntime, openvino, torch, or auto: OpenVINO when it is installed.",
+    ),
+    click.option(
+        "--provider",
+        "providers",
+        multiple=True,
+        metavar="NAME",
+        help="Execution provider of ONNX Runtime, as CUDAExecutionProvider; may be repeated.",
+    ),
+    click.option("--threads", type=int, help="Number of threads.  [default: the backend's choice]"),
+)
+
+selection_options = combined(
+    click.option(
+        "--threshold",
+        type=float,
+        default=0.5,
+        show_default=True,
+        help="Probability above which a pixel is a keypoint (tau).",
+    ),
+    click.option(
+        "--density",
+        type=float,
+        help="Wanted keypoints a pixel, from 0 to 1, instead of the threshold.",
+    ),
+    click.option("--max-keypoints", type=int, help="Keep only the most probable so many."),
+    click.option(
+        "--nms-radius",
+        type=int,
+        default=0,
+        show_default=True,
+        help="Keep only the most probable of keypoints so close, in pixels.",
+    ),
+)
+
+output_option = click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    default=Path("deepdetect-output"),
+    show_default=True,
+    help="Folder for the results.",
+)
+format_option = click.option(
+    "--format",
+    "file_format",
+    type=click.Choice(["npz", "csv"]),
+    default="npz",
+    show_default=True,
+    help="Format of the data files.",
+)
+pictures_option = click.option(
+    "--pictures/--no-pictures", default=True, show_default=True, help="Write pictures as PNG."
+)
+workers_option = click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Processes that make labels.  [default: one a processor]",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+
+
+def make_detector(values: dict[str, Any]) -> DeepDetect:
+    """Make the detector that `detector_options` describe, taking them out of the values."""
+    from ..detector import DeepDetect
+
+    names = ("weights", "resolution", "backend", "providers", "threads")
+    return DeepDetect(**{name: values.pop(name) for name in names})
+
+
+def expand_images(paths: Sequence[Path]) -> list[Path]:
+    """Replace folders by the images below them, and check that results will not collide.
+
+    Raises:
+        ImageError: a folder is empty.
+        OptionError: two images have the same name without its ending.
+    """
+    from ..image import find_images
+
+    images: list[Path] = []
+    for path in paths:
+        images += find_images(path) if path.is_dir() else [path]
+    seen: dict[str, Path] = {}
+    for image in dict.fromkeys(images):
+        if image.stem in seen:
+            raise OptionError(
+                f"{seen[image.stem]} and {image} would write the same files: "
+                "rename one, or do them one after the other into two folders"
+            )
+        seen[image.stem] = image
+    return list(seen.values())
+
+
+def report_failures(failures: Sequence[str], total: int) -> None:
+    """Raise when some of several images failed, naming the first.
+
+    Raises:
+        DeepDetectError: there are failures.
+    """
+    if failures and total == 1:
+        raise DeepDetectError(failures[0])
+    if failures:
+        raise DeepDetectError(
+            f"{len(failures)} of {total} images failed, the others are done; the first: "
+            f"{failures[0]}"
+        )
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON; paths become text."""
+    click.echo(json.dumps(value, indent=2, default=str))
+
+
+def print_table(rows: Sequence[tuple[str, str]], title: str = "") -> None:
+    """Print names and values in two columns."""
+    if title:
+        click.echo(title)
+    width = max((len(name) for name, _ in rows), default=0)
+    for name, value in rows:
+        click.echo(f"  {name:<{width}}  {value}")
+
+
+def seconds_rows(seconds: dict[str, float]) -> list[tuple[str, str]]:
+    """Make the table rows for the time of each stage."""
+    return [(f"seconds: {stage}", f"{value:.3f}") for stage, value in seconds.items()]

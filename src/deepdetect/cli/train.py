@@ -1,0 +1,131 @@
+"""`deepdetect train`: weights from a folder of photographs."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .shared import PATH, json_option, print_json, print_table, workers_option
+
+
+@click.command(short_help="Train the network on photographs.")
+@click.argument("photos", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, help="Folder of the run.")
+@click.option(
+    "--validation",
+    type=PATH,
+    help="Folder of other photographs.  [default: every twentieth is held out]",
+)
+@click.option("--labels", type=PATH, help="Folder for the label cache.  [default: in the run's]")
+@click.option(
+    "--stage",
+    "stages",
+    multiple=True,
+    metavar="CROPxBATCHxEPOCHS",
+    help="What is trained on; repeat it for several in turn.  [default: 240x16x44 480x8x10]",
+)
+@click.option(
+    "--short-side",
+    "short_sides",
+    type=int,
+    multiple=True,
+    help="Size of the photographs' shorter side in pixels; may be repeated.  "
+    "[default: 480 360 240]",
+)
+@click.option("--dark-fraction", type=float, help="Share of darkened images.  [default: 0.25]")
+@click.option("--learning-rate", type=float, help="Of Adam, at the start.  [default: 0.001]")
+@click.option("--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]")
+@click.option("--validations", type=int, help="How often the loss is validated.  [default: 12]")
+@click.option("--seed", type=int, help="Of all random choices.  [default: 0]")
+@click.option("--device", default="auto", show_default=True, help="cpu, cuda or auto.")
+@click.option(
+    "--precision", default="auto", show_default=True, help="float32, bfloat16 or auto (fastest)."
+)
+@click.option(
+    "--compile/--no-compile",
+    "compile_network",
+    default=None,
+    help="torch.compile.  [default: when there is a C++ compiler]",
+)
+@click.option("--threads", type=int, help="CPU threads.  [default: torch's choice]")
+@workers_option
+@json_option
+def train(
+    photos: Path,
+    output: Path,
+    validation: Path | None,
+    labels: Path | None,
+    device: str,
+    precision: str,
+    compile_network: bool | None,
+    threads: int | None,
+    workers: int | None,
+    as_json: bool,
+    **values: Any,
+) -> None:
+    r"""Train the network on the photographs in the folder PHOTOS.
+
+    Labels are made first, once, by `deepdetect label`'s detectors. The run's folder gets
+    checkpoint.safetensors, best.safetensors and deepdetect.onnx (the weights of the
+    lowest validation loss) and the loss curves, curves.csv and curves.png. A run that was
+    broken off goes on when the same command is given again.
+
+    \b
+    deepdetect train photos/ -o run
+    deepdetect detect photo.jpg --weights run/deepdetect.onnx
+    """
+    from ..errors import MissingExtraError
+    from ..options import changed
+
+    for package in ("torch", "safetensors", "onnx"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtraError(
+                f"training needs the package {package}, which is not installed: "
+                "run pip install 'deepdetect[train]'"
+            )
+    from ..training.device import DeviceOptions
+    from ..training.recipe import Stage, TrainingOptions
+    from ..training.trainer import train as run
+
+    given = {name: value for name, value in values.items() if value not in (None, ())}
+    if "stages" in given:
+        given["stages"] = tuple(Stage.parse(text) for text in given["stages"])
+    if "detectors" in given:
+        given["detectors"] = tuple(name.strip() for name in given["detectors"].split(","))
+    result = run(
+        photos,
+        output,
+        changed(TrainingOptions(), **given),
+        validation=validation,
+        labels=labels,
+        device=DeviceOptions(device, precision, compile_network, threads),
+        workers=workers,
+        say=None if as_json else click.echo,
+    )
+    best = result.best
+    if as_json:
+        print_json(
+            {
+                "weights": result.weights,
+                "onnx": result.onnx,
+                "epoch": best.epoch,
+                "validation_loss": best.validation_loss,
+                "normal": {"loss": best.normal_loss, "iou": best.normal_iou},
+                "dark": {"loss": best.dark_loss, "iou": best.dark_iou},
+                "images_per_second": round(result.images_per_second, 3),
+            }
+        )
+        return
+    print_table(
+        [
+            ("best after epoch", f"{best.epoch:.1f}"),
+            ("validation loss", f"{best.validation_loss:.4f}"),
+            ("normal images", f"loss {best.normal_loss:.4f}, IoU {best.normal_iou:.3f}"),
+            ("dark images", f"loss {best.dark_loss:.4f}, IoU {best.dark_iou:.3f}"),
+            ("480x480 images/s", f"{result.images_per_second:.1f}"),
+            ("written", f"{result.weights}, {result.onnx}"),
+        ]
+    )

@@ -1,0 +1,136 @@
+"""Pictures of heat maps, keypoints, matches and labels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from .atomic import atomic_path
+from .keypoints import Keypoints
+from .labels import Label
+
+SPARSE = 5000
+"""Up to so many keypoints are drawn as circles, more as single pixels."""
+
+CAPTION_HEIGHT = 28
+GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
+
+
+def save_picture(rgb: np.ndarray, path: str | Path) -> None:
+    """Write a (H, W, 3) uint8 RGB picture as PNG, whole or not at all."""
+    with atomic_path(path) as temporary:
+        data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1]
+        temporary.write_bytes(data.tobytes())
+
+
+def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
+    """Colour a (H, W) probability map: dark blue is 0, yellow is 1.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+    """
+    levels = np.rint(np.clip(heatmap, 0, 1) * 255).astype(np.uint8)
+    return cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+
+
+def draw_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
+    """Draw keypoints over a dimmed image: circles when they are few, else pixels.
+
+    Args:
+        rgb: (H, W, 3) uint8 RGB.
+        keypoints: its keypoints.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+    """
+    canvas = (rgb * 0.5).astype(np.uint8)
+    pixels = np.rint(keypoints.xy).astype(int)
+    if len(keypoints) <= SPARSE:
+        for x, y in pixels.tolist():
+            cv2.circle(canvas, (x, y), 3, GREEN, 1, cv2.LINE_AA)
+        return canvas
+    # Half transparent, so that the image shows through the dense points.
+    columns, rows = pixels.T
+    canvas[rows, columns] = canvas[rows, columns] // 2 + np.array(GREEN, np.uint8) // 2
+    return canvas
+
+
+def draw_matches(
+    rgb0: np.ndarray,
+    rgb1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    good: np.ndarray,
+    lines: int = 150,
+) -> np.ndarray:
+    """Draw the two images side by side, with lines between a sample of the matches.
+
+    Args:
+        rgb0, rgb1: the images, (H, W, 3) uint8 RGB.
+        points0, points1: (M, 2) matched positions.
+        good: (M,) bool: green lines, the others red.
+        lines: number of lines; the sample is random with a fixed seed, so the shares
+            of green and red are those of all matches.
+
+    Returns:
+        (H, W0 + W1, 3) uint8 RGB, H of the higher image.
+    """
+    height = max(rgb0.shape[0], rgb1.shape[0])
+    canvas = np.zeros((height, rgb0.shape[1] + rgb1.shape[1], 3), np.uint8)
+    canvas[: rgb0.shape[0], : rgb0.shape[1]] = (rgb0 * 0.7).astype(np.uint8)
+    canvas[: rgb1.shape[0], rgb0.shape[1] :] = (rgb1 * 0.7).astype(np.uint8)
+    chosen = np.random.default_rng(0).permutation(len(points0))[:lines]
+    for k in sorted(chosen, key=lambda k: bool(good[k])):  # the good ones on top
+        start = tuple(int(v) for v in np.rint(points0[k]))
+        end = tuple(int(v) for v in np.rint(points1[k] + [rgb0.shape[1], 0]))
+        colour = GREEN if good[k] else RED
+        cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
+        cv2.circle(canvas, start, 2, colour, -1, cv2.LINE_AA)
+        cv2.circle(canvas, end, 2, colour, -1, cv2.LINE_AA)
+    return canvas
+
+
+def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
+    """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
+
+    Args:
+        rgb: (H, W, 3) uint8 RGB.
+        label: its label.
+
+    Returns:
+        Four panels in a row, each with a caption that tells its density.
+    """
+    panels = [with_caption(rgb, f"image ({label.visibility} visibility settings)")]
+    for title, mask in (
+        ("keypoints", label.keypoints),
+        ("edges", label.edges),
+        ("combined", label.mask),
+    ):
+        picture = np.repeat((mask * np.uint8(255))[:, :, None], 3, 2)
+        panels.append(with_caption(picture, f"{title}: {mask.mean():.1%} of pixels"))
+    return side_by_side(panels)
+
+
+def with_caption(rgb: np.ndarray, text: str) -> np.ndarray:
+    """Put a line of text under a picture, shrunk to its width where needed."""
+    strip = np.zeros((CAPTION_HEIGHT, rgb.shape[1], 3), np.uint8)
+    scale = 0.5
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    scale *= min(1.0, (rgb.shape[1] - 12) / max(width, 1))
+    cv2.putText(strip, text, (6, 19), cv2.FONT_HERSHEY_SIMPLEX, scale, WHITE, 1, cv2.LINE_AA)
+    return np.concatenate([rgb, strip])
+
+
+def side_by_side(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
+    """Join pictures of one height in a row, with a white gap."""
+    height = max(panel.shape[0] for panel in panels)
+    joined = []
+    for panel in panels:
+        if joined:
+            joined.append(np.full((height, gap, 3), 255, np.uint8))
+        below = height - panel.shape[0]
+        joined.append(np.pad(panel, ((0, below), (0, 0), (0, 0))))
+    return np.concatenate(joined, axis=1)

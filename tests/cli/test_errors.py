@@ -1,0 +1,179 @@
+"""Whatever a user gets wrong ends with one sentence and exit code 2, and without a traceback."""
+
+from __future__ import annotations
+
+import errno
+import subprocess
+import sys
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetectError, Keypoints
+from deepdetect.storage import save_keypoints
+
+
+@pytest.fixture
+def bad(tmp_path: Path, photos: Path) -> Path:
+    """A folder of things that are no fit input."""
+    folder = tmp_path / "bad"
+    (folder / "empty").mkdir(parents=True)
+    png, jpg = (photos / "left.png").read_bytes(), (photos / "cat.jpg").read_bytes()
+    (folder / "good.png").write_bytes(png)
+    (folder / "truncated.png").write_bytes(png[: len(png) // 2])
+    (folder / "truncated.jpg").write_bytes(jpg[: len(jpg) // 2])
+    (folder / "text.png").write_text("I am no image")
+    (folder / "zero.jpg").write_bytes(b"")
+    (folder / "weights.onnx").write_text("I am no network")
+    (folder / "weights.safetensors").write_bytes(b"\x08\x00\x00\x00\x00\x00\x00\x00{}      ")
+    (folder / "weights.pth").write_bytes(b"\x80\x04K\x01.")
+    Image.new("L", (15, 40)).save(folder / "small.png")
+    (folder / "matrix.txt").write_text("1 2\n3 4\n")
+    return folder
+
+
+CASES = {
+    "missing image": "detect {bad}/nothing.png",
+    "truncated png": "detect {bad}/truncated.png",
+    "truncated jpg": "detect {bad}/truncated.jpg",
+    "no image": "detect {bad}/text.png",
+    "empty file": "detect {bad}/zero.jpg",
+    "empty folder": "detect {bad}/empty",
+    "small image": "detect {bad}/small.png",
+    "missing weights": "detect {bad}/good.png --weights {bad}/no.onnx",
+    "text as weights": "detect {bad}/good.png --weights {bad}/weights.onnx",
+    "text as weights, ONNX Runtime": (
+        "detect {bad}/good.png --weights {bad}/weights.onnx --backend onnxruntime"
+    ),
+    "other tensors": "detect {bad}/good.png --weights {bad}/weights.safetensors",
+    "a pickle": "detect {bad}/good.png --weights {bad}/weights.pth",
+    "backend": "detect {bad}/good.png --backend onnxruntim",
+    "provider": "detect {bad}/good.png --provider CUDA",
+    "threshold": "detect {bad}/good.png --threshold 2",
+    "density": "detect {bad}/good.png --density 0",
+    "resolution": "detect {bad}/good.png --resolution 481",
+    "output is a file": "detect {bad}/good.png -o {bad}/text.png",
+    "ignore mask": "detect {bad}/good.png --ignore {bad}/small.png",
+    "missing second image": "match {bad}/good.png {bad}/nothing.png",
+    "preset": "match {bad}/good.png {bad}/good.png --preset publishd",
+    "model": "match {bad}/good.png {bad}/good.png --model homografy",
+    "matcher": "match {bad}/good.png {bad}/good.png --matcher flan",
+    "homography": "match {bad}/good.png {bad}/good.png --homography {bad}/matrix.txt",
+    "label nothing": "label {bad}/empty -o {bad}/out",
+    "label detector": "label {bad}/good.png -o {bad}/out --detectors siift",
+    "label visibility": "label {bad}/good.png -o {bad}/out --visibility dark",
+    "train nothing": "train {bad}/empty -o {bad}/out",
+    "train missing": "train {bad}/nowhere -o {bad}/out",
+    "train stage": "train {bad} -o {bad}/out --stage 240",
+    "train device": "train {bad} -o {bad}/out --device tpu",
+    "evaluate nothing": "evaluate {bad}/empty",
+}
+
+
+@pytest.mark.parametrize("arguments", CASES.values(), ids=CASES.keys())
+def test_one_sentence_and_exit_code_2(run, bad: Path, arguments: str) -> None:
+    if arguments.startswith("train"):
+        pytest.importorskip("torch", reason="needs torch, which is for training only")
+    if "weights.safetensors" in arguments:
+        pytest.importorskip("torch", reason="needs torch, which is for training only")
+    before = {path: path.read_bytes() for path in bad.rglob("*") if path.is_file()}
+    result = run(*arguments.format(bad=bad).split())
+    assert result.exit_code == 2, result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    message = result.stderr.strip()
+    assert message.startswith("deepdetect: ")
+    assert len(message.splitlines()) == 1, message
+    assert "Traceback" not in message
+    assert {path: path.read_bytes() for path in bad.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        ("detekt x.png", "detect"),
+        ("detect x.png --treshold 0.5", "--threshold"),
+        ("match x.png", "IMAGE1"),
+        ("detect x.png --threshold high", "high"),
+        ("detect x.png --resolution full", "native"),
+        ("label x.png -o out --workers 0", "--workers"),
+    ],
+)
+def test_usage_errors_name_the_right_word(run, arguments: str, hint: str) -> None:
+    result = run(*arguments.split())
+    assert result.exit_code == 2
+    assert hint in result.stderr
+
+
+def test_what_was_written_before_survives(run, photos: Path, bad: Path) -> None:
+    assert run("detect", photos / "left.png", "-o", "out").exit_code == 0
+    before = {path.name: path.read_bytes() for path in Path("out").iterdir()}
+    broken = Path("in/left.png")
+    broken.parent.mkdir()
+    broken.write_bytes((bad / "truncated.png").read_bytes())
+    assert run("detect", broken, "-o", "out").exit_code == 2
+    assert {path.name: path.read_bytes() for path in Path("out").iterdir()} == before
+
+
+def test_a_process_of_its_own_ends_the_same_way(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "deepdetect", "detect", "nothing.png"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 2
+    assert done.stderr == "deepdetect: there is no file nothing.png: check the path\n"
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize("command", ["", "detect", "match", "label", "train", "evaluate", "demo"])
+def test_help_has_words_for_every_option(run, command: str) -> None:
+    result = run(*command.split(), "--help")
+    assert result.exit_code == 0
+    assert "Usage: " in result.stdout
+    if command:
+        from deepdetect.cli import main
+
+        for parameter in main.commands[command].params:
+            if parameter.param_type_name == "option":
+                assert parameter.help, f"{command} {parameter.name}"
+
+
+def test_nothing_heavy_is_imported_before_it_is_needed() -> None:
+    code = (
+        "import sys, deepdetect.cli;"
+        "heavy = {'numpy', 'cv2', 'onnxruntime', 'openvino', 'torch', 'PIL', 'skimage'};"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_detecting_imports_no_torch(photos: Path, tmp_path: Path) -> None:
+    code = (
+        "import sys; from deepdetect import DeepDetect;"
+        f"DeepDetect().detect({str(photos / 'cat.jpg')!r});"
+        "print(sorted({'torch', 'skimage', 'matplotlib', 'scipy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_full_disk_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "k.npz"
+    keypoints = Keypoints([[1, 2]], [0.5], (8, 8))
+    save_keypoints(keypoints, path)
+    before = path.read_bytes()
+
+    def write_half(file: BinaryIO, **arrays: np.ndarray) -> None:
+        file.write(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", write_half)
+    with pytest.raises(DeepDetectError, match="No space left"):
+        save_keypoints(keypoints, path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["k.npz"]

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import LabelOptions, fuse, load_image
+from deepdetect.image import luma
+
+
+def test_writes_one_bit_masks(run, photos: Path) -> None:
+    result = run("label", photos, "-o", "masks", "--workers", 1)
+    assert result.exit_code == 0, result.output
+    assert {p.name for p in Path("masks").iterdir()} == {"cat.png", "left.png", "right.png"}
+    with Image.open("masks/cat.png") as mask:
+        assert mask.mode == "1"
+        expected = fuse(luma(load_image(photos / "cat.jpg"))).mask
+        np.testing.assert_array_equal(np.asarray(mask), expected)
+    assert "3 labelled, 0 already done" in result.stdout
+
+
+def test_several_processes_give_the_same(run, photos: Path) -> None:
+    run("label", photos, "-o", "one", "--workers", 1)
+    run("label", photos, "-o", "two", "--workers", 2)
+    for path in Path("one").iterdir():
+        assert path.read_bytes() == (Path("two") / path.name).read_bytes()
+
+
+def test_what_is_done_is_skipped(run, photos: Path) -> None:
+    run("label", photos, "-o", "masks", "--workers", 1)
+    Path("masks/cat.png").unlink()
+    kept = Path("masks/left.png").stat().st_mtime_ns
+    report = json.loads(run("label", photos, "-o", "masks", "--workers", 1, "--json").stdout)
+    assert [Path(entry["image"]).name for entry in report["labelled"]] == ["cat.jpg"]
+    assert report["skipped"] == 2
+    assert Path("masks/left.png").stat().st_mtime_ns == kept
+
+
+def test_masks_of_other_settings_are_not_passed_off(run, photos: Path) -> None:
+    run("label", photos / "cat.jpg", "-o", "masks", "--workers", 1)
+    before = Path("masks/cat.png").read_bytes()
+    result = run("label", photos / "cat.jpg", "-o", "masks", "--detectors", "fast")
+    assert result.exit_code == 2
+    assert "--overwrite" in result.stderr
+    assert Path("masks/cat.png").read_bytes() == before
+    result = run("label", photos / "cat.jpg", "-o", "masks", "--detectors", "fast", "--overwrite")
+    assert result.exit_code == 0
+    assert Path("masks/cat.png").read_bytes() != before
+
+
+def test_explain_draws_four_panels(run, photos: Path) -> None:
+    run("label", photos / "cat.jpg", "-o", "masks", "--explain", "--workers", 1)
+    panels = np.asarray(Image.open("masks/cat_explain.png"))
+    label = fuse(luma(load_image(photos / "cat.jpg")))
+    assert panels.shape[1] == 4 * 200 + 3 * 6
+    # The panels in order: image, keypoint mask, edge mask, combined.
+    np.testing.assert_array_equal(panels[:150, :200], load_image(photos / "cat.jpg"))
+    for k, mask in ((1, label.keypoints), (2, label.edges), (3, label.mask)):
+        left = k * 206
+        np.testing.assert_array_equal(panels[:150, left : left + 200, 0] > 0, mask)
+
+
+@pytest.mark.parametrize("visibility", ["normal", "low"])
+def test_subset_and_override(run, photos: Path, visibility: str) -> None:
+    run(
+        *("label", photos / "cat.jpg", "-o", "masks", "--detectors", "sobel, fast"),
+        *("--visibility", visibility, "--workers", 1),
+    )
+    options = LabelOptions(("fast", "sobel"), visibility)
+    expected = fuse(luma(load_image(photos / "cat.jpg")), options).mask
+    np.testing.assert_array_equal(np.asarray(Image.open("masks/cat.png")), expected)
+
+
+def test_a_bad_image_is_reported_and_the_others_are_done(run, photos: Path) -> None:
+    Path("in").mkdir()
+    Path("in/bad.jpg").write_bytes(b"not a photograph")
+    Path("in/good.png").write_bytes((photos / "left.png").read_bytes())
+    result = run("label", "in", "-o", "masks", "--workers", 1)
+    assert result.exit_code == 2
+    assert "bad.jpg" in result.stderr
+    assert [p.name for p in Path("masks").iterdir()] == ["good.png"]

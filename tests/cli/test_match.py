@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from deepdetect import DeepDetect, match_images
+
+
+def test_writes_matches_and_a_picture(run, photos: Path) -> None:
+    result = run("match", photos / "left.png", photos / "right.png", "-o", "out")
+    assert result.exit_code == 0, result.output
+    expected = match_images(photos / "left.png", photos / "right.png")
+    with np.load("out/left_right_matches.npz", allow_pickle=False) as file:
+        np.testing.assert_array_equal(file["points0"], expected.points0)
+        np.testing.assert_array_equal(file["points1"], expected.points1)
+        np.testing.assert_array_equal(file["inliers"], expected.inliers)
+        np.testing.assert_allclose(file["model"], expected.model)
+        assert str(file["kind"]) == "fundamental"
+    assert np.asarray(Image.open("out/left_right_matches.png")).shape[1] == 400
+    assert f"{len(expected):,}" in result.stdout
+
+
+def test_options_reach_the_matcher(run, photos: Path) -> None:
+    result = run(
+        *("match", photos / "left.png", photos / "right.png", "--json", "--no-pictures"),
+        *("--ratio", 0.8, "--mutual", "--model", "none", "--matcher", "exact"),
+        *("--max-keypoints", 500, "--descriptor", "rootsift"),
+    )
+    report = json.loads(result.stdout)
+    expected = match_images(
+        photos / "left.png",
+        photos / "right.png",
+        ratio=0.8,
+        mutual=True,
+        model="none",
+        matcher="exact",
+        max_keypoints=500,
+        descriptor="rootsift",
+    )
+    assert report["keypoints0"] == 500
+    assert report["matches"] == len(expected)
+    assert report["model"] is None
+
+
+def test_the_preset_is_changed_by_given_options_only(run, photos: Path) -> None:
+    result = run(
+        *("match", photos / "left.png", photos / "right.png", "--preset", "published", "--json"),
+        "--no-pictures",
+    )
+    expected = match_images(photos / "left.png", photos / "right.png", preset="published")
+    report = json.loads(result.stdout)
+    assert report["matches"] == len(expected)
+    assert report["kind"] == "none"
+
+
+def test_a_given_homography_judges(run, photos: Path) -> None:
+    np.savetxt("H", np.eye(3))
+    result = run(
+        *("match", photos / "cat.jpg", photos / "cat.jpg", "--homography", "H", "--json"),
+        "--no-pictures",
+    )
+    report = json.loads(result.stdout)
+    assert report["kind"] == "homography"
+    assert report["inliers"] > 0.9 * report["matches"] > 0
+
+
+def test_csv(run, photos: Path) -> None:
+    run(
+        *("match", photos / "left.png", photos / "right.png", "-o", "out", "--format", "csv"),
+        *("--no-pictures", "--density", "0.02"),
+    )
+    lines = Path("out/left_right_matches.csv").read_text().splitlines()
+    assert lines[0] == "x0,y0,x1,y1,ratio,inlier"
+    table = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
+    expected = match_images(photos / "left.png", photos / "right.png", DeepDetect(), density=0.02)
+    np.testing.assert_allclose(table[:, :2], expected.points0)
+    assert set(table[:, 5]) <= {0.0, 1.0}
+
+
+def test_a_failed_estimate_is_said(run, tmp_path: Path) -> None:
+    for name in "ab":
+        Image.new("RGB", (64, 64), (90, 90, 90)).save(tmp_path / f"{name}.png")
+    result = run("match", "a.png", "b.png", "-o", "out")
+    assert result.exit_code == 0
+    assert "no fundamental could be estimated" in result.stderr

@@ -1,0 +1,259 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from skimage.transform import FundamentalMatrixTransform, ProjectiveTransform
+
+from deepdetect.geometry import (
+    disparity_errors,
+    epipolar_errors,
+    transfer_errors,
+    transform_points,
+)
+
+
+def rotation(x: float, y: float, z: float) -> np.ndarray:
+    """Turn by angles in radians about the three axes."""
+    cx, cy, cz = np.cos([x, y, z])
+    sx, sy, sz = np.sin([x, y, z])
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
+
+
+def cross_matrix(t: np.ndarray) -> np.ndarray:
+    return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+
+
+def project(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    image = points @ camera.T
+    return image[:, :2] / image[:, 2:]
+
+
+def two_cameras(seed: int = 0, count: int = 50) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points seen by two unlike cameras, and the fundamental matrix from its definition."""
+    rng = np.random.default_rng(seed)
+    scene = rng.uniform([-2, -2, 4], [2, 2, 9], (count, 3))
+    camera0 = np.array([[500, 0, 320], [0, 520, 240], [0, 0, 1]])
+    camera1 = np.array([[700, 0, 300], [0, 690, 260], [0, 0, 1]])
+    turn, shift = rotation(0.05, -0.1, 0.2), np.array([0.5, 0.1, -0.2])
+    points0 = project(scene, camera0)
+    points1 = project(scene @ turn.T + shift, camera1)
+    essential = cross_matrix(shift) @ turn
+    fundamental = np.linalg.inv(camera1).T @ essential @ np.linalg.inv(camera0)
+    return points0, points1, fundamental
+
+
+HOMOGRAPHY = np.array([[1.1, 0.05, -12.0], [-0.04, 0.95, 7.0], [1e-4, -2e-4, 1.0]])
+RECTIFIED = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]], float)
+"""The fundamental matrix of a rectified pair: matches lie in the same row."""
+
+
+@pytest.mark.parametrize(
+    ("homography", "point", "expected"),
+    [
+        (np.eye(3), (3, 4), (3, 4)),
+        ([[1, 0, 5], [0, 1, -2], [0, 0, 1]], (3, 4), (8, 2)),
+        ([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (3, 4), (-4, 3)),  # a quarter turn
+        (2 * np.eye(3), (3, 4), (3, 4)),  # the scale of the matrix plays no part
+        (-np.eye(3), (3, 4), (3, 4)),
+        ([[1, 0, 0], [0, 1, 0], [0.5, 0, 1]], (2, 4), (1, 2)),  # divided by x / 2 + 1
+        ([[1, 0, 0], [0, 1, 0], [0, 0, 2]], (3, 4), (1.5, 2)),
+    ],
+)
+def test_transform_known_answers(homography, point, expected) -> None:
+    mapped = transform_points([point], np.array(homography, float))
+    np.testing.assert_allclose(mapped, [expected], atol=1e-12)
+
+
+def test_transform_equals_scikit_image() -> None:
+    points = np.random.default_rng(0).uniform(0, 500, (100, 2))
+    expected = ProjectiveTransform(HOMOGRAPHY)(points)
+    mapped = transform_points(points, HOMOGRAPHY)
+    assert mapped.dtype == np.float64
+    np.testing.assert_allclose(mapped, expected, rtol=1e-12)
+
+
+def test_points_on_the_horizon_go_to_infinity() -> None:
+    homography = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 1]], float)  # x = 1 is the horizon
+    points = [[1, 5], [1, 0], [2, 4]]
+    np.testing.assert_array_equal(
+        transform_points(points, homography), [[np.inf, np.inf], [np.inf, np.inf], [-2, -4]]
+    )
+    errors = transfer_errors(points, np.zeros((3, 2)), homography)
+    np.testing.assert_allclose(errors, [np.inf, np.inf, np.hypot(2, 4)])
+
+
+def test_a_point_without_an_image_is_at_infinity() -> None:
+    """The kernel of a singular matrix: (0, 0, 0) / 0."""
+    homography = np.diag([1.0, 1.0, 0.0])
+    np.testing.assert_array_equal(transform_points([[0, 0]], homography), [[np.inf, np.inf]])
+
+
+@pytest.mark.parametrize(
+    ("homography", "offset", "expected"),
+    [
+        (np.eye(3), (0, 0), 0),
+        (np.eye(3), (3, 4), 5),
+        ([[1, 0, 3], [0, 1, 4], [0, 0, 1]], (3, 4), 0),
+        ([[1, 0, 3], [0, 1, 4], [0, 0, 1]], (0, 0), 5),
+        ([[1, 0, 3], [0, 1, 4], [0, 0, 1]], (3, 2.5), 1.5),
+    ],
+)
+def test_transfer_errors_known_answers(homography, offset, expected) -> None:
+    points = np.random.default_rng(0).uniform(0, 100, (20, 2))
+    errors = transfer_errors(points, points + offset, np.array(homography, float))
+    np.testing.assert_allclose(errors, np.full(20, float(expected)), atol=1e-9)
+
+
+def test_one_point_off_by_a_pixel_and_a_half() -> None:
+    points = np.random.default_rng(0).uniform(0, 100, (20, 2))
+    moved = transform_points(points, HOMOGRAPHY)
+    moved[7] += (0.9, -1.2)
+    expected = np.zeros(20)
+    expected[7] = 1.5
+    np.testing.assert_allclose(transfer_errors(points, moved, HOMOGRAPHY), expected, atol=1e-9)
+
+
+def test_transfer_is_measured_in_the_second_image_only() -> None:
+    """A homography that doubles: a pixel off in the first image is two in the second."""
+    double = np.diag([2.0, 2.0, 1.0])
+    first, second = np.array([[10.0, 10.0]]), np.array([[20.0, 22.0]])
+    np.testing.assert_allclose(transfer_errors(first, second, double), [2])
+    np.testing.assert_allclose(transfer_errors(second, first, np.linalg.inv(double)), [1])
+
+
+@pytest.mark.parametrize("measure", [transfer_errors, epipolar_errors])
+def test_no_points_have_no_errors(measure) -> None:
+    empty = np.empty((0, 2), np.float32)
+    assert measure(empty, empty, np.eye(3)).shape == (0,)
+
+
+@pytest.mark.parametrize("measure", [transfer_errors, epipolar_errors])
+def test_single_precision_points_are_measured_in_double(measure) -> None:
+    rng = np.random.default_rng(0)
+    points0 = rng.uniform(0, 4000, (30, 2)).astype(np.float32)
+    points1 = rng.uniform(0, 4000, (30, 2)).astype(np.float32)
+    errors = measure(points0, points1, HOMOGRAPHY)
+    assert errors.dtype == np.float64
+    doubles = measure(points0.astype(np.float64), points1.astype(np.float64), HOMOGRAPHY)
+    np.testing.assert_array_equal(errors, doubles)
+
+
+def test_true_matches_of_a_scene_lie_on_their_epipolar_lines() -> None:
+    points0, points1, fundamental = two_cameras()
+    np.testing.assert_allclose(epipolar_errors(points0, points1, fundamental), 0, atol=1e-9)
+    # The matrix the other way round is another model.
+    assert np.median(epipolar_errors(points0, points1, fundamental.T)) > 5
+
+
+def test_sampson_equals_scikit_image() -> None:
+    points0, points1, fundamental = two_cameras()
+    points1 = points1 + np.random.default_rng(1).normal(0, 3, points1.shape)
+    expected = FundamentalMatrixTransform(fundamental).residuals(points0, points1)
+    errors = epipolar_errors(points0, points1, fundamental)
+    np.testing.assert_allclose(errors, expected, rtol=1e-9)
+    assert np.median(errors) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("dx", "dy", "expected"),
+    [(0, 0, 0), (40, 0, 0), (0, 1, 1 / np.sqrt(2)), (-7, -3, 3 / np.sqrt(2))],
+)
+def test_sampson_of_a_rectified_pair_is_the_row_difference_shared_by_both_images(
+    dx: float, dy: float, expected: float
+) -> None:
+    """Both points move half of dy to meet: sqrt(2 * (dy / 2)^2) = |dy| / sqrt(2)."""
+    points = np.random.default_rng(0).uniform(0, 100, (20, 2))
+    errors = epipolar_errors(points, points + [dx, dy], RECTIFIED)
+    np.testing.assert_allclose(errors, np.full(20, expected), atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-3, -1.0, 1e12])
+def test_sampson_does_not_depend_on_the_scale_of_the_matrix(scale: float) -> None:
+    points0, points1, fundamental = two_cameras()
+    points1 = points1 + 2
+    errors = epipolar_errors(points0, points1, fundamental)
+    np.testing.assert_allclose(
+        epipolar_errors(points0, points1, fundamental * scale), errors, rtol=1e-9
+    )
+
+
+def test_the_epipoles_lie_on_every_epipolar_line() -> None:
+    _, _, fundamental = two_cameras()
+    left, _, right = np.linalg.svd(fundamental)
+    epipole0, epipole1 = right[2, :2] / right[2, 2], left[:2, 2] / left[2, 2]
+    errors = epipolar_errors([epipole0], [epipole1], fundamental)
+    assert np.isfinite(errors).all()
+
+
+@given(seed=st.integers(0, 10_000), noise=st.floats(0.0, 0.5))
+def test_sampson_is_at_most_the_noise(seed: int, noise: float) -> None:
+    """Sampson is, to first order, the least move of both points that makes them fit."""
+    points0, points1, fundamental = two_cameras(seed, 20)
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(0, 2 * np.pi, (2, 20))
+    moves = noise * np.stack([np.cos(angles), np.sin(angles)], 2)
+    errors = epipolar_errors(points0 + moves[0], points1 + moves[1], fundamental)
+    assert (errors <= noise * np.sqrt(2) * 1.02 + 1e-9).all()
+
+
+def make_disparity() -> np.ndarray:
+    """10 rows, 20 columns, each pixel its own disparity."""
+    return np.arange(200, dtype=float).reshape(10, 20) / 10
+
+
+@pytest.mark.parametrize(
+    ("point0", "point1", "expected"),
+    [
+        ((5, 2), (5 - 4.5, 2), 0),  # row 2, column 5 holds 4.5
+        ((5, 2), (5 - 4.5 + 1.5, 2), 1.5),
+        ((5, 2), (5 - 4.5, 4), 2),
+        ((5, 2), (5 - 4.5 + 3, 6), 5),
+        ((5, 2), (5 + 4.5, 2), 9),  # the wrong sign is wrong
+        ((5.3, 1.8), (5.3 - 4.5, 1.8), 0),  # read at the nearest pixel, (5, 2)
+        ((19, 9), (19 - 19.9, 9), 0),  # the last pixel
+        ((0, 0), (0, 0), 0),
+    ],
+)
+def test_disparity_known_answers(point0, point1, expected) -> None:
+    errors = disparity_errors(np.array([point0]), np.array([point1]), make_disparity())
+    assert errors.shape == (1,)
+    np.testing.assert_allclose(errors, [expected], atol=1e-9)
+
+
+@pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf])
+def test_unknown_disparity_gives_nan(unknown: float) -> None:
+    disparity = make_disparity()
+    disparity[2, 5] = unknown
+    points0 = np.array([[5.0, 2.0], [6.0, 2.0]])
+    points1 = np.array([[0.5, 2.0], [1.4, 2.0]])
+    errors = disparity_errors(points0, points1, disparity)
+    np.testing.assert_allclose(errors, [np.nan, 0], atol=1e-9)
+
+
+def test_disparity_of_no_points() -> None:
+    empty = np.empty((0, 2), np.float32)
+    assert disparity_errors(empty, empty, make_disparity()).shape == (0,)
+
+
+def test_disparity_takes_single_precision() -> None:
+    disparity = make_disparity().astype(np.float32)
+    points = np.array([[5, 2], [7, 3]], np.float32)
+    moved = points - np.array([[4.5, 0], [6.7, 0]], np.float32)
+    errors = disparity_errors(points, moved, disparity)
+    assert errors.dtype == np.float64
+    np.testing.assert_allclose(errors, 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("point", [(-0.4, -0.4), (19.4, 9.4)])
+def test_disparity_of_points_on_the_rim_is_that_of_the_rim(point) -> None:
+    corner = tuple(np.rint(np.clip(point, 0, (19, 9))).astype(int))
+    true = make_disparity()[corner[1], corner[0]]
+    errors = disparity_errors(
+        np.array([point]), np.array([[point[0] - true, point[1]]]), make_disparity()
+    )
+    np.testing.assert_allclose(errors, [0], atol=1e-9)

@@ -1,0 +1,383 @@
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from skimage.transform import FundamentalMatrixTransform, ProjectiveTransform
+
+from deepdetect import Geometry, GeometryOptions, OptionError, estimate_geometry
+
+CAMERA0 = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], float)
+CAMERA1 = np.array([[640, 0, 310], [0, 640, 250], [0, 0, 1]], float)
+HOMOGRAPHY = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 30.0], [1e-4, 5e-5, 1.0]])
+SHIFT = np.array([0.8, 0.1, 0.3]) / np.linalg.norm([0.8, 0.1, 0.3])
+TURN = cv2.Rodrigues(np.array([0.05, -0.15, 0.1]))[0]
+
+MODELS = ("homography", "fundamental", "essential")
+ESTIMATORS = ("magsac", "ransac")
+every_way = pytest.mark.parametrize(
+    ("model", "estimator"), [(model, name) for model in MODELS for name in ESTIMATORS]
+)
+
+
+@dataclass
+class Scene:
+    """Matches between two images, and which of them are true."""
+
+    points0: np.ndarray
+    points1: np.ndarray
+    true: np.ndarray
+
+
+def make_scene(
+    model: str, seed: int = 0, count: int = 300, outliers: float = 0.4, noise: float = 0.2
+) -> Scene:
+    """A plane under a homography, or a deep scene before two cameras."""
+    rng = np.random.default_rng(seed)
+    if model == "homography":
+        points0 = rng.uniform((0, 0), (640, 480), (count, 2))
+        points1 = ProjectiveTransform(HOMOGRAPHY)(points0)
+    else:
+        scene = rng.uniform((-2, -1.5, 4), (2, 1.5, 9), (count, 3))
+        points0, points1 = (
+            image[:, :2] / image[:, 2:]
+            for image in (scene @ CAMERA0.T, (scene @ TURN.T + SHIFT) @ CAMERA1.T)
+        )
+    points0 = points0 + rng.normal(0, noise, points0.shape)
+    points1 = points1 + rng.normal(0, noise, points1.shape)
+    true = np.arange(count) >= round(outliers * count)
+    points1[~true] = rng.uniform((0, 0), (640, 480), ((~true).sum(), 2))
+    order = rng.permutation(count)
+    return Scene(points0[order], points1[order], true[order])
+
+
+def make_options(model: str, estimator: str = "magsac", **changes: Any) -> GeometryOptions:
+    cameras = {"camera0": CAMERA0, "camera1": CAMERA1} if model == "essential" else {}
+    return GeometryOptions(model=model, estimator=estimator, **(cameras | changes))
+
+
+def true_matrix(model: str) -> np.ndarray:
+    if model == "homography":
+        return HOMOGRAPHY
+    x, y, z = SHIFT
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ TURN
+    if model == "essential":
+        return essential
+    return np.linalg.inv(CAMERA1).T @ essential @ np.linalg.inv(CAMERA0)
+
+
+def judged(points0: np.ndarray, points1: np.ndarray, kind: str, matrix: np.ndarray) -> np.ndarray:
+    """Errors in pixels, computed by scikit-image."""
+    if kind == "homography":
+        return ProjectiveTransform(matrix).residuals(points0, points1)
+    if kind == "essential":
+        matrix = np.linalg.inv(CAMERA1).T @ matrix @ np.linalg.inv(CAMERA0)
+    return FundamentalMatrixTransform(matrix).residuals(points0, points1)
+
+
+def assert_consistent(geometry: Geometry, count: int) -> None:
+    assert geometry.inliers.shape == (count,)
+    assert geometry.inliers.dtype == bool
+    if geometry.matrix is None:
+        assert not geometry.inliers.any()
+    else:
+        assert geometry.matrix.shape == (3, 3)
+        assert geometry.matrix.dtype == np.float64
+        assert np.isfinite(geometry.matrix).all()
+
+
+@every_way
+@pytest.mark.parametrize("seed", [0, 1])
+def test_finds_the_model_among_outliers(model: str, estimator: str, seed: int) -> None:
+    scene = make_scene(model, seed)
+    geometry = estimate_geometry(scene.points0, scene.points1, make_options(model, estimator))
+    assert geometry.kind == model
+    assert_consistent(geometry, len(scene.true))
+    assert geometry.inliers[scene.true].mean() > 0.9
+    # A random point falls near a line of 480 pixels far more often than near a point.
+    assert geometry.inliers[~scene.true].mean() < (0.01 if model == "homography" else 0.05)
+    # Judged on other matches, without noise: the model itself is right.
+    fresh = make_scene(model, seed + 100, outliers=0, noise=0)
+    assert np.median(judged(fresh.points0, fresh.points1, model, geometry.matrix)) < 0.3
+
+
+@every_way
+def test_without_noise_the_matrix_is_the_true_one(model: str, estimator: str) -> None:
+    scene = make_scene(model, outliers=0.3, noise=0)
+    geometry = estimate_geometry(scene.points0, scene.points1, make_options(model, estimator))
+    true = true_matrix(model)
+    found = geometry.matrix / np.linalg.norm(geometry.matrix)
+    found *= np.sign((found * true).sum())
+    np.testing.assert_allclose(found, true / np.linalg.norm(true), atol=1e-3)
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_essential_gives_rotation_and_direction(estimator: str, seed: int) -> None:
+    scene = make_scene("essential", seed, noise=0.1)
+    options = make_options("essential", estimator)
+    matrix = estimate_geometry(scene.points0, scene.points1, options).matrix
+    first, second, shift = cv2.decomposeEssentialMat(matrix)
+    cosines = [(np.trace(turn @ TURN.T) - 1) / 2 for turn in (first, second)]
+    assert np.degrees(np.arccos(min(1.0, max(cosines)))) < 1
+    assert np.degrees(np.arccos(min(1.0, abs(float(shift[:, 0] @ SHIFT))))) < 3
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_an_essential_matrix_has_two_equal_singular_values_and_a_zero(estimator: str) -> None:
+    scene = make_scene("essential")
+    options = make_options("essential", estimator)
+    matrix = estimate_geometry(scene.points0, scene.points1, options).matrix
+    first, second, third = np.linalg.svd(matrix)[1]
+    assert second / first > 0.99
+    assert third / first < 1e-3
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_a_fundamental_matrix_has_rank_two(estimator: str) -> None:
+    scene = make_scene("fundamental")
+    options = make_options("fundamental", estimator)
+    matrix = estimate_geometry(scene.points0, scene.points1, options).matrix
+    singular = np.linalg.svd(matrix)[1]
+    assert singular[2] / singular[0] < 1e-6
+
+
+@every_way
+def test_the_same_seed_gives_the_same_result(model: str, estimator: str) -> None:
+    scene = make_scene(model)
+    options = make_options(model, estimator, seed=4)
+    first = estimate_geometry(scene.points0, scene.points1, options)
+    cv2.setRNGSeed(12345)  # whatever ran before
+    again = estimate_geometry(scene.points0, scene.points1, options)
+    np.testing.assert_array_equal(first.matrix, again.matrix)
+    np.testing.assert_array_equal(first.inliers, again.inliers)
+
+
+@given(
+    way=st.sampled_from([(model, name) for model in MODELS for name in ESTIMATORS]),
+    seed=st.integers(0, 1000),
+    threshold=st.floats(0.2, 5.0),
+    noise=st.floats(0.0, 1.0),
+    outliers=st.floats(0.0, 0.5),
+)
+def test_inliers_are_exactly_the_matches_under_the_threshold(
+    way: tuple[str, str], seed: int, threshold: float, noise: float, outliers: float
+) -> None:
+    model, estimator = way
+    scene = make_scene(model, seed, 60, outliers, noise)
+    options = make_options(model, estimator, inlier_threshold=threshold, iterations=200)
+    geometry = estimate_geometry(scene.points0, scene.points1, options)
+    assert_consistent(geometry, 60)
+    if geometry.matrix is not None:
+        errors = judged(scene.points0, scene.points1, model, geometry.matrix)
+        clear = np.abs(errors - threshold) > 1e-6
+        np.testing.assert_array_equal(geometry.inliers[clear], (errors < threshold)[clear])
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_four_corners_make_a_homography(estimator: str) -> None:
+    corners = np.array([[0, 0], [99, 0], [99, 79], [0, 79]], float)
+    moved = ProjectiveTransform(HOMOGRAPHY)(corners)
+    geometry = estimate_geometry(corners, moved, make_options("homography", estimator))
+    np.testing.assert_allclose(geometry.matrix, HOMOGRAPHY, atol=1e-4)
+    assert geometry.inliers.all()
+
+
+@every_way
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_too_few_matches_give_no_matrix(model: str, estimator: str, count: int) -> None:
+    points = np.random.default_rng(0).uniform(0, 100, (count, 2)).astype(np.float32)
+    geometry = estimate_geometry(points, points + 1, make_options(model, estimator))
+    assert geometry.kind == model
+    assert geometry.matrix is None
+    assert_consistent(geometry, count)
+
+
+@every_way
+@pytest.mark.parametrize("count", range(4, 20))
+def test_few_matches_do_no_harm(model: str, estimator: str, count: int) -> None:
+    scene = make_scene(model, count, count, outliers=0.3, noise=0.3)
+    geometry = estimate_geometry(scene.points0, scene.points1, make_options(model, estimator))
+    assert_consistent(geometry, count)
+
+
+def degenerate(kind: str, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    ramp = np.arange(count, dtype=float)
+    rng = np.random.default_rng(0)
+    flat = np.stack([ramp * 3, np.full(count, 50.0)], 1)
+    slanted = np.stack([ramp * 3, ramp * 2 + 1], 1)
+    spread = rng.uniform(0, 400, (count, 2))
+    place = np.full((count, 2), 70.0)
+    return {
+        "all in one place": (place, place + 3),
+        "all at the origin": (place * 0, place * 0),
+        "a row": (flat, flat + [5, 0]),
+        "a line": (slanted, slanted + [4, -3]),
+        "two places": (np.repeat(place[:2] * [[1], [2]], count // 2, 0), spread),
+        "a line to anywhere": (slanted, spread),
+        "one place to anywhere": (place, spread),
+        "anywhere to one place": (spread, place),
+        "pure chance": (spread, rng.uniform(0, 400, (count, 2))),
+        "no movement": (spread, spread),
+        "mirrored": (spread, spread * [-1, 1]),
+        "huge": (spread * 1e6, spread * 1e6 + 1),
+    }[kind]
+
+
+DEGENERATE = (
+    "all in one place",
+    "all at the origin",
+    "a row",
+    "a line",
+    "two places",
+    "a line to anywhere",
+    "one place to anywhere",
+    "anywhere to one place",
+    "pure chance",
+    "no movement",
+    "mirrored",
+    "huge",
+)
+
+
+@every_way
+@pytest.mark.parametrize("kind", DEGENERATE)
+def test_degenerate_input_does_no_harm(model: str, estimator: str, kind: str) -> None:
+    points0, points1 = degenerate(kind)
+    options = make_options(model, estimator, iterations=500)
+    geometry = estimate_geometry(points0, points1, options)
+    assert_consistent(geometry, len(points0))
+
+
+@pytest.mark.parametrize("estimator", ESTIMATORS)
+def test_no_movement_is_the_identity(estimator: str) -> None:
+    points0, points1 = degenerate("no movement")
+    geometry = estimate_geometry(points0, points1, make_options("homography", estimator))
+    np.testing.assert_allclose(geometry.matrix, np.eye(3), atol=1e-6)
+    assert geometry.inliers.all()
+
+
+@pytest.mark.parametrize("model", [*MODELS, "none"])
+def test_a_given_homography_is_judged_and_not_estimated(model: str) -> None:
+    """Whatever the model: all matches agree with one translation, another one is given."""
+    points = np.random.default_rng(0).uniform(0, 100, (30, 2)).astype(np.float32)
+    moved = points + np.float32([4, 0])
+    moved[:10] += np.float32([3, 0])
+    given_matrix = np.array([[1, 0, 7], [0, 1, 0], [0, 0, 1]])
+    options = make_options(model, homography=given_matrix)
+    geometry = estimate_geometry(points, moved, options)
+    assert geometry.kind == "homography"
+    np.testing.assert_array_equal(geometry.matrix, given_matrix)
+    np.testing.assert_array_equal(geometry.inliers, np.arange(30) < 10)
+
+
+@pytest.mark.parametrize(
+    ("distance", "threshold", "inlier"),
+    [(0, 1e-9, True), (1.0, 1.0, False), (1.0, 1.0001, True), (3.0, 2.9, False), (3.0, 3.1, True)],
+)
+def test_a_given_homography_keeps_errors_strictly_under_the_threshold(
+    distance: float, threshold: float, inlier: bool
+) -> None:
+    options = GeometryOptions(homography=np.eye(3), inlier_threshold=threshold)
+    geometry = estimate_geometry([[2.0, 3.0]], [[2.0, 3.0 + distance]], options)
+    assert geometry.inliers.tolist() == [inlier]
+
+
+def test_a_given_homography_needs_no_matches() -> None:
+    empty = np.empty((0, 2), np.float32)
+    geometry = estimate_geometry(empty, empty, GeometryOptions(homography=np.eye(3)))
+    assert geometry.inliers.shape == (0,)
+    np.testing.assert_array_equal(geometry.matrix, np.eye(3))
+
+
+def test_the_model_none_agrees_with_all() -> None:
+    scene = make_scene("homography")
+    geometry = estimate_geometry(scene.points0, scene.points1, GeometryOptions(model="none"))
+    assert geometry.kind == "none"
+    assert geometry.matrix is None
+    assert geometry.inliers.dtype == bool
+    assert geometry.inliers.all()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_a_wider_threshold_takes_more_inliers(model: str) -> None:
+    scene = make_scene(model, noise=1.0, outliers=0)
+    counts = [
+        estimate_geometry(
+            scene.points0, scene.points1, make_options(model, inlier_threshold=threshold)
+        ).inliers.sum()
+        for threshold in (0.3, 3.0)
+    ]
+    assert counts[0] < 0.6 * len(scene.true)
+    assert counts[1] > 0.9 * len(scene.true)
+
+
+def test_estimation_leaves_its_input_alone() -> None:
+    scene = make_scene("homography")
+    before = scene.points0.copy(), scene.points1.copy()
+    estimate_geometry(scene.points0, scene.points1, make_options("homography"))
+    np.testing.assert_array_equal(scene.points0, before[0])
+    np.testing.assert_array_equal(scene.points1, before[1])
+
+
+def test_the_defaults_are_documented_ones() -> None:
+    options = GeometryOptions()
+    assert options.model == "fundamental"
+    assert options.estimator == "magsac"
+    assert options.inlier_threshold == 1.0
+    assert options.homography is None
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"model": "homografy"}, "unknown model 'homografy': did you mean 'homography'?"),
+        ({"model": "Essential"}, "did you mean 'essential'?"),
+        ({"estimator": "ransack"}, "unknown estimator 'ransack': did you mean 'ransac'?"),
+        ({"inlier_threshold": 0}, "inlier threshold must be above 0 pixels, not 0"),
+        ({"inlier_threshold": -2.0}, "not -2.0"),
+        ({"inlier_threshold": float("nan")}, "not nan"),
+        ({"confidence": 0.0}, "confidence must lie between 0 and 1, not 0.0"),
+        ({"confidence": 1.0}, "not 1.0"),
+        ({"confidence": float("nan")}, "not nan"),
+        ({"iterations": 0}, "iterations must be at least 1, not 0"),
+        ({"homography": np.eye(2)}, "homography must be a (3, 3) matrix"),
+        ({"homography": np.arange(9)}, "homography must be a (3, 3) matrix"),
+        ({"homography": np.diag([1, 1, np.nan])}, "of finite numbers"),
+        ({"camera0": np.ones((3, 4))}, "camera0 must be a (3, 3) matrix"),
+        ({"camera1": np.full((3, 3), np.inf)}, "camera1 must be a (3, 3) matrix"),
+        ({"model": "essential"}, "needs both cameras"),
+        ({"model": "essential", "camera0": CAMERA0}, "needs both cameras"),
+        ({"model": "essential", "camera1": CAMERA1}, "needs both cameras"),
+    ],
+)
+def test_wrong_options_say_what_is_wrong(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(OptionError) as caught:
+        GeometryOptions(**values)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["homography", "camera0", "camera1"])
+@pytest.mark.parametrize("value", ["H1to6p", [[1, 2, 3], [4, 5], [6]], [["a"] * 3] * 3])
+def test_matrices_that_are_none_are_option_errors(name: str, value: Any) -> None:
+    """A mistake of the user's gets the package's own error, whatever NumPy would say."""
+    with pytest.raises(OptionError, match=name):
+        GeometryOptions(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["camera0", "camera1"])
+def test_a_singular_camera_is_an_option_error(name: str) -> None:
+    cameras = {"camera0": CAMERA0, "camera1": CAMERA1, name: np.zeros((3, 3))}
+    with pytest.raises(OptionError, match=name):
+        GeometryOptions(model="essential", **cameras)
+
+
+def test_matrices_may_be_nested_lists() -> None:
+    options = GeometryOptions(homography=[[1, 0, 7], [0, 1, 0], [0, 0, 1]])
+    assert options.homography.dtype == np.float64
+    assert options.homography[0, 2] == 7

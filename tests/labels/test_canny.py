@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect.labels.canny import CannySettings, canny_mask
+
+
+def test_constant_images(marks_nothing_on_constant_images: Callable[[str], None]) -> None:
+    marks_nothing_on_constant_images("canny")
+
+
+@pytest.mark.parametrize(
+    ("contrast", "marked"),
+    # A step of c gives a gradient of 4 c: 248 is not above the high threshold 250, 252 is.
+    [(30, False), (62, False), (63, True), (200, True)],
+)
+def test_a_step_edge_is_one_pixel_thin(contrast: int, marked: bool) -> None:
+    gray = np.full((30, 40), 20, np.uint8)
+    gray[:, 17:] += contrast
+    mask = canny_mask(gray, CannySettings())
+    assert mask.dtype == bool
+    columns = np.flatnonzero(mask.any(0))
+    assert len(columns) == marked
+    if marked:
+        assert columns[0] in (16, 17)
+        assert mask[1:-1, columns[0]].all()
+
+
+@pytest.mark.parametrize(
+    ("weak", "marked"),
+    # 4 * 37 = 148 is not above the low threshold 150, 4 * 38 = 152 is.
+    [(37, False), (38, True)],
+)
+def test_a_weak_edge_counts_when_it_continues_a_strong_one(weak: int, marked: bool) -> None:
+    gray = np.zeros((60, 40), np.uint8)
+    gray[:30, 17:] = 100
+    gray[30:, 17:] = weak
+    lower = canny_mask(gray, CannySettings())[40:58, 15:19]
+    assert lower.any(1).all() == marked
+    assert lower.any() == marked
+    alone = np.zeros((60, 40), np.uint8)
+    alone[:, 17:] = weak
+    assert not canny_mask(alone, CannySettings()).any()
+
+
+def test_hysteresis_on_a_photograph(gray: np.ndarray) -> None:
+    ndimage = pytest.importorskip("scipy.ndimage")
+    settings = CannySettings()
+    values = gray.astype(np.float64)
+    gradient = sum(abs(ndimage.sobel(values, axis, mode="nearest")) for axis in (0, 1))
+    mask = canny_mask(gray, settings)
+    assert mask.sum() > 500
+    assert (gradient[mask] > settings.low_threshold).all()
+    # Every piece of an edge holds a strong pixel.
+    pieces, count = ndimage.label(mask, np.ones((3, 3)))
+    strongest = ndimage.maximum(gradient, pieces, np.arange(1, count + 1))
+    assert (strongest > settings.high_threshold).all()
+    # Most strong ridges are marked: pixels stronger than both neighbours in x or in y.
+    ridge = (gradient[1:-1, 1:-1] > gradient[1:-1, :-2]) & (
+        gradient[1:-1, 1:-1] > gradient[1:-1, 2:]
+    )
+    ridge &= (gradient[1:-1, 1:-1] > gradient[:-2, 1:-1]) & (
+        gradient[1:-1, 1:-1] > gradient[2:, 1:-1]
+    )
+    ridge &= gradient[1:-1, 1:-1] > settings.high_threshold
+    assert ridge.sum() > 100
+    assert mask[1:-1, 1:-1][ridge].mean() > 0.95
+
+
+def test_agrees_with_scikit_image_up_to_a_pixel(gray: np.ndarray) -> None:
+    feature = pytest.importorskip("skimage.feature")
+    blurred = cv2.GaussianBlur(gray, (0, 0), 1.5)
+    settings = CannySettings(40.0, 80.0)
+    ours = canny_mask(blurred, settings)
+    # scikit-image's Sobel is an eighth of OpenCV's, its gradient Euclidean (OpenCV's: sum of both).
+    theirs = feature.canny(
+        blurred.astype(np.float64), sigma=1e-6, low_threshold=40 / 4, high_threshold=80 / 4
+    )
+    near = np.ones((3, 3), np.uint8)
+    assert ours.sum() > 500
+    assert cv2.dilate(ours.astype(np.uint8), near)[theirs].mean() > 0.9

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepdetect.errors import OptionError
+from deepdetect.image import load_image, luma
+from deepdetect.labels import DETECTOR_NAMES, DETECTORS, Label, LabelOptions, fuse
+from deepdetect.labels.files import load_mask
+
+
+@pytest.fixture(scope="module")
+def single(gray: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
+    """What each detector marks by itself, in each of its settings."""
+    masks = {}
+    for detector in DETECTORS:
+        masks[detector.name, "normal"] = detector.mask(gray, detector.normal)
+        masks[detector.name, "low"] = detector.mask(gray, detector.low_visibility)
+    return masks
+
+
+@pytest.mark.parametrize("visibility", ["normal", "low"])
+def test_the_or_of_all_parts(visibility: str, gray: np.ndarray, single: dict) -> None:
+    label = fuse(gray, LabelOptions(visibility=visibility))
+    edges = single["canny", visibility] | single["sobel", visibility]
+    points = np.zeros_like(edges)
+    for name in set(DETECTOR_NAMES) - {"canny", "sobel"}:
+        points = points | single[name, visibility]
+    assert label.visibility == visibility
+    assert label.mask.dtype == bool
+    np.testing.assert_array_equal(label.edges, edges)
+    np.testing.assert_array_equal(label.keypoints, points)
+    np.testing.assert_array_equal(label.mask, edges | points)
+    assert label.density == pytest.approx((edges | points).sum() / gray.size)
+    assert 0 < label.density < 1
+
+
+@pytest.mark.parametrize("detector", DETECTORS, ids=DETECTOR_NAMES)
+def test_one_detector_by_itself(detector: object, gray: np.ndarray, single: dict) -> None:
+    label = fuse(gray, LabelOptions((detector.name,), "normal"))
+    np.testing.assert_array_equal(label.mask, single[detector.name, "normal"])
+    empty = label.edges if detector.kind == "keypoint" else label.keypoints
+    assert not empty.any()
+
+
+@given(
+    gray_seed=st.integers(0, 10_000),
+    names=st.sets(st.sampled_from(DETECTOR_NAMES), min_size=1, max_size=8),
+    more=st.sampled_from(DETECTOR_NAMES),
+    visibility=st.sampled_from(["normal", "low"]),
+)
+def test_adding_a_detector_never_removes_a_pixel(
+    gray_seed: int, names: set[str], more: str, visibility: str
+) -> None:
+    generator = np.random.default_rng(gray_seed)
+    coarse = generator.integers(0, 256, (6, 8), dtype=np.uint8)
+    gray = cv2.resize(coarse, (50, 40), interpolation=cv2.INTER_NEAREST)
+    fewer = fuse(gray, LabelOptions(tuple(names), visibility)).mask
+    both = fuse(gray, LabelOptions((*names, more), visibility)).mask
+    alone = fuse(gray, LabelOptions((more,), visibility)).mask
+    np.testing.assert_array_equal(both, fewer | alone)
+
+
+def test_visibility_is_found_by_itself(gray: np.ndarray, dark: np.ndarray) -> None:
+    for image, expected in ((gray, "normal"), (dark, "low")):
+        label = fuse(image)
+        assert label.visibility == expected
+        forced = fuse(image, LabelOptions(visibility=expected))
+        np.testing.assert_array_equal(label.mask, forced.mask)
+
+
+@pytest.mark.parametrize("level", [0, 20, 128, 255])
+@pytest.mark.parametrize("visibility", ["auto", "normal", "low"])
+def test_a_constant_image_has_an_empty_label(level: int, visibility: str) -> None:
+    label = fuse(np.full((40, 56), level, np.uint8), LabelOptions(visibility=visibility))
+    assert label.mask.shape == (40, 56)
+    assert not label.mask.any()
+    assert label.density == 0
+
+
+def test_options() -> None:
+    assert LabelOptions().detectors == DETECTOR_NAMES
+    assert LabelOptions(("sobel", "fast", "sobel")).detectors == ("fast", "sobel")
+    assert LabelOptions(["fast"]).detectors == ("fast",)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"detectors": ("fsat",)}, "did you mean 'fast'"),
+        ({"detectors": ()}, "no label detector"),
+        ({"visibility": "norm"}, "did you mean 'normal'"),
+    ],
+)
+def test_unknown_options(changes: dict[str, object], words: str) -> None:
+    with pytest.raises(OptionError, match=words):
+        LabelOptions(**changes)
+
+
+def test_a_label_is_the_or_of_its_halves() -> None:
+    label = Label(np.array([[True, False, False]]), np.array([[True, True, False]]), "low")
+    assert label.mask.tolist() == [[True, True, False]]
+    assert label.density == pytest.approx(2 / 3)
+
+
+def published(shared: Path) -> list[tuple[Path, bool]]:
+    """The published images, and whether each is dark."""
+    first_dark = {"train": 32986, "val": 35996}
+    root = shared / "data" / "label-samples"
+    return [
+        (path, int(path.stem.removeprefix("image_")) >= first)
+        for split, first in first_dark.items()
+        for path in sorted((root / split).glob("image_*.png"))
+    ]
+
+
+def test_the_published_labels(shared: Path) -> None:
+    scores: dict[bool, list[float]] = {False: [], True: []}
+    for path, is_dark in published(shared):
+        rgb = load_image(path)
+        # The dark ones are stored with red and blue swapped.
+        gray = cv2.cvtColor(rgb, cv2.COLOR_BGR2GRAY) if is_dark else luma(rgb)
+        truth = load_mask(path.with_name(f"mask_{path.name}"))
+        label = fuse(gray)
+        assert label.visibility == ("low" if is_dark else "normal"), path.name
+        scores[is_dark].append((label.mask & truth).sum() / (label.mask | truth).sum())
+    assert {is_dark: len(values) for is_dark, values in scores.items()} == {False: 20, True: 20}
+    assert np.mean(scores[False]) >= 0.996
+    assert min(scores[True]) == 1.0

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from PIL import Image, ImageEnhance
+
+from deepdetect.errors import OptionError
+from deepdetect.image import luma
+from deepdetect.labels.visibility import LOW_VISIBILITY_RANGE, luma_range, visibility_of
+
+
+def two_levels(low: int, high: int) -> np.ndarray:
+    gray = np.full((20, 20), low, np.uint8)
+    gray[:, 10:] = high
+    return gray
+
+
+def test_a_photograph_and_its_darkened_form(photo: np.ndarray) -> None:
+    dim = ImageEnhance.Brightness(Image.fromarray(photo)).enhance(0.3)
+    dark = np.asarray(ImageEnhance.Contrast(dim).enhance(0.4))
+    assert visibility_of(luma(photo)) == "normal"
+    assert visibility_of(luma(dark)) == "low"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (0, 0, "low"),
+        (255, 255, "low"),
+        (0, 63, "low"),
+        (0, 64, "normal"),
+        (180, 243, "low"),  # bright, but flat
+        (180, 244, "normal"),
+        (0, 255, "normal"),
+    ],
+)
+def test_the_rule_at_its_limit(low: int, high: int, expected: str) -> None:
+    assert LOW_VISIBILITY_RANGE == 64
+    assert luma_range(two_levels(low, high)) == high - low
+    assert visibility_of(two_levels(low, high)) == expected
+
+
+@pytest.mark.parametrize(("bright", "expected"), [(3, "low"), (5, "normal")])
+def test_a_hundredth_of_the_pixels_does_not_count(bright: int, expected: str) -> None:
+    gray = np.zeros((20, 20), np.uint8)
+    gray.ravel()[:bright] = 255
+    assert visibility_of(gray) == expected
+
+
+@given(arrays(np.uint8, st.tuples(st.integers(1, 30), st.integers(1, 30))))
+def test_the_range_is_that_of_two_percentiles(gray: np.ndarray) -> None:
+    low, high = np.percentile(gray, [1, 99], method="inverted_cdf")
+    assert luma_range(gray) == float(high) - float(low)
+
+
+@pytest.mark.parametrize("choice", ["normal", "low"])
+@pytest.mark.parametrize("high", [5, 255])
+def test_a_choice_overrides_the_rule(choice: str, high: int) -> None:
+    assert visibility_of(two_levels(0, high), choice) == choice
+
+
+@pytest.mark.parametrize(
+    ("given", "hint"), [("lo", "did you mean 'low'"), ("dark", "auto, normal, low"), ("", "auto")]
+)
+def test_an_unknown_choice(given: str, hint: str) -> None:
+    with pytest.raises(OptionError, match=f"unknown visibility '{given}'") as caught:
+        visibility_of(two_levels(0, 255), given)
+    assert hint in str(caught.value)

@@ -1,0 +1,313 @@
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from deepdetect.errors import ImageError
+from deepdetect.image import IMAGE_SUFFIXES, MINIMUM_SIDE, find_images, load_image, luma
+
+OneLine = Callable[[BaseException], str]
+
+RNG = np.random.default_rng(7)
+RGB = RNG.integers(0, 256, (18, 25, 3), dtype=np.uint8)
+GREY = RGB[:, :, 0]
+ALPHA = RNG.integers(0, 256, (18, 25, 1), dtype=np.uint8)
+DEEP = RNG.integers(0, 65536, (18, 25), dtype=np.uint16)
+DEEP_RGB = RNG.integers(0, 65536, (18, 25, 3), dtype=np.uint16)
+
+
+def triple(grey: np.ndarray) -> np.ndarray:
+    return np.stack([grey] * 3, axis=2)
+
+
+def shallow(deep: np.ndarray) -> np.ndarray:
+    """The 8-bit level nearest to a 16-bit one, in exact decimal arithmetic."""
+    return np.floor(deep.astype(np.float64) * 255 / 65535 + 0.5).astype(np.uint8)
+
+
+ARRAYS = {
+    "rgb": (RGB, RGB),
+    "grey": (GREY, triple(GREY)),
+    "one channel": (GREY[:, :, None], triple(GREY)),
+    "rgba": (np.dstack([RGB, ALPHA]), RGB),
+    "strided": (RGB[:, ::-1], RGB[:, ::-1]),
+    "fortran order": (np.asfortranarray(RGB), RGB),
+    "uint16 grey": (DEEP, triple(shallow(DEEP))),
+    "uint16 rgb": (DEEP_RGB, shallow(DEEP_RGB)),
+    "uint16 of the other byte order": (DEEP.astype(DEEP.dtype.newbyteorder()), triple(shallow(DEEP))),
+    "uint16 full range": (
+        np.repeat(np.array([[0, 65535]], np.uint16), 16, 0).repeat(8, 1),
+        triple(np.repeat(np.array([[0, 255]], np.uint8), 16, 0).repeat(8, 1)),
+    ),
+    "float32 grey": ((GREY / 255).astype(np.float32), triple(GREY)),
+    "float64 rgb": (RGB / 255, RGB),
+    "float16 rgba": ((np.dstack([RGB, ALPHA]) / 255).astype(np.float16), RGB),
+    "float of the other byte order": ((RGB / 255).astype(">f4"), RGB),
+    "bool grey": (GREY > 99, triple(np.where(GREY > 99, 255, 0))),
+    "bool rgb": (RGB > 99, np.where(RGB > 99, 255, 0)),
+    "nested lists": ((GREY / 255).tolist(), triple(GREY)),
+}
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+def test_arrays(kind: str) -> None:
+    given, expected = ARRAYS[kind]
+    before = np.array(given)
+    loaded = load_image(given)
+    np.testing.assert_array_equal(given, before)
+    assert loaded.dtype == np.uint8
+    assert loaded.flags.c_contiguous
+    np.testing.assert_array_equal(loaded, expected)
+
+
+PALETTE = Image.fromarray(RGB).quantize(16)
+PIL_IMAGES = {
+    "RGB": (Image.fromarray(RGB), RGB),
+    "L": (Image.fromarray(GREY), triple(GREY)),
+    "RGBA": (Image.fromarray(np.dstack([RGB, ALPHA])), RGB),
+    "LA": (Image.fromarray(np.dstack([GREY, ALPHA])), triple(GREY)),
+    "P": (PALETTE, np.array(PALETTE.getpalette(), np.uint8).reshape(-1, 3)[np.asarray(PALETTE)]),
+    "1": (Image.fromarray(GREY > 99), triple(np.where(GREY > 99, 255, 0))),
+    "I;16": (Image.fromarray(DEEP), triple(shallow(DEEP))),
+    "I": (Image.fromarray(DEEP.astype(np.int32)), triple(shallow(DEEP))),
+    "F": (Image.fromarray((GREY / 255).astype(np.float32)), triple(GREY)),
+}
+
+
+@pytest.mark.parametrize("mode", PIL_IMAGES)
+def test_pil_images(mode: str) -> None:
+    given, expected = PIL_IMAGES[mode]
+    assert given.mode == mode
+    loaded = load_image(given)
+    assert loaded.dtype == np.uint8
+    np.testing.assert_array_equal(loaded, expected)
+
+
+@pytest.mark.parametrize("mode", [mode for mode in PIL_IMAGES if mode not in ("I", "F")])
+@pytest.mark.parametrize("as_text", [True, False])
+def test_files(mode: str, as_text: bool, tmp_path: Path) -> None:
+    given, expected = PIL_IMAGES[mode]
+    path = tmp_path / "image.png"
+    given.save(path)
+    np.testing.assert_array_equal(load_image(str(path) if as_text else path), expected)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "exact"),
+    [(".bmp", True), (".ppm", True), (".tif", True), (".jpg", False), (".webp", False)],
+)
+def test_file_formats(suffix: str, exact: bool, photo: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / f"image{suffix}"
+    Image.fromarray(photo).save(path)
+    loaded = load_image(path)
+    difference = np.abs(loaded.astype(int) - photo)
+    assert loaded.shape == photo.shape
+    assert difference.max() == 0 if exact else difference.mean() < 6
+
+
+def test_palette_with_transparency_loads_in_silence(tmp_path: Path) -> None:
+    # Pillow warns about such files, which are common; a warning is an error in these tests.
+    path = tmp_path / "palette.png"
+    PALETTE.save(path, transparency=bytes(range(16)))
+    np.testing.assert_array_equal(load_image(path), PIL_IMAGES["P"][1])
+
+
+@pytest.mark.parametrize(
+    ("orientation", "upright"),
+    [
+        (1, lambda a: a),
+        (2, lambda a: a[:, ::-1]),
+        (3, lambda a: a[::-1, ::-1]),
+        (4, lambda a: a[::-1]),
+        (5, lambda a: a.swapaxes(0, 1)),
+        (6, lambda a: np.rot90(a, -1)),
+        (7, lambda a: a.swapaxes(0, 1)[::-1, ::-1]),
+        (8, lambda a: np.rot90(a)),
+    ],
+)
+def test_exif_orientation(
+    orientation: int, upright: Callable[[np.ndarray], np.ndarray], tmp_path: Path
+) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / "turned.png"
+    Image.fromarray(RGB).save(path, exif=exif)
+    np.testing.assert_array_equal(load_image(path), upright(RGB))
+
+
+def encoded(rgb: np.ndarray, kind: str) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(buffer, kind)
+    return buffer.getvalue()
+
+
+PNG = encoded(RGB, "PNG")
+JPEG = encoded(RNG.integers(0, 256, (64, 80, 3), dtype=np.uint8), "JPEG")
+
+
+def write(name: str, content: bytes) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / name).write_bytes(content)
+        return folder / name
+
+    return make
+
+
+BAD_FILES = {
+    "missing": (lambda folder: folder / "none.png", "there is no file"),
+    "folder": (lambda folder: folder, "is a folder"),
+    "text": (write("text.png", b"These are words.\n" * 9), "is not an image that can be read"),
+    "empty": (write("empty.png", b""), "is not an image that can be read"),
+    "half a PNG": (write("half.png", PNG[: len(PNG) // 2]), "damaged or truncated"),
+    "half a JPEG": (write("half.jpg", JPEG[: len(JPEG) // 2]), "damaged or truncated"),
+    "broken PNG": (write("broken.png", PNG.replace(b"IDAT", b"IDAX")), "damaged or truncated"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_FILES)
+def test_bad_files(kind: str, tmp_path: Path, one_line: OneLine) -> None:
+    make, words = BAD_FILES[kind]
+    path = make(tmp_path)
+    with pytest.raises(ImageError) as caught:
+        load_image(path)
+    message = one_line(caught.value)
+    assert words in message
+    assert str(path) in message
+
+
+def test_a_name_too_long_for_a_file(one_line: OneLine) -> None:
+    with pytest.raises(ImageError) as caught:
+        load_image("a" * 5000 + ".png")
+    one_line(caught.value)
+
+
+@given(kept=st.floats(0, 0.999))
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_cut_file_is_an_error_or_whole(
+    suffix: str, kept: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    content = PNG if suffix == ".png" else JPEG
+    folder = tmp_path_factory.mktemp("cut")
+    path, whole = folder / f"cut{suffix}", folder / f"whole{suffix}"
+    whole.write_bytes(content)
+    path.write_bytes(content[: int(kept * len(content))])
+    try:
+        loaded = load_image(path)
+    except ImageError as error:
+        assert "\n" not in str(error)
+    else:
+        np.testing.assert_array_equal(loaded, load_image(whole))
+
+
+def test_a_pil_image_of_a_cut_file() -> None:
+    with (
+        Image.open(io.BytesIO(JPEG[: len(JPEG) // 2])) as opened,
+        pytest.raises(ImageError, match="truncated"),
+    ):
+        load_image(opened)
+
+
+def with_value(value: float) -> np.ndarray:
+    array = np.full((20, 20), 0.5)
+    array[3, 4] = value
+    return array
+
+
+BAD_ARRAYS = {
+    "too narrow": (np.zeros((16, 15), np.uint8), "15x16 pixels"),
+    "too low": (np.zeros((15, 16, 3), np.uint8), "16x15 pixels"),
+    "no pixel": (np.zeros((0, 0)), "0x0 pixels"),
+    "NaN": (with_value(np.nan), "NaN"),
+    "infinite": (with_value(np.inf), "infinite"),
+    "minus infinite": (with_value(-np.inf), "infinite"),
+    "above 1": (with_value(1.01), "[0.5, 1.01]"),
+    "below 0": (with_value(-0.01), "[-0.01, 0.5]"),
+    "float 0..255": (RGB.astype(np.float32), "[0, 1]"),
+    "1-D": (np.zeros(400, np.uint8), "(400,)"),
+    "4-D": (np.zeros((1, 20, 20, 3), np.uint8), "(1, 20, 20, 3)"),
+    "2 channels": (np.zeros((20, 20, 2), np.uint8), "1, 3 or 4 channels"),
+    "5 channels": (np.zeros((20, 20, 5), np.uint8), "1, 3 or 4 channels"),
+    "channels first": (np.zeros((3, 20, 20), np.uint8), "1, 3 or 4 channels"),
+    "int64": (np.zeros((20, 20), np.int64), "int64"),
+    "int8": (np.zeros((20, 20), np.int8), "int8"),
+    "complex": (np.zeros((20, 20), complex), "complex"),
+    "words": (np.full((20, 20), "a"), "not understood"),
+    "nothing": (None, "shape ()"),
+    "a number": (5, "shape ()"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_ARRAYS)
+def test_bad_arrays(kind: str, one_line: OneLine) -> None:
+    given, words = BAD_ARRAYS[kind]
+    with pytest.raises(ImageError) as caught:
+        load_image(given)
+    assert words in one_line(caught.value)
+
+
+def test_the_smallest_image() -> None:
+    assert MINIMUM_SIDE == 16
+    assert load_image(np.zeros((16, 16), np.uint8)).shape == (16, 16, 3)
+
+
+def test_a_small_file_is_named(tmp_path: Path, one_line: OneLine) -> None:
+    path = tmp_path / "small.png"
+    Image.fromarray(RGB[:10]).save(path)
+    with pytest.raises(ImageError) as caught:
+        load_image(path)
+    message = one_line(caught.value)
+    assert str(path) in message
+    assert "25x10 pixels" in message
+
+
+def test_luma_is_bt601(photo: np.ndarray) -> None:
+    exact = photo @ np.array([0.299, 0.587, 0.114])
+    grey = luma(photo)
+    assert grey.shape == photo.shape[:2]
+    assert grey.dtype == np.uint8
+    assert np.abs(grey - exact).max() < 0.51
+
+
+@pytest.mark.parametrize("level", [0, 1, 127, 254, 255])
+def test_luma_of_grey_is_the_grey(level: int) -> None:
+    assert (luma(np.full((16, 16, 3), level, np.uint8)) == level).all()
+
+
+def test_find_images(tmp_path: Path) -> None:
+    wanted = [f"a{suffix}" for suffix in IMAGE_SUFFIXES]
+    wanted += ["b/UPPER.PNG", "b/c/deep.jpg", "z.jpg"]
+    others = ["notes.txt", "no_suffix", ".hidden.png", ".cache/thumb.png", "b/.c/thumb.jpg"]
+    for name in wanted + others:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "folder.png").mkdir()
+    found = find_images(str(tmp_path))
+    assert found == sorted(tmp_path / name for name in wanted)
+
+
+def test_find_images_below_a_hidden_folder(tmp_path: Path) -> None:
+    # Only what lies below the folder that was asked for decides.
+    (tmp_path / ".data").mkdir()
+    (tmp_path / ".data" / "a.png").touch()
+    assert find_images(tmp_path / ".data") == [tmp_path / ".data" / "a.png"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("none", "there is no folder"), ("file.png", "there is no folder"), ("void", "no image in")],
+)
+def test_find_images_errors(name: str, words: str, tmp_path: Path, one_line: OneLine) -> None:
+    (tmp_path / "file.png").touch()
+    (tmp_path / "void").mkdir()
+    with pytest.raises(ImageError) as caught:
+        find_images(tmp_path / name)
+    message = one_line(caught.value)
+    assert words in message
+    assert str(tmp_path / name) in message

@@ -1,0 +1,22 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="session")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of twelve small real photographs, cut from scikit-image's."""
+    from PIL import Image
+    from skimage import data
+
+    folder = tmp_path_factory.mktemp("photographs")
+    k = 0
+    for image in (data.astronaut(), data.chelsea(), data.coffee()):
+        for top, left in ((0, 0), (120, 40), (60, 200), (140, 240)):
+            crop = np.ascontiguousarray(image[top : top + 128, left : left + 144])
+            Image.fromarray(crop).save(folder / f"photo{k:02d}.png")
+            k += 1
+    return folder

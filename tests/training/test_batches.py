@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect.image import luma
+from deepdetect.labels import LabelOptions, fuse
+from deepdetect.training.batches import Batches
+from deepdetect.training.label_cache import LabelCache
+from deepdetect.training.photos import ViewStore, list_photos
+from deepdetect.training.recipe import Schedule, Stage, TrainingOptions
+from deepdetect.training.views import render
+
+OPTIONS = TrainingOptions(
+    stages=(Stage(64, 4, 6), Stage(96, 2, 1)),
+    short_sides=(96, 64),
+    detectors=("fast", "harris", "sobel"),
+)
+
+
+@pytest.fixture(scope="module")
+def batches(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Batches:
+    cache = LabelCache(tmp_path_factory.mktemp("labels"), photographs, OPTIONS.detectors)
+    photos = list_photos(photographs, OPTIONS)
+    wanted = [(p.path, view) for p in photos for view in p.normal + p.dark]
+    assert cache.make(wanted, 1, quiet=True) == len(wanted) == 12 * 4
+    assert cache.make(wanted, 1, quiet=True) == 0, "labels are made once"
+    return Batches(photos, ViewStore(cache), Schedule(OPTIONS, len(photos)))
+
+
+def test_a_batch_is_a_pure_function_of_the_step(batches: Batches) -> None:
+    fresh = Batches(batches.photos, batches.store, batches.schedule)
+    for step in (7, 0, 3, 7):
+        for ours, theirs in zip(batches.batch(step), fresh.batch(step), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+    assert not np.array_equal(batches.batch(0)[0], batches.batch(1)[0])
+
+
+def test_the_stream_gives_the_same_from_any_step(batches: Batches) -> None:
+    whole = [masks.sum() for _, masks in batches.stream(0)]
+    assert len(whole) == batches.schedule.steps == 12 * 6 // 4 + 12 // 2
+    assert [masks.sum() for _, masks in batches.stream(5)] == whole[5:]
+
+
+def test_shapes_follow_the_stage(batches: Batches) -> None:
+    images, masks = batches.batch(0)
+    assert images.shape == (4, 64, 64, 3)
+    assert (images.dtype, masks.dtype) == (np.uint8, np.bool_)
+    images, masks = batches.batch(batches.schedule.steps - 1)
+    assert images.shape == (2, 96, 96, 3)
+    assert masks.shape == (2, 96, 96)
+
+
+def test_each_photograph_is_seen_once_an_epoch(batches: Batches) -> None:
+    for epoch in range(3):
+        assert sorted(batches._order(epoch)) == list(range(12))
+    assert batches._order(0).tolist() != batches._order(1).tolist()
+
+
+def test_about_a_quarter_is_dark(batches: Batches) -> None:
+    from deepdetect.labels import visibility_of
+
+    dark = [
+        visibility_of(luma(image)) == "low"
+        for step in range(18)
+        for image in batches.batch(step)[0]
+    ]
+    assert 0.1 < np.mean(dark) < 0.45
+
+
+def test_crops_and_labels_belong_together(batches: Batches) -> None:
+    """Each crop lies in one of the views, and its mask at the same place of the view's label."""
+    photo_views = [
+        (render(photo.path, view), batches.store.labels.load(photo.path, view))
+        for photo in batches.photos
+        for view in photo.normal + photo.dark
+    ]
+    images, masks = batches.batch(2)
+    for image, mask in zip(images, masks, strict=True):
+        assert any(_found(image, mask, *pair) for pair in photo_views)
+
+
+def _found(image: np.ndarray, mask: np.ndarray, view: np.ndarray, label: np.ndarray) -> bool:
+    side = len(image)
+    for flipped, flipped_mask in (
+        (image[::a, ::b], mask[::a, ::b]) for a in (1, -1) for b in (1, -1)
+    ):
+        corner = (view[: len(view) - side + 1, : view.shape[1] - side + 1] == flipped[0, 0]).all(2)
+        for top, left in np.argwhere(corner):
+            place = np.s_[top : top + side, left : left + side]
+            if np.array_equal(view[place], flipped) and np.array_equal(label[place], flipped_mask):
+                return True
+    return False
+
+
+def test_dark_labels_use_the_low_visibility_settings(batches: Batches) -> None:
+    photo = batches.photos[0]
+    view = photo.dark[0]
+    expected = fuse(luma(render(photo.path, view)), LabelOptions(OPTIONS.detectors, "low"))
+    np.testing.assert_array_equal(batches.store.labels.load(photo.path, view), expected.mask)
+
+
+def test_an_error_of_the_thread_reaches_the_trainer(batches: Batches) -> None:
+    class Broken(ViewStore):
+        def load(self, photo, view):
+            raise ValueError("broken on purpose")
+
+    broken = Batches(batches.photos, Broken(batches.store.labels), batches.schedule)
+    with pytest.raises(ValueError, match="on purpose"):
+        next(broken.stream(0))
+
+
+def test_memory_limit_changes_nothing_but_the_time(batches: Batches) -> None:
+    frugal = Batches(batches.photos, ViewStore(batches.store.labels, memory=0), batches.schedule)
+    np.testing.assert_array_equal(frugal.batch(4)[0], batches.batch(4)[0])
+    assert not frugal.store._kept

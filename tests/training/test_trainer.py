@@ -1,0 +1,244 @@
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
+
+from safetensors.torch import load_file  # noqa: E402
+
+from deepdetect import DeepDetect, ImageError, OptionError, WeightsError  # noqa: E402
+from deepdetect.network.espnet import ESPNet  # noqa: E402
+from deepdetect.training.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from deepdetect.training.device import DeviceOptions, Engine  # noqa: E402
+from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
+from deepdetect.training.trainer import train  # noqa: E402
+
+PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
+RECIPE = ["--stage", "64x4x8", "--stage", "96x2x2", "--short-side", "96", "--short-side", "64"]
+
+
+def command(photographs: Path, run: Path, labels: Path) -> list[str]:
+    """The same tiny run as a command of its own, which can be killed."""
+    return [
+        *(sys.executable, "-m", "deepdetect", "train", str(photographs), "-o", str(run)),
+        *("--labels", str(labels), "--validations", "8", "--detectors", "fast,sobel"),
+        *("--precision", "float32", "--no-compile", "--threads", "1", "--workers", "1", "--json"),
+        *RECIPE,
+    ]
+
+
+def tensors_equal(a: Path, b: Path) -> bool:
+    first, second = load_file(a), load_file(b)
+    return first.keys() == second.keys() and all(
+        torch.equal(first[name], second[name]) for name in first
+    )
+
+
+@pytest.fixture(scope="module")
+def unbroken(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("unbroken")
+    labels = run.parent / "labels"
+    subprocess.run(command(photographs, run, labels), check=True, capture_output=True)
+    return run
+
+
+def test_a_killed_run_ends_with_the_same_weights(
+    photographs: Path, unbroken: Path, tmp_path: Path
+) -> None:
+    run, labels = tmp_path / "killed", unbroken.parent / "labels"
+    process = subprocess.Popen(
+        command(photographs, run, labels), stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    deadline = time.monotonic() + 120
+    while not (run / "checkpoint.safetensors").exists() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL, "the run must be killed before its end"
+    steps_done = _steps(run)
+    assert 0 < steps_done < _steps(unbroken)
+
+    subprocess.run(command(photographs, run, labels), check=True, capture_output=True)
+    assert tensors_equal(run / "best.safetensors", unbroken / "best.safetensors")
+    assert tensors_equal(run / "checkpoint.safetensors", unbroken / "checkpoint.safetensors")
+    assert (run / "curves.csv").read_text() == (unbroken / "curves.csv").read_text()
+
+
+def _steps(run: Path) -> int:
+    tensors = load_file(run / "checkpoint.safetensors")
+    return int(next(value for name, value in tensors.items() if name.startswith("adam.step.")))
+
+
+def test_a_run_writes_weights_and_curves(unbroken: Path) -> None:
+    names = {path.name for path in unbroken.iterdir()}
+    assert names >= {
+        "best.safetensors",
+        "checkpoint.safetensors",
+        "curves.csv",
+        "curves.png",
+        "deepdetect.onnx",
+    }
+    rows = list(csv.DictReader((unbroken / "curves.csv").read_text().splitlines()))
+    assert len(rows) == 8
+    losses = [float(row["training_loss"]) for row in rows]
+    assert losses[-1] < losses[0]
+    image = np.random.default_rng(0).integers(0, 256, (40, 56, 3), np.uint8)
+    torch_map = DeepDetect(unbroken / "best.safetensors").heatmap(image)
+    onnx_map = DeepDetect(unbroken / "deepdetect.onnx", backend="onnxruntime").heatmap(image)
+    np.testing.assert_allclose(torch_map, onnx_map, atol=1e-4)
+
+
+def test_the_best_weights_are_those_of_the_lowest_validation_loss(unbroken: Path) -> None:
+    import json
+
+    from safetensors import safe_open
+
+    with safe_open(unbroken / "best.safetensors", "pt") as file:
+        point = json.loads(file.metadata()["point"])
+    rows = list(csv.DictReader((unbroken / "curves.csv").read_text().splitlines()))
+    assert point["validation_loss"] == pytest.approx(
+        min(float(row["validation_loss"]) for row in rows), rel=1e-5
+    )
+
+
+def test_starting_again_after_the_end_changes_nothing(photographs: Path, unbroken: Path) -> None:
+    before = (unbroken / "checkpoint.safetensors").read_bytes()
+    done = subprocess.run(
+        command(photographs, unbroken, unbroken.parent / "labels"),
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert '"validation_loss"' in done.stdout
+    assert (unbroken / "checkpoint.safetensors").read_bytes() == before
+
+
+def test_other_options_are_refused_in_the_same_folder(photographs: Path, unbroken: Path) -> None:
+    changed = [*command(photographs, unbroken, unbroken.parent / "labels"), "--seed", "5"]
+    done = subprocess.run(changed, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "seed" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"\x80\x04K\x01."])
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(content)
+    network = ESPNet()
+    with pytest.raises(WeightsError, match="delete it"):
+        load_checkpoint(path, network, torch.optim.Adam(network.parameters()))
+
+
+def test_checkpoints_hold_everything_and_stay_small(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = ESPNet()
+    optimizer = torch.optim.Adam(network.parameters(), fused=True)
+    network(torch.rand(2, 3, 32, 32)).mean().backward()
+    optimizer.step()
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, network, optimizer, {"step": 1})
+    assert path.stat().st_size < 10_000_000
+
+    other = ESPNet()
+    other_optimizer = torch.optim.Adam(other.parameters(), fused=True)
+    assert load_checkpoint(path, other, other_optimizer) == {"step": 1}
+    for a, b in zip(network.parameters(), other.parameters(), strict=True):
+        assert torch.equal(a, b)
+        for moment in ("step", "exp_avg", "exp_avg_sq"):
+            assert torch.equal(optimizer.state[a][moment], other_optimizer.state[b][moment])
+
+
+def gradients(engine: Engine, images: torch.Tensor, truth: torch.Tensor) -> list[torch.Tensor]:
+    engine.network.train()
+    engine.network.zero_grad()
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(engine.logits(images), truth)
+    loss.backward()
+    return [parameter.grad.clone() for parameter in engine.network.parameters()]
+
+
+def test_gradients_in_bfloat16_are_those_of_float32_within_rounding() -> None:
+    torch.manual_seed(0)
+    first, second = ESPNet(), ESPNet()
+    second.load_state_dict(first.state_dict())
+    rgb = torch.randint(0, 256, (4, 240, 240, 3), dtype=torch.uint8)
+    truth = (torch.rand(4, 1, 240, 240) < 0.4).float()
+    exact = Engine(first, DeviceOptions("cpu", "float32", compile=False))
+    rounded = Engine(second, DeviceOptions("cpu", "bfloat16", compile=False))
+    expected = gradients(exact, exact.images(rgb), truth)
+    found = gradients(rounded, rounded.images(rgb), truth)
+    for name, gradient in zip(dict(first.named_parameters()), found, strict=True):
+        assert torch.isfinite(gradient).all(), name
+    a = torch.cat([gradient.flatten() for gradient in expected])
+    b = torch.cat([gradient.flatten() for gradient in found])
+    assert torch.nn.functional.cosine_similarity(a, b, dim=0) > 0.99
+    assert (a - b).norm() / a.norm() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("bad", "hint"),
+    [({"device": "cpuu"}, "cpu"), ({"precision": "float16"}, "bfloat16"), ({"threads": 0}, "1")],
+)
+def test_bad_device_options_are_refused(bad: dict, hint: str) -> None:
+    with pytest.raises(OptionError, match=hint):
+        DeviceOptions(**bad)
+
+
+def test_a_photograph_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path) -> None:
+    import shutil
+
+    folder = tmp_path / "photos"
+    shutil.copytree(photographs, folder)
+    (folder / "broken.jpg").write_bytes(b"no photograph")
+    options = TrainingOptions(
+        stages=(Stage(64, 2, 1),), short_sides=(64,), detectors=("fast",), validations=1
+    )
+    with pytest.raises(Exception, match=r"broken\.jpg") as caught:
+        train(folder, tmp_path / "run", options, device=PLAIN, workers=1)
+    assert type(caught.value).__name__ == "DeepDetectError"
+    assert len(list((tmp_path / "run" / "labels").rglob("*.png"))) > 10, "the others are kept"
+
+
+@pytest.mark.parametrize("make", [lambda path: None, lambda path: path.mkdir()])
+def test_a_missing_or_empty_folder_is_refused(tmp_path: Path, make) -> None:
+    make(tmp_path / "photos")
+    with pytest.raises(ImageError):
+        train(tmp_path / "photos", tmp_path / "run", device=PLAIN)
+
+
+def test_one_seed_gives_one_result(photographs: Path, tmp_path: Path) -> None:
+    options = TrainingOptions(
+        stages=(Stage(64, 4, 1),), short_sides=(64,), detectors=("fast",), validations=1
+    )
+    for name in ("a", "b"):
+        train(photographs, tmp_path / name, options, labels=tmp_path / "l", device=PLAIN, workers=1)
+    assert tensors_equal(tmp_path / "a" / "best.safetensors", tmp_path / "b" / "best.safetensors")
+
+
+@pytest.mark.skipif(
+    not os.environ.get("DEEPDETECT_TEST_COMPILE"),
+    reason="takes minutes: set DEEPDETECT_TEST_COMPILE=1",
+)
+def test_compiled_training_gives_the_eager_gradients() -> None:
+    torch.manual_seed(0)
+    first, second = ESPNet(), ESPNet()
+    second.load_state_dict(first.state_dict())
+    rgb = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8)
+    truth = (torch.rand(2, 1, 64, 64) < 0.4).float()
+    eager = Engine(first, DeviceOptions("cpu", "float32", compile=False))
+    compiled = Engine(second, DeviceOptions("cpu", "float32", compile=True))
+    for a, b in zip(
+        gradients(eager, eager.images(rgb), truth),
+        gradients(compiled, compiled.images(rgb), truth),
+        strict=True,
+    ):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-3)
