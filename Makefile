@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 VENV_OPENCV4 ?= .venv-opencv4
+DEMO_OUTPUT ?= demo-output
 LOCK := requirements/lock.txt
 OPENCV4 := opencv-contrib-python-headless==4.14.0.94
 PIP_FLAGS := --quiet --disable-pip-version-check
@@ -9,7 +10,7 @@ PIP_FLAGS := --quiet --disable-pip-version-check
 .PHONY: demo test test-opencv4 lint format clean
 
 demo: $(VENV)/.demo
-	$(VENV)/bin/deepdetect demo -o demo-output
+	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
 
 test: $(VENV)/.test test-opencv4
 	$(VENV)/bin/python -m pytest

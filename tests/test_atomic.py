@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from pathlib import Path
@@ -18,7 +19,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def write_and_fail(target: Path, error: type[BaseException]) -> None:
+def write_and_fail(target: Path, error: type[BaseException] | BaseException) -> None:
     with atomic_path(target) as temporary:
         temporary.write_text("half")
         raise error
@@ -45,12 +46,18 @@ def test_the_temporary_name_keeps_the_suffix(name: str, tmp_path: Path) -> None:
     assert names(tmp_path) == [name]
 
 
-@pytest.mark.parametrize("error", [BlockFailed, OSError, KeyboardInterrupt])
-def test_nothing_appears_when_the_block_fails(
-    error: type[BaseException], tmp_path: Path
-) -> None:
+@pytest.mark.parametrize("error", [BlockFailed, ValueError, KeyboardInterrupt])
+def test_nothing_appears_when_the_block_fails(error: type[BaseException], tmp_path: Path) -> None:
     with pytest.raises(error):
         write_and_fail(tmp_path / "out.txt", error)
+    assert names(tmp_path) == []
+
+
+def test_a_full_disk_is_an_error_of_ours(tmp_path: Path) -> None:
+    with pytest.raises(DeepDetectError, match="No space left on device") as caught:
+        write_and_fail(tmp_path / "out.txt", OSError(errno.ENOSPC, "No space left on device"))
+    assert str(tmp_path / "out.txt") in str(caught.value)
+    assert "\n" not in str(caught.value)
     assert names(tmp_path) == []
 
 

@@ -32,36 +32,32 @@ def changed(options: Options, **changes: Any) -> Options:
 (known: model, estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations, \
 seed)
     """
-    homes = _homes(options)
+    names = option_names(options)
     for name in changes:
-        if name not in homes:
-            raise unknown_name("option", name, homes)
+        if name not in names:
+            raise unknown_name("option", name, names)
     return _rebuild(options, changes)
 
 
 def option_names(options: Any) -> list[str]:
-    """List the names that `changed` takes for these options."""
-    return list(_homes(options))
-
-
-def _homes(options: Any) -> dict[str, Any]:
-    """Map each name to the dataclass that holds it, the outermost where several do."""
-    own: dict[str, Any] = {}
-    inner: dict[str, Any] = {}
-    for field in dataclasses.fields(options):
-        value = getattr(options, field.name)
-        if dataclasses.is_dataclass(value):
-            inner |= _homes(value)
-        own[field.name] = options
-    return own | {name: home for name, home in inner.items() if name not in own}
+    """List the names that `changed` takes for these options, the outer ones first."""
+    fields = [field.name for field in dataclasses.fields(options) if field.init]
+    inner = [getattr(options, name) for name in fields]
+    nested = [option_names(value) for value in inner if dataclasses.is_dataclass(value)]
+    return list(dict.fromkeys(fields + [name for names in nested for name in names]))
 
 
 def _rebuild(options: Any, changes: dict[str, Any]) -> Any:
-    values = {}
-    for field in dataclasses.fields(options):
-        value = getattr(options, field.name)
-        if field.name in changes:
-            values[field.name] = changes[field.name]
-        elif dataclasses.is_dataclass(value):
-            values[field.name] = _rebuild(value, changes)
+    """Apply each change at the outermost place of its name; a new group before its members."""
+    fields = [field.name for field in dataclasses.fields(options) if field.init]
+    values = {name: changes[name] for name in fields if name in changes}
+    left = {name: value for name, value in changes.items() if name not in values}
+    for name in fields:
+        group = values.get(name, getattr(options, name))
+        if dataclasses.is_dataclass(group):
+            own = {key: left.pop(key) for key in option_names(group) if key in left}
+            if own:
+                values[name] = _rebuild(group, own)
+    if left:
+        raise unknown_name("option", next(iter(left)), option_names(options))
     return dataclasses.replace(options, **values)

@@ -12,7 +12,7 @@ from .keypoints import SelectionOptions
 from .matchers import get_matcher
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MatchingOptions:
     """How two images are matched.
 

@@ -84,7 +84,9 @@ def test_no_points_give_an_empty_array(describe, xy) -> None:
 @pytest.mark.parametrize("kind", [int, np.int32, np.float32, np.float64])
 def test_positions_may_have_any_number_type(kind: type) -> None:
     gray, xy = make_gray(), make_points()
-    np.testing.assert_array_equal(sift_descriptors(gray, xy.astype(kind)), sift_descriptors(gray, xy))
+    np.testing.assert_array_equal(
+        sift_descriptors(gray, xy.astype(kind)), sift_descriptors(gray, xy)
+    )
 
 
 def test_the_unset_angle_is_a_turn_of_one_degree() -> None:

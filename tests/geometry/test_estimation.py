@@ -158,6 +158,93 @@ def test_the_same_seed_gives_the_same_result(model: str, estimator: str) -> None
     np.testing.assert_array_equal(first.inliers, again.inliers)
 
 
+@every_way
+def test_the_seed_decides_the_samples(model: str, estimator: str) -> None:
+    """Among many outliers few iterations end at whatever was drawn."""
+    scene = make_scene(model, outliers=0.6, noise=1.0)
+    found = {
+        estimate_geometry(
+            scene.points0, scene.points1, make_options(model, estimator, iterations=20, seed=seed)
+        ).inliers.tobytes()
+        for seed in range(6)
+    }
+    assert len(found) > 1
+
+
+def opencv_fit(scene: Scene, model: str, method: int) -> np.ndarray:
+    if model == "homography":
+        return cv2.findHomography(
+            scene.points0, scene.points1, method, 1.0, maxIters=10_000, confidence=0.999
+        )[0]
+    if model == "fundamental":
+        return cv2.findFundamentalMat(scene.points0, scene.points1, method, 1.0, 0.999, 10_000)[0]
+    points0 = cv2.undistortPoints(scene.points0, CAMERA0, None)
+    points1 = cv2.undistortPoints(scene.points1, CAMERA1, None)
+    threshold = 1 / 620  # a pixel over the mean focal length
+    return cv2.findEssentialMat(
+        points0, points1, np.eye(3), method, 0.999, threshold, maxIters=10_000
+    )[0]
+
+
+@every_way
+def test_judges_as_well_as_opencv_does_with_the_wanted_estimator(
+    model: str, estimator: str
+) -> None:
+    """The samples may differ, so the errors of true matches are compared."""
+    ratios = []
+    for seed in range(5):
+        scene = make_scene(model, seed, noise=0.5)
+        options = make_options(model, estimator)
+        found = estimate_geometry(scene.points0, scene.points1, options).matrix
+        method = {"magsac": cv2.USAC_MAGSAC, "ransac": cv2.RANSAC}[estimator]
+        fresh = make_scene(model, seed + 50, outliers=0, noise=0)
+        errors = [
+            np.median(judged(fresh.points0, fresh.points1, model, matrix))
+            for matrix in (found, opencv_fit(scene, model, method))
+        ]
+        ratios.append(errors[0] / errors[1])
+    assert 0.5 < np.median(ratios) < 2
+
+
+@every_way
+def test_the_estimator_is_the_wanted_one(
+    model: str, estimator: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = {
+        "homography": "findHomography",
+        "fundamental": "findFundamentalMat",
+        "essential": "findEssentialMat",
+    }[model]
+    original, seen = getattr(cv2, name), []
+
+    def spy(*args: Any, **named: Any) -> Any:
+        seen.extend([*args, *named.values()])
+        return original(*args, **named)
+
+    monkeypatch.setattr(cv2, name, spy)
+    scene = make_scene(model)
+    estimate_geometry(scene.points0, scene.points1, make_options(model, estimator))
+    methods = {"magsac": cv2.USAC_MAGSAC, "ransac": cv2.RANSAC}
+    numbers = [value for value in seen if isinstance(value, int)]
+    assert methods.pop(estimator) in numbers
+    assert not set(methods.values()) & set(numbers)
+
+
+@pytest.mark.parametrize("answer", ["error", None, np.ones((2, 2)), np.full((3, 3), np.nan)])
+def test_a_failure_of_opencv_is_no_crash(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*args: Any, **named: Any) -> tuple[Any, None]:
+        if isinstance(answer, str):
+            raise cv2.error("degenerate")
+        return answer, None
+
+    monkeypatch.setattr(cv2, "findHomography", fail)
+    scene = make_scene("homography")
+    geometry = estimate_geometry(scene.points0, scene.points1, make_options("homography"))
+    assert geometry.kind == "homography"
+    assert geometry.matrix is None
+    assert_consistent(geometry, len(scene.true))
+
+
 @given(
     way=st.sampled_from([(model, name) for model in MODELS for name in ESTIMATORS]),
     seed=st.integers(0, 1000),

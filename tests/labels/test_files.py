@@ -19,7 +19,7 @@ MASK = np.random.default_rng(3).random((19, 26)) > 0.6
 
 @given(arrays(bool, st.tuples(st.integers(1, 20), st.integers(1, 20))))
 def test_round_trip(tmp_path_factory: pytest.TempPathFactory, mask: np.ndarray) -> None:
-    path = tmp_path_factory.mktemp("masks") / "mask.png"
+    path = tmp_path_factory.getbasetemp() / "round_trip.png"
     save_mask(mask, path)
     with Image.open(path) as opened:
         assert opened.mode == "1"
@@ -55,7 +55,7 @@ def test_brighter_than_half_at_any_bit_depth(depth: str, tmp_path: Path) -> None
 
 
 def test_a_palette_of_two_colours(tmp_path: Path) -> None:
-    image = Image.fromarray(MASK.astype(np.uint8), mode=None).convert("P")
+    image = Image.fromarray(MASK.astype(np.uint8)).convert("P")
     image.putpalette([255, 255, 255, 0, 0, 0])  # 0 is white
     image.save(tmp_path / "mask.png")
     np.testing.assert_array_equal(load_mask(tmp_path / "mask.png"), ~MASK)

@@ -15,8 +15,12 @@ def test_constant_images(marks_nothing_on_constant_images: Callable[[str], None]
 def test_the_corners_of_a_square(square: np.ndarray) -> None:
     row, column = np.nonzero(orb_mask(square, OrbSettings()))
     corners = [(24, 20), (47, 20), (24, 43), (47, 43)]
-    distance = np.array([[max(abs(column - x), abs(row - y)).max() for x, y in corners]
-                         for column, row in zip(column, row, strict=True)])
+    distance = np.array(
+        [
+            [max(abs(column - x), abs(row - y)).max() for x, y in corners]
+            for column, row in zip(column, row, strict=True)
+        ]
+    )
     assert distance.min(1).max() <= 2
     assert distance.min(0).max() <= 2
 

@@ -26,9 +26,7 @@ def nearest(value: float) -> int:
     shape=st.tuples(st.integers(1, 12), st.integers(1, 12)),
     points=st.lists(st.tuples(COORDINATES, COORDINATES), max_size=30),
 )
-def test_equals_a_plain_loop(
-    shape: tuple[int, int], points: list[tuple[float, float]]
-) -> None:
+def test_equals_a_plain_loop(shape: tuple[int, int], points: list[tuple[float, float]]) -> None:
     expected = np.zeros(shape, bool)
     for x, y in points:
         column, row = nearest(x), nearest(y)

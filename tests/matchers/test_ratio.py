@@ -138,9 +138,7 @@ counts = st.integers(2, 40)
 ratios = st.floats(0.05, 1.0)
 
 
-@given(
-    seed=seeds, count0=counts, count1=counts, low=ratios, high=ratios, mutual=st.booleans()
-)
+@given(seed=seeds, count0=counts, count1=counts, low=ratios, high=ratios, mutual=st.booleans())
 def test_a_lower_ratio_only_removes_matches(
     seed: int, count0: int, count1: int, low: float, high: float, mutual: bool
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +24,9 @@ class GeometryOptions:
         model: "homography" (planes, pure rotation), "fundamental" (any static scene),
             "essential" (known cameras), or "none".
         estimator: "magsac" or "ransac".
-        inlier_threshold: largest distance of an inlier from the model, in pixels.
+        inlier_threshold: a match is an inlier when it is nearer to the model than this, in
+            pixels: the transfer error of a homography, else Sampson's distance (in a
+            rectified pair an error of d rows counts d / sqrt(2)).
         homography: a given (3, 3) homography: nothing is estimated, the inliers are
             the matches that it takes to less than the threshold.
         camera0, camera1: (3, 3) camera matrices, for "essential".
@@ -59,17 +62,28 @@ class GeometryOptions:
         if self.iterations < 1:
             raise OptionError(f"iterations must be at least 1, not {self.iterations}")
         for name in ("homography", "camera0", "camera1"):
-            value = getattr(self, name)
-            if value is not None:
-                matrix = np.asarray(value, np.float64)
-                if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-                    raise OptionError(f"{name} must be a (3, 3) matrix of finite numbers")
-                object.__setattr__(self, name, matrix)
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, _matrix(name, getattr(self, name)))
         if self.model == "essential" and (self.camera0 is None or self.camera1 is None):
             raise OptionError(
                 "an essential matrix needs both cameras: give camera0 and camera1, "
                 "or choose the fundamental matrix"
             )
+
+
+def _matrix(name: str, value: Any) -> np.ndarray:
+    """Return a copy of a (3, 3) matrix, or raise the error that says what is wrong with it."""
+    try:
+        matrix = np.array(value, np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise OptionError(f"{name} must be a (3, 3) matrix of finite numbers")
+    if name != "homography" and (np.linalg.matrix_rank(matrix) < 3 or matrix[0, 0] <= 0):
+        raise OptionError(
+            f"{name} is no camera matrix: it must be invertible, with a focal length above 0"
+        )
+    return matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +142,11 @@ def estimate_geometry(
     nothing = Geometry(options.model, None, np.zeros(len(points0), bool))
     if len(points0) < model.fewest:
         return nothing
-    cv2.setRNGSeed(options.seed)
+    # OpenCV draws the same samples every time; another order of the matches is another draw.
+    order = np.random.default_rng(options.seed).permutation(len(points0))
     method = cv2.USAC_MAGSAC if options.estimator == "magsac" else cv2.RANSAC
     try:
-        matrix = model.fit(points0, points1, options, method)
+        matrix = model.fit(points0[order], points1[order], options, method)
     except cv2.error:  # degenerate input, as all points in one place
         return nothing
     if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
@@ -190,8 +205,9 @@ def _normalised(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray((homogeneous @ np.linalg.inv(camera).T)[:, :2])
 
 
+# With fewer than 15 matches OpenCV's RANSAC leaves the threshold out of account.
 MODELS: dict[str, Model] = {
     "homography": Model(4, _fit_homography, lambda a, b, m, _: transfer_errors(a, b, m)),
-    "fundamental": Model(8, _fit_fundamental, lambda a, b, m, _: epipolar_errors(a, b, m)),
+    "fundamental": Model(15, _fit_fundamental, lambda a, b, m, _: epipolar_errors(a, b, m)),
     "essential": Model(6, _fit_essential, _essential_errors),
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 BLOCK = 32_000_000
-"""Distances held at a time, to bound the memory (128 MB)."""
+"""Numbers of four bytes held at a time, to bound the memory (128 MB and some)."""
 
 
 def exact_neighbours(
@@ -27,15 +27,23 @@ def exact_neighbours(
     """
     rows = np.empty((len(queries), count), np.int32)
     distances = np.empty((len(queries), count), np.float32)
-    lengths = np.einsum("ij,ij->i", base, base)
-    step = max(1, BLOCK // len(base))
+    # Double precision: the expansion below loses digits where distances are small.
+    wide = base.astype(np.float64)
+    lengths = np.einsum("ij,ij->i", wide, wide)
+    step = max(1, BLOCK // (2 * max(len(base), 2 * count * base.shape[1])))
     for start in range(0, len(queries), step):
         block = queries[start : start + step]
         # |q - b|^2 less the constant |q|^2.
-        partial = lengths - 2 * (block @ base.T)
-        found = np.argpartition(partial, count - 1, axis=1)[:, :count]
+        partial = block.astype(np.float64) @ wide.T
+        partial *= -2
+        partial += lengths
+        found = np.empty((len(block), count), np.intp)
+        every = np.arange(len(block))
+        for rank in range(count):  # argmin takes the lower row of equals
+            found[:, rank] = partial.argmin(1)
+            partial[every, found[:, rank]] = np.inf
         found.sort(axis=1)
-        # The differences are taken anew: the expansion above loses digits near 0.
+        # The differences are taken anew, for distances that are exact near 0.
         gaps = np.linalg.norm(block[:, None] - base[found], axis=2)
         order = np.argsort(gaps, axis=1, kind="stable")
         rows[start : start + step] = np.take_along_axis(found, order, 1)

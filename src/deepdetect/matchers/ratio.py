@@ -45,8 +45,8 @@ def match_descriptors(
         seed: of a matcher that is random.
 
     Returns:
-        The matches, by ascending row of the first set. None are found when a set has
-        fewer than two descriptors: there is no second-best then.
+        The matches, by ascending row of the first set. None are found when the second
+        set has fewer than two descriptors: there is no second-best then.
 
     Example:
         >>> from deepdetect.matchers import get_matcher

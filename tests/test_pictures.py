@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from deepdetect import Keypoints
+from deepdetect.pictures import (
+    GREEN,
+    RED,
+    draw_heatmap,
+    draw_keypoints,
+    draw_matches,
+    save_picture,
+    with_caption,
+)
+
+
+def test_heat_map_colours_are_viridis() -> None:
+    from matplotlib import colormaps
+
+    levels = np.linspace(0, 1, 256, dtype=np.float32)[None].repeat(16, 0)
+    expected = colormaps["viridis"](levels)[..., :3] * 255
+    assert np.abs(draw_heatmap(levels).astype(float) - expected).max() <= 2
+
+
+def test_dense_keypoints_colour_their_own_pixels_only() -> None:
+    rgb = np.full((100, 120, 3), 100, np.uint8)
+    row, column = np.divmod(np.arange(6000), 120)
+    picture = draw_keypoints(rgb, Keypoints(np.stack([column, row], 1), np.ones(6000), (120, 100)))
+    greener = picture[..., 1] > picture[..., 0]
+    assert greener[:50].all()
+    assert not greener[50:].any()
+
+
+def test_sparse_keypoints_are_circles_around_them() -> None:
+    rgb = np.zeros((40, 60, 3), np.uint8)
+    picture = draw_keypoints(rgb, Keypoints([[30, 20]], [1], (60, 40)))
+    rows, columns = np.nonzero(picture.any(2))
+    assert (columns.mean(), rows.mean()) == (30, 20)
+
+
+def test_match_lines_join_the_right_pixels() -> None:
+    black = np.zeros((50, 60, 3), np.uint8)
+    picture = draw_matches(
+        black, black, np.array([[10, 5], [10, 40]]), np.array([[20, 5], [50, 40]]), [True, False]
+    )
+    assert picture.shape == (50, 120, 3)
+    assert tuple(picture[5, 10]) == tuple(picture[5, 60 + 20]) == GREEN
+    assert tuple(picture[40, 10]) == tuple(picture[40, 60 + 50]) == RED
+    assert not picture[20:30].any()
+
+
+def test_pictures_are_saved_as_they_are(tmp_path: Path) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
+    save_picture(rgb, tmp_path / "deep" / "p.png")
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "deep" / "p.png")), rgb)
+
+
+def test_captions_fit_narrow_pictures() -> None:
+    picture = with_caption(np.zeros((20, 60, 3), np.uint8), "a caption that is far too long")
+    assert picture.shape[1] == 60
+    assert picture[20:].any()
+    assert not picture[20:, -2:].any()

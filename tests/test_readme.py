@@ -1,0 +1,171 @@
+"""Every command of the README is run."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from skimage import data
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
+SHELL = [
+    line.split("#")[0].strip()
+    for block in re.findall(r"```sh\n(.*?)```", README, re.S)
+    for line in block.splitlines()
+    if line.strip()
+]
+PYTHON = re.findall(r"```python\n(.*?)```", README, re.S)
+TABLE = re.findall(r"^\| `(deepdetect [^`]*)`", README, re.M)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the files that the README's examples name."""
+    left, right, _ = data.stereo_motorcycle()
+    for name, view in (("left", left), ("right", right)):
+        Image.fromarray(view[100:260, 300:500]).save(tmp_path / f"{name}.png")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_it_starts_as_promised() -> None:
+    """One sentence, a picture, two commands, six lines of Python, two command lines."""
+    title, sentence, picture, *rest = [part for part in README.split("\n\n") if part]
+    assert title == "# DeepDetect"
+    assert sentence.count(". ") == 0
+    assert sentence.endswith(".")
+    assert re.fullmatch(r"!\[.*\]\((.*)\)", picture)
+    assert (ROOT / picture.split("(")[1].rstrip(")")).stat().st_size > 10_000
+    assert [line.split()[:2] for line in rest[0].splitlines()[1:-1]] == [
+        ["make", "demo"],
+        ["make", "test"],
+    ]
+    assert len([line for line in PYTHON[0].splitlines() if line]) <= 6
+    assert SHELL[2:4] == ["deepdetect detect left.png", "deepdetect match left.png right.png"]
+
+
+def test_links_lead_somewhere() -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", README):
+        assert (ROOT / target).exists(), target
+
+
+def test_the_python_lines_run(folder: Path) -> None:
+    for block in PYTHON:
+        done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.startswith("2000 ") or int(done.stdout.split()[0]) > 100
+
+
+@pytest.mark.parametrize("line", [line for line in SHELL if line.startswith("deepdetect ")])
+def test_the_command_lines_run(folder: Path, line: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", *shlex.split(line)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert list((folder / "deepdetect-output").glob("*.npz"))
+    assert list((folder / "deepdetect-output").glob("*.png"))
+
+
+@pytest.mark.parametrize("line", TABLE)
+def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
+    words = shlex.split(line)
+    if "train" in words:
+        pytest.importorskip("torch", reason="needs torch, which is for training only")
+        words += [
+            "--stage",
+            "32x2x1",
+            "--short-side",
+            "32",
+            "--detectors",
+            "fast",
+            "--validations",
+            "1",
+        ]
+        words += ["--no-compile", "--workers", "1", "--validation", "PHOTOS"]
+    if "evaluate" in words:
+        (folder / "samples").mkdir()
+        shutil.copy("left.png", "samples/image_1.png")
+        mask = np.asarray(Image.open("left.png").convert("L")) > 100
+        Image.fromarray(mask).save("samples/mask_image_1.png")
+    (folder / "photos").mkdir()
+    shutil.copy("left.png", "photos")
+    shutil.copy("right.png", "photos")
+    places = {
+        "IMAGES": "left.png",
+        "IMAGE0": "left.png",
+        "IMAGE1": "right.png",
+        "DIR": "out",
+        "PHOTOS": "photos",
+        "SAMPLES": "samples",
+    }
+    command = [sys.executable, "-m", *(places.get(word, word) for word in words)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_make_demo_runs(tmp_path: Path) -> None:
+    if Path(sys.prefix) != ROOT / ".venv" or shutil.which("make") is None:
+        pytest.skip("needs make, and to be run by `make test` in .venv")
+    done = subprocess.run(
+        ["make", "demo", f"DEMO_OUTPUT={tmp_path}"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    for word in ("keypoints", "density", "matches", "truth", "seconds: matching"):
+        assert word in done.stdout
+    pictures = {path.name.removeprefix("motorcycle_") for path in tmp_path.glob("*.png")}
+    assert pictures == {
+        "left_keypoints.png",
+        "right_keypoints.png",
+        "left_heatmap.png",
+        "matches.png",
+    }
+
+
+def test_make_test_is_what_ci_runs() -> None:
+    assert "make test" in (ROOT / ".ci" / "run").read_text()
+    assert re.search(r"^test:", (ROOT / "Makefile").read_text(), re.M)
+
+
+@pytest.mark.parametrize("line", [line for line in SHELL if line.startswith("pip install")])
+def test_the_installs_name_extras_that_exist(line: str) -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    named = re.findall(r"\[(.*)\]", line)
+    assert all(extra in extras for extra in named)
+
+
+def test_the_wheel_installs_and_detects(folder: Path) -> None:
+    """`pip install .`, built and installed into an empty folder, with the weights inside."""
+    pytest.importorskip("hatchling", reason="needs hatchling to build the wheel")
+    target = folder / "site"
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"),
+            *("--no-deps", "--no-build-isolation", "--target", str(target), str(ROOT)),
+        ],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    weights = target / "deepdetect" / "weights"
+    for name in ("deepdetect.onnx", "deepdetect.safetensors"):
+        assert 0 < (weights / name).stat().st_size < 2_000_000
+    assert (weights / "MODEL_CARD.md").exists()
+    code = (
+        f"import sys; sys.path.insert(0, {str(target)!r}); import deepdetect;"
+        f"assert deepdetect.__file__.startswith({str(target)!r}), deepdetect.__file__;"
+        "print(len(deepdetect.DeepDetect().detect('left.png')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 100
