@@ -52,6 +52,8 @@ ARRAYS = {
     "float32 grey": ((GREY / 255).astype(np.float32), triple(GREY)),
     "float64 rgb": (RGB / 255, RGB),
     "float16 rgba": ((np.dstack([RGB, ALPHA]) / 255).astype(np.float16), RGB),
+    "float a little below a level": ((GREY - 0.4).clip(0) / 255, triple(GREY)),
+    "float a little above a level": ((GREY + 0.4).clip(0, 255) / 255, triple(GREY)),
     "float of the other byte order": ((RGB / 255).astype(">f4"), RGB),
     "bool grey": (GREY > 99, triple(np.where(GREY > 99, 255, 0))),
     "bool rgb": (RGB > 99, np.where(RGB > 99, 255, 0)),

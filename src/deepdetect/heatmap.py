@@ -34,12 +34,14 @@ class HeatmapOptions:
 
     def __post_init__(self) -> None:
         if isinstance(self.resolution, str):
-            if self.resolution != "native":
-                raise unknown_name("resolution", self.resolution, ["native"])
-        elif self.resolution < 16 or self.resolution % STRIDE:
+            known = self.resolution == "native"
+        else:
+            known = isinstance(self.resolution, (int, np.integer))
+            known = known and self.resolution >= 16 and self.resolution % STRIDE == 0
+        if not known:
             raise OptionError(
                 f"the resolution must be 'native' or a multiple of {STRIDE} from 16 on, "
-                f"not {self.resolution}"
+                f"not {self.resolution!r}"
             )
         if self.channels not in ("rgb", "bgr"):
             raise unknown_name("channel order", self.channels, ["rgb", "bgr"])

@@ -86,22 +86,32 @@ def find_images(folder: str | Path) -> list[Path]:
 def _read_file(path: Path) -> np.ndarray:
     from PIL import Image, ImageOps, UnidentifiedImageError
 
-    if not path.exists():
-        raise ImageError(f"there is no file {path}: check the path")
-    if path.is_dir():
-        raise ImageError(f"{path} is a folder: name an image file")
     try:
         with Image.open(path) as opened:
-            return _from_pil(ImageOps.exif_transpose(opened))
+            return _from_pil(ImageOps.exif_transpose(opened), str(path))
+    except FileNotFoundError:
+        raise ImageError(f"there is no file {path}: check the path") from None
+    except IsADirectoryError:
+        raise ImageError(f"{path} is a folder: name an image file") from None
     except UnidentifiedImageError:
         raise ImageError(f"{path} is not an image that can be read: use PNG or JPEG") from None
     except Image.DecompressionBombError:
         raise ImageError(f"{path} is too large to be a photograph: make it smaller") from None
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        raise ImageError(f"{path} is damaged or truncated ({error}): get it anew") from None
+    except (OSError, SyntaxError, ValueError) as error:
+        raise _damaged(str(path), error) from None
 
 
-def _from_pil(image: Any) -> np.ndarray:
+def _damaged(name: str, error: Exception) -> ImageError:
+    return ImageError(f"{name} is damaged or truncated ({error}): get it anew")
+
+
+def _from_pil(image: Any, name: str = "the image") -> np.ndarray:
+    try:
+        image.load()
+    except (OSError, SyntaxError, ValueError) as error:
+        raise _damaged(name, error) from None
+    if image.mode == "P" and isinstance(image.info.get("transparency"), bytes):
+        image = image.convert("RGBA")  # Pillow warns when it drops such an alpha at once
     if image.mode.startswith("I") or image.mode == "F":  # 16 or 32 bits a pixel
         values = np.asarray(image)
         if image.mode != "F":
@@ -111,7 +121,10 @@ def _from_pil(image: Any) -> np.ndarray:
 
 
 def _from_array(image: Any) -> np.ndarray:
-    array = np.asarray(image)
+    try:
+        array = np.asarray(image)
+    except ValueError:
+        raise ImageError("an image array must have rows of equal length") from None
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[:, :, 0]
     if not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] in (3, 4))):
@@ -130,7 +143,7 @@ def _to_uint8(array: np.ndarray) -> np.ndarray:
         return array
     if array.dtype == np.bool_:
         return array.astype(np.uint8) * 255
-    if array.dtype == np.uint16:
+    if array.dtype.kind == "u" and array.dtype.itemsize == 2:  # of either byte order
         # Divide by 257 with rounding, so that 65535 becomes 255.
         return ((array.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if np.issubdtype(array.dtype, np.floating):

@@ -103,8 +103,10 @@ class SelectionOptions:
             raise OptionError(f"the density must lie in (0, 1], not {self.density}")
         if self.max_keypoints is not None and self.max_keypoints < 1:
             raise OptionError(f"max_keypoints must be at least 1, not {self.max_keypoints}")
-        if self.nms_radius < 0:
-            raise OptionError(f"nms_radius must be 0 or more pixels, not {self.nms_radius}")
+        if self.nms_radius < 0 or self.nms_radius != int(self.nms_radius):
+            raise OptionError(
+                f"nms_radius must be a whole number of pixels from 0 on, not {self.nms_radius}"
+            )
 
 
 def select_keypoints(
@@ -175,7 +177,7 @@ def _suppress(
     plane = np.zeros(shape)
     plane.ravel()[pixels] = ranks
     # Windows that reach over the border see -infinity there.
-    side = 2 * radius + 1
+    side = 2 * int(radius) + 1
     best = cv2.dilate(plane, np.ones((1, side), np.uint8))
     best = cv2.dilate(best, np.ones((side, 1), np.uint8))
     return best.ravel()[pixels] == ranks

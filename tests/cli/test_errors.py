@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError, Keypoints
+from deepdetect.detector import bundled_weights
 from deepdetect.storage import save_keypoints
 
 
@@ -177,3 +178,20 @@ def test_a_full_disk_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.Mon
         save_keypoints(keypoints, path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["k.npz"]
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+@pytest.mark.parametrize("content", ["text", "half"])
+def test_bad_weights_make_no_noise_of_native_code(
+    photos: Path, tmp_path: Path, backend: str, content: str
+) -> None:
+    pytest.importorskip(backend, reason=f"needs {backend}")
+    whole = bundled_weights().read_bytes()
+    path = tmp_path / "weights.onnx"
+    path.write_bytes(b"no network" if content == "text" else whole[: len(whole) // 2])
+    command = [sys.executable, "-m", "deepdetect", "detect", str(photos / "cat.jpg")]
+    command += ["--weights", str(path), "--backend", backend]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("deepdetect: ")
+    assert len(done.stderr.strip().splitlines()) == 1, done.stderr

@@ -85,6 +85,8 @@ def load_mask(path: str | Path) -> np.ndarray:
 
     try:
         with Image.open(path) as opened:
+            if opened.mode.startswith("I"):  # 16 bits a pixel
+                return np.asarray(opened) > 32767
             return np.asarray(opened.convert("L")) > 127
     except FileNotFoundError:
         raise ImageError(f"there is no mask {path}: check the path") from None

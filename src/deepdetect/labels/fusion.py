@@ -26,12 +26,13 @@ class LabelOptions:
     visibility: VisibilityChoice = "auto"
 
     def __post_init__(self) -> None:
-        chosen = select_detectors(self.detectors)
+        names = (self.detectors,) if isinstance(self.detectors, str) else self.detectors
+        chosen = select_detectors(names)
         object.__setattr__(self, "detectors", tuple(detector.name for detector in chosen))
         visibility_of(np.zeros((1, 1), np.uint8), self.visibility)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Label:
     """A fusion label.
 

@@ -42,7 +42,9 @@ def load_network(path: str | Path) -> ESPNet:
             names = list(file.keys())
             network.load_state_dict({name: file.get_tensor(name) for name in names})
     except (SafetensorError, OSError, RuntimeError, KeyError) as error:
-        reason = str(error).strip().splitlines()[0].rstrip(":")
+        # torch names the first wrong tensor on its second line.
+        reason = " ".join(str(error).split("\n\t")[:2]).strip()
+        reason = reason if len(reason) < 160 else reason[:160] + "..."
         raise WeightsError(
             f"{path} does not fit the network ({reason}): "
             "use weights that deepdetect has trained, or the published ones"

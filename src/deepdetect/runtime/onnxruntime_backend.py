@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import OptionError, WeightsError, unknown_name
-from .shapes import check_shapes
+from .shapes import check_network
 
 if TYPE_CHECKING:
     from .registry import RuntimeOptions
@@ -56,5 +56,14 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
             "get it anew"
         ) from None
     inputs, outputs = session.get_inputs(), session.get_outputs()
-    check_shapes(path, [value.shape for value in inputs], [value.shape for value in outputs])
+    check_network(
+        path,
+        [value.shape for value in inputs],
+        [value.shape for value in outputs],
+        # It says "tensor(float)" for float32.
+        {
+            "float32" if value.type == "tensor(float)" else value.type
+            for value in [*inputs, *outputs]
+        },
+    )
     return OnnxRuntimeNetwork(session, inputs[0].name)

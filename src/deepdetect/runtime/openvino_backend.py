@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import WeightsError
-from .shapes import check_shapes
+from .shapes import check_network
 
 if TYPE_CHECKING:
     from .registry import RuntimeOptions
@@ -31,20 +31,28 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         WeightsError: the file is damaged or is another network.
     """
     import openvino
+    from openvino.frontend import FrontEndManager
 
     # Its default on newer CPUs is bfloat16, which moves keypoints.
     settings: dict[str, object] = {"INFERENCE_PRECISION_HINT": "f32"}
     if options.threads is not None:
         settings["INFERENCE_NUM_THREADS"] = options.threads
     try:
-        model = openvino.Core().compile_model(str(path), "CPU", settings)
-    except RuntimeError as error:
+        # Named, not guessed: guessing tries all formats and prints each one's complaint.
+        reader = FrontEndManager().load_by_framework("onnx")
+        model = openvino.Core().compile_model(
+            reader.convert(reader.load(str(path))), "CPU", settings
+        )
+    except Exception as error:  # its exceptions share no base class
         reason = str(error).strip().splitlines()[-1]
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({reason}): get it anew"
         ) from None
-    check_shapes(
-        path, [_shape(value) for value in model.inputs], [_shape(v) for v in model.outputs]
+    check_network(
+        path,
+        [_shape(value) for value in model.inputs],
+        [_shape(value) for value in model.outputs],
+        {str(value.get_element_type().to_dtype()) for value in [*model.inputs, *model.outputs]},
     )
     return OpenVinoNetwork(model)
 

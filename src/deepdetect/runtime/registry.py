@@ -56,24 +56,22 @@ class RuntimeOptions:
         if self.threads is not None and self.threads < 1:
             raise OptionError(f"threads must be at least 1, not {self.threads}")
         if self.providers and self.backend not in ("auto", "onnxruntime"):
-            raise OptionError(
-                f"providers belong to onnxruntime, not to {self.backend}: leave one of them out"
-            )
+            raise _foreign_providers(self.backend)
 
 
 @dataclass(frozen=True)
 class Backend:
-    """A backend: its package, the weights it reads, and the function that loads them."""
+    """A backend: its packages, the weights it reads, and the function that loads them."""
 
-    package: str
+    packages: tuple[str, ...]
     suffixes: tuple[str, ...]
     open: Callable[[Path, RuntimeOptions], Network]
 
 
 BACKENDS: dict[str, Backend] = {
-    "onnxruntime": Backend("onnxruntime", (".onnx",), open_onnxruntime),
-    "openvino": Backend("openvino", (".onnx",), open_openvino),
-    "torch": Backend("torch", (".safetensors",), open_torch),
+    "onnxruntime": Backend(("onnxruntime",), (".onnx",), open_onnxruntime),
+    "openvino": Backend(("openvino",), (".onnx",), open_openvino),
+    "torch": Backend(("torch", "safetensors"), (".safetensors",), open_torch),
 }
 
 
@@ -103,14 +101,20 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
             f"the backend {name} reads {' or '.join(backend.suffixes)} files, not {path.name}: "
             "leave the backend out, or give other weights"
         )
-    if importlib.util.find_spec(backend.package) is None:
-        extra = "train" if name == "torch" else name
-        what = f"weights of the kind {path.suffix}" if name == "torch" else f"the backend {name}"
-        raise MissingExtraError(
-            f"{what} need the package {backend.package}, which is not installed: "
-            f"run pip install 'deepdetect[{extra}]'"
-        )
+    if options.providers and name != "onnxruntime":
+        raise _foreign_providers(name)
+    for package in backend.packages:
+        if importlib.util.find_spec(package) is None:
+            extra = "train" if name == "torch" else name
+            raise MissingExtraError(
+                f"reading {path.name} with the backend {name} needs the package {package}, "
+                f"which is not installed: run pip install 'deepdetect[{extra}]'"
+            )
     return backend.open(path, options), name
+
+
+def _foreign_providers(backend: str) -> OptionError:
+    return OptionError(f"providers belong to onnxruntime, not to {backend}: leave one of them out")
 
 
 def _choose(path: Path, options: RuntimeOptions) -> str:

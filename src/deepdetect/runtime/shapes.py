@@ -10,15 +10,18 @@ from ..errors import WeightsError
 Shape = Sequence[int | str | None]
 
 
-def check_shapes(path: Path, inputs: Sequence[Shape], outputs: Sequence[Shape]) -> None:
+def check_network(
+    path: Path, inputs: Sequence[Shape], outputs: Sequence[Shape], types: set[str]
+) -> None:
     """Check that a network maps one RGB image to one map, for any size.
 
     Args:
         path: the file, for the message.
         inputs, outputs: their shapes; a free dimension is no number.
+        types: names of all their number types.
 
     Raises:
-        WeightsError: the shapes do not fit.
+        WeightsError: the shapes or the types do not fit.
     """
     fits = (
         len(inputs) == len(outputs) == 1
@@ -30,10 +33,17 @@ def check_shapes(path: Path, inputs: Sequence[Shape], outputs: Sequence[Shape]) 
             f"{path} does not fit: it maps {_text(inputs)} to {_text(outputs)}, and must map "
             "one image (1, 3, height, width) to one map (1, 1, height, width) of any size"
         )
+    if types != {"float32"}:
+        raise WeightsError(
+            f"{path} does not fit: it computes with {', '.join(sorted(types))}, "
+            "and must take and give float32"
+        )
 
 
 def _like(shape: Shape, channels: int) -> bool:
-    if len(shape) != 4 or (isinstance(shape[1], int) and shape[1] != channels):
+    if len(shape) != 4 or (isinstance(shape[0], int) and shape[0] != 1):
+        return False
+    if isinstance(shape[1], int) and shape[1] != channels:
         return False
     return not any(isinstance(side, int) for side in shape[2:])
 

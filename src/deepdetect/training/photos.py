@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import zlib
 from dataclasses import dataclass
@@ -53,8 +54,11 @@ def hold_out(photos: list[Photo], share: int = 20) -> tuple[list[Photo], list[Ph
     Raises:
         ImageError: there are too few photographs to split.
     """
-    held = [photo for photo in photos if zlib.crc32(photo.path.name.encode()) % share == 0]
-    kept = [photo for photo in photos if photo not in held]
+    held: list[Photo] = []
+    kept: list[Photo] = []
+    for photo in photos:
+        part = held if zlib.crc32(photo.path.name.encode()) % share == 0 else kept
+        part.append(photo)
     if not held and len(photos) > 1:
         held, kept = photos[-1:], photos[:-1]
     if not held or not kept:
@@ -70,12 +74,13 @@ class ViewStore:
 
     Args:
         labels: the label cache.
-        memory: bytes that may be kept; views beyond it are made anew each time.
+        memory: bytes that may be kept, default half of the free memory; views beyond it
+            are made anew each time.
     """
 
-    def __init__(self, labels: LabelCache, memory: int = 6_000_000_000) -> None:
+    def __init__(self, labels: LabelCache, memory: int | None = None) -> None:
         self.labels = labels
-        self.memory = memory
+        self.memory = _half_of_free_memory() if memory is None else memory
         self._kept: dict[tuple[Path, View], tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
 
@@ -96,3 +101,11 @@ class ViewStore:
                 self.memory -= image.nbytes + mask.nbytes
                 self._kept[key] = image, mask
         return image, mask
+
+
+def _half_of_free_memory() -> int:
+    """Return half of the free memory in bytes, or 2 GB where the system does not tell."""
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    except (AttributeError, ValueError, OSError):
+        return 2_000_000_000
