@@ -34,14 +34,16 @@ class HeatmapOptions:
 
     def __post_init__(self) -> None:
         if isinstance(self.resolution, str):
-            known = self.resolution == "native"
-        else:
-            known = isinstance(self.resolution, (int, np.integer))
-            known = known and self.resolution >= 16 and self.resolution % STRIDE == 0
-        if not known:
+            if self.resolution != "native":
+                raise unknown_name("resolution", self.resolution, ["native", "a number of pixels"])
+        elif (
+            not isinstance(self.resolution, (int, np.integer))
+            or self.resolution < 16
+            or self.resolution % STRIDE
+        ):
             raise OptionError(
                 f"the resolution must be 'native' or a multiple of {STRIDE} from 16 on, "
-                f"not {self.resolution!r}"
+                f"not {self.resolution}"
             )
         if self.channels not in ("rgb", "bgr"):
             raise unknown_name("channel order", self.channels, ["rgb", "bgr"])

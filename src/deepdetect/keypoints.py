@@ -103,10 +103,10 @@ class SelectionOptions:
             raise OptionError(f"the density must lie in (0, 1], not {self.density}")
         if self.max_keypoints is not None and self.max_keypoints < 1:
             raise OptionError(f"max_keypoints must be at least 1, not {self.max_keypoints}")
-        if self.nms_radius < 0 or self.nms_radius != int(self.nms_radius):
-            raise OptionError(
-                f"nms_radius must be a whole number of pixels from 0 on, not {self.nms_radius}"
-            )
+        if self.nms_radius < 0:
+            raise OptionError(f"nms_radius must be 0 or more pixels, not {self.nms_radius}")
+        if self.nms_radius != int(self.nms_radius):
+            raise OptionError(f"nms_radius must be a whole number of pixels, not {self.nms_radius}")
 
 
 def select_keypoints(
