@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, ImageOps
 
 from deepdetect.errors import ImageError
 from deepdetect.image import IMAGE_SUFFIXES, MINIMUM_SIDE, find_images, load_image, luma
@@ -318,3 +319,26 @@ def test_find_images_errors(name: str, words: str, tmp_path: Path, one_line: One
     message = one_line(caught.value)
     assert words in message
     assert str(tmp_path / name) in message
+
+
+def test_broken_exif_is_no_broken_picture(tmp_path: Path) -> None:
+    """A signed resolution cannot be rewritten by Pillow; the picture can be read all the same."""
+    entries = struct.pack("<HHIHxx", 0x0112, 3, 1, 6) + struct.pack("<HHII", 0x011A, 10, 1, 38)
+    exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 2) + entries + struct.pack("<Iii", 0, -1, 0)
+    path = tmp_path / "photo.jpg"
+    Image.new("RGB", (30, 20)).save(path, exif=exif)
+    with Image.open(path) as opened, pytest.raises(struct.error):
+        ImageOps.exif_transpose(opened)
+    assert load_image(path).shape == (30, 20, 3)
+
+
+def test_every_exif_orientation_is_that_of_pillow(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
+    for orientation in range(1, 9):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        path = tmp_path / f"{orientation}.png"
+        Image.fromarray(pixels).save(path, exif=exif)
+        with Image.open(path) as opened:
+            expected = np.asarray(ImageOps.exif_transpose(opened))
+        np.testing.assert_array_equal(load_image(path), expected)

@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import math
 import os
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from deepdetect.errors import ImageError, OptionError
+from deepdetect.errors import DeepDetectError, ImageError, OptionError
 from deepdetect.image import load_image
 from deepdetect.processes import map_in_processes, processor_count
 
@@ -76,3 +79,44 @@ def test_errors_reach_the_caller(
 
 def test_processor_count() -> None:
     assert 1 <= processor_count() <= (os.cpu_count() or 1)
+
+
+def test_a_dead_worker_is_one_sentence() -> None:
+    with pytest.raises(DeepDetectError, match="fewer --workers"):
+        list(map_in_processes(os._exit, [9, 9, 9], 2))
+
+
+def test_workers_end_when_the_parent_is_killed(tmp_path: Path) -> None:
+    """Nobody should have to look for left-over processes."""
+    (tmp_path / "endless.py").write_text(
+        "import time\n"
+        "from pathlib import Path\n"
+        "from deepdetect.processes import map_in_processes\n"
+        "def work(task):\n"
+        "    import os\n"
+        "    Path(f'pid{task}').write_text(str(os.getpid()))\n"
+        "    time.sleep(600)\n"
+        "if __name__ == '__main__':\n"
+        "    list(map_in_processes(work, [0, 1], 2))\n"
+    )
+    process = subprocess.Popen([sys.executable, "endless.py"], cwd=tmp_path)
+    pids = [tmp_path / "pid0", tmp_path / "pid1"]
+    _wait_until(lambda: all(path.exists() and path.read_text() for path in pids))
+    process.kill()
+    process.wait()
+    _wait_until(lambda: not any(_runs(int(path.read_text())) for path in pids))
+
+
+def _runs(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/stat")
+    if not Path("/proc").is_dir():
+        pytest.skip("needs /proc to see whether a process runs")
+    # A killed process may stay as a zombie until it is collected.
+    return status.exists() and status.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+
+
+def _wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen within a minute"
+        time.sleep(0.05)

@@ -67,7 +67,7 @@ class DeepDetect:
     ) -> None:
         self.weights = Path(weights) if weights is not None else bundled_weights()
         self.heatmap_options = HeatmapOptions(resolution, channels)
-        runtime = RuntimeOptions(backend, tuple(providers), threads)
+        runtime = RuntimeOptions(backend, providers, threads)
         self._network, self.backend = open_network(self.weights, runtime)
 
     def configured(self, heatmap_options: HeatmapOptions) -> DeepDetect:
@@ -106,7 +106,8 @@ class DeepDetect:
         Args:
             image: as for `heatmap`.
             threshold: tau: pixels with a probability above it.
-            density: wanted keypoints a pixel, in (0, 1], instead of the threshold.
+            density: wanted keypoints a pixel, in (0, 1], instead of the threshold. So many
+                are returned even where there is little to detect.
             max_keypoints: keep the most probable so many.
             nms_radius: keep only the most probable of pixels so close, in pixels.
             ignore: (H, W) array, true where no keypoint is wanted.

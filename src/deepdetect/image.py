@@ -5,6 +5,7 @@ Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +60,12 @@ def luma(rgb: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
 
 
-def find_images(folder: str | Path) -> list[Path]:
+def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     """List the image files below a folder, sorted by path.
+
+    Args:
+        folder: the folder.
+        exclude: folders below it that are left out, as those of one's own results.
 
     Raises:
         ImageError: the folder is missing, or holds no image.
@@ -68,12 +73,14 @@ def find_images(folder: str | Path) -> list[Path]:
     root = Path(folder)
     if not root.is_dir():
         raise ImageError(f"there is no folder {root}: check the path")
+    left_out = [path.resolve() for path in exclude if path.resolve() != root.resolve()]
     found = sorted(
         path
         for path in root.rglob("*")
         if path.suffix.lower() in IMAGE_SUFFIXES
         and path.is_file()
         and not any(part.startswith(".") for part in path.relative_to(root).parts)
+        and not any(path.resolve().is_relative_to(other) for other in left_out)
     )
     if not found:
         raise ImageError(
@@ -84,11 +91,11 @@ def find_images(folder: str | Path) -> list[Path]:
 
 
 def _read_file(path: Path) -> np.ndarray:
-    from PIL import Image, ImageOps, UnidentifiedImageError
+    from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path) as opened:
-            return _from_pil(ImageOps.exif_transpose(opened), str(path))
+            return _from_pil(_upright(opened), str(path))
     except FileNotFoundError:
         raise ImageError(f"there is no file {path}: check the path") from None
     except IsADirectoryError:
@@ -96,9 +103,33 @@ def _read_file(path: Path) -> np.ndarray:
     except UnidentifiedImageError:
         raise ImageError(f"{path} is not an image that can be read: use PNG or JPEG") from None
     except Image.DecompressionBombError:
-        raise ImageError(f"{path} is too large to be a photograph: make it smaller") from None
-    except (OSError, SyntaxError, ValueError) as error:
+        raise ImageError(f"{path} has over 178 million pixels: make it smaller") from None
+    except PermissionError:
+        raise ImageError(f"{path} may not be read: check its rights") from None
+    except ImageError:
+        raise
+    except Exception as error:  # Pillow's decoders raise many kinds
         raise _damaged(str(path), error) from None
+
+
+def _upright(image: Any) -> Any:
+    """Turn a picture by its EXIF tag; a broken tag is no broken picture."""
+    from PIL import Image
+
+    try:
+        orientation = image.getexif().get(0x0112, 1)
+    except Exception:
+        return image
+    turns = {
+        2: Image.Transpose.FLIP_LEFT_RIGHT,
+        3: Image.Transpose.ROTATE_180,
+        4: Image.Transpose.FLIP_TOP_BOTTOM,
+        5: Image.Transpose.TRANSPOSE,
+        6: Image.Transpose.ROTATE_270,
+        7: Image.Transpose.TRANSVERSE,
+        8: Image.Transpose.ROTATE_90,
+    }
+    return image.transpose(turns[orientation]) if orientation in turns else image
 
 
 def _damaged(name: str, error: Exception) -> ImageError:
@@ -108,7 +139,7 @@ def _damaged(name: str, error: Exception) -> ImageError:
 def _from_pil(image: Any, name: str = "the image") -> np.ndarray:
     try:
         image.load()
-    except (OSError, SyntaxError, ValueError) as error:
+    except Exception as error:  # Pillow's decoders raise many kinds
         raise _damaged(name, error) from None
     if image.mode == "P" and isinstance(image.info.get("transparency"), bytes):
         image = image.convert("RGBA")  # Pillow warns when it drops such an alpha at once
@@ -116,11 +147,11 @@ def _from_pil(image: Any, name: str = "the image") -> np.ndarray:
         values = np.asarray(image)
         if image.mode != "F":
             values = np.clip(values, 0, 65535).astype(np.uint16)
-        return _from_array(values)
+        return _from_array(values, name)
     return np.asarray(image.convert("RGB"))
 
 
-def _from_array(image: Any) -> np.ndarray:
+def _from_array(image: Any, name: str = "the image") -> np.ndarray:
     try:
         array = np.asarray(image)
     except ValueError:
@@ -132,13 +163,13 @@ def _from_array(image: Any) -> np.ndarray:
             f"an image array has shape {array.shape}: "
             "it must be (height, width), or (height, width, channels) with 1, 3 or 4 channels"
         )
-    values = _to_uint8(array)
+    values = _to_uint8(array, name)
     if values.ndim == 2:
         return np.repeat(values[:, :, None], 3, axis=2)
     return np.ascontiguousarray(values[:, :, :3])
 
 
-def _to_uint8(array: np.ndarray) -> np.ndarray:
+def _to_uint8(array: np.ndarray, name: str) -> np.ndarray:
     if array.dtype == np.uint8:
         return array
     if array.dtype == np.bool_:
@@ -148,10 +179,10 @@ def _to_uint8(array: np.ndarray) -> np.ndarray:
         return ((array.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if np.issubdtype(array.dtype, np.floating):
         if not np.isfinite(array).all():
-            raise ImageError("the image holds NaN or infinite values: replace them first")
+            raise ImageError(f"{name} holds NaN or infinite values: replace them first")
         if array.size and (array.min() < 0 or array.max() > 1):
             raise ImageError(
-                f"a float image must lie in [0, 1], this one spans "
+                f"a float image must lie in [0, 1], {name} spans "
                 f"[{array.min():g}, {array.max():g}]: scale it first"
             )
         return np.rint(array * 255).astype(np.uint8)

@@ -12,6 +12,7 @@ from .errors import ImageError
 from .image import load_image, luma
 from .labels import visibility_of
 from .labels.files import load_mask
+from .progress import progress
 
 EPSILON = 1e-7
 """Probabilities are kept so far from 0 and 1: the next float32 under 1 is 6e-8 away."""
@@ -70,13 +71,14 @@ def mean_score(scores: Iterable[MaskScore]) -> MaskScore:
 
 
 def score_samples(
-    heatmap: Callable[[np.ndarray], np.ndarray], folder: str | Path
+    heatmap: Callable[[np.ndarray], np.ndarray], folder: str | Path, *, quiet: bool = True
 ) -> dict[str, MaskScore]:
     """Score a detector on a folder of samples `image_*.png` with masks `mask_image_*.png`.
 
     Args:
         heatmap: maps a (H, W, 3) uint8 RGB image to a (H, W) probability.
         folder: the samples.
+        quiet: show no progress bar.
 
     Returns:
         The means by visibility, "normal" and "low", each as far as there are images.
@@ -85,12 +87,15 @@ def score_samples(
         ImageError: there are no samples, or a mask is missing or of another size.
     """
     scores: dict[str, list[MaskScore]] = {"normal": [], "low": []}
-    for path in sorted(Path(folder).glob("image_*.png")):
-        rgb = load_image(path)
-        mask = load_mask(path.with_name(f"mask_{path.name}"))
-        if mask.shape != rgb.shape[:2]:
-            raise ImageError(f"the mask of {path} has another size than the image")
-        scores[visibility_of(luma(rgb))].append(score_heatmap(heatmap(rgb), mask))
+    paths = sorted(Path(folder).glob("image_*.png"))
+    with progress(len(paths), "scoring", "image", quiet) as bar:
+        for path in paths:
+            rgb = load_image(path)
+            mask = load_mask(path.with_name(f"mask_{path.name}"))
+            if mask.shape != rgb.shape[:2]:
+                raise ImageError(f"the mask of {path} has another size than the image")
+            scores[visibility_of(luma(rgb))].append(score_heatmap(heatmap(rgb), mask))
+            bar.update(1)
     if not any(scores.values()):
         raise ImageError(
             f"there are no samples in {folder}: it must hold image_NAME.png and mask_image_NAME.png"

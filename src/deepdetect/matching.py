@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -18,8 +18,12 @@ from .heatmap import HeatmapOptions
 from .image import load_image, luma
 from .keypoints import Keypoints, select_keypoints
 from .matchers import get_matcher, match_descriptors
+from .memory import free_memory
 from .options import changed
 from .presets import MatchingOptions, get_preset
+
+BYTES_A_KEYPOINT = 1500
+"""Memory that matching takes: 128 float32 of the descriptor, twice with FLANN's trees and copy."""
 
 
 class HeatmapDetector(Protocol):
@@ -76,7 +80,8 @@ def match_images(
         detector: a `DeepDetect`, or anything with its `heatmap` method; default
             `DeepDetect()` with the bundled weights.
         preset: name of the options to start from: "default", or "published" for exactly
-            what the paper's published code does.
+            what the paper's published code does, whatever the detector's own resolution
+            and channels.
         options: all options at once, instead of a preset.
         **changes: single options by name: those of `MatchingOptions`, `SelectionOptions`
             and `GeometryOptions`, as `ratio=0.9, density=0.1, model="homography"`.
@@ -103,6 +108,7 @@ def match_images(
         heatmaps = [detector.heatmap(image) for image in rgb]
     with _timed(seconds, "keypoints"):
         keypoints = [select_keypoints(heatmap, chosen.selection) for heatmap in heatmaps]
+    _check_memory(keypoints)
     with _timed(seconds, "descriptors"):
         describe = get_descriptor(chosen.descriptor)
         descriptors = [
@@ -147,6 +153,21 @@ def _configured(
             "detector can follow: use it, or set heatmap to None"
         )
     return detector.configured(heatmap)
+
+
+def _check_memory(keypoints: Sequence[Keypoints]) -> None:
+    """Stop before the descriptors and their search trees fill the memory.
+
+    Raises:
+        OptionError: there are too many keypoints.
+    """
+    needed = sum(len(points) for points in keypoints) * BYTES_A_KEYPOINT
+    if needed > free_memory():
+        raise OptionError(
+            f"{len(keypoints[0]):,} and {len(keypoints[1]):,} keypoints need about "
+            f"{needed / 1e9:.0f} GB of memory to be matched: make them fewer with "
+            "max_keypoints, density, or a smaller resolution"
+        )
 
 
 @contextmanager

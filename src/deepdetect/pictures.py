@@ -46,7 +46,7 @@ def draw_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    canvas = (rgb * 0.5).astype(np.uint8)
+    canvas = rgb // 2
     pixels = np.rint(keypoints.xy).astype(int)
     if len(keypoints) <= SPARSE:
         for x, y in pixels.tolist():
@@ -80,8 +80,8 @@ def draw_matches(
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
     canvas = np.zeros((height, rgb0.shape[1] + rgb1.shape[1], 3), np.uint8)
-    canvas[: rgb0.shape[0], : rgb0.shape[1]] = (rgb0 * 0.7).astype(np.uint8)
-    canvas[: rgb1.shape[0], rgb0.shape[1] :] = (rgb1 * 0.7).astype(np.uint8)
+    canvas[: rgb0.shape[0], : rgb0.shape[1]] = cv2.convertScaleAbs(rgb0, alpha=0.7)
+    canvas[: rgb1.shape[0], rgb0.shape[1] :] = cv2.convertScaleAbs(rgb1, alpha=0.7)
     chosen = np.random.default_rng(0).permutation(len(points0))[:lines]
     for k in sorted(chosen, key=lambda k: bool(good[k])):  # the good ones on top
         start = tuple(int(v) for v in np.rint(points0[k]))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import TypeVar
 
-from .errors import OptionError
+from .errors import DeepDetectError, OptionError
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
@@ -38,17 +40,19 @@ def map_in_processes(
 
     Raises:
         OptionError: `workers` is under 1.
+        DeepDetectError: a worker process died.
     """
     if workers is not None and workers < 1:
         raise OptionError(f"workers must be at least 1, not {workers}")
-    count = min(workers or processor_count(), len(tasks))
+    count = min(workers or processor_count(), len(tasks), 61)  # Windows waits for 63 at most
     if count <= 1:
-        yield from map(function, tasks)
+        with _one_opencv_thread():
+            yield from map(function, tasks)
         return
     # Spawned, not forked: a fork copies the locks of the parent's threads.
     context = multiprocessing.get_context("spawn")
     with _worker_environment():
-        pool = ProcessPoolExecutor(count, mp_context=context, initializer=_single_thread)
+        pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
         remaining = iter(tasks)
         # The first submissions start the processes, inside the environment above.
         pending = {
@@ -63,6 +67,11 @@ def map_in_processes(
             pending |= {
                 pool.submit(function, task) for _, task in zip(done, remaining, strict=False)
             }
+    except BrokenProcessPool:
+        raise DeepDetectError(
+            "a worker process died, most likely for lack of memory: "
+            "use fewer --workers, or smaller images"
+        ) from None
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -88,7 +97,28 @@ def _worker_environment() -> Iterator[None]:
                 os.environ.pop(name, None)
 
 
-def _single_thread() -> None:
+def _start_worker() -> None:
+    """Prepare a worker: one OpenCV thread, and an end when the parent is gone."""
     import cv2
 
     cv2.setNumThreads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+@contextmanager
+def _one_opencv_thread() -> Iterator[None]:
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -82,3 +82,22 @@ def test_a_bad_image_is_reported_and_the_others_are_done(run, photos: Path) -> N
     assert result.exit_code == 2
     assert "bad.jpg" in result.stderr
     assert [p.name for p in Path("masks").iterdir()] == ["good.png"]
+
+
+def test_a_photograph_is_never_replaced_by_its_mask(run, photos: Path, tmp_path: Path) -> None:
+    photograph = tmp_path / "photo.png"
+    photograph.write_bytes((photos / "left.png").read_bytes())
+    for more in ([], ["--overwrite"]):
+        result = run("label", "photo.png", "-o", ".", *more)
+        assert result.exit_code == 2
+        assert "would replace" in result.stderr
+    assert photograph.read_bytes() == (photos / "left.png").read_bytes()
+
+
+def test_masks_below_the_photographs_are_not_labelled_themselves(run, photos: Path) -> None:
+    Path("in").mkdir()
+    Path("in/left.png").write_bytes((photos / "left.png").read_bytes())
+    for expected in ("1 labelled, 0 already done", "0 labelled, 1 already done"):
+        result = run("label", "in", "-o", "in/masks", "--workers", 1)
+        assert result.exit_code == 0, result.output
+        assert expected in result.stdout

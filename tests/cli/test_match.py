@@ -86,3 +86,25 @@ def test_a_failed_estimate_is_said(run, tmp_path: Path) -> None:
     result = run("match", "a.png", "b.png", "-o", "out")
     assert result.exit_code == 0
     assert "no fundamental could be estimated" in result.stderr
+
+
+def test_an_essential_matrix_from_camera_files(run, photos: Path) -> None:
+    np.savetxt("K.txt", [[994.978, 0, 11.193], [0, 994.978, 154.877], [0, 0, 1]])
+    result = run(
+        *("match", photos / "left.png", photos / "right.png", "--model", "essential"),
+        *("--camera0", "K.txt", "--json", "--no-pictures"),
+    )
+    report = json.loads(result.stdout)
+    assert report["kind"] == "essential"
+    assert report["inliers"] > 0.3 * report["matches"]
+
+
+def test_resolution_changes_the_preset(run, photos: Path) -> None:
+    counts = []
+    for more in ([], ["--resolution", "240"]):
+        result = run(
+            *("match", photos / "left.png", photos / "right.png", "--preset", "published"),
+            *("--json", "--no-pictures", *more),
+        )
+        counts.append(json.loads(result.stdout)["keypoints0"])
+    assert counts[0] != counts[1]

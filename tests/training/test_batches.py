@@ -9,8 +9,9 @@ from deepdetect.image import luma
 from deepdetect.labels import LabelOptions, fuse
 from deepdetect.training.batches import Batches
 from deepdetect.training.label_cache import LabelCache
-from deepdetect.training.photos import ViewStore, list_photos
+from deepdetect.training.photos import list_photos
 from deepdetect.training.recipe import Schedule, Stage, TrainingOptions
+from deepdetect.training.view_store import ViewStore
 from deepdetect.training.views import render
 
 OPTIONS = TrainingOptions(
@@ -22,10 +23,10 @@ OPTIONS = TrainingOptions(
 
 @pytest.fixture(scope="module")
 def batches(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Batches:
-    cache = LabelCache(tmp_path_factory.mktemp("labels"), photographs, OPTIONS.detectors)
+    cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.detectors)
     photos = list_photos(photographs, OPTIONS)
-    wanted = [(p.path, view) for p in photos for view in p.normal + p.dark]
-    assert cache.make(wanted, 1, quiet=True) == len(wanted) == 12 * 4
+    wanted = [(photo, photo.normal + photo.dark) for photo in photos]
+    assert cache.make(wanted, 1, quiet=True) == 12 * 4
     assert cache.make(wanted, 1, quiet=True) == 0, "labels are made once"
     return Batches(photos, ViewStore(cache), Schedule(OPTIONS, len(photos)))
 
@@ -73,7 +74,7 @@ def test_about_a_quarter_is_dark(batches: Batches) -> None:
 def test_crops_and_labels_belong_together(batches: Batches) -> None:
     """Each crop lies in one of the views, and its mask at the same place of the view's label."""
     photo_views = [
-        (render(photo.path, view), batches.store.labels.load(photo.path, view))
+        (render(photo.path, view), batches.store.labels.load(photo, view))
         for photo in batches.photos
         for view in photo.normal + photo.dark
     ]
@@ -99,7 +100,7 @@ def test_dark_labels_use_the_low_visibility_settings(batches: Batches) -> None:
     photo = batches.photos[0]
     view = photo.dark[0]
     expected = fuse(luma(render(photo.path, view)), LabelOptions(OPTIONS.detectors, "low"))
-    np.testing.assert_array_equal(batches.store.labels.load(photo.path, view), expected.mask)
+    np.testing.assert_array_equal(batches.store.labels.load(photo, view), expected.mask)
 
 
 def test_an_error_of_the_thread_reaches_the_trainer(batches: Batches) -> None:

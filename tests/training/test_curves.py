@@ -24,7 +24,8 @@ def test_csv_holds_every_number(tmp_path: Path) -> None:
 def test_the_picture_is_a_picture(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs matplotlib")
     save_curves(POINTS, tmp_path)
-    assert Image.open(tmp_path / "curves.png").size[0] > 500
+    with Image.open(tmp_path / "curves.png") as picture:
+        assert picture.size[0] > 500
 
 
 def test_without_matplotlib_the_csv_is_written_all_the_same(

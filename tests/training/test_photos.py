@@ -5,14 +5,15 @@ from pathlib import Path
 import pytest
 
 from deepdetect.errors import ImageError
-from deepdetect.training.photos import Photo, hold_out, list_photos
+from deepdetect.training.label_cache import LabelCache
+from deepdetect.training.photos import Photo, hold_out, list_photos, photos_digest
 from deepdetect.training.recipe import Stage, TrainingOptions
 
 OPTIONS = TrainingOptions(stages=(Stage(64, 2, 1),), short_sides=(96, 64), dark_variants=2)
 
 
 def photos(count: int) -> list[Photo]:
-    return [Photo(Path(f"photo{k}.jpg"), (), ()) for k in range(count)]
+    return [Photo(Path(f"photo{k}.jpg"), f"{k:08x}", (), ()) for k in range(count)]
 
 
 def test_views_are_all_sizes_in_both_lights(photographs: Path) -> None:
@@ -44,3 +45,34 @@ def test_few_photographs_still_give_one_for_validation() -> None:
     assert (len(kept), len(held)) == (1, 1)
     with pytest.raises(ImageError, match="too few"):
         hold_out(photos(1))
+
+
+def test_photographs_of_one_name_have_their_own_labels(photographs: Path, tmp_path: Path) -> None:
+    """Training and validation folders often number their photographs alike."""
+    for part, source in (("train", "photo00.png"), ("val", "photo05.png")):
+        (tmp_path / part).mkdir()
+        (tmp_path / part / "0001.png").write_bytes((photographs / source).read_bytes())
+    cache = LabelCache(tmp_path / "labels", ("fast",))
+    (first,), (second,) = (list_photos(tmp_path / part, OPTIONS) for part in ("train", "val"))
+    assert cache.path(first, first.normal[0]) != cache.path(second, second.normal[0])
+    assert photos_digest([first], [second]) != photos_digest([second], [first])
+
+
+def test_a_replaced_photograph_gets_a_new_label(photographs: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    cache = LabelCache(tmp_path / "labels", ("fast",))
+    paths = []
+    for source in ("photo00.png", "photo01.png"):
+        (folder / "a.png").write_bytes((photographs / source).read_bytes())
+        (photo,) = list_photos(folder, OPTIONS)
+        paths.append(cache.path(photo, photo.normal[0]))
+    assert paths[0] != paths[1]
+
+
+def test_results_below_the_photographs_are_left_out(photographs: Path, tmp_path: Path) -> None:
+    (tmp_path / "run" / "labels").mkdir(parents=True)
+    for place in ("a.png", "run/curves.png", "run/labels/b.png"):
+        (tmp_path / place).write_bytes((photographs / "photo00.png").read_bytes())
+    listed = list_photos(tmp_path, OPTIONS, exclude=(tmp_path / "run",))
+    assert [photo.path.name for photo in listed] == ["a.png"]

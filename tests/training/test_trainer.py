@@ -184,6 +184,21 @@ def test_gradients_in_bfloat16_are_those_of_float32_within_rounding() -> None:
     assert (a - b).norm() / a.norm() < 0.1
 
 
+def test_a_compiler_that_does_not_work_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*arguments: object) -> torch.Tensor:
+        raise torch._dynamo.exc.TorchDynamoException("Python.h is missing")
+
+    monkeypatch.setattr(torch, "compile", lambda *arguments, **options: broken)
+    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/g++")
+    images = torch.rand(1, 3, 32, 32)
+    engine = Engine(ESPNet(), DeviceOptions("cpu", "float32"))
+    assert engine.compiled
+    assert engine.logits(images).shape == (1, 1, 32, 32)
+    assert "eager" in engine.describe()
+    with pytest.raises(OptionError, match="--no-compile"):
+        Engine(ESPNet(), DeviceOptions("cpu", "float32", compile=True)).logits(images)
+
+
 @pytest.mark.parametrize(
     ("bad", "hint"),
     [({"device": "cpuu"}, "cpu"), ({"precision": "float16"}, "bfloat16"), ({"threads": 0}, "1")],

@@ -64,7 +64,7 @@ def detect(
     from ..labels.files import load_mask
     from ..progress import progress
 
-    paths = expand_images(images)
+    paths = expand_images(images, output)
     mask = load_mask(ignore) if ignore is not None else None
     selection = SelectionOptions(threshold, density, max_keypoints, nms_radius, mask)
     detector = make_detector(values)

@@ -32,7 +32,7 @@ def evaluate(
     from ..mask_scores import score_samples
 
     detector = make_detector(values)
-    scores = score_samples(detector.heatmap, samples)
+    scores = score_samples(detector.heatmap, samples, quiet=as_json)
     if as_json:
         print_json(
             {

@@ -55,7 +55,7 @@ def label(
     deepdetect label photo.jpg -o masks --detectors fast,sobel --explain
     """
     from ..labels import DETECTOR_NAMES, LabelOptions
-    from ..labels.files import LabelTask, label_files, pending
+    from ..labels.files import LabelTask, check_outputs, label_files, pending
     from ..progress import progress
 
     names = DETECTOR_NAMES
@@ -69,8 +69,9 @@ def label(
             output / f"{path.stem}_explain.png" if explain else None,
             options,
         )
-        for path in expand_images(images)
+        for path in expand_images(images, output)
     ]
+    check_outputs(tasks)
     left = tasks if overwrite else pending(tasks)
     with progress(len(left), "labelling", "image") as bar:
         reports = label_files(left, workers, lambda report: bar.update(1))

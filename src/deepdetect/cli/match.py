@@ -40,7 +40,8 @@ from .shared import (
 @click.option("--mutual/--no-mutual", default=None, help="Keep mutual nearest neighbours only.")
 @click.option(
     "--model",
-    help="fundamental (any static scene), homography (planes, pure rotation) or none.  "
+    help="fundamental (any static scene), essential (the same with known cameras), homography "
+    "(planes, pure rotation) or none.  "
     "[default: fundamental]",
 )
 @click.option("--estimator", help="magsac or ransac.  [default: magsac]")
@@ -48,6 +49,8 @@ from .shared import (
 @click.option(
     "--homography", type=PATH, help="Text file of a known 3x3 homography to judge matches by."
 )
+@click.option("--camera0", type=PATH, help="Text file of the 3x3 camera matrix, for essential.")
+@click.option("--camera1", type=PATH, help="The same of the second image.  [default: camera0]")
 @click.option("--seed", type=int, help="Of the random choices.  [default: 0]")
 @detector_options
 @format_option
@@ -61,6 +64,8 @@ def match(
     output: Path,
     preset: str,
     homography: Path | None,
+    camera0: Path | None,
+    camera1: Path | None,
     file_format: str,
     pictures: bool,
     as_json: bool,
@@ -78,18 +83,22 @@ def match(
     """
     from ..image import load_image
     from ..matching import match_images
+    from ..presets import get_preset
     from ..storage import save_matches
 
     rgb0, rgb1 = load_image(image0), load_image(image1)
     detector = make_detector(values)
     # Only what was given on the command line changes the preset.
-    given = {
-        name: value
-        for name, value in values.items()
-        if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
-    }
-    if homography is not None:
-        given["homography"] = _read_homography(homography)
+    given = {name: value for name, value in values.items() if _was_given(context, name)}
+    for name, path in (
+        ("homography", homography),
+        ("camera0", camera0),
+        ("camera1", camera1 or camera0),
+    ):
+        if path is not None:
+            given[name] = _read_matrix(path)
+    if get_preset(preset).heatmap is not None and _was_given(context, "resolution"):
+        given["resolution"] = detector.heatmap_options.resolution
     matches = match_images(rgb0, rgb1, detector, preset=preset, **given)
     stem = f"{image0.stem}_{image1.stem}_matches"
     file = output / f"{stem}.{file_format}"
@@ -143,7 +152,11 @@ def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
     save_picture(with_caption(picture, caption), path)
 
 
-def _read_homography(path: Path) -> Any:
+def _was_given(context: click.Context, name: str) -> bool:
+    return context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
+
+
+def _read_matrix(path: Path) -> Any:
     import numpy as np
 
     from ..errors import OptionError
@@ -154,5 +167,5 @@ def _read_homography(path: Path) -> Any:
         raise OptionError(f"there is no file {path}: check the path") from None
     except (OSError, ValueError, UnicodeDecodeError):
         raise OptionError(
-            f"{path} holds no homography: it must be three rows of three numbers"
+            f"{path} holds no matrix: it must be three rows of three numbers"
         ) from None

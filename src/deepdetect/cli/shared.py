@@ -129,8 +129,12 @@ def make_detector(values: dict[str, Any]) -> DeepDetect:
     return DeepDetect(**{name: values.pop(name) for name in names})
 
 
-def expand_images(paths: Sequence[Path]) -> list[Path]:
+def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
     """Replace folders by the images below them, and check that results will not collide.
+
+    Args:
+        paths: files and folders.
+        output: folder of the results, which is left out when it lies in one of the folders.
 
     Raises:
         ImageError: a folder is empty.
@@ -140,7 +144,7 @@ def expand_images(paths: Sequence[Path]) -> list[Path]:
 
     images: list[Path] = []
     for path in paths:
-        images += find_images(path) if path.is_dir() else [path]
+        images += find_images(path, [output]) if path.is_dir() else [path]
     seen: dict[str, Path] = {}
     for image in dict.fromkeys(images):
         if image.stem in seen:

@@ -84,7 +84,7 @@ def train(
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(
                 f"training needs the package {package}, which is not installed: "
-                "run pip install 'deepdetect[train]'"
+                "run pip install torch safetensors onnx matplotlib"
             )
     from ..training.device import DeviceOptions
     from ..training.recipe import Stage, TrainingOptions

@@ -19,7 +19,7 @@ def load_motorcycle() -> StereoPair:
     except ImportError:
         raise MissingExtraError(
             "the Motorcycle pair needs the package scikit-image, which is not installed: "
-            "run pip install 'deepdetect[demo]'"
+            "run pip install scikit-image"
         ) from None
     left, right, disparity = data.stereo_motorcycle()
     disparity = np.asarray(disparity, np.float32).squeeze()

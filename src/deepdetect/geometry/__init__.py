@@ -1,7 +1,7 @@
 """Geometry between two images: homography, fundamental and essential matrix."""
 
-from .errors import disparity_errors, epipolar_errors, transfer_errors, transform_points
 from .estimation import Geometry, GeometryOptions, estimate_geometry
+from .residuals import disparity_errors, epipolar_errors, transfer_errors, transform_points
 
 __all__ = [
     "Geometry",

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ..errors import OptionError, unknown_name
-from .errors import epipolar_errors, transfer_errors
+from .residuals import epipolar_errors, transfer_errors
 
 ESTIMATORS = ("magsac", "ransac")
 MODEL_NAMES = ("homography", "fundamental", "essential", "none")
@@ -59,6 +59,8 @@ class GeometryOptions:
             )
         if not 0 < self.confidence < 1:
             raise OptionError(f"the confidence must lie between 0 and 1, not {self.confidence}")
+        if not 0 <= self.seed < 2**31:
+            raise OptionError(f"the seed must lie in [0, 2147483647], not {self.seed}")
         if self.iterations < 1:
             raise OptionError(f"iterations must be at least 1, not {self.iterations}")
         for name in ("homography", "camera0", "camera1"):

@@ -75,6 +75,8 @@ def save_mask(mask: np.ndarray, path: str | Path, settings: str = "") -> None:
 def load_mask(path: str | Path) -> np.ndarray:
     """Read a mask of any bit depth: True where a pixel is brighter than half.
 
+    In a file that holds zeros and ones only, the ones are True.
+
     Returns:
         (H, W) bool.
 
@@ -85,9 +87,9 @@ def load_mask(path: str | Path) -> np.ndarray:
 
     try:
         with Image.open(path) as opened:
-            if opened.mode.startswith("I"):  # 16 bits a pixel
-                return np.asarray(opened) > 32767
-            return np.asarray(opened.convert("L")) > 127
+            deep = opened.mode.startswith("I")  # 16 bits a pixel
+            values = np.asarray(opened if deep else opened.convert("L"))
+        return values > (0 if values.max() <= 1 else 32767 if deep else 127)
     except FileNotFoundError:
         raise ImageError(f"there is no mask {path}: check the path") from None
     except (OSError, SyntaxError, ValueError) as error:
@@ -108,6 +110,22 @@ def mask_settings(path: Path) -> str | None:
 def settings_text(options: LabelOptions) -> str:
     """Return the text that identifies label options."""
     return json.dumps(asdict(options), sort_keys=True)
+
+
+def check_outputs(tasks: Sequence[LabelTask]) -> None:
+    """Check that no result replaces one of the images.
+
+    Raises:
+        OptionError: one would.
+    """
+    images = {task.image.resolve() for task in tasks}
+    for task in tasks:
+        for path in (task.mask, task.picture):
+            if path is not None and path.resolve() in images:
+                raise OptionError(
+                    f"the result {path} would replace an image that is to be labelled: "
+                    "choose another folder with -o"
+                )
 
 
 def pending(tasks: Sequence[LabelTask]) -> list[LabelTask]:

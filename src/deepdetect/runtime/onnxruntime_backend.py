@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import OptionError, WeightsError, unknown_name
+from ..errors import DeepDetectError, OptionError, WeightsError, unknown_name
 from .shapes import check_network
 
 if TYPE_CHECKING:
@@ -17,12 +17,19 @@ if TYPE_CHECKING:
 class OnnxRuntimeNetwork:
     """A network run by ONNX Runtime."""
 
-    def __init__(self, session: object, input_name: str) -> None:
+    def __init__(self, session: Any, input_name: str) -> None:
         self._session = session
         self._input_name = input_name
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        return self._session.run(None, {self._input_name: image})[0]
+        try:
+            return self._session.run(None, {self._input_name: image})[0]
+        except Exception as error:  # its exceptions share no base class
+            height, width = image.shape[2:]
+            raise DeepDetectError(
+                f"the network failed on an image of {width}x{height} pixels "
+                f"({str(error).splitlines()[0]}): use a smaller one, or another provider"
+            ) from None
 
 
 def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
@@ -55,6 +62,13 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
             f"{path} is not an ONNX file that can be read ({str(error).splitlines()[0]}): "
             "get it anew"
         ) from None
+    # It goes on with the CPU when a provider cannot start, and says so in a log only.
+    session.disable_fallback()
+    if providers[0] not in session.get_providers():
+        raise OptionError(
+            f"the provider {providers[0]} could not start: check its driver and libraries, "
+            "or leave it out"
+        )
     inputs, outputs = session.get_inputs(), session.get_outputs()
     check_network(
         path,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,11 +18,15 @@ if TYPE_CHECKING:
 class OpenVinoNetwork:
     """A network run by OpenVINO on the CPU."""
 
-    def __init__(self, model: object) -> None:
+    def __init__(self, model: Any) -> None:
         self._model = model
+        self._local = threading.local()
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        return self._model(image)[0]
+        # A request holds one image at a time, so each thread gets its own.
+        if not hasattr(self._local, "request"):
+            self._local.request = self._model.create_infer_request()
+        return self._local.request.infer([image], share_inputs=True)[0]
 
 
 def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:

@@ -51,6 +51,8 @@ class RuntimeOptions:
     threads: int | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.providers, str):
+            object.__setattr__(self, "providers", (self.providers,))
         if self.backend != "auto" and self.backend not in BACKENDS:
             raise unknown_name("backend", self.backend, ("auto", *BACKENDS))
         if self.threads is not None and self.threads < 1:
@@ -105,10 +107,9 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
         raise _foreign_providers(name)
     for package in backend.packages:
         if importlib.util.find_spec(package) is None:
-            extra = "train" if name == "torch" else name
             raise MissingExtraError(
                 f"reading {path.name} with the backend {name} needs the package {package}, "
-                f"which is not installed: run pip install 'deepdetect[{extra}]'"
+                f"which is not installed: run pip install {package}"
             )
     return backend.open(path, options), name
 

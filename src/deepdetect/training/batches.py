@@ -10,10 +10,12 @@ import queue
 import threading
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 
-from .photos import Photo, ViewStore
+from .photos import Photo
 from .recipe import Schedule
+from .view_store import ViewStore
 from .views import View
 
 
@@ -89,10 +91,11 @@ class Batches:
         left = int(generator.integers(image.shape[1] - side + 1))
         image = image[top : top + side, left : left + side]
         mask = mask[top : top + side, left : left + side]
-        if generator.random() < 0.5:
-            image, mask = image[:, ::-1], mask[:, ::-1]
-        if generator.random() < 0.5:
-            image, mask = image[::-1], mask[::-1]
+        for axis in (1, 0):  # left-right, then upside down
+            if generator.random() < 0.5:
+                # Copies a hundred times faster than a negative stride.
+                image = cv2.flip(image, axis)
+                mask = cv2.flip(mask.view(np.uint8), axis).view(bool)
         return image, mask
 
     def _choose_view(self, photo: Photo, side: int, generator: np.random.Generator) -> View:

@@ -59,7 +59,7 @@ def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam)
         for name, parameter in network.named_parameters():
             if f"adam.step.{name}" in tensors:
                 optimizer.state[parameter] = {
-                    "step": tensors[f"adam.step.{name}"].to(parameter.device),
+                    "step": tensors[f"adam.step.{name}"].to(parameter.device, copy=True),
                     # Laid out in memory as the parameter is: fused Adam walks them in parallel.
                     **{
                         moment: torch.empty_like(parameter).copy_(tensors[f"adam.{moment}.{name}"])

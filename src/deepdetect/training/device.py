@@ -21,7 +21,7 @@ class DeviceOptions:
 
     Attributes:
         device: "auto" (CUDA when there is one, else the CPU), "cpu" or "cuda".
-        precision: "bfloat16" runs all but the dilated convolutions in bfloat16;
+        precision: "bfloat16" runs in bfloat16, but on the CPU the dilated convolutions;
             "auto" takes it where the processor computes with it.
         compile: torch.compile; None means when a C++ compiler is at hand.
         threads: CPU threads of torch; None leaves torch's choice.
@@ -67,7 +67,11 @@ class Engine:
         if compiled is None:
             compiled = kind == "cuda" or any(shutil.which(name) for name in ("g++", "clang++"))
         self.compiled = bool(compiled)
-        self._forward = torch.compile(self.network) if self.compiled else self.network
+        self._may_fall_back = options.compile is None
+        # Not dynamic: there are only as many shapes as stages, and each gets its own code.
+        self._forward = (
+            torch.compile(self.network, dynamic=False) if self.compiled else self.network
+        )
 
     def images(self, rgb: torch.Tensor) -> torch.Tensor:
         """Turn (B, H, W, 3) uint8 into (B, 3, H, W) float32 in [0, 1], channels last."""
@@ -81,12 +85,24 @@ class Engine:
 
     def logits(self, images: torch.Tensor) -> torch.Tensor:
         """Run the network for training; logits are float32."""
-        with self.autocast():
-            return self._forward(images).float()
+        try:
+            with self.autocast():
+                return self._forward(images).float()
+        except torch._dynamo.exc.TorchDynamoException as error:
+            # A compiler on the path may still lack headers, and CUDA its Triton.
+            if not self._may_fall_back:
+                reason = str(error).strip().splitlines()[0]
+                raise OptionError(
+                    f"torch.compile does not work here ({reason}): use --no-compile"
+                ) from None
+            self.compiled, self._forward = False, self.network
+            return self.logits(images)
 
     def describe(self) -> str:
         """Say in words how the network is run."""
-        precision = "bfloat16 (dilated convolutions float32)" if self.bfloat16 else "float32"
+        precision = "bfloat16" if self.bfloat16 else "float32"
+        if self.bfloat16 and self.device.type == "cpu":
+            precision += " (dilated convolutions float32)"
         return f"{self.device.type}, {precision}, {'compiled' if self.compiled else 'eager'}"
 
 

@@ -3,62 +3,67 @@
 from __future__ import annotations
 
 import hashlib
-import zlib
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import DeepDetectError
-from ..image import luma
+from ..image import load_image, luma
 from ..labels import DETECTORS, LabelOptions, fuse
 from ..labels.files import load_mask, save_mask
 from ..processes import map_in_processes
 from ..progress import progress
+from .photos import Photo
 from .views import View, render
 
 
 @dataclass(frozen=True)
-class LabelTask:
-    """A label to be made: of a view of a photograph, into a file."""
+class PhotoLabelTask:
+    """The labels of one photograph that are to be made.
 
-    photo: Path
-    view: View
-    path: Path
-    options: LabelOptions
-
-
-class LabelCache:
-    """The labels of a set of photographs under one folder.
-
-    Args:
-        folder: where the labels lie; other label settings get another subfolder.
-        root: the folder of the photographs; labels are named by the path below it.
+    Attributes:
+        photo: the photograph's file.
+        views: the views, each with the file of its label.
         detectors: names of the label detectors.
     """
 
-    def __init__(self, folder: Path, root: Path, detectors: tuple[str, ...]) -> None:
-        self.root = root
+    photo: Path
+    views: tuple[tuple[View, Path], ...]
+    detectors: tuple[str, ...]
+
+
+class LabelCache:
+    """The labels of photographs under one folder.
+
+    A label is named by the content of its photograph, so photographs of the same name
+    do not get each other's labels, and a replaced one gets a new label.
+
+    Args:
+        folder: where the labels lie; other label settings get another subfolder.
+        detectors: names of the label detectors.
+    """
+
+    def __init__(self, folder: Path, detectors: tuple[str, ...]) -> None:
         self.detectors = detectors
         self.folder = folder / _settings_digest(detectors)
 
-    def path(self, photo: Path, view: View) -> Path:
+    def path(self, photo: Photo, view: View) -> Path:
         """Return the file of a label."""
-        relative = photo.relative_to(self.root)
-        # The stem is for people, the checksum tells equal stems in two folders apart.
-        name = f"{photo.stem}_{zlib.crc32(relative.as_posix().encode()):08x}_{view.name}.png"
-        return self.folder / name
+        return self.folder / f"{photo.path.stem}_{photo.digest}_{view.name}.png"
 
-    def load(self, photo: Path, view: View) -> np.ndarray:
+    def load(self, photo: Photo, view: View) -> np.ndarray:
         """Read a label as (H, W) bool."""
         return load_mask(self.path(photo, view))
 
-    def make(self, wanted: Iterable[tuple[Path, View]], workers: int | None, quiet: bool) -> int:
+    def make(
+        self, wanted: Sequence[tuple[Photo, Sequence[View]]], workers: int | None, quiet: bool
+    ) -> int:
         """Make the labels that are not there yet, in parallel over processes.
 
         Args:
-            wanted: photographs and views.
+            wanted: photographs, each with the views that are needed.
             workers: number of processes; default one for each processor.
             quiet: show no progress bar.
 
@@ -70,34 +75,38 @@ class LabelCache:
         """
         there = {path.name for path in self.folder.glob("*.png")} if self.folder.is_dir() else set()
         tasks = []
-        for photo, view in wanted:
-            path = self.path(photo, view)
-            if path.name not in there:
-                # A dark view gets the low-visibility settings, a normal one the normal ones.
-                visibility = "normal" if view.darkening is None else "low"
-                tasks.append(LabelTask(photo, view, path, LabelOptions(self.detectors, visibility)))
+        for photo, views in wanted:
+            paths = [(view, self.path(photo, view)) for view in views]
+            missing = tuple((view, path) for view, path in paths if path.name not in there)
+            if missing:
+                tasks.append(PhotoLabelTask(photo.path, missing, self.detectors))
+        total = sum(len(task.views) for task in tasks)
         failures = []
-        with progress(len(tasks), "labels", "label", quiet) as bar:
-            for failure in map_in_processes(make_label, tasks, workers):
-                bar.update(1)
+        with progress(total, "labels", "label", quiet) as bar:
+            for done, failure in map_in_processes(make_labels, tasks, workers):
+                bar.update(done)
                 if failure:
                     failures.append(failure)
         if failures:
             raise DeepDetectError(
-                f"{len(failures)} of {len(tasks)} labels could not be made, the others are kept; "
-                f"the first: {failures[0]}"
+                f"{len(failures)} of {len(wanted)} photographs cannot be read, the labels of the "
+                f"others are kept; the first: {failures[0]}"
             )
-        return len(tasks)
+        return total
 
 
-def make_label(task: LabelTask) -> str | None:
-    """Make one label; return what went wrong, or None."""
+def make_labels(task: PhotoLabelTask) -> tuple[int, str | None]:
+    """Make the labels of one photograph; return how many, and what went wrong, or None."""
     try:
-        gray = luma(render(task.photo, task.view))
-        save_mask(fuse(gray, task.options).mask, task.path)
+        rgb = load_image(task.photo)
+        for view, path in task.views:
+            # A dark view gets the low-visibility settings, a normal one the normal ones.
+            visibility = "normal" if view.darkening is None else "low"
+            label = fuse(luma(render(rgb, view)), LabelOptions(task.detectors, visibility))
+            save_mask(label.mask, path)
     except DeepDetectError as error:
-        return str(error)
-    return None
+        return len(task.views), str(error)
+    return len(task.views), None
 
 
 def _settings_digest(detectors: tuple[str, ...]) -> str:

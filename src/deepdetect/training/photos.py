@@ -1,33 +1,45 @@
-"""The photographs of a run, their views, and views in memory."""
+"""The photographs of a run, their views, and which are held out for validation."""
 
 from __future__ import annotations
 
-import os
-import threading
+import hashlib
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from ..errors import ImageError
 from ..image import find_images
-from .label_cache import LabelCache
 from .recipe import TrainingOptions
-from .views import View, render, views_of
+from .views import View, views_of
+
+DIGESTED_BYTES = 65536
+"""A photograph is told from others by its size and so many bytes from its start."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph and its views."""
+    """A photograph and its views.
+
+    Attributes:
+        path: its file.
+        digest: eight hexadecimal digits that depend on the content.
+        normal, dark: its views.
+    """
 
     path: Path
+    digest: str
     normal: tuple[View, ...]
     dark: tuple[View, ...]
 
 
-def list_photos(root: Path, options: TrainingOptions) -> list[Photo]:
+def list_photos(root: Path, options: TrainingOptions, exclude: Sequence[Path] = ()) -> list[Photo]:
     """List the photographs below a folder with their views.
+
+    Args:
+        root: the folder.
+        options: sizes and darkening of the views.
+        exclude: folders below it that are left out.
 
     Raises:
         ImageError: the folder is missing or empty.
@@ -35,6 +47,7 @@ def list_photos(root: Path, options: TrainingOptions) -> list[Photo]:
     return [
         Photo(
             path,
+            _content_digest(path),
             *views_of(
                 path.relative_to(root).as_posix(),
                 options.short_sides,
@@ -42,7 +55,7 @@ def list_photos(root: Path, options: TrainingOptions) -> list[Photo]:
                 options.dark_variants,
             ),
         )
-        for path in find_images(root)
+        for path in find_images(root, exclude)
     ]
 
 
@@ -50,6 +63,9 @@ def hold_out(photos: list[Photo], share: int = 20) -> tuple[list[Photo], list[Ph
     """Split off every twentieth photograph for validation, by the checksum of its name.
 
     A photograph stays on its side when others are added.
+
+    Returns:
+        The photographs to train on, and those held out.
 
     Raises:
         ImageError: there are too few photographs to split.
@@ -69,43 +85,16 @@ def hold_out(photos: list[Photo], share: int = 20) -> tuple[list[Photo], list[Ph
     return kept, held
 
 
-class ViewStore:
-    """Rendered views with their labels, kept in memory up to a limit.
-
-    Args:
-        labels: the label cache.
-        memory: bytes that may be kept, default half of the free memory; views beyond it
-            are made anew each time.
-    """
-
-    def __init__(self, labels: LabelCache, memory: int | None = None) -> None:
-        self.labels = labels
-        self.memory = _half_of_free_memory() if memory is None else memory
-        self._kept: dict[tuple[Path, View], tuple[np.ndarray, np.ndarray]] = {}
-        self._lock = threading.Lock()
-
-    def load(self, photo: Photo, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool."""
-        key = (photo.path, view)
-        if key in self._kept:
-            return self._kept[key]
-        image = render(photo.path, view)
-        mask = self.labels.load(photo.path, view)
-        if mask.shape != image.shape[:2]:
-            raise ImageError(
-                f"the label of {photo.path} has another size than the photograph: "
-                f"delete {self.labels.folder} and start again"
-            )
-        with self._lock:
-            if self.memory >= image.nbytes + mask.nbytes:
-                self.memory -= image.nbytes + mask.nbytes
-                self._kept[key] = image, mask
-        return image, mask
+def photos_digest(training: Sequence[Photo], held: Sequence[Photo]) -> str:
+    """Return a digest of which photographs a run trains on and validates with."""
+    digests = [photo.digest for photo in training] + ["|"] + [photo.digest for photo in held]
+    return hashlib.sha256(" ".join(digests).encode()).hexdigest()[:16]
 
 
-def _half_of_free_memory() -> int:
-    """Return half of the free memory in bytes, or 2 GB where the system does not tell."""
+def _content_digest(path: Path) -> str:
     try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
-    except (AttributeError, ValueError, OSError):
-        return 2_000_000_000
+        with path.open("rb") as file:
+            start = file.read(DIGESTED_BYTES)
+        return f"{zlib.crc32(start, path.stat().st_size & 0xFFFFFFFF):08x}"
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check its rights") from None

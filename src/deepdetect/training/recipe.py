@@ -98,6 +98,8 @@ class TrainingOptions:
             raise OptionError(f"the dark fraction must lie in [0, 1], not {self.dark_fraction}")
         if self.dark_variants < 1 or self.validations < 1:
             raise OptionError("dark variants and validations must be at least 1")
+        if not 0 <= self.seed < 2**31:
+            raise OptionError(f"the seed must lie in [0, 2147483647], not {self.seed}")
         if not 0 <= self.final_learning_rate <= self.learning_rate:
             raise OptionError("the learning rate must not be under the final one, nor negative")
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,9 +26,11 @@ from .checkpoint import load_checkpoint, save_checkpoint
 from .curves import CurvePoint, save_curves
 from .device import DeviceOptions, Engine
 from .label_cache import LabelCache
-from .photos import Photo, ViewStore, hold_out, list_photos
+from .photos import Photo, hold_out, list_photos, photos_digest
 from .recipe import Schedule, TrainingOptions
 from .validation import score_network
+from .view_store import ViewStore
+from .views import View
 
 CHECKPOINT = "checkpoint.safetensors"
 BEST = "best.safetensors"
@@ -92,36 +95,23 @@ def train(
     Example:
         >>> train("photographs", "run")  # doctest: +SKIP
     """
-    root, folder = Path(photos), Path(output)
-    training = list_photos(root, options)
+    folder = Path(output)
+    cache = Path(labels) if labels is not None else folder / "labels"
+    training = list_photos(Path(photos), options, exclude=(folder, cache))
     if validation is None:
         training, held = hold_out(training)
-        held_root = root
     else:
-        held_root = Path(validation)
-        held = list_photos(held_root, options)
-    cache = Path(labels) if labels is not None else folder / "labels"
-    stores = []
-    for part, part_root in ((training, root), (held, held_root)):
-        store = ViewStore(LabelCache(cache, part_root, options.detectors))
-        wanted = [(p.path, view) for p in part for view in _views(p, part is held)]
-        store.labels.make(wanted, workers, quiet=say is None)
-        stores.append(store)
-    run = _Run(training, held, stores, folder, options, device, say)
-    return run.finish()
+        held = list_photos(Path(validation), options, exclude=(folder, cache))
+    store = ViewStore(LabelCache(cache, options.detectors))
+    wanted = [(photo, photo.normal + photo.dark) for photo in training]
+    wanted += [(photo, (_largest(photo.normal), _largest(photo.dark))) for photo in held]
+    store.labels.make(wanted, workers, quiet=say is None)
+    return _Run(training, held, store, folder, options, device, say).finish()
 
 
-def _views(photo: Photo, validation: bool) -> tuple:
-    """Return the views of a photograph that are needed: validation takes the largest size only."""
-    views = photo.normal + photo.dark
-    if validation:
-        return _largest(photo.normal)[:1] + _largest(photo.dark)[:1]
-    return views
-
-
-def _largest(views: tuple) -> tuple:
-    side = max(view.short_side for view in views)
-    return tuple(view for view in views if view.short_side == side)
+def _largest(views: Sequence[View]) -> View:
+    """Return the first view of the largest size, which validation takes."""
+    return max(views, key=lambda view: view.short_side)
 
 
 class _Run:
@@ -131,16 +121,17 @@ class _Run:
         self,
         training: list[Photo],
         held: list[Photo],
-        stores: list[ViewStore],
+        store: ViewStore,
         folder: Path,
         options: TrainingOptions,
         device: DeviceOptions,
         say: Callable[[str], None] | None,
     ) -> None:
-        self.held, self.held_store = held, stores[1]
+        self.held, self.store = held, store
         self.folder, self.options, self.say = folder, options, say
         self.schedule = Schedule(options, len(training))
-        self.batches = Batches(training, stores[0], self.schedule)
+        self.batches = Batches(training, store, self.schedule)
+        self.digest = photos_digest(training, held)
         torch.manual_seed(options.seed)
         network = ESPNet()
         self.engine = Engine(network, device)
@@ -161,6 +152,8 @@ class _Run:
         saved = started
         if self.step < self.schedule.steps and self.say is not None:
             self.say(f"training on {self.engine.describe()}")
+        if self.step in milestones and self.step not in {point.step for point in self.points}:
+            self._validate()  # the run was killed while it validated
         bar = progress(self.schedule.steps, "training", "step", self.say is None, self.step)
         with bar:
             for rgb, masks in self.batches.stream(self.step):
@@ -176,6 +169,7 @@ class _Run:
                     f"loss {self.loss_sum / self.loss_count:.4f}, {rate:.1f} images/s", False
                 )
                 if self.step in milestones:
+                    self._save()  # the validation takes its time too
                     self._validate()
                 if self.step in milestones or time.monotonic() - saved > CHECKPOINT_SECONDS:
                     self._save()
@@ -196,19 +190,21 @@ class _Run:
         self.optimizer.zero_grad(set_to_none=True)
         loss = binary_cross_entropy_with_logits(self.engine.logits(images), truth)
         loss.backward()
-        self.optimizer.step()
-        value = loss.item()
-        if not np.isfinite(value):
+        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
+        # A finite loss can have gradients that are not, in bfloat16.
+        value = loss.item() if torch.nn.utils.get_total_norm(gradients).isfinite() else math.nan
+        if not math.isfinite(value):
             raise OptionError(
-                f"the loss is {value} at step {self.step}: "
-                "lower the learning rate, or use --precision float32"
+                f"the loss or its gradients are not finite at step {self.step}: start again with "
+                "--precision float32, or with a lower --learning-rate"
             )
+        self.optimizer.step()
         return value
 
     def _validate(self) -> None:
         """Take the validation losses; keep the weights when they are the best so far."""
-        normal = self._score([_largest(photo.normal)[0] for photo in self.held])
-        dark = self._score([_largest(photo.dark)[0] for photo in self.held])
+        normal = self._score([_largest(photo.normal) for photo in self.held])
+        dark = self._score([_largest(photo.dark) for photo in self.held])
         share = self.options.dark_fraction
         point = CurvePoint(
             step=self.step,
@@ -230,9 +226,7 @@ class _Run:
         save_curves(self.points, self.folder)
 
     def _score(self, views: list) -> MaskScore:
-        pairs = (
-            self.held_store.load(photo, view) for photo, view in zip(self.held, views, strict=True)
-        )
+        pairs = (self.store.load(photo, view) for photo, view in zip(self.held, views, strict=True))
         return score_network(self.network, pairs, self.engine.device)
 
     def _provenance(self, point: CurvePoint) -> dict[str, str]:
@@ -240,6 +234,7 @@ class _Run:
         return {
             "options": self.options.to_json(),
             "photographs": str(self.schedule.photos),
+            "photographs_digest": self.digest,
             "point": json.dumps(dataclasses.asdict(point)),
             "torch": torch.__version__,
             "python": platform.python_version(),
@@ -248,7 +243,7 @@ class _Run:
     def _save(self) -> None:
         state = {
             "options": self.options.to_json(),
-            "photographs": self.schedule.photos,
+            "photographs": self.digest,
             "step": self.step,
             "images": self.images,
             "loss_sum": self.loss_sum,
@@ -268,10 +263,10 @@ class _Run:
                 f"({_difference(state, self.options)}): "
                 "use the same options to continue it, or another folder with -o"
             )
-        if state["photographs"] != self.schedule.photos:
+        if state["photographs"] != self.digest:
             raise OptionError(
-                f"{self.folder} holds a run over {state['photographs']} photographs, "
-                f"now there are {self.schedule.photos}: use another folder with -o"
+                f"{self.folder} holds a run over other photographs: use the same ones, to train "
+                "on and to validate with, or another folder with -o"
             )
         self.step, self.images = state["step"], state["images"]
         self.loss_sum, self.loss_count = state["loss_sum"], state["loss_count"]

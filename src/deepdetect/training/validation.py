@@ -36,7 +36,7 @@ def score_network(
 def _probability(network: nn.Module, rgb: np.ndarray, device: torch.device) -> np.ndarray:
     """Run the network on a (H, W, 3) uint8 image of any size."""
     height, width = rgb.shape[:2]
-    image = torch.from_numpy(np.ascontiguousarray(rgb)).to(device)
+    image = torch.from_numpy(np.array(rgb)).to(device)  # a copy: torch wants to write
     image = image.permute(2, 0, 1)[None].float().div_(255)
     image = pad(image, (0, -width % 8, 0, -height % 8), mode="replicate")
     image = image.contiguous(memory_format=torch.channels_last)
