@@ -155,7 +155,8 @@ def label_files(
 ) -> list[LabelReport]:
     """Label image files, in parallel over processes.
 
-    An image that cannot be read is reported; the others are labelled all the same.
+    An image that cannot be read is reported; the others are labelled all the same. A
+    script must call this under `if __name__ == "__main__":`, since processes are started.
 
     Args:
         tasks: what to do.

@@ -1,4 +1,4 @@
-"""OpenVINO: twice as fast as ONNX Runtime on CPUs, an extra."""
+"""OpenVINO: 1.5 times as fast as ONNX Runtime on CPUs, an extra."""
 
 from __future__ import annotations
 

@@ -71,7 +71,8 @@ def train(
     """Train the network on a folder of photographs.
 
     A run that was killed goes on from its last checkpoint when it is started again
-    with the same options, with the same result as an unbroken one.
+    with the same options, with the same result as an unbroken one. Labels are made in
+    processes of their own, so a script must call this under `if __name__ == "__main__":`.
 
     Args:
         photos: folder of photographs.
