@@ -112,6 +112,19 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("line", re.findall(r"\| `([^`]*\([^`]*\))` \|$", README, re.M))
+def test_the_calls_of_the_table_run(folder: Path, line: str) -> None:
+    import deepdetect
+
+    left = deepdetect.load_image("left.png")
+    names = {
+        **{name: getattr(deepdetect, name) for name in ("DeepDetect", "match_images")},
+        **{"detector": deepdetect.DeepDetect(), "image": left, "mask": left[..., 0] > 100},
+        **{"a": left, "b": deepdetect.load_image("right.png")},
+    }
+    assert eval(line, names) is not None
+
+
 def test_make_demo_runs(tmp_path: Path) -> None:
     if Path(sys.prefix) != ROOT / ".venv" or shutil.which("make") is None:
         pytest.skip("needs make, and to be run by `make test` in .venv")

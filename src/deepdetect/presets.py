@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from .descriptors import get_descriptor
-from .errors import OptionError, unknown_name
+from .errors import OptionError, look_up
 from .geometry import GeometryOptions
 from .heatmap import HeatmapOptions
 from .keypoints import SelectionOptions
@@ -78,6 +78,4 @@ def get_preset(name: str) -> MatchingOptions:
     Raises:
         OptionError: the name is unknown.
     """
-    if name not in PRESETS:
-        raise unknown_name("preset", name, PRESETS)
-    return PRESETS[name]
+    return look_up("preset", name, PRESETS)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from ..errors import unknown_name
+from ..errors import look_up
 from .motorcycle import load_motorcycle
 from .stereo import StereoPair
 
@@ -17,9 +17,7 @@ def load_stereo_pair(name: str) -> StereoPair:
     Raises:
         OptionError: the name is unknown.
     """
-    if name not in STEREO_PAIRS:
-        raise unknown_name("stereo pair", name, STEREO_PAIRS)
-    return STEREO_PAIRS[name]()
+    return look_up("stereo pair", name, STEREO_PAIRS)()
 
 
 __all__ = ["STEREO_PAIRS", "StereoPair", "load_stereo_pair"]

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..errors import unknown_name
+from ..errors import look_up
 from .sift import root_sift_descriptors, sift_descriptors
 
 Descriptor = Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]
@@ -27,6 +27,4 @@ def get_descriptor(name: str) -> Descriptor:
     Raises:
         OptionError: the name is unknown.
     """
-    if name not in DESCRIPTORS:
-        raise unknown_name("descriptor", name, DESCRIPTORS)
-    return DESCRIPTORS[name]
+    return look_up("descriptor", name, DESCRIPTORS)

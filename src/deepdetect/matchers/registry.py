@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..errors import unknown_name
+from ..errors import look_up
 from .exact import exact_neighbours
 from .flann import flann_neighbours
 
@@ -28,6 +28,4 @@ def get_matcher(name: str) -> Matcher:
     Raises:
         OptionError: the name is unknown.
     """
-    if name not in MATCHERS:
-        raise unknown_name("matcher", name, MATCHERS)
-    return MATCHERS[name]
+    return look_up("matcher", name, MATCHERS)
