@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -114,18 +114,14 @@ def reference(heatmap: np.ndarray, options: SelectionOptions) -> list[tuple[int,
         ]
     )
     radius = options.nms_radius
-    kept = (
-        [
-            one
-            for rank, one in enumerate(candidates)
-            if not any(
-                abs(one[1] - better[1]) <= radius and abs(one[2] - better[2]) <= radius
-                for better in candidates[:rank]
-            )
-        ]
-        if radius
-        else candidates
-    )
+    kept: list[tuple[float, int, int]] = []
+    for one in candidates:
+        near = (
+            abs(one[1] - better[1]) <= radius and abs(one[2] - better[2]) <= radius
+            for better in kept
+        )
+        if not radius or not any(near):
+            kept.append(one)
     if options.density is not None:
         kept = kept[: round(options.density * heatmap.size)]
     if options.max_keypoints is not None:
@@ -138,6 +134,7 @@ LEVELS = st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0]) | st.floats(0, 1, width=32
 SHAPES = st.tuples(st.integers(1, 12), st.integers(1, 12))
 
 
+@settings(max_examples=300)
 @given(data=st.data(), shape=SHAPES)
 def test_equals_plain_loops(data: st.DataObject, shape: tuple[int, int]) -> None:
     heatmap = data.draw(arrays(np.float32, shape, elements=LEVELS))
@@ -168,6 +165,14 @@ def test_suppressed_keypoints_keep_their_distance(heatmap: np.ndarray, radius: i
     # The most probable pixel is always kept.
     if (heatmap > 0.25).any():
         assert keypoints.scores.max() == heatmap.max()
+
+
+def test_a_ramp_is_thinned_and_not_emptied() -> None:
+    """Its top suppresses the next pixel only, so the one after that is kept again."""
+    heatmap = np.zeros((16, 16), np.float32)
+    heatmap[4, 2:12] = np.linspace(0.6, 0.9, 10)
+    keypoints = select_keypoints(heatmap, SelectionOptions(nms_radius=1))
+    assert keypoints.xy.tolist() == [[3, 4], [5, 4], [7, 4], [9, 4], [11, 4]]
 
 
 def test_the_threshold_is_strict() -> None:

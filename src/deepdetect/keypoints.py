@@ -82,8 +82,8 @@ class SelectionOptions:
         density: wanted number of keypoints a pixel, in (0, 1]; takes the place of the
             threshold: the most probable pixels are taken, as many as that.
         max_keypoints: the most probable so many are kept.
-        nms_radius: of pixels at most so far apart in x and in y, only the most probable
-            is kept (0 keeps all).
+        nms_radius: each keypoint, the most probable first, suppresses those at most so
+            far from it in x and in y (0 suppresses none).
         ignore: (H, W) bool or number array, true where no keypoint is wanted.
 
     Raises:
@@ -168,16 +168,19 @@ def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
 def _suppress(
     pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...], radius: int
 ) -> np.ndarray:
-    """Tell which pixels are the best of the square window around them.
+    """Tell which pixels are kept when each kept one, best first, suppresses those around it.
 
-    The map is nearly flat near 1, so pixels are compared by rank, which has no ties.
+    The map is nearly flat near 1, so pixels are compared by rank, which has no ties. All
+    pixels that are the best of their window are kept at once, their neighbours fall out,
+    and so on with what is left, until nothing is: the same as going through the list.
     """
-    ranks = np.empty(len(pixels))
-    ranks[np.argsort(-scores, kind="stable")] = np.arange(len(pixels), 0, -1)
-    plane = np.zeros(shape)
-    plane.ravel()[pixels] = ranks
-    # Windows that reach over the border see -infinity there.
-    side = 2 * int(radius) + 1
-    best = cv2.dilate(plane, np.ones((1, side), np.uint8))
-    best = cv2.dilate(best, np.ones((side, 1), np.uint8))
-    return best.ravel()[pixels] == ranks
+    left = np.zeros(shape, np.float64)
+    left.ravel()[pixels[np.argsort(-scores, kind="stable")]] = np.arange(len(pixels), 0, -1)
+    kept = np.zeros(shape, np.uint8)
+    window = np.ones((2 * int(radius) + 1,) * 2, np.uint8)  # a box is dilated in linear time
+    while left.any():
+        # Beyond the border is -infinity.
+        best = ((cv2.dilate(left, window) == left) & (left > 0)).astype(np.uint8)
+        kept |= best
+        left[cv2.dilate(best, window) > 0] = 0
+    return kept.ravel()[pixels] > 0
