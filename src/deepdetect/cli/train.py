@@ -21,6 +21,9 @@ from .shared import PATH, json_option, print_json, print_table, workers_option
 )
 @click.option("--labels", type=PATH, help="Folder for the label cache.  [default: in the run's]")
 @click.option(
+    "--start", type=PATH, help="Weights (.safetensors) to start from.  [default: random ones]"
+)
+@click.option(
     "--stage",
     "stages",
     multiple=True,
@@ -37,6 +40,7 @@ from .shared import PATH, json_option, print_json, print_table, workers_option
 )
 @click.option("--dark-fraction", type=float, help="Share of darkened images.  [default: 0.25]")
 @click.option("--learning-rate", type=float, help="Of Adam, at the start.  [default: 0.001]")
+@click.option("--warm-up", type=int, help="Steps to that rate.  [default: 0]")
 @click.option("--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]")
 @click.option("--validations", type=int, help="How often the loss is validated.  [default: 12]")
 @click.option("--seed", type=int, help="Of all random choices.  [default: 0]")
@@ -58,6 +62,7 @@ def train(
     output: Path,
     validation: Path | None,
     labels: Path | None,
+    start: Path | None,
     device: str,
     precision: str,
     compile_network: bool | None,
@@ -101,6 +106,7 @@ def train(
         changed(TrainingOptions(), **given),
         validation=validation,
         labels=labels,
+        start=start,
         device=DeviceOptions(device, precision, compile_network, threads),
         workers=workers,
         say=None if as_json else click.echo,

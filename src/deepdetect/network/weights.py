@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -50,3 +51,12 @@ def load_network(path: str | Path) -> ESPNet:
             "use weights that deepdetect has trained, or the published ones"
         ) from None
     return network.eval()
+
+
+def weights_digest(network: nn.Module) -> str:
+    """Return the SHA-256 of a network's state, the same whatever file it came from."""
+    digest = hashlib.sha256()
+    for name, value in sorted(network.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -63,6 +63,8 @@ class TrainingOptions:
         dark_variants: darkened versions of each photograph at each size.
         darkening: ranges of the darkening.
         learning_rate, final_learning_rate: ends of the cosine annealing of Adam.
+        warm_up: steps over which the rate rises from zero. A run that starts from trained
+            weights needs them: Adam's first steps, without moments, would undo a good deal.
         detectors: label detectors to fuse.
         validations: how often the validation loss is taken.
         seed: decides the start weights, the order, the crops and the flips.
@@ -78,6 +80,7 @@ class TrainingOptions:
     darkening: DarkeningRange = field(default_factory=DarkeningRange)
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-6
+    warm_up: int = 0
     detectors: tuple[str, ...] = DETECTOR_NAMES
     validations: int = 12
     seed: int = 0
@@ -98,6 +101,8 @@ class TrainingOptions:
             raise OptionError(f"the dark fraction must lie in [0, 1], not {self.dark_fraction}")
         if self.dark_variants < 1 or self.validations < 1:
             raise OptionError("dark variants and validations must be at least 1")
+        if self.warm_up < 0:
+            raise OptionError(f"the warm-up must not be negative, not {self.warm_up} steps")
         if not 0 <= self.seed < 2**31:
             raise OptionError(f"the seed must lie in [0, 2147483647], not {self.seed}")
         if not 0 <= self.final_learning_rate <= self.learning_rate:
@@ -144,12 +149,13 @@ class Schedule:
         raise IndexError("the step lies behind the last one")
 
     def learning_rate(self, step: int) -> float:
-        """Return Adam's rate at a step: cosine annealing from the first to the final rate."""
+        """Return Adam's rate at a step: a linear warm-up into cosine annealing."""
         options = self.options
         share = (1 + math.cos(math.pi * step / self.steps)) / 2
-        return options.final_learning_rate + share * (
+        rate = options.final_learning_rate + share * (
             options.learning_rate - options.final_learning_rate
         )
+        return rate * min(1.0, (step + 1) / (options.warm_up + 1))
 
     def milestones(self, count: int) -> set[int]:
         """Return the numbers of steps done at `count` evenly spaced points, the end among them."""

@@ -19,7 +19,7 @@ from ..errors import OptionError
 from ..mask_scores import MaskScore
 from ..network.espnet import ESPNet
 from ..network.onnx_export import export_onnx
-from ..network.weights import load_network, save_weights
+from ..network.weights import load_network, save_weights, weights_digest
 from ..progress import progress
 from .batches import Batches
 from .checkpoint import load_checkpoint, save_checkpoint
@@ -64,6 +64,7 @@ def train(
     *,
     validation: str | Path | None = None,
     labels: str | Path | None = None,
+    start: str | Path | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
     say: Callable[[str], None] | None = None,
@@ -81,6 +82,7 @@ def train(
         options: the recipe.
         validation: folder of other photographs; default: every twentieth is held out.
         labels: folder for the label cache; default: in `output`.
+        start: weights (.safetensors) to start from; default: random ones, by the seed.
         device: how the network is run.
         workers: processes that make labels; default one for each processor.
         say: takes the one line that says how the network is run; without it there is
@@ -92,10 +94,13 @@ def train(
     Raises:
         ImageError: a folder is missing or empty, or a photograph cannot be read.
         OptionError: the folder holds a run with other options.
+        WeightsError: the weights to start from are missing or do not fit.
 
     Example:
         >>> train("photographs", "run")  # doctest: +SKIP
     """
+    # Before the labels, which take minutes.
+    network = None if start is None else load_network(start)
     folder = Path(output)
     cache = Path(labels) if labels is not None else folder / "labels"
     training = list_photos(Path(photos), options, exclude=(folder, cache))
@@ -107,7 +112,7 @@ def train(
     wanted = [(photo, photo.normal + photo.dark) for photo in training]
     wanted += [(photo, (_largest(photo.normal), _largest(photo.dark))) for photo in held]
     store.labels.make(wanted, workers, quiet=say is None)
-    return _Run(training, held, store, folder, options, device, say).finish()
+    return _Run(training, held, store, folder, options, device, say, network).finish()
 
 
 def _largest(views: Sequence[View]) -> View:
@@ -127,6 +132,7 @@ class _Run:
         options: TrainingOptions,
         device: DeviceOptions,
         say: Callable[[str], None] | None,
+        start: ESPNet | None,
     ) -> None:
         self.held, self.store = held, store
         self.folder, self.options, self.say = folder, options, say
@@ -134,7 +140,8 @@ class _Run:
         self.batches = Batches(training, store, self.schedule)
         self.digest = photos_digest(training, held)
         torch.manual_seed(options.seed)
-        network = ESPNet()
+        network = ESPNet() if start is None else start
+        self.start = "" if start is None else weights_digest(start)
         self.engine = Engine(network, device)
         self.network = self.engine.network
         self.optimizer = torch.optim.Adam(
@@ -236,6 +243,7 @@ class _Run:
             "options": self.options.to_json(),
             "photographs": str(self.schedule.photos),
             "photographs_digest": self.digest,
+            "start": self.start,
             "point": json.dumps(dataclasses.asdict(point)),
             "torch": torch.__version__,
             "python": platform.python_version(),
@@ -245,6 +253,7 @@ class _Run:
         state = {
             "options": self.options.to_json(),
             "photographs": self.digest,
+            "start": self.start,
             "step": self.step,
             "images": self.images,
             "loss_sum": self.loss_sum,
@@ -268,6 +277,11 @@ class _Run:
             raise OptionError(
                 f"{self.folder} holds a run over other photographs: use the same ones, to train "
                 "on and to validate with, or another folder with -o"
+            )
+        if state["start"] != self.start:
+            raise OptionError(
+                f"{self.folder} holds a run that started from other weights: "
+                "start from the same ones to continue it, or use another folder with -o"
             )
         self.step, self.images = state["step"], state["images"]
         self.loss_sum, self.loss_count = state["loss_sum"], state["loss_count"]
