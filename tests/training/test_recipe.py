@@ -26,6 +26,7 @@ def test_bad_stages_are_refused(text: str) -> None:
         {"dark_variants": 0},
         {"validations": 0},
         {"learning_rate": -1.0},
+        {"warm_up": -1},
         {"detectors": ("siift",)},
         {"short_sides": ()},
     ],
@@ -50,6 +51,14 @@ def test_learning_rate_is_a_cosine_from_first_to_final() -> None:
     assert schedule.learning_rate(0) == pytest.approx(1e-3)
     assert schedule.learning_rate(50) == pytest.approx((1e-3 + 1e-6) / 2)
     assert schedule.learning_rate(100) == pytest.approx(1e-6)
+
+
+def test_the_warm_up_rises_evenly_into_the_cosine() -> None:
+    stages = (Stage(64, 2, 10),)
+    plain = Schedule(TrainingOptions(stages=stages, short_sides=(64,)), 20)
+    warm = Schedule(TrainingOptions(stages=stages, short_sides=(64,), warm_up=9), 20)
+    shares = [warm.learning_rate(step) / plain.learning_rate(step) for step in range(12)]
+    assert shares == pytest.approx([k / 10 for k in range(1, 11)] + [1, 1])
 
 
 @given(

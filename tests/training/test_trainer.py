@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from safetensors.torch import load_file  # noqa: E402
 
 from deepdetect import DeepDetect, ImageError, OptionError, WeightsError  # noqa: E402
 from deepdetect.network.espnet import ESPNet  # noqa: E402
+from deepdetect.network.weights import load_network, weights_digest  # noqa: E402
 from deepdetect.training.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
 from deepdetect.training.device import DeviceOptions, Engine  # noqa: E402
 from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
@@ -128,6 +130,37 @@ def test_other_options_are_refused_in_the_same_folder(photographs: Path, unbroke
     assert done.returncode == 2
     assert "seed" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_run_can_start_from_trained_weights(
+    photographs: Path, unbroken: Path, tmp_path: Path
+) -> None:
+    from safetensors import safe_open
+
+    options = TrainingOptions(
+        stages=(Stage(64, 4, 1),), short_sides=(64,), detectors=("fast",), validations=1
+    )
+    start = unbroken / "best.safetensors"
+    still = dataclasses.replace(options, learning_rate=0.0, final_learning_rate=0.0)
+    for name, recipe in (("still", still), ("moved", options)):
+        train(photographs, tmp_path / name, recipe, start=start, device=PLAIN, workers=1)
+    before, after = load_file(start), load_file(tmp_path / "still" / "best.safetensors")
+    names = dict(ESPNet().named_parameters())
+    assert all(torch.equal(before[name], after[name]) for name in names)
+    moved = load_file(tmp_path / "moved" / "best.safetensors")
+    assert not any(torch.equal(before[name], moved[name]) for name in names)
+    with safe_open(tmp_path / "moved" / "best.safetensors", "pt") as file:
+        assert file.metadata()["start"] == weights_digest(load_network(start))
+    with pytest.raises(OptionError, match="started from other weights"):
+        train(photographs, tmp_path / "moved", options, device=PLAIN, workers=1)
+
+
+def test_missing_weights_to_start_from_are_refused_before_any_work(
+    photographs: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(WeightsError, match="there is no weights file"):
+        train(photographs, tmp_path / "run", start=tmp_path / "none.safetensors")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"\x80\x04K\x01."])
