@@ -23,7 +23,7 @@ OPTIONS = TrainingOptions(
 
 @pytest.fixture(scope="module")
 def batches(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Batches:
-    cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.detectors)
+    cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.label_options)
     photos = list_photos(photographs, OPTIONS)
     wanted = [(photo, photo.normal + photo.dark) for photo in photos]
     assert cache.make(wanted, 1, quiet=True) == 12 * 4

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from deepdetect.errors import ImageError
+from deepdetect.labels import LabelOptions
 from deepdetect.training.label_cache import LabelCache
 from deepdetect.training.photos import Photo, hold_out, list_photos, photos_digest
 from deepdetect.training.recipe import Stage, TrainingOptions
@@ -52,7 +53,7 @@ def test_photographs_of_one_name_have_their_own_labels(photographs: Path, tmp_pa
     for part, source in (("train", "photo00.png"), ("val", "photo05.png")):
         (tmp_path / part).mkdir()
         (tmp_path / part / "0001.png").write_bytes((photographs / source).read_bytes())
-    cache = LabelCache(tmp_path / "labels", ("fast",))
+    cache = LabelCache(tmp_path / "labels", LabelOptions(("fast",)))
     (first,), (second,) = (list_photos(tmp_path / part, OPTIONS) for part in ("train", "val"))
     assert cache.path(first, first.normal[0]) != cache.path(second, second.normal[0])
     assert photos_digest([first], [second]) != photos_digest([second], [first])
@@ -61,7 +62,7 @@ def test_photographs_of_one_name_have_their_own_labels(photographs: Path, tmp_pa
 def test_a_replaced_photograph_gets_a_new_label(photographs: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
-    cache = LabelCache(tmp_path / "labels", ("fast",))
+    cache = LabelCache(tmp_path / "labels", LabelOptions(("fast",)))
     paths = []
     for source in ("photo00.png", "photo01.png"):
         (folder / "a.png").write_bytes((photographs / source).read_bytes())

@@ -19,7 +19,7 @@ from safetensors.torch import load_file  # noqa: E402
 from deepdetect import DeepDetect, ImageError, OptionError, WeightsError  # noqa: E402
 from deepdetect.network.espnet import ESPNet  # noqa: E402
 from deepdetect.network.weights import load_network, weights_digest  # noqa: E402
-from deepdetect.training.checkpoint import load_checkpoint, save_checkpoint  # noqa: E402
+from deepdetect.training.checkpoint import read_checkpoint, restore, save_checkpoint  # noqa: E402
 from deepdetect.training.device import DeviceOptions, Engine  # noqa: E402
 from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
 from deepdetect.training.trainer import train  # noqa: E402
@@ -124,6 +124,52 @@ def test_starting_again_after_the_end_changes_nothing(photographs: Path, unbroke
     assert (unbroken / "checkpoint.safetensors").read_bytes() == before
 
 
+def test_where_weights_come_from_is_written_into_them(unbroken: Path) -> None:
+    import json
+
+    from safetensors import safe_open
+
+    with safe_open(unbroken / "best.safetensors", "pt") as file:
+        notes = file.metadata()
+    assert notes["command"].startswith("deepdetect train")
+    assert "torch 2." in notes["versions"]
+    assert len(notes["photographs_digest"]) == 16
+    assert json.loads(notes["options"])["seed"] == 0
+    state = read_checkpoint(unbroken / "checkpoint.safetensors").state
+    assert {"command", "commit", "versions", "machine", "photographs"} <= state.keys()
+
+
+def test_own_photographs_and_settings_from_the_shipped_weights(
+    photographs: Path, tmp_path: Path
+) -> None:
+    """The command of docs/fine-tuning.md, on few photographs."""
+    from deepdetect.detector import bundled_weights
+
+    settings = tmp_path / "labels.toml"
+    settings.write_text('detectors = ["fast", "sobel"]\n[fast]\nnormal = { threshold = 30 }\n')
+    start = bundled_weights().with_suffix(".safetensors")
+    arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
+    arguments += [str(tmp_path / "run"), "--start", str(start), "--label-settings", str(settings)]
+    arguments += ["--stage", "96x4x3", "--short-side", "96", "--learning-rate", "0.0005"]
+    arguments += [
+        "--validations",
+        "3",
+        "--no-compile",
+        "--workers",
+        "1",
+        "--threads",
+        "1",
+        "--json",
+    ]
+    subprocess.run(arguments, check=True, capture_output=True)
+    rows = list(csv.DictReader((tmp_path / "run" / "curves.csv").read_text().splitlines()))
+    losses = [float(row["training_loss"]) for row in rows]
+    assert losses[-1] < losses[0], "it learns the new labels"
+    image = photographs / "photo00.png"
+    tuned = DeepDetect(tmp_path / "run" / "deepdetect.onnx").detect(image)
+    assert 0 < len(tuned) < len(DeepDetect().detect(image)), "fewer corners are wanted"
+
+
 def test_other_options_are_refused_in_the_same_folder(photographs: Path, unbroken: Path) -> None:
     changed = [*command(photographs, unbroken, unbroken.parent / "labels"), "--seed", "5"]
     done = subprocess.run(changed, capture_output=True, text=True)
@@ -167,9 +213,16 @@ def test_missing_weights_to_start_from_are_refused_before_any_work(
 def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(content)
-    network = ESPNet()
     with pytest.raises(WeightsError, match="delete it"):
-        load_checkpoint(path, network, torch.optim.Adam(network.parameters()))
+        read_checkpoint(path)
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path: Path) -> None:
+    network, other = ESPNet(), ESPNet(p=2)
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, other, torch.optim.Adam(other.parameters()), {})
+    with pytest.raises(WeightsError, match="delete it"):
+        restore(read_checkpoint(path), path, network, torch.optim.Adam(network.parameters()))
 
 
 def test_checkpoints_hold_everything_and_stay_small(tmp_path: Path) -> None:
@@ -184,7 +237,9 @@ def test_checkpoints_hold_everything_and_stay_small(tmp_path: Path) -> None:
 
     other = ESPNet()
     other_optimizer = torch.optim.Adam(other.parameters(), fused=True)
-    assert load_checkpoint(path, other, other_optimizer) == {"step": 1}
+    found = read_checkpoint(path)
+    assert found.state == {"step": 1}
+    restore(found, path, other, other_optimizer)
     for a, b in zip(network.parameters(), other.parameters(), strict=True):
         assert torch.equal(a, b)
         for moment in ("step", "exp_avg", "exp_avg_sq"):
@@ -195,7 +250,7 @@ def gradients(engine: Engine, images: torch.Tensor, truth: torch.Tensor) -> list
     engine.network.train()
     engine.network.zero_grad()
     loss = torch.nn.functional.binary_cross_entropy_with_logits(engine.logits(images), truth)
-    loss.backward()
+    engine.backward(loss)
     return [parameter.grad.clone() for parameter in engine.network.parameters()]
 
 

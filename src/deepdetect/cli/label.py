@@ -8,8 +8,10 @@ import click
 
 from .shared import (
     PATH,
+    chosen_label_settings,
     expand_images,
     json_option,
+    label_settings_option,
     print_json,
     report_failures,
     workers_option,
@@ -24,6 +26,7 @@ from .shared import (
     metavar="NAME,NAME,...",
     help="Some of sift, orb, brisk, fast, agast, harris, shi-tomasi, canny, sobel.  [default: all]",
 )
+@label_settings_option
 @click.option(
     "--visibility",
     default="auto",
@@ -39,6 +42,7 @@ def label(
     images: tuple[Path, ...],
     output: Path,
     detectors: str | None,
+    label_settings: Path | None,
     visibility: str,
     explain: bool,
     overwrite: bool,
@@ -54,14 +58,12 @@ def label(
     deepdetect label photos/ -o masks
     deepdetect label photo.jpg -o masks --detectors fast,sobel --explain
     """
-    from ..labels import DETECTOR_NAMES, LabelOptions
+    from ..labels import LabelOptions
     from ..labels.files import LabelTask, check_outputs, label_files, pending
     from ..progress import progress
 
-    names = DETECTOR_NAMES
-    if detectors is not None:
-        names = tuple(name.strip() for name in detectors.split(",") if name.strip())
-    options = LabelOptions(names, visibility)
+    settings = chosen_label_settings(detectors, label_settings)
+    options = LabelOptions(settings.detectors, visibility, settings.changes)
     tasks = [
         LabelTask(
             path,

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from ..errors import DeepDetectError
+from .datasets import datasets
 from .demo import demo
 from .detect import detect
 from .evaluate import evaluate
@@ -58,5 +59,5 @@ def main() -> None:
     """
 
 
-for command in (detect, match, label, train, evaluate, demo):
+for command in (detect, match, label, train, datasets, evaluate, demo):
     main.add_command(command)

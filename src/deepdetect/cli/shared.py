@@ -13,6 +13,7 @@ from ..errors import DeepDetectError, OptionError
 
 if TYPE_CHECKING:
     from ..detector import DeepDetect
+    from ..labels import LabelSettings
 
 PATH = click.Path(path_type=Path)
 
@@ -118,7 +119,31 @@ workers_option = click.option(
     type=click.IntRange(min=1),
     help="Processes that make labels.  [default: one a processor]",
 )
+label_settings_option = click.option(
+    "--label-settings",
+    type=PATH,
+    metavar="FILE.toml",
+    help="Detectors and their settings.  [default: the paper's]",
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+
+
+def chosen_label_settings(detectors: str | None, path: Path | None) -> LabelSettings:
+    """Read the settings file; detectors named on the command line take the place of its own.
+
+    Args:
+        detectors: names with commas between, or None.
+        path: TOML file, or None.
+    """
+    import dataclasses
+
+    from ..labels import LabelSettings, read_label_settings
+
+    settings = LabelSettings() if path is None else read_label_settings(path)
+    if detectors is None:
+        return settings
+    names = tuple(name.strip() for name in detectors.split(",") if name.strip())
+    return dataclasses.replace(settings, detectors=names)
 
 
 def make_detector(values: dict[str, Any]) -> DeepDetect:

@@ -4,20 +4,37 @@ from __future__ import annotations
 
 import importlib.util
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from .shared import PATH, json_option, print_json, print_table, workers_option
+from .shared import (
+    PATH,
+    chosen_label_settings,
+    json_option,
+    label_settings_option,
+    print_json,
+    print_table,
+    workers_option,
+)
+
+if TYPE_CHECKING:
+    from ..training.profile import StageProfile
 
 
 @click.command(short_help="Train the network on photographs.")
 @click.argument("photos", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="Folder of the run.")
 @click.option(
+    "--preset",
+    default="default",
+    show_default=True,
+    help="Recipe that the other options change: default, or paper (the paper's own).",
+)
+@click.option(
     "--validation",
     type=PATH,
-    help="Folder of other photographs.  [default: every twentieth is held out]",
+    help="Folder of other photographs.  [default: one in twenty is held out]",
 )
 @click.option("--labels", type=PATH, help="Folder for the label cache.  [default: in the run's]")
 @click.option(
@@ -42,6 +59,7 @@ from .shared import PATH, json_option, print_json, print_table, workers_option
 @click.option("--learning-rate", type=float, help="Of Adam, at the start.  [default: 0.001]")
 @click.option("--warm-up", type=int, help="Steps to that rate.  [default: 0]")
 @click.option("--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]")
+@label_settings_option
 @click.option("--validations", type=int, help="How often the loss is validated.  [default: 12]")
 @click.option("--seed", type=int, help="Of all random choices.  [default: 0]")
 @click.option("--device", default="auto", show_default=True, help="cpu, cuda or auto.")
@@ -55,6 +73,17 @@ from .shared import PATH, json_option, print_json, print_table, workers_option
     help="torch.compile.  [default: when there is a C++ compiler]",
 )
 @click.option("--threads", type=int, help="CPU threads.  [default: torch's choice]")
+@click.option(
+    "--loaders",
+    type=int,
+    help="Threads that make batches.  [default: 1 beside a CPU that trains, else all but one]",
+)
+@click.option(
+    "--profile",
+    "timed",
+    is_flag=True,
+    help="Time 30 steps of each stage and say what holds them back; train nothing.",
+)
 @workers_option
 @json_option
 def train(
@@ -67,6 +96,11 @@ def train(
     precision: str,
     compile_network: bool | None,
     threads: int | None,
+    loaders: int | None,
+    timed: bool,
+    preset: str,
+    detectors: str | None,
+    label_settings: Path | None,
     workers: int | None,
     as_json: bool,
     **values: Any,
@@ -85,32 +119,39 @@ def train(
     from ..errors import MissingExtraError
     from ..options import changed
 
-    for package in ("torch", "safetensors", "onnx"):
+    for package in ("torch", "lightning_fabric", "safetensors", "onnx"):
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(
-                f"training needs the package {package}, which is not installed: "
-                "run pip install torch safetensors onnx matplotlib"
+                f"training needs the package {package.replace('_', '-')}, which is not installed: "
+                "run pip install torch lightning-fabric safetensors onnx matplotlib"
             )
+    from ..training import trainer
+    from ..training.cluster import place_in_cluster
     from ..training.device import DeviceOptions
-    from ..training.recipe import Stage, TrainingOptions
-    from ..training.trainer import train as run
+    from ..training.presets import training_preset
+    from ..training.recipe import Stage
 
     given = {name: value for name, value in values.items() if value not in (None, ())}
     if "stages" in given:
         given["stages"] = tuple(Stage.parse(text) for text in given["stages"])
-    if "detectors" in given:
-        given["detectors"] = tuple(name.strip() for name in given["detectors"].split(","))
-    result = run(
-        photos,
-        output,
-        changed(TrainingOptions(), **given),
-        validation=validation,
-        labels=labels,
-        start=start,
-        device=DeviceOptions(device, precision, compile_network, threads),
-        workers=workers,
-        say=None if as_json else click.echo,
-    )
+    if detectors is not None or label_settings is not None:
+        settings = chosen_label_settings(detectors, label_settings)
+        given["detectors"], given["label_changes"] = settings.detectors, settings.changes
+    arguments = {
+        "validation": validation,
+        "labels": labels,
+        "start": start,
+        "device": DeviceOptions(device, precision, compile_network, threads, loaders),
+        "workers": workers,
+        "say": None if as_json else click.echo,
+    }
+    options = changed(training_preset(preset), **given)
+    if timed:
+        _print_profiles(trainer.profile(photos, output, options, **arguments), as_json)
+        return
+    result = trainer.train(photos, output, options, **arguments)
+    if not place_in_cluster().is_first:
+        return
     best = result.best
     if as_json:
         print_json(
@@ -135,3 +176,27 @@ def train(
             ("written", f"{result.weights}, {result.onnx}"),
         ]
     )
+
+
+def _print_profiles(profiles: list[StageProfile], as_json: bool) -> None:
+    from dataclasses import asdict
+
+    from ..training.cluster import place_in_cluster
+
+    if not place_in_cluster().is_first:
+        return
+    if as_json:
+        print_json([asdict(profile) for profile in profiles])
+        return
+    for profile in profiles:
+        rows = [
+            ("steps timed", f"{profile.steps}"),
+            ("crops/s", f"{profile.images_per_second:.1f}"),
+            ("480x480 images/s", f"{profile.full_images_per_second:.1f}"),
+            ("waiting for data", f"{100 * profile.waiting_share:.1f} %"),
+            ("peak memory", f"{profile.memory / 1e9:.2f} GB"),
+        ]
+        if profile.device_memory is not None:
+            rows.append(("peak GPU memory", f"{profile.device_memory / 1e9:.2f} GB"))
+        stage = profile.stage
+        print_table(rows, f"{stage.batch} crops of {stage.crop}x{stage.crop} pixels a step")

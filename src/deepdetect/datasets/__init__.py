@@ -3,12 +3,25 @@
 from collections.abc import Callable
 
 from ..errors import look_up
+from .coco import COCO
 from .motorcycle import load_motorcycle
+from .remote import RemoteDataset, get_dataset
 from .stereo import StereoPair
 
 STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {
     "motorcycle": load_motorcycle,
 }
+
+REMOTE_DATASETS: dict[str, RemoteDataset] = {dataset.name: dataset for dataset in (COCO,)}
+
+
+def find_remote_dataset(name: str) -> RemoteDataset:
+    """Look a data set on the web up by name.
+
+    Raises:
+        OptionError: the name is unknown.
+    """
+    return look_up("data set", name, REMOTE_DATASETS)
 
 
 def load_stereo_pair(name: str) -> StereoPair:
@@ -20,4 +33,12 @@ def load_stereo_pair(name: str) -> StereoPair:
     return look_up("stereo pair", name, STEREO_PAIRS)()
 
 
-__all__ = ["STEREO_PAIRS", "StereoPair", "load_stereo_pair"]
+__all__ = [
+    "REMOTE_DATASETS",
+    "STEREO_PAIRS",
+    "RemoteDataset",
+    "StereoPair",
+    "find_remote_dataset",
+    "get_dataset",
+    "load_stereo_pair",
+]

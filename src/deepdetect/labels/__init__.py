@@ -2,6 +2,7 @@
 
 from .fusion import Label, LabelOptions, fuse
 from .registry import DETECTOR_NAMES, DETECTORS, LabelDetector
+from .settings import LabelSettings, SettingChange, read_label_settings
 from .visibility import LOW_VISIBILITY_RANGE, luma_range, visibility_of
 
 __all__ = [
@@ -11,7 +12,10 @@ __all__ = [
     "Label",
     "LabelDetector",
     "LabelOptions",
+    "LabelSettings",
+    "SettingChange",
     "fuse",
     "luma_range",
+    "read_label_settings",
     "visibility_of",
 ]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .registry import DETECTOR_NAMES, select_detectors
+from .settings import SettingChange, settings_for
 from .visibility import Visibility, VisibilityChoice, visibility_of
 
 
@@ -17,6 +18,7 @@ class LabelOptions:
     Attributes:
         detectors: names of the detectors to fuse (default: all nine).
         visibility: "auto" decides by `visibility_of`; "normal" and "low" override it.
+        changes: settings of detectors that differ from the paper's.
 
     Raises:
         OptionError: a name is unknown.
@@ -24,6 +26,7 @@ class LabelOptions:
 
     detectors: tuple[str, ...] = DETECTOR_NAMES
     visibility: VisibilityChoice = "auto"
+    changes: tuple[SettingChange, ...] = ()
 
     def __post_init__(self) -> None:
         names = (self.detectors,) if isinstance(self.detectors, str) else self.detectors
@@ -76,6 +79,6 @@ def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
     visibility = visibility_of(gray, options.visibility)
     marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
     for detector in select_detectors(options.detectors):
-        settings = detector.normal if visibility == "normal" else detector.low_visibility
+        settings = settings_for(detector, visibility, options.changes)
         marked[detector.kind] |= detector.mask(gray, settings)
     return Label(marked["keypoint"], marked["edge"], visibility)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 
+from .cluster import Place
 from .photos import Photo
 from .recipe import Schedule
 from .view_store import ViewStore
@@ -26,29 +28,61 @@ class Batches:
         photos: the photographs.
         store: their views.
         schedule: the steps.
+        place: this process's place among those of the run; it makes its part of each batch.
+        loaders: threads that cut crops.
+
+    Raises:
+        OptionError: a batch cannot be shared evenly by the processes.
     """
 
-    def __init__(self, photos: list[Photo], store: ViewStore, schedule: Schedule) -> None:
+    def __init__(
+        self,
+        photos: list[Photo],
+        store: ViewStore,
+        schedule: Schedule,
+        place: Place = Place(),
+        loaders: int = 1,
+    ) -> None:
+        for stage in schedule.options.stages:
+            place.share(stage.batch)
         self.photos = photos
         self.store = store
         self.schedule = schedule
+        self.place = place
+        self.loaders = loaders
 
-    def batch(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """Make a step's batch.
+    def batch(
+        self, step: int, apply: Callable[..., Iterable] = map
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Make a step's batch, or this process's part of it.
+
+        Args:
+            step: number of the step.
+            apply: a map that may work in threads.
 
         Returns:
             (B, crop, crop, 3) uint8 RGB and (B, crop, crop) bool labels.
         """
         position = self.schedule.position(step)
-        crops = [
-            self._crop(position.epoch_offset, position.sample + k, position.stage.crop)
-            for k in range(position.stage.batch)
+        stage = position.stage
+        numbers = range(position.sample, position.sample + stage.batch)[
+            self.place.share(stage.batch)
         ]
+        crops = apply(lambda k: self._crop(position.epoch_offset, k, stage.crop), numbers)
         images, masks = zip(*crops, strict=True)
         return np.stack(images), np.stack(masks)
 
-    def stream(self, first: int, ahead: int = 4) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield the batches from a step to the last, made ahead by a thread."""
+    def stream(
+        self, first: int, last: int | None = None, ahead: int = 4
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yield the batches of the steps from `first` to before `last`, made ahead by threads.
+
+        Args:
+            first: the first step.
+            last: the step after the last one; default: the end of the schedule.
+            ahead: how many batches are held ready.
+        """
+        end = self.schedule.steps if last is None else last
         ready: queue.Queue = queue.Queue(maxsize=ahead)
         stopped = threading.Event()
 
@@ -61,16 +95,18 @@ class Batches:
 
         def make() -> None:
             try:
-                for step in range(first, self.schedule.steps):
-                    if stopped.is_set():
-                        return
-                    hand_over(self.batch(step))
+                with ThreadPoolExecutor(self.loaders, "crops") as pool:
+                    apply = map if self.loaders == 1 else pool.map
+                    for step in range(first, end):
+                        if stopped.is_set():
+                            return
+                        hand_over(self.batch(step, apply))
             except BaseException as error:  # handed to the thread that trains
                 hand_over(error)
 
         threading.Thread(target=make, daemon=True, name="batches").start()
         try:
-            for _ in range(first, self.schedule.steps):
+            for _ in range(first, end):
                 item = ready.get()
                 if isinstance(item, BaseException):
                     raise item

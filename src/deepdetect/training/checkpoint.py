@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,21 +39,45 @@ def save_checkpoint(
         save_file(contiguous, temporary, metadata={"state": json.dumps(state)})
 
 
-def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam) -> dict[str, Any]:
-    """Read a checkpoint into the network and the optimiser.
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint file holds.
 
-    Returns:
-        The run's state.
+    Attributes:
+        state: the run's state.
+        tensors: the network's and Adam's, by name.
+    """
+
+    state: dict[str, Any]
+    tensors: dict[str, torch.Tensor]
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint's file.
 
     Raises:
-        WeightsError: the file is damaged or does not fit the network.
+        WeightsError: the file is damaged.
     """
     try:
         with safe_open(path, framework="pt") as file:
-            names = list(file.keys())
-            tensors = {name: file.get_tensor(name) for name in names}
+            tensors = {name: file.get_tensor(name) for name in list(file.keys())}
             state = json.loads((file.metadata() or {})["state"])
-        prefix = "network."
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        raise _unfit(path, error) from None
+    return Checkpoint(state, tensors)
+
+
+def restore(
+    checkpoint: Checkpoint, path: Path, network: nn.Module, optimizer: torch.optim.Adam
+) -> None:
+    """Bring the network and Adam to a checkpoint's state.
+
+    Raises:
+        WeightsError: the checkpoint does not fit the network.
+    """
+    tensors = checkpoint.tensors
+    prefix = "network."
+    try:
         network.load_state_dict(
             {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
         )
@@ -66,10 +91,13 @@ def load_checkpoint(path: Path, network: nn.Module, optimizer: torch.optim.Adam)
                         for moment in MOMENTS[1:]
                     },
                 }
-    except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise WeightsError(
-            f"{path} is not a checkpoint of this network ({reason}): "
-            "delete it, or train into another folder"
-        ) from None
-    return state
+    except (KeyError, ValueError, RuntimeError) as error:
+        raise _unfit(path, error) from None
+
+
+def _unfit(path: Path, error: Exception) -> WeightsError:
+    reason = str(error).splitlines()[0]
+    return WeightsError(
+        f"{path} is not a checkpoint of this network ({reason}): "
+        "delete it, or train into another folder"
+    )

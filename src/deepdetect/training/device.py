@@ -1,18 +1,31 @@
-"""The fastest correct way to run the network for training on this machine."""
+"""The fastest correct way to run the network for training, on one machine or on many.
+
+Lightning Fabric places the network, wraps it for several processes (DistributedDataParallel)
+and sets the precision; `torchrun` starts the processes.
+"""
 
 from __future__ import annotations
 
-import contextlib
+import datetime
+import logging
+import os
 import shutil
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 import torch
 from torch import nn
 
 from ..errors import OptionError, unknown_name
+from .batch_norm import synchronize_batch_norm
+from .cluster import Place, place_in_cluster
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
 
 PRECISIONS = ("auto", "float32", "bfloat16")
+PATIENCE = datetime.timedelta(hours=12)  # the first process of a machine makes the labels first
 
 
 @dataclass(frozen=True)
@@ -25,12 +38,15 @@ class DeviceOptions:
             "auto" takes it where the processor computes with it.
         compile: torch.compile; None means when a C++ compiler is at hand.
         threads: CPU threads of torch; None leaves torch's choice.
+        loaders: threads that make batches; None means one beside a CPU that trains, and
+            all but one of the processors beside a GPU.
     """
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     compile: bool | None = None
     threads: int | None = None
+    loaders: int | None = None
 
     def __post_init__(self) -> None:
         if self.device not in ("auto", "cpu", "cuda"):
@@ -39,12 +55,14 @@ class DeviceOptions:
             raise unknown_name("precision", self.precision, PRECISIONS)
         if self.device == "cuda" and not torch.cuda.is_available():
             raise OptionError("there is no CUDA device: use --device cpu")
-        if self.threads is not None and self.threads < 1:
-            raise OptionError(f"threads must be at least 1, not {self.threads}")
+        for name in ("threads", "loaders"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise OptionError(f"{name} must be at least 1, not {value}")
 
 
 class Engine:
-    """A network placed on its device, with autocast and compilation as chosen.
+    """A network placed on its device, with processes, precision and compilation as chosen.
 
     Args:
         network: the network; it is moved and keeps its own identity (for its state).
@@ -54,40 +72,52 @@ class Engine:
     def __init__(self, network: nn.Module, options: DeviceOptions) -> None:
         if options.threads is not None:
             torch.set_num_threads(options.threads)
+        self.place = place_in_cluster()
         kind = options.device
         if kind == "auto":
             kind = "cuda" if torch.cuda.is_available() else "cpu"
-        self.device = torch.device(kind)
+        self.bfloat16 = options.precision == "bfloat16" or (
+            options.precision == "auto" and _computes_bfloat16(kind)
+        )
+        self.fabric = _fabric(kind, self.bfloat16, self.place)
+        self.fabric.launch()
+        self.device = self.fabric.device
         # channels_last is faster by 40 % on CPUs, and what tensor cores want.
         self.network = network.to(self.device, memory_format=torch.channels_last)
-        self.bfloat16 = options.precision == "bfloat16" or (
-            options.precision == "auto" and _computes_bfloat16(self.device)
-        )
+        if self.place.processes > 1:
+            synchronize_batch_norm(self.network, self.device)
         compiled = options.compile
         if compiled is None:
-            compiled = kind == "cuda" or any(shutil.which(name) for name in ("g++", "clang++"))
+            has_compiler = any(shutil.which(name) for name in ("g++", "clang++"))
+            # The sums over CPU processes inside the batch normalisation break the graph.
+            compiled = kind == "cuda" or (has_compiler and self.place.processes == 1)
         self.compiled = bool(compiled)
+        self.loaders = options.loaders or _loaders(kind, self.place)
         self._may_fall_back = options.compile is None
-        # Not dynamic: there are only as many shapes as stages, and each gets its own code.
-        self._forward = (
-            torch.compile(self.network, dynamic=False) if self.compiled else self.network
-        )
+        self._forward = self._set_up()
 
-    def images(self, rgb: torch.Tensor) -> torch.Tensor:
+    def _set_up(self) -> nn.Module:
+        network = self.network
+        if self.compiled:
+            # Not dynamic: there are only as many shapes as stages, and each gets its own code.
+            network = torch.compile(network, dynamic=False)
+        return self.fabric.setup_module(network, move_to_device=False)
+
+    def images(self, rgb: np.ndarray | torch.Tensor) -> torch.Tensor:
         """Turn (B, H, W, 3) uint8 into (B, 3, H, W) float32 in [0, 1], channels last."""
-        return rgb.to(self.device).permute(0, 3, 1, 2).float().div_(255)
+        return self.place_tensor(rgb).permute(0, 3, 1, 2).float().div_(255)
 
-    def autocast(self) -> contextlib.AbstractContextManager:
-        """Return the context that the forward pass of training runs in."""
-        if not self.bfloat16:
-            return contextlib.nullcontext()
-        return torch.autocast(self.device.type, dtype=torch.bfloat16)
+    def place_tensor(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
+        """Bring values onto the device."""
+        tensor = torch.as_tensor(values)
+        if self.device.type == "cuda":
+            return tensor.pin_memory().to(self.device, non_blocking=True)
+        return tensor
 
     def logits(self, images: torch.Tensor) -> torch.Tensor:
         """Run the network for training; logits are float32."""
         try:
-            with self.autocast():
-                return self._forward(images).float()
+            return self._forward(images)
         except torch._dynamo.exc.TorchDynamoException as error:
             # A compiler on the path may still lack headers, and CUDA its Triton.
             if not self._may_fall_back:
@@ -95,19 +125,75 @@ class Engine:
                 raise OptionError(
                     f"torch.compile does not work here ({reason}): use --no-compile"
                 ) from None
-            self.compiled, self._forward = False, self.network
+            self.compiled = False
+            self._forward = self._set_up()
             return self.logits(images)
+
+    def backward(self, loss: torch.Tensor) -> None:
+        """Take the gradients, averaged over all processes."""
+        self.fabric.backward(loss)
+
+    def mean_over_processes(self, value: torch.Tensor) -> torch.Tensor:
+        """Average a tensor over all processes."""
+        if self.place.processes == 1:
+            return value
+        return self.fabric.all_reduce(value, reduce_op="mean")
+
+    def gather(self, values: Any) -> list[Any]:
+        """Return every process's values, in the order of the processes, to all of them."""
+        if self.place.processes == 1:
+            return [values]
+        gathered: list[Any] = [None] * self.place.processes
+        torch.distributed.all_gather_object(gathered, values)
+        return gathered
+
+    def broadcast(self, values: Any) -> Any:
+        """Return the first process's values to all."""
+        return self.fabric.broadcast(values)
+
+    def close(self) -> None:
+        """Part from the other processes."""
+        if self.place.processes > 1:
+            torch.distributed.destroy_process_group()
 
     def describe(self) -> str:
         """Say in words how the network is run."""
         precision = "bfloat16" if self.bfloat16 else "float32"
         if self.bfloat16 and self.device.type == "cpu":
             precision += " (dilated convolutions float32)"
-        return f"{self.device.type}, {precision}, {'compiled' if self.compiled else 'eager'}"
+        words = [self.device.type, precision, "compiled" if self.compiled else "eager"]
+        if self.place.processes > 1:
+            words.append(f"{self.place.processes} processes on {self.place.machines} machine(s)")
+        return ", ".join(words)
 
 
-def _computes_bfloat16(device: torch.device) -> bool:
-    if device.type == "cuda":
+def _fabric(kind: str, bfloat16: bool, place: Place) -> Fabric:
+    from lightning_fabric import Fabric
+    from lightning_fabric.plugins.environments import LightningEnvironment, TorchElasticEnvironment
+    from lightning_fabric.strategies import DDPStrategy
+
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
+    alone = place.processes == 1
+    return Fabric(
+        accelerator=kind,
+        devices=place.local_processes,
+        num_nodes=place.machines,
+        strategy="auto" if alone else DDPStrategy(timeout=PATIENCE),
+        precision="bf16-mixed" if bfloat16 else "32-true",
+        # Named, so that a batch system's variables in the environment change nothing.
+        plugins=[LightningEnvironment() if alone else TorchElasticEnvironment()],
+    )
+
+
+def _loaders(kind: str, place: Place) -> int:
+    """Return how many threads make batches: a CPU that trains has none to spare."""
+    if kind == "cpu":
+        return 1
+    return max(1, (os.cpu_count() or 2) // place.local_processes - 1)
+
+
+def _computes_bfloat16(kind: str) -> bool:
+    if kind == "cuda":
         return torch.cuda.is_bf16_supported()
     capabilities = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
     return bool(capabilities and capabilities())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +12,17 @@ import numpy as np
 
 from ..errors import DeepDetectError
 from ..image import load_image, luma
-from ..labels import DETECTORS, LabelOptions, fuse
+from ..labels import LabelOptions, fuse
 from ..labels.files import load_mask, save_mask
+from ..labels.registry import select_detectors
+from ..labels.settings import settings_for
+from ..labels.visibility import Visibility
 from ..processes import map_in_processes
 from ..progress import progress
 from .photos import Photo
 from .views import View, render
+
+VISIBILITIES: tuple[Visibility, ...] = ("normal", "low")
 
 
 @dataclass(frozen=True)
@@ -26,12 +32,12 @@ class PhotoLabelTask:
     Attributes:
         photo: the photograph's file.
         views: the views, each with the file of its label.
-        detectors: names of the label detectors.
+        options: the label options; each view decides the visibility itself.
     """
 
     photo: Path
     views: tuple[tuple[View, Path], ...]
-    detectors: tuple[str, ...]
+    options: LabelOptions
 
 
 class LabelCache:
@@ -42,12 +48,12 @@ class LabelCache:
 
     Args:
         folder: where the labels lie; other label settings get another subfolder.
-        detectors: names of the label detectors.
+        options: the label options; each view decides the visibility itself.
     """
 
-    def __init__(self, folder: Path, detectors: tuple[str, ...]) -> None:
-        self.detectors = detectors
-        self.folder = folder / _settings_digest(detectors)
+    def __init__(self, folder: Path, options: LabelOptions) -> None:
+        self.options = options
+        self.folder = folder / _settings_digest(options)
 
     def path(self, photo: Photo, view: View) -> Path:
         """Return the file of a label."""
@@ -79,7 +85,7 @@ class LabelCache:
             paths = [(view, self.path(photo, view)) for view in views]
             missing = tuple((view, path) for view, path in paths if path.name not in there)
             if missing:
-                tasks.append(PhotoLabelTask(photo.path, missing, self.detectors))
+                tasks.append(PhotoLabelTask(photo.path, missing, self.options))
         total = sum(len(task.views) for task in tasks)
         failures = []
         with progress(total, "labels", "label", quiet) as bar:
@@ -102,18 +108,18 @@ def make_labels(task: PhotoLabelTask) -> tuple[int, str | None]:
         for view, path in task.views:
             # A dark view gets the low-visibility settings, a normal one the normal ones.
             visibility = "normal" if view.darkening is None else "low"
-            label = fuse(luma(render(rgb, view)), LabelOptions(task.detectors, visibility))
+            options = dataclasses.replace(task.options, visibility=visibility)
+            label = fuse(luma(render(rgb, view)), options)
             save_mask(label.mask, path)
     except DeepDetectError as error:
         return len(task.views), str(error)
     return len(task.views), None
 
 
-def _settings_digest(detectors: tuple[str, ...]) -> str:
+def _settings_digest(options: LabelOptions) -> str:
     """Name a folder by all that a label depends on besides the photograph and the view."""
     used = [
-        (detector.name, repr(detector.normal), repr(detector.low_visibility))
-        for detector in DETECTORS
-        if detector.name in detectors
+        (detector.name, *(repr(settings_for(detector, v, options.changes)) for v in VISIBILITIES))
+        for detector in select_detectors(options.detectors)
     ]
     return hashlib.sha256(repr(used).encode()).hexdigest()[:12]

@@ -33,17 +33,27 @@ class Photo:
     dark: tuple[View, ...]
 
 
-def list_photos(root: Path, options: TrainingOptions, exclude: Sequence[Path] = ()) -> list[Photo]:
+def list_photos(
+    root: Path,
+    options: TrainingOptions,
+    exclude: Sequence[Path] = (),
+    limit: int | None = None,
+) -> list[Photo]:
     """List the photographs below a folder with their views.
 
     Args:
         root: the folder.
         options: sizes and darkening of the views.
         exclude: folders below it that are left out.
+        limit: take no more than so many, by the checksums of their names.
 
     Raises:
         ImageError: the folder is missing or empty.
     """
+    paths = find_images(root, exclude)
+    if limit is not None and len(paths) > limit:
+        chosen = sorted(paths, key=lambda path: (zlib.crc32(path.name.encode()), path))[:limit]
+        paths = sorted(chosen)
     return [
         Photo(
             path,
@@ -53,16 +63,21 @@ def list_photos(root: Path, options: TrainingOptions, exclude: Sequence[Path] = 
                 options.short_sides,
                 options.darkening,
                 options.dark_variants,
+                options.square,
             ),
         )
-        for path in find_images(root, exclude)
+        for path in paths
     ]
 
 
-def hold_out(photos: list[Photo], share: int = 20) -> tuple[list[Photo], list[Photo]]:
-    """Split off every twentieth photograph for validation, by the checksum of its name.
+def hold_out(photos: list[Photo], share: float = 0.05) -> tuple[list[Photo], list[Photo]]:
+    """Split off a share of the photographs for validation, by the checksums of their names.
 
     A photograph stays on its side when others are added.
+
+    Args:
+        photos: the photographs.
+        share: about so many of them are held out.
 
     Returns:
         The photographs to train on, and those held out.
@@ -73,7 +88,9 @@ def hold_out(photos: list[Photo], share: int = 20) -> tuple[list[Photo], list[Ph
     held: list[Photo] = []
     kept: list[Photo] = []
     for photo in photos:
-        part = held if zlib.crc32(photo.path.name.encode()) % share == 0 else kept
+        # Of the mirrored checksum, which has nothing to do with the choice of `list_photos`.
+        draw = int(f"{zlib.crc32(photo.path.name.encode()):032b}"[::-1], 2) / 2**32
+        part = held if draw < share else kept
         part.append(photo)
     if not held and len(photos) > 1:
         held, kept = photos[-1:], photos[:-1]

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass, field
 
 from ..errors import OptionError
-from ..labels import DETECTOR_NAMES, LabelOptions
+from ..labels import DETECTOR_NAMES, LabelOptions, SettingChange
 from .darkening import DarkeningRange
 
 
@@ -59,6 +59,10 @@ class TrainingOptions:
             (Harris and Sobel labels are relative to the image's largest response).
         short_sides: sizes in pixels that the photographs' shorter side is scaled to;
             a crop is taken from those that are large enough.
+        square: squash the photographs to squares, as the paper does, instead.
+        max_photos: use no more photographs than so many, those held out among them; None
+            uses all.
+        held_out: share of the photographs held out for validation, when no folder is named.
         dark_fraction: share of darkened images (paper: a quarter).
         dark_variants: darkened versions of each photograph at each size.
         darkening: ranges of the darkening.
@@ -66,6 +70,7 @@ class TrainingOptions:
         warm_up: steps over which the rate rises from zero. A run that starts from trained
             weights needs them: Adam's first steps, without moments, would undo a good deal.
         detectors: label detectors to fuse.
+        label_changes: settings of label detectors that differ from the paper's.
         validations: how often the validation loss is taken.
         seed: decides the start weights, the order, the crops and the flips.
 
@@ -75,6 +80,9 @@ class TrainingOptions:
 
     stages: tuple[Stage, ...] = (Stage(240, 16, 44), Stage(480, 8, 10))
     short_sides: tuple[int, ...] = (480, 360, 240)
+    square: bool = False
+    max_photos: int | None = None
+    held_out: float = 0.05
     dark_fraction: float = 0.25
     dark_variants: int = 1
     darkening: DarkeningRange = field(default_factory=DarkeningRange)
@@ -82,6 +90,7 @@ class TrainingOptions:
     final_learning_rate: float = 1e-6
     warm_up: int = 0
     detectors: tuple[str, ...] = DETECTOR_NAMES
+    label_changes: tuple[SettingChange, ...] = ()
     validations: int = 12
     seed: int = 0
 
@@ -97,6 +106,10 @@ class TrainingOptions:
                 f"a crop of {largest} pixels does not fit into images of "
                 f"{max(self.short_sides)}: raise the sizes or make the crops smaller"
             )
+        if self.max_photos is not None and self.max_photos < 2:
+            raise OptionError(f"max_photos must be at least 2, not {self.max_photos}")
+        if not 0 < self.held_out < 1:
+            raise OptionError(f"the share held out must lie in (0, 1), not {self.held_out}")
         if not 0 <= self.dark_fraction <= 1:
             raise OptionError(f"the dark fraction must lie in [0, 1], not {self.dark_fraction}")
         if self.dark_variants < 1 or self.validations < 1:
@@ -107,6 +120,11 @@ class TrainingOptions:
             raise OptionError(f"the seed must lie in [0, 2147483647], not {self.seed}")
         if not 0 <= self.final_learning_rate <= self.learning_rate:
             raise OptionError("the learning rate must not be under the final one, nor negative")
+
+    @property
+    def label_options(self) -> LabelOptions:
+        """How labels are made."""
+        return LabelOptions(self.detectors, changes=self.label_changes)
 
     def to_json(self) -> str:
         """Return the options as JSON text, to be kept beside the weights."""

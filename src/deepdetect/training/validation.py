@@ -23,13 +23,13 @@ def score_network(
         device: where the network is.
 
     Returns:
-        Means over the images.
+        Means over the images; zeros when there is none.
     """
     was_training = network.training
     network.eval()
     scores = [score_heatmap(_probability(network, rgb, device), mask) for rgb, mask in pairs]
     network.train(was_training)
-    return mean_score(scores)
+    return mean_score(scores) if scores else MaskScore(0.0, 0.0, 0)
 
 
 @torch.inference_mode()

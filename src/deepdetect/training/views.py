@@ -19,10 +19,12 @@ class View:
     Attributes:
         short_side: length in pixels that the shorter side is scaled to.
         darkening: the darkening, or None for the photograph as it is.
+        square: squashed to a square instead of scaled evenly.
     """
 
     short_side: int
     darkening: Darkening | None = None
+    square: bool = False
 
     @property
     def name(self) -> str:
@@ -30,11 +32,15 @@ class View:
         light = "normal"
         if self.darkening is not None:
             light = f"b{self.darkening.brightness:.3f}c{self.darkening.contrast:.3f}"
-        return f"{self.short_side}_{light}"
+        return f"{self.short_side}{'x' * self.square}_{light}"
 
 
 def views_of(
-    name: str, short_sides: tuple[int, ...], darkening: DarkeningRange, variants: int
+    name: str,
+    short_sides: tuple[int, ...],
+    darkening: DarkeningRange,
+    variants: int,
+    square: bool = False,
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """List the normal and the dark views of a photograph, the same on every call.
 
@@ -43,14 +49,17 @@ def views_of(
         short_sides: sizes of the views, in pixels.
         darkening: ranges of the factors.
         variants: dark views of each size.
+        square: squash the photograph to squares.
 
     Returns:
         The normal views and the dark ones, of each size in turn.
     """
     generator = np.random.default_rng(zlib.crc32(name.encode()))
-    normal = tuple(View(side) for side in short_sides)
+    normal = tuple(View(side, None, square) for side in short_sides)
     dark = tuple(
-        View(side, darkening.draw(generator)) for side in short_sides for _ in range(variants)
+        View(side, darkening.draw(generator), square)
+        for side in short_sides
+        for _ in range(variants)
     )
     return normal, dark
 
@@ -67,6 +76,13 @@ def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
     return cv2.resize(rgb, size, interpolation=method)
 
 
+def squash(rgb: np.ndarray, side: int) -> np.ndarray:
+    """Scale an image to a square, as the paper's training images are (cubic)."""
+    if rgb.shape[:2] == (side, side):
+        return rgb
+    return cv2.resize(rgb, (side, side), interpolation=cv2.INTER_CUBIC)
+
+
 def render(photo: object, view: View) -> np.ndarray:
     """Make a view of a photograph.
 
@@ -77,5 +93,6 @@ def render(photo: object, view: View) -> np.ndarray:
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    rgb = scale_short_side(load_image(photo), view.short_side)
+    scale = squash if view.square else scale_short_side
+    rgb = scale(load_image(photo), view.short_side)
     return rgb if view.darkening is None else darken(rgb, view.darkening)

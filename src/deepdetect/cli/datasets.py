@@ -1,0 +1,59 @@
+"""`deepdetect datasets`: data sets on the web."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from .shared import PATH, json_option, print_json, print_table
+
+
+@click.group(short_help="Download data sets.")
+def datasets() -> None:
+    """Download data sets for training."""
+
+
+@datasets.command("list", short_help="Show the data sets that can be had.")
+@json_option
+def list_datasets(as_json: bool) -> None:
+    """Show the data sets that can be downloaded."""
+    from dataclasses import asdict
+
+    from ..datasets import REMOTE_DATASETS
+
+    if as_json:
+        print_json([asdict(dataset) for dataset in REMOTE_DATASETS.values()])
+        return
+    for dataset in REMOTE_DATASETS.values():
+        rows = [
+            ("images", f"{dataset.images:,}"),
+            ("download", f"{dataset.size / 1e9:.1f} GB, and as much again unpacked"),
+            ("licence", dataset.licence),
+        ]
+        print_table(rows, f"{dataset.name}: {dataset.title}")
+
+
+@datasets.command(short_help="Download and unpack a data set.")
+@click.argument("name")
+@click.option("-o", "--output", type=PATH, help="Folder for the images.  [default: data/NAME]")
+@json_option
+def get(name: str, output: Path | None, as_json: bool) -> None:
+    r"""Download the data set NAME and unpack it.
+
+    Given again, the command goes on where it was broken off.
+
+    \b
+    deepdetect datasets get coco
+    deepdetect train --preset paper data/coco -o run
+    """
+    from ..datasets import find_remote_dataset, get_dataset
+    from ..image import find_images
+
+    dataset = find_remote_dataset(name)
+    folder = get_dataset(dataset, output or Path("data") / dataset.name, quiet=as_json)
+    images = len(find_images(folder))
+    if as_json:
+        print_json({"name": dataset.name, "folder": folder, "images": images})
+        return
+    print_table([("images", f"{images:,}"), ("written", str(folder)), ("licence", dataset.licence)])

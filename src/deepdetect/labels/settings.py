@@ -1,0 +1,145 @@
+"""Changes of the detectors' settings: from Python, or from a TOML file."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import OptionError, unknown_name
+from .registry import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
+from .visibility import Visibility
+
+SECTIONS: dict[str, Visibility] = {"normal": "normal", "low_visibility": "low"}
+
+
+@dataclass(frozen=True)
+class SettingChange:
+    """One setting of one label detector, changed.
+
+    Attributes:
+        detector: the detector's name, as "fast".
+        visibility: which of its two settings is changed, "normal" or "low".
+        name: the setting's name, as "threshold".
+        value: its new value.
+
+    Raises:
+        OptionError: a name is unknown, or the value has another type than the default.
+
+    Example:
+        >>> SettingChange("fast", "normal", "threshold", 20).value
+        20
+        >>> SettingChange("fast", "normal", "treshold", 20)
+        Traceback (most recent call last):
+        ...
+        deepdetect.errors.OptionError: unknown setting of fast 'treshold': did you mean \
+'threshold'? (known: threshold, suppression)
+    """
+
+    detector: str
+    visibility: Visibility
+    name: str
+    value: bool | int | float
+
+    def __post_init__(self) -> None:
+        if self.detector not in DETECTOR_NAMES:
+            raise unknown_name("label detector", self.detector, DETECTOR_NAMES)
+        if self.visibility not in SECTIONS.values():
+            raise unknown_name("visibility", self.visibility, SECTIONS.values())
+        default = next(entry for entry in DETECTORS if entry.name == self.detector).normal
+        known = [field.name for field in dataclasses.fields(default)]
+        if self.name not in known:
+            raise unknown_name(f"setting of {self.detector}", self.name, known)
+        kind = type(getattr(default, self.name))
+        fits = type(self.value) is kind or (kind is float and type(self.value) is int)
+        if not fits:
+            raise OptionError(
+                f"the setting {self.name} of {self.detector} must be of type {kind.__name__}, "
+                f"not {self.value!r}"
+            )
+
+
+def settings_for(
+    detector: LabelDetector, visibility: Visibility, changes: Iterable[SettingChange]
+) -> Any:
+    """Return a detector's settings for a visibility, with the changes that concern them."""
+    settings = detector.normal if visibility == "normal" else detector.low_visibility
+    values = {
+        change.name: change.value
+        for change in changes
+        if (change.detector, change.visibility) == (detector.name, visibility)
+    }
+    return dataclasses.replace(settings, **values)
+
+
+@dataclass(frozen=True)
+class LabelSettings:
+    """What a settings file says.
+
+    Attributes:
+        detectors: names of the detectors to fuse.
+        changes: changed settings.
+    """
+
+    detectors: tuple[str, ...] = DETECTOR_NAMES
+    changes: tuple[SettingChange, ...] = ()
+
+    def __post_init__(self) -> None:
+        select_detectors(self.detectors)
+
+
+def read_label_settings(path: str | Path) -> LabelSettings:
+    """Read detectors and their settings from a TOML file.
+
+    The file may name the detectors, and changes some of their settings::
+
+        detectors = ["fast", "harris", "sobel"]  # default: all nine
+
+        [fast]
+        normal = { threshold = 20 }
+        low_visibility = { threshold = 4 }
+
+    Raises:
+        OptionError: the file cannot be read, or a name or value is wrong.
+    """
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise OptionError(f"{path} is no valid TOML file ({error})") from None
+    try:
+        return _parsed(content)
+    except OptionError as error:
+        raise OptionError(f"{path}: {error}") from None
+
+
+def _parsed(content: dict[str, Any]) -> LabelSettings:
+    detectors = content.pop("detectors", list(DETECTOR_NAMES))
+    if not isinstance(detectors, list) or not all(isinstance(name, str) for name in detectors):
+        raise OptionError('detectors must be a list of names, as ["fast", "sobel"]')
+    changes = []
+    for detector, sections in content.items():
+        changes += _changes(detector, sections)
+    return LabelSettings(tuple(detectors), tuple(changes))
+
+
+def _changes(detector: str, sections: Any) -> list[SettingChange]:
+    if detector not in DETECTOR_NAMES:
+        raise unknown_name("label detector", detector, ("detectors", *DETECTOR_NAMES))
+    if not isinstance(sections, dict):
+        raise OptionError(f"{detector} must be a table, as [{detector}]")
+    found = []
+    for section, values in sections.items():
+        if section not in SECTIONS:
+            raise unknown_name(f"part of {detector}", section, SECTIONS)
+        if not isinstance(values, dict):
+            raise OptionError(f"{section} of {detector} must be a table, as {{ threshold = 20 }}")
+        found += [
+            SettingChange(detector, SECTIONS[section], name, value)
+            for name, value in values.items()
+        ]
+    return found

@@ -1,0 +1,82 @@
+"""What a run needs before its first step: photographs, their views, all labels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from .cluster import place_in_cluster
+from .label_cache import LabelCache
+from .photos import Photo, hold_out, list_photos, photos_digest
+from .recipe import TrainingOptions
+from .view_store import ViewStore
+from .views import View
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """The photographs of a run.
+
+    Attributes:
+        training: those to train on.
+        held: those to validate with.
+        store: their views and labels.
+    """
+
+    training: list[Photo]
+    held: list[Photo]
+    store: ViewStore
+
+    @property
+    def digest(self) -> str:
+        """A digest of which photographs there are."""
+        return photos_digest(self.training, self.held)
+
+
+def prepare(
+    photos: str | Path,
+    output: str | Path,
+    options: TrainingOptions,
+    *,
+    validation: str | Path | None = None,
+    labels: str | Path | None = None,
+    workers: int | None = None,
+    quiet: bool = True,
+) -> Photographs:
+    """List the photographs of a run and make the labels of all their views.
+
+    The first process of each machine makes the labels; the others go ahead, and wait for
+    it where the processes meet.
+
+    Args:
+        photos: folder of photographs.
+        output: folder of the run, which is left out when it lies below.
+        options: the recipe.
+        validation: folder of other photographs; default: some are held out.
+        labels: folder for the label cache; default: in `output`.
+        workers: processes that make labels; default one for each processor.
+        quiet: show no progress bar.
+
+    Raises:
+        ImageError: a folder is missing or empty.
+        DeepDetectError: a photograph cannot be read.
+    """
+    cache = Path(labels) if labels is not None else Path(output) / "labels"
+    exclude = (Path(output), cache)
+    training = list_photos(Path(photos), options, exclude, options.max_photos)
+    if validation is None:
+        training, held = hold_out(training, options.held_out)
+    else:
+        held = list_photos(Path(validation), options, exclude)
+    store = ViewStore(LabelCache(cache, options.label_options))
+    wanted = [(photo, photo.normal + photo.dark) for photo in training]
+    wanted += [(photo, (largest(photo.normal), largest(photo.dark))) for photo in held]
+    if place_in_cluster().local_rank == 0:
+        store.labels.make(wanted, workers, quiet)
+    return Photographs(training, held, store)
+
+
+def largest(views: Sequence[View]) -> View:
+    """Return the first view of the largest size, which validation takes."""
+    return max(views, key=lambda view: view.short_side)

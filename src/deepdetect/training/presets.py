@@ -1,0 +1,37 @@
+"""Recipes by name."""
+
+from __future__ import annotations
+
+from ..errors import look_up
+from .recipe import Stage, TrainingOptions
+
+PRESETS: dict[str, TrainingOptions] = {
+    # Ours: small crops first, evenly scaled photographs of several sizes.
+    "default": TrainingOptions(),
+    # The paper's (Section III-B): about 33,000 photographs to train on and 8,000 to validate
+    # with, squashed to 480x480, a quarter darkened, 100 epochs in batches of 64.
+    "paper": TrainingOptions(
+        stages=(Stage(480, 64, 100),),
+        short_sides=(480,),
+        square=True,
+        max_photos=41_000,
+        held_out=8 / 41,
+        dark_fraction=0.25,
+        learning_rate=1e-3,
+        final_learning_rate=1e-6,
+        validations=100,
+    ),
+}
+
+
+def training_preset(name: str) -> TrainingOptions:
+    """Look a recipe up by name.
+
+    Raises:
+        OptionError: the name is unknown (the nearest right one is named).
+
+    Example:
+        >>> training_preset("paper").stages
+        (Stage(crop=480, batch=64, epochs=100),)
+    """
+    return look_up("training preset", name, PRESETS)

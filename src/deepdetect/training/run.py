@@ -1,0 +1,246 @@
+"""One training run: where it stands, its files, and how it goes on after a break."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import OptionError
+from ..mask_scores import MaskScore, mean_score
+from ..network.espnet import ESPNet
+from ..network.onnx_export import export_onnx
+from ..network.weights import load_network, save_weights, weights_digest
+from ..progress import progress
+from .batches import Batches
+from .checkpoint import read_checkpoint, restore, save_checkpoint
+from .curves import CurvePoint, save_curves
+from .device import DeviceOptions
+from .learner import Learner, NotFiniteError
+from .preparation import Photographs, largest
+from .provenance import provenance
+from .recipe import Schedule, TrainingOptions
+from .validation import score_network
+from .views import View
+
+CHECKPOINT = "checkpoint.safetensors"
+BEST = "best.safetensors"
+ONNX = "deepdetect.onnx"
+CHECKPOINT_SECONDS = 60.0  # a killed run loses at most so much
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a run has made.
+
+    Attributes:
+        weights: safetensors file of the weights with the lowest validation loss.
+        onnx: the same weights as ONNX, fit for `DeepDetect(weights=...)`.
+        points: the loss curves.
+        best: the point of those weights.
+        images_per_second: mean rate of this process, in 480x480 images' worth of pixels.
+    """
+
+    weights: Path
+    onnx: Path
+    points: list[CurvePoint]
+    best: CurvePoint
+    images_per_second: float
+
+
+class Run:
+    """The state of one run: where it stands, its files, its losses.
+
+    Args:
+        photographs: what is trained on and validated with.
+        folder: where the files go.
+        options: the recipe.
+        device: how the network is run.
+        network: the network with the weights that it starts from.
+        say: takes lines of text for the user; without it there is no progress bar either.
+        resume: go on from the folder's checkpoint.
+
+    Raises:
+        OptionError: the folder holds a run with other options.
+    """
+
+    def __init__(
+        self,
+        photographs: Photographs,
+        folder: Path,
+        options: TrainingOptions,
+        device: DeviceOptions,
+        network: ESPNet,
+        say: Callable[[str], None] | None = None,
+        resume: bool = True,
+    ) -> None:
+        self.photographs, self.folder, self.options = photographs, folder, options
+        self.start = weights_digest(network)
+        self.schedule = Schedule(options, len(photographs.training))
+        self.learner = Learner(network, device)
+        self.engine, self.network = self.learner.engine, self.learner.network
+        self.place = self.engine.place
+        self.say = say if self.place.is_first else None
+        self.batches = Batches(
+            photographs.training,
+            photographs.store,
+            self.schedule,
+            self.place,
+            self.engine.loaders,
+        )
+        self.origin = provenance()
+        self.step = 0
+        self.images = 0
+        self.loss_sum, self.loss_count = 0.0, 0
+        self.points: list[CurvePoint] = []
+        if resume:
+            self._resume()
+
+    def finish(self) -> TrainingResult:
+        """Train to the last step."""
+        milestones = self.schedule.milestones(self.options.validations)
+        started, pixels = time.monotonic(), 0
+        saved = started
+        if self.step < self.schedule.steps and self.say is not None:
+            self.say(f"training on {self.engine.describe()}")
+        if self.step in milestones and self.step not in {point.step for point in self.points}:
+            self._validate()  # the run was killed while it validated
+        bar = progress(self.schedule.steps, "training", "step", self.say is None, self.step)
+        with bar:
+            for rgb, masks in self.batches.stream(self.step):
+                loss = self._learn(rgb, masks)
+                batch = len(masks) * self.place.processes
+                pixels += batch * masks[0].size
+                self.loss_sum += loss
+                self.loss_count += 1
+                self.step += 1
+                self.images += batch
+                bar.update(1)
+                rate = pixels / (480 * 480) / (time.monotonic() - started)
+                bar.set_postfix_str(
+                    f"loss {self.loss_sum / self.loss_count:.4f}, {rate:.1f} images/s", False
+                )
+                if self.step in milestones:
+                    self._save()  # the validation takes its time too
+                    self._validate()
+                if self.step in milestones or time.monotonic() - saved > CHECKPOINT_SECONDS:
+                    self._save()
+                    saved = time.monotonic()
+        seconds = max(time.monotonic() - started, 1e-9)
+        best = min(self.points, key=lambda point: point.validation_loss)
+        if self.place.is_first:
+            export_onnx(load_network(self.folder / BEST), self.folder / ONNX)
+        rate = pixels / (480 * 480) / seconds
+        return TrainingResult(self.folder / BEST, self.folder / ONNX, self.points, best, rate)
+
+    def _learn(self, rgb: np.ndarray, masks: np.ndarray) -> float:
+        """Make one optimiser step; return the loss."""
+        try:
+            return self.learner.learn(rgb, masks, self.schedule.learning_rate(self.step))
+        except NotFiniteError:
+            raise OptionError(
+                f"the loss or its gradients are not finite at step {self.step}: start again with "
+                "--precision float32, or with a lower --learning-rate"
+            ) from None
+
+    def _validate(self) -> None:
+        """Take the validation losses; keep the weights when they are the best so far."""
+        held = self.photographs.held
+        normal = self._score([largest(photo.normal) for photo in held])
+        dark = self._score([largest(photo.dark) for photo in held])
+        share = self.options.dark_fraction
+        point = CurvePoint(
+            step=self.step,
+            epoch=self.images / self.schedule.photos,
+            images=self.images,
+            learning_rate=self.schedule.learning_rate(self.step - 1),
+            training_loss=self.loss_sum / self.loss_count,
+            validation_loss=(1 - share) * normal.loss + share * dark.loss,
+            normal_loss=normal.loss,
+            normal_iou=normal.iou,
+            dark_loss=dark.loss,
+            dark_iou=dark.iou,
+        )
+        self.loss_sum, self.loss_count = 0.0, 0
+        best = min((p.validation_loss for p in self.points), default=float("inf"))
+        self.points.append(point)
+        if self.place.is_first:
+            if point.validation_loss < best:
+                save_weights(self.network, self.folder / BEST, self._provenance(point))
+            save_curves(self.points, self.folder)
+
+    def _score(self, views: list[View]) -> MaskScore:
+        """Score the network on views of the photographs held out, shared by the processes."""
+        photos_and_views = list(zip(self.photographs.held, views, strict=True))
+        mine = photos_and_views[self.place.rank :: self.place.processes]
+        pairs = (self.photographs.store.load(photo, view) for photo, view in mine)
+        scores = score_network(self.network, pairs, self.engine.device)
+        return mean_score(self.engine.gather(scores))
+
+    def _provenance(self, point: CurvePoint) -> dict[str, str]:
+        """Return what is written into the weights' file."""
+        return {
+            "options": self.options.to_json(),
+            "photographs": str(self.schedule.photos),
+            "photographs_digest": self.photographs.digest,
+            "start": self.start,
+            "point": json.dumps(dataclasses.asdict(point)),
+            **self.origin,
+        }
+
+    def _save(self) -> None:
+        if not self.place.is_first:
+            return
+        state = {
+            "options": self.options.to_json(),
+            "photographs": self.photographs.digest,
+            "start": self.start,
+            "step": self.step,
+            "images": self.images,
+            "loss_sum": self.loss_sum,
+            "loss_count": self.loss_count,
+            "points": [dataclasses.asdict(point) for point in self.points],
+            **self.origin,
+        }
+        save_checkpoint(self.folder / CHECKPOINT, self.network, self.learner.optimizer, state)
+
+    def _resume(self) -> None:
+        """Go on from the checkpoint that the first process finds."""
+        path = self.folder / CHECKPOINT
+        found = read_checkpoint(path) if self.place.is_first and path.exists() else None
+        found = self.engine.broadcast(found)
+        if found is None:
+            return
+        state = found.state
+        if state["options"] != self.options.to_json():
+            raise OptionError(
+                f"{self.folder} holds a run with other options "
+                f"({_difference(state, self.options)}): "
+                "use the same options to continue it, or another folder with -o"
+            )
+        if state["photographs"] != self.photographs.digest:
+            raise OptionError(
+                f"{self.folder} holds a run over other photographs: use the same ones, to train "
+                "on and to validate with, or another folder with -o"
+            )
+        if state["start"] != self.start:
+            raise OptionError(
+                f"{self.folder} holds a run that started from other weights: "
+                "start from the same ones to continue it, or use another folder with -o"
+            )
+        restore(found, path, self.network, self.learner.optimizer)
+        self.step, self.images = state["step"], state["images"]
+        self.loss_sum, self.loss_count = state["loss_sum"], state["loss_count"]
+        self.points = [CurvePoint(**point) for point in state["points"]]
+
+
+def _difference(state: dict, options: TrainingOptions) -> str:
+    """Name the options that differ between a checkpoint and this run."""
+    before, now = json.loads(state["options"]), json.loads(options.to_json())
+    names = [name for name in now if before.get(name) != now[name]]
+    return ", ".join(names) or "an older version"

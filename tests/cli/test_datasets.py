@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import json
+
+import pytest
+
+pytest.importorskip("pooch", reason="needs pooch (pip install '.[data]')")
+
+from deepdetect import datasets
+
+
+def test_list_names_size_and_licence(run) -> None:
+    result = run("datasets", "list")
+    assert result.exit_code == 0
+    assert "coco" in result.output
+    assert "19.3 GB" in result.output
+    assert "licence" in result.output
+    (entry,) = json.loads(run("datasets", "list", "--json").output)
+    assert entry["images"] == 118_287
+
+
+def test_get_reports_what_it_has_written(run, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fake(dataset, folder, quiet):
+        from PIL import Image
+
+        folder.mkdir(parents=True)
+        Image.new("RGB", (16, 16)).save(folder / "a.png")
+        return folder
+
+    monkeypatch.setattr(datasets, "get_dataset", fake)
+    result = run("datasets", "get", "coco", "--json")
+    assert json.loads(result.output)["images"] == 1
+    assert (tmp_path / "data" / "coco" / "a.png").exists()
+
+
+def test_an_unknown_name_ends_with_exit_code_2(run) -> None:
+    result = run("datasets", "get", "kodak")
+    assert result.exit_code == 2
+    assert "known: coco" in result.output

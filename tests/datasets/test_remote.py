@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+import functools
+import hashlib
+import http.server
+import io
+import threading
+import zipfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pooch", reason="needs pooch (pip install '.[data]')")
+
+from deepdetect import DeepDetectError, OptionError
+from deepdetect.datasets import (
+    REMOTE_DATASETS,
+    RemoteDataset,
+    find_remote_dataset,
+    get_dataset,
+)
+
+NAMES = [f"train/{k:04d}.jpg" for k in range(5)]
+
+
+class Server(http.server.ThreadingHTTPServer):
+    """Serves one archive on loopback, by ranges; it can break off after some bytes."""
+
+    daemon_threads = True
+    content = b""
+    break_after: int | None = None
+    knows_ranges = True
+
+    def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
+        self.ranges: list[str | None] = []
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}/train.zip"
+
+
+class Handler(http.server.BaseHTTPRequestHandler):
+    server: Server
+
+    def do_GET(self) -> None:
+        asked = self.headers.get("Range")
+        self.server.ranges.append(asked)
+        first = 0
+        if asked and self.server.knows_ranges:
+            first = int(asked.removeprefix("bytes=").removesuffix("-"))
+            if first >= len(self.server.content):
+                self.send_error(416)
+                return
+        self.send_response(206 if asked and self.server.knows_ranges else 200)
+        self.send_header("Content-Length", str(len(self.server.content) - first))
+        self.end_headers()
+        part = self.server.content[first:]
+        self.wfile.write(part[: self.server.break_after])
+
+    def log_message(self, *arguments: object) -> None:
+        pass
+
+
+def archive() -> bytes:
+    """A zip archive of five files that do not compress, 1 MB together."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as file:
+        for k, name in enumerate(NAMES):
+            noise = b"".join(
+                hashlib.sha256(f"{k} {block}".encode()).digest() for block in range(6500)
+            )
+            file.writestr(name, noise)
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    with Server() as made:
+        made.content = archive()
+        thread = threading.Thread(target=functools.partial(made.serve_forever, 0.01), daemon=True)
+        thread.start()
+        yield made
+        made.shutdown()
+
+
+@pytest.fixture
+def dataset(server: Server) -> RemoteDataset:
+    checksum = "md5:" + hashlib.md5(server.content).hexdigest()
+    return RemoteDataset("tiny", "a test", server.url, checksum, len(server.content), 5, "none")
+
+
+def unpacked(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.jpg"))
+
+
+def test_a_data_set_is_downloaded_and_unpacked(dataset: RemoteDataset, tmp_path: Path) -> None:
+    folder = get_dataset(dataset, tmp_path / "data" / "tiny")
+    assert unpacked(folder) == NAMES
+    assert [path.name for path in folder.parent.iterdir()] == ["tiny"], "nothing else is left"
+
+
+def test_what_is_there_is_not_done_again(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    get_dataset(dataset, tmp_path / "tiny")
+    get_dataset(dataset, tmp_path / "tiny")
+    assert len(server.ranges) == 1
+
+
+def test_a_download_goes_on_where_it_was_broken_off(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    server.break_after = 400_000
+    with pytest.raises(DeepDetectError, match="same command again"):
+        get_dataset(dataset, tmp_path / "tiny")
+    assert not (tmp_path / "tiny").exists()
+    server.break_after = None
+    assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
+    first, second = server.ranges
+    assert first is None
+    assert second is not None
+    assert 300_000 < int(second.removeprefix("bytes=").removesuffix("-")) <= 400_000
+
+
+def test_a_server_without_ranges_sends_all_again(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    server.break_after, server.knows_ranges = 300_000, False
+    with pytest.raises(DeepDetectError):
+        get_dataset(dataset, tmp_path / "tiny")
+    server.break_after = None
+    assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
+
+
+def test_a_run_stopped_between_download_and_check_goes_on(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    (tmp_path / "tiny.zip.part").write_bytes(server.content)
+    assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
+
+
+def test_a_wrong_checksum_is_refused_and_nothing_stays(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    server.content = server.content[:-1] + b"?"
+    with pytest.raises(DeepDetectError, match="checksum"):
+        get_dataset(dataset, tmp_path / "tiny")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_server_that_says_no_is_told_in_one_sentence(
+    dataset: RemoteDataset, tmp_path: Path
+) -> None:
+    gone = replace(dataset, url="http://127.0.0.1:9/train.zip")
+    with pytest.raises(DeepDetectError, match="cannot be downloaded"):
+        get_dataset(gone, tmp_path / "tiny")
+
+
+def test_too_little_room_is_told_before_the_download(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    with pytest.raises(DeepDetectError, match="GB free"):
+        get_dataset(replace(dataset, size=10**18), tmp_path / "tiny")
+    assert server.ranges == []
+
+
+def test_names_are_looked_up() -> None:
+    assert find_remote_dataset("coco").images == 118_287
+    with pytest.raises(OptionError, match="did you mean 'coco'"):
+        find_remote_dataset("cocoo")
+    for name, entry in REMOTE_DATASETS.items():
+        assert name == entry.name
+        assert entry.checksum.startswith(("md5:", "sha256:"))

@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import OptionError
+from deepdetect.labels import LabelOptions, SettingChange, fuse, read_label_settings
+from deepdetect.labels.fast import FastSettings, fast_mask
+from deepdetect.labels.registry import DETECTOR_NAMES
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "labels.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def gray() -> np.ndarray:
+    from skimage import data
+
+    return data.camera()[100:260, 150:310]
+
+
+def test_a_file_chooses_detectors_and_settings(tmp_path: Path, gray: np.ndarray) -> None:
+    settings = read_label_settings(
+        write(
+            tmp_path,
+            'detectors = ["fast"]\n[fast]\nnormal = { threshold = 40, suppression = true }\n'
+            "low_visibility = { threshold = 7 }\n",
+        )
+    )
+    options = LabelOptions(settings.detectors, "normal", settings.changes)
+    np.testing.assert_array_equal(fuse(gray, options).mask, fast_mask(gray, FastSettings(40, True)))
+    low = LabelOptions(settings.detectors, "low", settings.changes)
+    np.testing.assert_array_equal(fuse(gray, low).mask, fast_mask(gray, FastSettings(7)))
+
+
+def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
+    settings = read_label_settings(write(tmp_path, ""))
+    assert settings.detectors == DETECTOR_NAMES
+    assert settings.changes == ()
+
+
+def test_a_whole_number_serves_for_a_fraction() -> None:
+    assert SettingChange("sobel", "low", "relative_threshold", 1).value == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [
+        ('detectors = ["fasst"]', "did you mean 'fast'"),
+        ('detectors = "fast"', "list of names"),
+        ("[fasst]\nnormal = { threshold = 3 }", "did you mean 'fast'"),
+        ("[fast]\nnormall = { threshold = 3 }", "did you mean 'normal'"),
+        ("[fast]\nnormal = { treshold = 3 }", "did you mean 'threshold'"),
+        ("[fast]\nnormal = { threshold = 3.5 }", "type int"),
+        ("[fast]\nnormal = { suppression = 1 }", "type bool"),
+        ("[fast]\nnormal = 3", "must be a table"),
+        ("fast = 3", "must be a table"),
+        ("[fast", "no valid TOML"),
+    ],
+)
+def test_mistakes_in_the_file_are_named(tmp_path: Path, text: str, hint: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(OptionError, match=hint):
+        read_label_settings(path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=r"none\.toml cannot be read"):
+        read_label_settings(tmp_path / "none.toml")
