@@ -143,13 +143,10 @@ def test_own_photographs_and_settings_from_the_shipped_weights(
     photographs: Path, tmp_path: Path
 ) -> None:
     """The command of docs/fine-tuning.md, on few photographs."""
-    from deepdetect.detector import bundled_weights
-
     settings = tmp_path / "labels.toml"
     settings.write_text('detectors = ["fast", "sobel"]\n[fast]\nnormal = { threshold = 30 }\n')
-    start = bundled_weights().with_suffix(".safetensors")
     arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
-    arguments += [str(tmp_path / "run"), "--start", str(start), "--label-settings", str(settings)]
+    arguments += [str(tmp_path / "run"), "--start", "bundled", "--label-settings", str(settings)]
     arguments += ["--stage", "96x4x12", "--short-side", "96", "--learning-rate", "0.0005"]
     arguments += ["--warm-up", "5", "--dark-fraction", "0"]
     arguments += [

@@ -1,47 +1,130 @@
-"""`deepdetect evaluate`: how well weights predict known masks."""
+"""`deepdetect evaluate`: how good weights are."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from .shared import PATH, detector_options, json_option, make_detector, print_json
 
+if TYPE_CHECKING:
+    from ..detector import DeepDetect
+    from ..mask_scores import MaskScore
+    from ..weights_quality import OxfordQuality
 
-@click.command(short_help="How well weights predict known masks.")
+WIDTH = 12
+
+
+@click.command(short_help="How good weights are.")
 @click.argument("samples", type=PATH)
 @detector_options
+@click.option(
+    "--against",
+    type=PATH,
+    multiple=True,
+    metavar="WEIGHTS",
+    help="Measure these weights too, beside the first; may be repeated.",
+)
+@click.option(
+    "--oxford",
+    type=PATH,
+    metavar="FOLDER",
+    help="Measure density, repeatability and correct matches on the eight Oxford scenes too.",
+)
 @json_option
 def evaluate(
     samples: Path,
+    against: tuple[Path, ...],
+    oxford: Path | None,
     as_json: bool,
     **values: Any,
 ) -> None:
     r"""Score the network on a folder SAMPLES of image_NAME.png with mask_image_NAME.png.
 
     Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), apart
-    for normal and for low-visibility images.
+    for normal and for low-visibility images; with --oxford also what the paper's protocol
+    gives: images squashed to 480x480, FLANN, ratio 0.99, correct under 1 px.
 
     \b
     deepdetect evaluate samples/
-    deepdetect evaluate samples/ --weights run/deepdetect.onnx
+    deepdetect evaluate samples/ --weights run/deepdetect.onnx --against other.onnx
     """
+    from ..detector import DeepDetect
     from ..mask_scores import score_samples
 
-    detector = make_detector(values)
-    scores = score_samples(detector.heatmap, samples, quiet=as_json)
+    first = make_detector(values)
+    backend = "auto" if against else first.backend
+    detectors = [first, *(DeepDetect(path, backend=backend) for path in against)]
+    scores = [score_samples(each.heatmap, samples, quiet=as_json) for each in detectors]
+    on_oxford = _measure_oxford(detectors, oxford, as_json) if oxford is not None else []
     if as_json:
-        print_json(
-            {
+        results = []
+        for k, (detector, score) in enumerate(zip(detectors, scores, strict=True)):
+            result = {
                 "weights": detector.weights,
                 "backend": detector.backend,
-                **{name: asdict(score) for name, score in scores.items()},
+                **{name: asdict(value) for name, value in score.items()},
             }
-        )
+            if on_oxford:
+                result["oxford"] = asdict(on_oxford[k])
+            results.append(result)
+        print_json({**results[0], "against": results[1:]} if against else results[0])
         return
-    click.echo(f"{'visibility':<12}{'images':>8}{'BCE':>9}{'IoU':>8}")
-    for name, score in scores.items():
-        click.echo(f"{name:<12}{score.images:>8}{score.loss:>9.4f}{score.iou:>8.3f}")
+    names = [_short(detector.weights) for detector in detectors]
+    _print_scores(names, scores)
+    if on_oxford:
+        click.echo()
+        _print_oxford(names, on_oxford)
+
+
+def _measure_oxford(
+    detectors: Sequence[DeepDetect], folder: Path, quiet: bool
+) -> list[OxfordQuality]:
+    from ..datasets.oxford import load_oxford
+    from ..progress import progress
+    from ..weights_quality import oxford_quality, oxford_steps
+
+    scenes = load_oxford(folder)
+    total = oxford_steps(scenes) * len(detectors)
+    with progress(total, "Oxford", "step", quiet) as bar:
+        return [oxford_quality(detector, scenes, bar.update) for detector in detectors]
+
+
+def _short(path: Path) -> str:
+    """Return a name that fits a table: the file's, without its ending."""
+    name = path.stem
+    return name if len(name) <= 2 * WIDTH else f"...{name[3 - 2 * WIDTH :]}"
+
+
+def _row(title: str, values: Sequence[str]) -> None:
+    click.echo(f"{title:<24}" + "".join(f"{value:>{2 * WIDTH + 2}}" for value in values))
+
+
+def _print_scores(names: Sequence[str], scores: Sequence[dict[str, MaskScore]]) -> None:
+    if len(names) == 1:
+        click.echo(f"{'visibility':<12}{'images':>8}{'BCE':>9}{'IoU':>8}")
+        for name, score in scores[0].items():
+            click.echo(f"{name:<12}{score.images:>8}{score.loss:>9.4f}{score.iou:>8.3f}")
+        return
+    _row("known masks, BCE / IoU", names)
+    for visibility, score in scores[0].items():
+        cells = [f"{each[visibility].loss:.4f} / {each[visibility].iou:.3f}" for each in scores]
+        _row(f"  {visibility} ({score.images} images)", cells)
+
+
+def _print_oxford(names: Sequence[str], found: Sequence[OxfordQuality]) -> None:
+    _row("Oxford, density", names)
+    for threshold in found[0].density:
+        _row(f"  tau {threshold}", [f"{each.density[threshold]:.4f}" for each in found])
+    _row("repeatability at 1 px", names)
+    for scene in found[0].repeatability:
+        _row(f"  {scene}", [f"{each.repeatability[scene]:.4f}" for each in found])
+    means = [sum(each.repeatability.values()) / len(each.repeatability) for each in found]
+    _row("  mean", [f"{mean:.4f}" for mean in means])
+    _row("correct matches of all", names)
+    for pair in found[0].correct:
+        _row(f"  {pair}", [f"{each.correct[pair]:,} / {each.matches[pair]:,}" for each in found])

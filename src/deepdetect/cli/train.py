@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 )
 @click.option("--labels", type=PATH, help="Folder for the label cache.  [default: in the run's]")
 @click.option(
-    "--start", type=PATH, help="Weights (.safetensors) to start from.  [default: random ones]"
+    "--start",
+    type=PATH,
+    help="Weights (.safetensors) to start from, or the word bundled.  [default: random ones]",
 )
 @click.option(
     "--stage",

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from ..detector import bundled_weights
 from ..network.espnet import ESPNet
 from ..network.weights import load_network
 from ..progress import progress
@@ -16,6 +17,8 @@ from .preparation import prepare
 from .profile import WARM_UP_STEPS, StageProfile, profile_stages
 from .recipe import TrainingOptions
 from .run import Run, TrainingResult
+
+BUNDLED = bundled_weights().with_suffix(".safetensors")
 
 
 def train(
@@ -43,7 +46,8 @@ def train(
         options: the recipe.
         validation: folder of other photographs; default: some are held out.
         labels: folder for the label cache; default: in `output`.
-        start: weights (.safetensors) to start from; default: random ones, by the seed.
+        start: weights (.safetensors) to start from, or "bundled" for those inside the
+            package; default: random ones, by the seed.
         device: how the network is run.
         workers: processes that make labels; default one for each processor.
         say: takes the one line that says how the network is run; without it there is
@@ -126,6 +130,6 @@ def profile(
 def _first_network(options: TrainingOptions, start: str | Path | None) -> ESPNet:
     """Make the network with the weights that the run starts from."""
     if start is not None:
-        return load_network(start)
+        return load_network(BUNDLED if str(start) == "bundled" else start)
     torch.manual_seed(options.seed)
     return ESPNet()

@@ -1,0 +1,72 @@
+"""Scenes of planar data sets: images with the true homographies between them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import ImageError
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarPair:
+    """Two images of a plane, or from one point of view.
+
+    Attributes:
+        scene: the scene's name.
+        number: the second image's number; the first one's is 1.
+        first, second: the images' files.
+        homography: (3, 3) float64, takes columns (x, y, 1) of the first image to the
+            second; centre of the first pixel (0, 0).
+    """
+
+    scene: str
+    number: int
+    first: Path
+    second: Path
+    homography: np.ndarray
+
+    @property
+    def name(self) -> str:
+        """As papers write it: "graf 1-6"."""
+        return f"{self.scene} 1-{self.number}"
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarScene:
+    """A scene: its first image, and others with their homographies from the first.
+
+    Attributes:
+        name: the scene's name.
+        images: the files, the first one first.
+        homographies: one for each image but the first.
+    """
+
+    name: str
+    images: tuple[Path, ...]
+    homographies: tuple[np.ndarray, ...]
+
+    def pairs(self) -> Iterator[PlanarPair]:
+        """Yield the pairs of the first image with each other one."""
+        for k, homography in enumerate(self.homographies, start=2):
+            yield PlanarPair(self.name, k, self.images[0], self.images[k - 1], homography)
+
+
+def read_homography(path: Path) -> np.ndarray:
+    """Read nine numbers from a text file as a (3, 3) float64 matrix.
+
+    Raises:
+        ImageError: the file is missing or holds something else.
+    """
+    try:
+        matrix = np.array(path.read_text().split(), np.float64).reshape(3, 3)
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check the folder") from None
+    except ValueError:
+        raise ImageError(f"{path} holds no 3x3 matrix: nine numbers are expected") from None
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
+        raise ImageError(f"{path} holds no homography: the matrix cannot be inverted")
+    return matrix

@@ -1,0 +1,109 @@
+"""How good weights are, by the measures of the paper: known masks, and the Oxford scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from .datasets.oxford import find_scene
+from .datasets.planar import PlanarPair, PlanarScene
+from .detector import DeepDetect
+from .geometry.residuals import transfer_errors
+from .heatmap import HeatmapOptions
+from .image import load_image
+from .keypoints import Keypoints, SelectionOptions, select_keypoints
+from .matching import match_images
+from .metrics import published_repeatability
+
+THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
+PAIRS = (
+    *(("graf", 6), ("wall", 6), ("bikes", 6), ("leuven", 6), ("trees", 6), ("ubc", 6)),
+    ("boat", 2),
+)
+"""The pairs of the paper's Table II: scene, and number of the second image."""
+
+RESOLUTION = 480
+CORRECT = 1.0  # pixels, strictly under
+
+
+@dataclass(frozen=True)
+class OxfordQuality:
+    """What weights give on the Oxford scenes, images squashed to 480x480 and RGB.
+
+    Attributes:
+        density: keypoints a pixel at each of `THRESHOLDS`, mean over all images.
+        repeatability: by scene, mean over its five pairs, as published, clipped.
+        correct: correct matches (FLANN, ratio 0.99, under 1 px by the published
+            homography) by pair.
+        matches: all matches that pass the ratio test, by pair.
+    """
+
+    density: dict[float, float]
+    repeatability: dict[str, float]
+    correct: dict[str, int]
+    matches: dict[str, int]
+
+
+def oxford_quality(
+    detector: DeepDetect,
+    scenes: list[PlanarScene],
+    done: Callable[[int], object] = lambda _: None,
+) -> OxfordQuality:
+    """Measure weights on the Oxford scenes.
+
+    Args:
+        detector: its weights are measured; its own resolution is not used.
+        scenes: of `load_oxford`.
+        done: called with 1 after each of `oxford_steps` steps.
+    """
+    squashing = detector.configured(HeatmapOptions(RESOLUTION))
+    densities: dict[float, list[float]] = {threshold: [] for threshold in THRESHOLDS}
+    repeatability = {}
+    for scene in scenes:
+        points = []
+        for path in scene.images:
+            heatmap = squashing.heatmap(load_image(path))
+            for threshold in THRESHOLDS:
+                densities[threshold].append(float((heatmap > threshold).mean()))
+            points.append(select_keypoints(heatmap, SelectionOptions()))
+            done(1)
+        repeatability[scene.name] = _scene_repeatability(scene, points)
+    correct, matches = {}, {}
+    for name, number in PAIRS:
+        pair = list(find_scene(scenes, name).pairs())[number - 2]
+        correct[pair.name], matches[pair.name] = count_correct(detector, pair)
+        done(1)
+    density = {threshold: float(np.mean(found)) for threshold, found in densities.items()}
+    return OxfordQuality(density, repeatability, correct, matches)
+
+
+def oxford_steps(scenes: list[PlanarScene]) -> int:
+    """Return how often `oxford_quality` calls `done`."""
+    return sum(len(scene.images) for scene in scenes) + len(PAIRS)
+
+
+def _scene_repeatability(scene: PlanarScene, points: list[Keypoints]) -> float:
+    values = [
+        published_repeatability(points[0].xy, points[pair.number - 1].xy, pair.homography)
+        for pair in scene.pairs()
+    ]
+    return float(np.mean(values))
+
+
+def count_correct(detector: DeepDetect, pair: PlanarPair) -> tuple[int, int]:
+    """Match a pair the paper's way, but with the channels in the order of the training.
+
+    Returns:
+        The number of correct matches, and of all.
+    """
+    found = match_images(
+        pair.first,
+        pair.second,
+        detector,
+        preset="published",
+        heatmap=HeatmapOptions(RESOLUTION),
+    )
+    errors = transfer_errors(found.points0, found.points1, pair.homography)
+    return int(np.count_nonzero(errors < CORRECT)), len(found)

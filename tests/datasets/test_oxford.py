@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import ImageError, OptionError
+from deepdetect.datasets.oxford import SCENES, find_scene, load_oxford
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The public layout, with homographies that can be told apart."""
+    for index, scene in enumerate(SCENES):
+        (tmp_path / scene).mkdir()
+        for number in range(1, 7):
+            (tmp_path / scene / f"img{number}.ppm").touch()
+        for number in range(2, 7):
+            text = f"1 0 {index}\n0 1 {number}\n0 0 1\n"
+            (tmp_path / scene / f"H1to{number}p").write_text(text)
+    (tmp_path / "graf" / "H1to6p.refined").write_text("1 0 0.5 0 1 0.5 0 0 1")
+    return tmp_path
+
+
+def test_scenes_have_six_images_and_five_pairs(folder: Path) -> None:
+    scenes = load_oxford(folder)
+    assert tuple(scene.name for scene in scenes) == SCENES
+    pairs = list(find_scene(scenes, "boat").pairs())
+    assert [pair.name for pair in pairs] == [f"boat 1-{number}" for number in range(2, 7)]
+    assert pairs[3].second.name == "img5.ppm"
+    np.testing.assert_array_equal(pairs[3].homography, [[1, 0, 2], [0, 1, 5], [0, 0, 1]])
+
+
+def test_refined_homographies_are_taken_where_there_are(folder: Path) -> None:
+    published = find_scene(load_oxford(folder), "graf").homographies
+    refined = find_scene(load_oxford(folder, "refined"), "graf").homographies
+    assert refined[4][0, 2] == 0.5
+    np.testing.assert_array_equal(published[:4], refined[:4])
+
+
+def test_what_is_missing_or_wrong_is_named(folder: Path) -> None:
+    with pytest.raises(OptionError, match="did you mean 'refined'"):
+        load_oxford(folder, "refine")
+    with pytest.raises(OptionError, match="known are bark"):
+        find_scene(load_oxford(folder), "grafitti")
+    (folder / "wall" / "H1to3p").write_text("1 2 3")
+    with pytest.raises(ImageError, match="nine numbers"):
+        load_oxford(folder)
+    (folder / "ubc" / "img4.ppm").unlink()
+    with pytest.raises(ImageError, match="no img4 in"):
+        load_oxford(folder)
+
+
+def test_the_shared_copy_is_complete(shared: Path) -> None:
+    scenes = load_oxford(shared / "data" / "oxford", "refined")
+    assert sum(len(scene.images) for scene in scenes) == 48

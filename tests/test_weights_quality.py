@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetect
+from deepdetect.datasets.oxford import SCENES, load_oxford
+from deepdetect.weights_quality import PAIRS, THRESHOLDS, oxford_quality, oxford_steps
+
+SIZE = 160
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight scenes of small crops, each image shifted by whole pixels against the first."""
+    from skimage import data
+
+    root = tmp_path_factory.mktemp("oxford")
+    image = cv2.resize(data.astronaut(), (384, 384), interpolation=cv2.INTER_AREA)
+    for index, scene in enumerate(SCENES):
+        (root / scene).mkdir()
+        for number in range(1, 7):
+            left, top = 8 * index + 2 * (number - 1), 40 + number - 1
+            crop = np.ascontiguousarray(image[top : top + SIZE, left : left + SIZE])
+            Image.fromarray(crop).save(root / scene / f"img{number}.png")
+            if number > 1:
+                shift = f"1 0 {-2 * (number - 1)} 0 1 {-(number - 1)} 0 0 1"
+                (root / scene / f"H1to{number}p").write_text(shift)
+    return root
+
+
+def test_shifted_images_repeat_and_match(folder: Path) -> None:
+    scenes = load_oxford(folder)
+    steps: list[int] = []
+    found = oxford_quality(DeepDetect(), scenes, steps.append)
+    assert sum(steps) == oxford_steps(scenes) == 48 + 7
+    densities = [found.density[threshold] for threshold in THRESHOLDS]
+    assert densities == sorted(densities, reverse=True)
+    assert 0.1 < densities[0] < 0.9
+    assert set(found.repeatability) == set(SCENES)
+    assert min(found.repeatability.values()) > 0.8
+    assert set(found.correct) == {f"{scene} 1-{number}" for scene, number in PAIRS}
+    for pair, correct in found.correct.items():
+        assert 0.5 * found.matches[pair] < correct <= found.matches[pair]
+
+
+def test_the_command_prints_weights_side_by_side(run_evaluate, folder: Path) -> None:
+    weights = "src/deepdetect/weights/deepdetect.onnx"
+    text = run_evaluate("--against", weights, "--oxford", folder)
+    for word in ("BCE", "tau 0.9", "graf 1-6", "boat 1-2", "mean"):
+        assert word in text
+    line = next(line for line in text.splitlines() if "graf 1-6" in line)
+    assert line.count("/") == 2
+
+
+@pytest.fixture
+def run_evaluate(tmp_path: Path):
+    """Run `deepdetect evaluate` on one sample and return what it prints."""
+    from click.testing import CliRunner
+
+    from deepdetect.cli import main
+    from deepdetect.detector import bundled_weights
+
+    generator = np.random.default_rng(0)
+    Image.fromarray(generator.integers(0, 256, (64, 64, 3), np.uint8)).save(
+        tmp_path / "image_1.png"
+    )
+    Image.fromarray(generator.random((64, 64)) > 0.5).save(tmp_path / "mask_image_1.png")
+
+    def run(*arguments: object) -> str:
+        given = [bundled_weights() if str(a).endswith(".onnx") else a for a in arguments]
+        result = CliRunner().invoke(main, ["evaluate", str(tmp_path), *map(str, given)])
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    return run
