@@ -139,6 +139,19 @@ def test_where_weights_come_from_is_written_into_them(unbroken: Path) -> None:
     assert {"command", "commit", "versions", "machine", "photographs"} <= state.keys()
 
 
+def test_the_model_card_tells_it_too(unbroken: Path) -> None:
+    from safetensors import safe_open
+
+    with safe_open(unbroken / "best.safetensors", "pt") as file:
+        notes = file.metadata()
+    card = (unbroken / "MODEL_CARD.md").read_text()
+    for name in ("command", "commit", "versions", "photographs_digest", "start"):
+        assert notes[name] in card
+    rows = (unbroken / "curves.csv").read_text().splitlines()
+    assert card.count("\n| ") > len(rows), "options and losses are tables"
+    assert "short_sides | [96, 64]" in card
+
+
 def test_own_photographs_and_settings_from_the_shipped_weights(
     photographs: Path, tmp_path: Path
 ) -> None:

@@ -53,6 +53,19 @@ def load_network(path: str | Path) -> ESPNet:
     return network.eval()
 
 
+def read_notes(path: str | Path) -> dict[str, str]:
+    """Read the notes in a weights file's header.
+
+    Raises:
+        WeightsError: the file is missing or damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            return dict(file.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path} is not a weights file ({error})") from None
+
+
 def weights_digest(network: nn.Module) -> str:
     """Return the SHA-256 of a network's state, the same whatever file it came from."""
     digest = hashlib.sha256()

@@ -15,13 +15,14 @@ from ..errors import OptionError
 from ..mask_scores import MaskScore, mean_score
 from ..network.espnet import ESPNet
 from ..network.onnx_export import export_onnx
-from ..network.weights import load_network, save_weights, weights_digest
+from ..network.weights import load_network, read_notes, save_weights, weights_digest
 from ..progress import progress
 from .batches import Batches
 from .checkpoint import read_checkpoint, restore, save_checkpoint
 from .curves import CurvePoint, save_curves
 from .device import DeviceOptions
 from .learner import Learner, NotFiniteError
+from .model_card import write_model_card
 from .preparation import Photographs, largest
 from .provenance import provenance
 from .recipe import Schedule, TrainingOptions
@@ -31,6 +32,7 @@ from .views import View
 CHECKPOINT = "checkpoint.safetensors"
 BEST = "best.safetensors"
 ONNX = "deepdetect.onnx"
+CARD = "MODEL_CARD.md"
 CHECKPOINT_SECONDS = 60.0  # a killed run loses at most so much
 
 
@@ -135,6 +137,8 @@ class Run:
         best = min(self.points, key=lambda point: point.validation_loss)
         if self.place.is_first:
             export_onnx(load_network(self.folder / BEST), self.folder / ONNX)
+            notes = read_notes(self.folder / BEST)
+            write_model_card(self.folder / CARD, self.folder / BEST, notes, self.points)
         rate = pixels / (480 * 480) / seconds
         return TrainingResult(self.folder / BEST, self.folder / ONNX, self.points, best, rate)
 
