@@ -53,8 +53,19 @@ def test_the_command_prints_weights_side_by_side(run_evaluate, folder: Path) -> 
     text = run_evaluate("--against", weights, "--oxford", folder)
     for word in ("BCE", "tau 0.9", "graf 1-6", "boat 1-2", "mean"):
         assert word in text
-    line = next(line for line in text.splitlines() if "graf 1-6" in line)
-    assert line.count("/") == 2
+    for word in ("graf 1-6", "normal (1 images)", "tau 0.9", "bark"):
+        line = next(line for line in text.splitlines() if word in line)
+        cells = line.split(word)[1].replace(" / ", "/").split()
+        assert len(cells) == 2
+        assert cells[0] == cells[1], "the same weights give the same"
+
+
+def test_all_weights_see_the_images_alike(run_evaluate, tmp_path: Path) -> None:
+    import json
+
+    found = json.loads(run_evaluate("--against", "deepdetect.onnx", "--resolution", 160, "--json"))
+    native = json.loads(run_evaluate("--json"))
+    assert found["normal"] == found["against"][0]["normal"] != native["normal"]
 
 
 @pytest.fixture

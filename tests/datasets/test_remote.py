@@ -32,6 +32,7 @@ class Server(http.server.ThreadingHTTPServer):
     content = b""
     break_after: int | None = None
     knows_ranges = True
+    status: int | None = None
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
@@ -48,6 +49,9 @@ class Handler(http.server.BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         asked = self.headers.get("Range")
         self.server.ranges.append(asked)
+        if self.server.status is not None:
+            self.send_error(self.server.status)
+            return
         first = 0
         if asked and self.server.knows_ranges:
             first = int(asked.removeprefix("bytes=").removesuffix("-"))
@@ -149,6 +153,50 @@ def test_a_wrong_checksum_is_refused_and_nothing_stays(
     with pytest.raises(DeepDetectError, match="checksum"):
         get_dataset(dataset, tmp_path / "tiny")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stop_while_the_checksum_is_taken_loses_nothing(
+    dataset: RemoteDataset, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import pooch.core
+
+    def stopped(*arguments: object, **options: object) -> bool:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pooch.core, "hash_matches", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            get_dataset(dataset, tmp_path / "tiny")
+    assert [path.name for path in tmp_path.iterdir()] == ["tiny.zip.part"]
+    assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
+    assert server.ranges == [None, f"bytes={len(server.content)}-"], "no byte came twice"
+
+
+def test_a_folder_of_something_else_is_refused(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    (tmp_path / "tiny").mkdir()
+    (tmp_path / "tiny" / "mine.jpg").touch()
+    with pytest.raises(DeepDetectError, match="holds 1 images, not the 5 of tiny"):
+        get_dataset(dataset, tmp_path / "tiny")
+    assert server.ranges == []
+
+
+def test_an_empty_folder_is_filled(dataset: RemoteDataset, tmp_path: Path) -> None:
+    (tmp_path / "tiny").mkdir()
+    assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
+
+
+def test_an_archive_with_too_few_images_is_refused(dataset: RemoteDataset, tmp_path: Path) -> None:
+    with pytest.raises(DeepDetectError, match="holds 5 images, not the 6"):
+        get_dataset(replace(dataset, images=6), tmp_path / "tiny")
+    assert not (tmp_path / "tiny").exists()
+
+
+def test_the_servers_answer_is_told(dataset: RemoteDataset, server: Server, tmp_path: Path) -> None:
+    server.status = 404
+    with pytest.raises(DeepDetectError, match="answers 404"):
+        get_dataset(dataset, tmp_path / "tiny")
 
 
 def test_a_server_that_says_no_is_told_in_one_sentence(

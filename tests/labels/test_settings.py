@@ -61,6 +61,9 @@ def test_a_whole_number_serves_for_a_fraction() -> None:
         ("[fast]\nnormal = 3", "must be a table"),
         ("fast = 3", "must be a table"),
         ("[fast", "no valid TOML"),
+        ("[sobel]\nnormal = { kernel_size = 12 }", "OpenCV refuses the settings of sobel"),
+        ("[sobel]\nnormal = { relative_threshold = nan }", "must be finite"),
+        ('detectors = ["sobel"]\n[fast]\nnormal = { threshold = 3 }', "not among the detectors"),
     ],
 )
 def test_mistakes_in_the_file_are_named(tmp_path: Path, text: str, hint: str) -> None:
@@ -72,3 +75,19 @@ def test_mistakes_in_the_file_are_named(tmp_path: Path, text: str, hint: str) ->
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=r"none\.toml cannot be read"):
         read_label_settings(tmp_path / "none.toml")
+
+
+def test_the_order_in_the_file_says_nothing(tmp_path: Path) -> None:
+    first = read_label_settings(
+        write(
+            tmp_path,
+            "[sobel]\nnormal = { relative_threshold = 1 }\n[fast]\nnormal = { threshold = 9 }",
+        )
+    )
+    second = read_label_settings(
+        write(
+            tmp_path,
+            "[fast]\nnormal = { threshold = 9 }\n[sobel]\nnormal = { relative_threshold = 1.0 }",
+        )
+    )
+    assert first == second

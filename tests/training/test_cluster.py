@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -26,14 +29,24 @@ ARGUMENTS = [
 ]
 
 
-def run(processes: int, photographs: Path, output: Path, labels: Path, *more: str) -> str:
-    """Train in so many processes (gloo) and return what is printed."""
-    launcher = [sys.executable]
-    if processes > 1:
-        launcher += ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
-    command = [*launcher, "-m", "deepdetect", "train", str(photographs), "-o", str(output)]
-    command += ["--labels", str(labels), "--device", "cpu", *ARGUMENTS, *more]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+def launcher(processes: int) -> list[str]:
+    if processes == 1:
+        return [sys.executable]
+    torchrun = ["torch.distributed.run", "--standalone", f"--nproc-per-node={processes}"]
+    return [sys.executable, "-m", *torchrun]
+
+
+def command(processes: int, photographs: Path, output: Path, labels: Path) -> list[str]:
+    """A tiny run in so many processes (gloo)."""
+    arguments = ["-m", "deepdetect", "train", str(photographs), "-o", str(output)]
+    arguments += ["--labels", str(labels), "--device", "cpu", *ARGUMENTS]
+    return [*launcher(processes), *arguments]
+
+
+def run(processes: int, photographs: Path, output: Path, labels: Path) -> str:
+    """Train and return what is printed."""
+    whole = command(processes, photographs, output, labels)
+    done = subprocess.run(whole, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -75,30 +88,102 @@ def test_only_the_first_process_speaks(two_processes: tuple[Path, str]) -> None:
     assert "2 processes" in output
 
 
-def test_a_run_of_two_processes_goes_on_in_two(
-    photographs: Path, two_processes: tuple[Path, str]
+GRADIENTS = """
+import sys
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from torch.nn.functional import binary_cross_entropy_with_logits
+from deepdetect.network.espnet import ESPNet
+from deepdetect.training.device import DeviceOptions, Engine
+
+torch.manual_seed(0)
+network = ESPNet()
+engine = Engine(network, DeviceOptions("cpu", "float32", compile=False, threads=1))
+generator = np.random.default_rng(0)
+rgb = generator.integers(0, 256, (4, 64, 64, 3), np.uint8)
+masks = torch.from_numpy(generator.random((4, 1, 64, 64)) > 0.5).float()
+mine = engine.place.share(4)
+network.train()
+loss = binary_cross_entropy_with_logits(engine.logits(engine.images(rgb[mine])), masks[mine])
+engine.backward(loss)
+if engine.place.is_first:
+    tensors = {f"gradient.{n}": p.grad.contiguous() for n, p in network.named_parameters()}
+    tensors |= {n: b.float().contiguous() for n, b in network.named_buffers()}
+    save_file(tensors, sys.argv[1])
+engine.close()
+"""
+
+
+def test_gradients_and_statistics_are_those_of_one_process(tmp_path: Path) -> None:
+    """Adam would hide gradients that are too large by a factor."""
+    from safetensors.torch import load_file
+
+    script = tmp_path / "gradients.py"
+    script.write_text(GRADIENTS)
+    results = []
+    for processes in (1, 2):
+        path = tmp_path / f"{processes}.safetensors"
+        subprocess.run(
+            [*launcher(processes), str(script), str(path)], check=True, capture_output=True
+        )
+        results.append(load_file(path))
+    alone, together = results
+    assert alone.keys() == together.keys()
+    largest = max(float(alone[name].norm()) for name in alone if name.startswith("gradient."))
+    for name, expected in alone.items():
+        tolerance = 1e-4 * (largest if name.startswith("gradient.") else 1)
+        torch.testing.assert_close(together[name], expected, atol=tolerance, rtol=1e-4)
+
+
+def test_a_killed_run_of_two_processes_goes_on_with_the_same_losses(
+    photographs: Path, two_processes: tuple[Path, str], tmp_path: Path
 ) -> None:
-    folder = two_processes[0]
-    before = (folder / "checkpoint.safetensors").read_bytes()
-    run(2, photographs, folder, folder.parent / "labels")
-    assert (folder / "checkpoint.safetensors").read_bytes() == before
+    unbroken = two_processes[0]
+    whole = command(2, photographs, tmp_path / "killed", unbroken.parent / "labels")
+    process = subprocess.Popen(
+        whole, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    checkpoint = tmp_path / "killed" / "checkpoint.safetensors"
+    deadline = time.monotonic() + 120
+    while not checkpoint.exists() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "killed" / "deepdetect.onnx").exists(), "it was killed before its end"
+    subprocess.run(whole, check=True, capture_output=True, timeout=300)
+    for expected, found in zip(curves(unbroken), curves(tmp_path / "killed"), strict=True):
+        assert found["training_loss"] == pytest.approx(expected["training_loss"], abs=1e-5)
+        assert found["validation_loss"] == pytest.approx(expected["validation_loss"], abs=1e-5)
 
 
-def test_an_uneven_share_is_refused(photographs: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
-    command += [str(tmp_path / "run"), *ARGUMENTS, "--stage", "64x3x1", "--device", "cpu"]
-    environment = {
-        **os.environ,
-        "TORCHELASTIC_RUN_ID": "test",
-        "RANK": "0",
-        "WORLD_SIZE": "1",
-        "LOCAL_RANK": "0",
-        "LOCAL_WORLD_SIZE": "1",
-    }
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, "one process takes any batch"
-    with pytest.raises(OptionError, match="multiple"):
-        Place(1, 2, 1, 2).share(3)
+def test_an_uneven_share_is_told_before_any_work(photographs: Path, tmp_path: Path) -> None:
+    whole = [*command(2, photographs, tmp_path / "run", tmp_path / "labels"), "--stage", "64x3x1"]
+    done = subprocess.run(whole, capture_output=True, text=True, timeout=300)
+    assert done.returncode != 0
+    assert "a batch of 3 cannot be shared evenly by 2 processes" in done.stderr
+    assert "OptionError" not in done.stderr
+    assert not (tmp_path / "labels").exists()
+
+
+def test_processes_without_the_same_photographs_all_stop(photographs: Path, tmp_path: Path) -> None:
+    """As on two machines, one of which lacks a photograph."""
+    script = tmp_path / "machine.py"
+    for k in range(2):
+        shutil.copytree(photographs, tmp_path / f"photos{k}")
+    (tmp_path / "photos1" / "photo03.png").unlink()
+    arguments = ["train", "PHOTOS", "-o", str(tmp_path / "run"), "--device", "cpu", *ARGUMENTS]
+    script.write_text(
+        "import os, sys\n"
+        "from deepdetect.cli import main\n"
+        f"arguments = {arguments!r}\n"
+        f"arguments[1] = {str(tmp_path / 'photos')!r} + os.environ['RANK']\n"
+        "main(arguments)\n"
+    )
+    done = subprocess.run([*launcher(2), str(script)], capture_output=True, text=True, timeout=300)
+    assert done.returncode != 0
+    assert "every machine needs the same files" in done.stderr
+    assert not (tmp_path / "run" / "checkpoint.safetensors").exists()
 
 
 @given(processes=st.integers(1, 9), part=st.integers(1, 9))
@@ -124,3 +209,6 @@ def test_the_place_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch)
     assert place == Place(3, 8, 1, 2)
     assert place.machines == 4
     assert not place.is_first
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
+    with pytest.raises(OptionError, match="as many processes on each machine"):
+        place_in_cluster()

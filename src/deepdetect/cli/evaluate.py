@@ -12,6 +12,7 @@ import click
 from .shared import PATH, detector_options, json_option, make_detector, print_json
 
 if TYPE_CHECKING:
+    from ..datasets.planar import PlanarScene
     from ..detector import DeepDetect
     from ..mask_scores import MaskScore
     from ..weights_quality import OxfordQuality
@@ -53,14 +54,14 @@ def evaluate(
     deepdetect evaluate samples/
     deepdetect evaluate samples/ --weights run/deepdetect.onnx --against other.onnx
     """
-    from ..detector import DeepDetect
+    from ..datasets.oxford import load_oxford
     from ..mask_scores import score_samples
 
-    first = make_detector(values)
-    backend = "auto" if against else first.backend
-    detectors = [first, *(DeepDetect(path, backend=backend) for path in against)]
+    scenes = load_oxford(oxford) if oxford is not None else []
+    weights = [values["weights"], *against]
+    detectors = [make_detector({**values, "weights": path}) for path in weights]
     scores = [score_samples(each.heatmap, samples, quiet=as_json) for each in detectors]
-    on_oxford = _measure_oxford(detectors, oxford, as_json) if oxford is not None else []
+    on_oxford = _measure_oxford(detectors, scenes, as_json) if scenes else []
     if as_json:
         results = []
         for k, (detector, score) in enumerate(zip(detectors, scores, strict=True)):
@@ -74,7 +75,7 @@ def evaluate(
             results.append(result)
         print_json({**results[0], "against": results[1:]} if against else results[0])
         return
-    names = [_short(detector.weights) for detector in detectors]
+    names = _short_names([detector.weights for detector in detectors])
     _print_scores(names, scores)
     if on_oxford:
         click.echo()
@@ -82,22 +83,22 @@ def evaluate(
 
 
 def _measure_oxford(
-    detectors: Sequence[DeepDetect], folder: Path, quiet: bool
+    detectors: Sequence[DeepDetect], scenes: list[PlanarScene], quiet: bool
 ) -> list[OxfordQuality]:
-    from ..datasets.oxford import load_oxford
     from ..progress import progress
     from ..weights_quality import oxford_quality, oxford_steps
 
-    scenes = load_oxford(folder)
     total = oxford_steps(scenes) * len(detectors)
     with progress(total, "Oxford", "step", quiet) as bar:
         return [oxford_quality(detector, scenes, bar.update) for detector in detectors]
 
 
-def _short(path: Path) -> str:
-    """Return a name that fits a table: the file's, without its ending."""
-    name = path.stem
-    return name if len(name) <= 2 * WIDTH else f"...{name[3 - 2 * WIDTH :]}"
+def _short_names(paths: Sequence[Path]) -> list[str]:
+    """Return names that fit a table: the files', with their folders when they are alike."""
+    names = [path.stem for path in paths]
+    if len(set(names)) < len(names):
+        names = [f"{path.parent.name}/{path.stem}" for path in paths]
+    return [name if len(name) <= 2 * WIDTH else f"...{name[3 - 2 * WIDTH :]}" for name in names]
 
 
 def _row(title: str, values: Sequence[str]) -> None:

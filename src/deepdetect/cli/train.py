@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +33,8 @@ if TYPE_CHECKING:
     "--preset",
     default="default",
     show_default=True,
-    help="Recipe that the other options change: default, or paper (the paper's own).",
+    help="Recipe that the other options change: default (its values are shown below), or "
+    "paper (the paper's own).",
 )
 @click.option(
     "--validation",
@@ -148,10 +153,11 @@ def train(
         "say": None if as_json else click.echo,
     }
     options = changed(training_preset(preset), **given)
-    if timed:
-        _print_profiles(trainer.profile(photos, output, options, **arguments), as_json)
-        return
-    result = trainer.train(photos, output, options, **arguments)
+    with _ending_all_processes():
+        if timed:
+            _print_profiles(trainer.profile(photos, output, options, **arguments), as_json)
+            return
+        result = trainer.train(photos, output, options, **arguments)
     if not place_in_cluster().is_first:
         return
     best = result.best
@@ -180,6 +186,26 @@ def train(
     )
 
 
+@contextlib.contextmanager
+def _ending_all_processes() -> Iterator[None]:
+    """End at once after an error of one of several processes, and torchrun ends the others.
+
+    The usual way out would first wait for the others, which wait for this one.
+    """
+    from ..errors import DeepDetectError
+    from ..training.cluster import place_in_cluster
+
+    try:
+        yield
+    except DeepDetectError as error:
+        if place_in_cluster().processes == 1:
+            raise
+        click.echo(f"deepdetect: {error}", err=True)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(2)
+
+
 def _print_profiles(profiles: list[StageProfile], as_json: bool) -> None:
     from dataclasses import asdict
 
@@ -196,8 +222,9 @@ def _print_profiles(profiles: list[StageProfile], as_json: bool) -> None:
             ("crops/s", f"{profile.images_per_second:.1f}"),
             ("480x480 images/s", f"{profile.full_images_per_second:.1f}"),
             ("waiting for data", f"{100 * profile.waiting_share:.1f} %"),
-            ("peak memory", f"{profile.memory / 1e9:.2f} GB"),
         ]
+        if profile.memory is not None:
+            rows.append(("peak memory", f"{profile.memory / 1e9:.2f} GB"))
         if profile.device_memory is not None:
             rows.append(("peak GPU memory", f"{profile.device_memory / 1e9:.2f} GB"))
         stage = profile.stage

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DeepDetectError, MissingExtraError
+from ..image import find_images
 from ..progress import progress
 
 CHUNK = 1 << 16  # bytes; so many are lost when a download is broken off
@@ -56,7 +57,8 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
 
     Raises:
         MissingExtraError: pooch is not installed.
-        DeepDetectError: the download fails, its checksum is wrong, or there is no room.
+        DeepDetectError: the download fails, its checksum is wrong, there is no room, or
+            the folder holds something else.
     """
     if importlib.util.find_spec("pooch") is None:
         raise MissingExtraError(
@@ -64,16 +66,18 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
             "run pip install pooch"
         )
     final = Path(folder)
-    if final.exists():
+    if final.is_dir() and any(final.iterdir()):
+        _check_count(dataset, final, f"{final} is there and")
         return final
     archive = final.with_name(f"{final.name}.zip")
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         if not archive.exists():
-            # As much again as is missing, for what is unpacked.
+            # As much again, for what is unpacked.
             _need_room(final.parent, 2 * dataset.size - _size(_part(archive)))
-        _download(dataset, archive, quiet)
-        _unpack(archive, final, quiet)
+            _download(dataset, archive, quiet)
+        _need_room(final.parent, dataset.size)
+        _unpack(dataset, archive, final, quiet)
         archive.unlink()
     except OSError as error:
         raise DeepDetectError(
@@ -101,7 +105,7 @@ def _size(path: Path) -> int:
 
 def _download(dataset: RemoteDataset, archive: Path, quiet: bool) -> None:
     import pooch
-    from requests import RequestException
+    from requests import HTTPError, RequestException
 
     part = _part(archive)
     pooch.get_logger().setLevel("WARNING")  # the progress bar says enough
@@ -113,16 +117,23 @@ def _download(dataset: RemoteDataset, archive: Path, quiet: bool) -> None:
             path=archive.parent,
             downloader=_resuming(part, dataset, quiet),
         )
+    except HTTPError as error:
+        raise DeepDetectError(
+            f"{dataset.url} cannot be downloaded (the server answers "
+            f"{error.response.status_code}): try again later"
+        ) from None
     except RequestException as error:
         raise DeepDetectError(
             f"{dataset.url} cannot be downloaded ({error.__class__.__name__}): "
             "give the same command again to go on where it stopped"
         ) from None
     except ValueError:  # pooch's word for a wrong checksum
+        part.unlink(missing_ok=True)
         raise DeepDetectError(
             f"{dataset.url} has another checksum than {dataset.checksum}: "
             "it has changed or was damaged on the way; try again later"
         ) from None
+    part.unlink(missing_ok=True)
 
 
 def _resuming(part: Path, dataset: RemoteDataset, quiet: bool) -> Callable[..., None]:
@@ -135,7 +146,7 @@ def _resuming(part: Path, dataset: RemoteDataset, quiet: bool) -> Callable[..., 
         headers = {"Range": f"bytes={have}-"} if have else {}
         with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as response:
             if response.status_code == 416:  # nothing is missing
-                shutil.move(part, output)
+                _second_name(part, Path(output))
                 return
             response.raise_for_status()
             if response.status_code != 206:  # the server sends all of it again
@@ -151,12 +162,30 @@ def _resuming(part: Path, dataset: RemoteDataset, quiet: bool) -> Callable[..., 
                     bar.update(len(chunk))
         if part.stat().st_size < total:
             raise requests.ConnectionError("the connection broke off")
-        shutil.move(part, output)
+        _second_name(part, Path(output))
 
     return download
 
 
-def _unpack(archive: Path, final: Path, quiet: bool) -> None:
+def _second_name(part: Path, output: Path) -> None:
+    """Give the file to pooch, which deletes it when it is stopped, and keep it."""
+    output.unlink(missing_ok=True)
+    try:
+        output.hardlink_to(part)
+    except OSError:  # a file system without links
+        shutil.copyfile(part, output)
+
+
+def _check_count(dataset: RemoteDataset, folder: Path, subject: str) -> None:
+    count = len(find_images(folder))
+    if count != dataset.images:
+        raise DeepDetectError(
+            f"{subject} holds {count:,} images, not the {dataset.images:,} of {dataset.name}: "
+            "choose another folder with -o"
+        )
+
+
+def _unpack(dataset: RemoteDataset, archive: Path, final: Path, quiet: bool) -> None:
     """Unpack into a folder beside the final one, and rename it when all is there."""
     unfinished = final.with_name(f".{final.name}.part")
     shutil.rmtree(unfinished, ignore_errors=True)
@@ -169,4 +198,7 @@ def _unpack(archive: Path, final: Path, quiet: bool) -> None:
                     bar.update(1)
     except zipfile.BadZipFile:
         raise DeepDetectError(f"{archive} is no zip archive: delete it and try again") from None
+    _check_count(dataset, unfinished, str(archive))
+    if final.exists():
+        final.rmdir()
     unfinished.rename(final)

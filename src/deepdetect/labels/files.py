@@ -109,7 +109,10 @@ def mask_settings(path: Path) -> str | None:
 
 def settings_text(options: LabelOptions) -> str:
     """Return the text that identifies label options."""
-    return json.dumps(asdict(options), sort_keys=True)
+    values = asdict(options)
+    if not values["changes"]:
+        del values["changes"]  # as before there were any
+    return json.dumps(values, sort_keys=True)
 
 
 def check_outputs(tasks: Sequence[LabelTask]) -> None:

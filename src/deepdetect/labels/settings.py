@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import cv2
+import numpy as np
 
 from ..errors import OptionError, unknown_name
 from .registry import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
@@ -60,6 +64,9 @@ class SettingChange:
                 f"the setting {self.name} of {self.detector} must be of type {kind.__name__}, "
                 f"not {self.value!r}"
             )
+        if not math.isfinite(self.value):
+            raise OptionError(f"the setting {self.name} of {self.detector} must be finite")
+        object.__setattr__(self, "value", kind(self.value))
 
 
 def settings_for(
@@ -88,7 +95,13 @@ class LabelSettings:
     changes: tuple[SettingChange, ...] = ()
 
     def __post_init__(self) -> None:
-        select_detectors(self.detectors)
+        chosen = {detector.name for detector in select_detectors(self.detectors)}
+        idle = sorted({change.detector for change in self.changes} - chosen)
+        if idle:
+            raise OptionError(
+                f"settings of {idle[0]} are given, but it is not among the detectors: "
+                "add it to them, or take its settings away"
+            )
 
 
 def read_label_settings(path: str | Path) -> LabelSettings:
@@ -124,7 +137,24 @@ def _parsed(content: dict[str, Any]) -> LabelSettings:
     changes = []
     for detector, sections in content.items():
         changes += _changes(detector, sections)
+    # The order in the file says nothing, so it must not make other options of the same.
+    changes.sort(key=lambda change: (change.detector, change.visibility, change.name))
+    for detector in select_detectors({change.detector for change in changes}) if changes else ():
+        for visibility in SECTIONS.values():
+            _try(detector, visibility, changes)
     return LabelSettings(tuple(detectors), tuple(changes))
+
+
+def _try(detector: LabelDetector, visibility: Visibility, changes: list[SettingChange]) -> None:
+    """Run a detector once, so that values OpenCV refuses are told at once."""
+    pattern = (np.indices((64, 64)).sum(0) // 8 % 2 * 200).astype(np.uint8)
+    try:
+        detector.mask(pattern, settings_for(detector, visibility, changes))
+    except (cv2.error, ValueError, OverflowError) as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise OptionError(
+            f"OpenCV refuses the settings of {detector.name} for {visibility} images ({reason})"
+        ) from None
 
 
 def _changes(detector: str, sections: Any) -> list[SettingChange]:

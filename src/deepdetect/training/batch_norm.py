@@ -2,8 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+
+
+class _SumOverProcesses(torch.autograd.Function):
+    """The sum of a tensor over the processes; its gradient is the sum of theirs."""
+
+    @staticmethod
+    def forward(context: Any, x: Tensor) -> Tensor:
+        total = x.clone()
+        torch.distributed.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> Tensor:
+        total = gradient.clone(memory_format=torch.contiguous_format)
+        torch.distributed.all_reduce(total)
+        return total
 
 
 class SynchronizedBatchNorm(nn.BatchNorm2d):
@@ -16,24 +34,18 @@ class SynchronizedBatchNorm(nn.BatchNorm2d):
     def forward(self, x: Tensor) -> Tensor:
         if not self.training:
             return super().forward(x)
-        x = x.float()  # sums in bfloat16 would lose too much
-        count = x.numel() // x.shape[1] * torch.distributed.get_world_size()
-        mean = _mean_over_processes(x.mean((0, 2, 3)))
-        centred = x - mean[:, None, None]
-        variance = _mean_over_processes(centred.square().mean((0, 2, 3)))
+        values = x.float()  # sums in bfloat16 would lose too much
+        processes = torch.distributed.get_world_size()
+        count = values.numel() // values.shape[1] * processes
+        mean = _SumOverProcesses.apply(values.mean((0, 2, 3))) / processes
+        centred = values - mean[:, None, None]
+        variance = _SumOverProcesses.apply(centred.square().mean((0, 2, 3))) / processes
         with torch.no_grad():
             self.running_mean.lerp_(mean, self.momentum)
             self.running_var.lerp_(variance * (count / (count - 1)), self.momentum)
             self.num_batches_tracked.add_(1)
         scale = self.weight * torch.rsqrt(variance + self.eps)
-        return centred * scale[:, None, None] + self.bias[:, None, None]
-
-
-def _mean_over_processes(x: Tensor) -> Tensor:
-    """Average a tensor over the processes; gradients flow back to all of them."""
-    from torch.distributed.nn.functional import all_reduce
-
-    return all_reduce(x) / torch.distributed.get_world_size()
+        return (centred * scale[:, None, None] + self.bias[:, None, None]).to(x.dtype)
 
 
 def synchronize_batch_norm(network: nn.Module, device: torch.device) -> None:

@@ -6,16 +6,14 @@ goes on with exactly the batches it would have seen.
 
 from __future__ import annotations
 
-import queue
-import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 
 from .cluster import Place
 from .photos import Photo
+from .prefetch import prefetched
 from .recipe import Schedule
 from .view_store import ViewStore
 from .views import View
@@ -29,7 +27,7 @@ class Batches:
         store: their views.
         schedule: the steps.
         place: this process's place among those of the run; it makes its part of each batch.
-        loaders: threads that cut crops.
+        loaders: threads that make batches, each whole ones.
 
     Raises:
         OptionError: a batch cannot be shared evenly by the processes.
@@ -51,14 +49,8 @@ class Batches:
         self.place = place
         self.loaders = loaders
 
-    def batch(
-        self, step: int, apply: Callable[..., Iterable] = map
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def batch(self, step: int) -> tuple[np.ndarray, np.ndarray]:
         """Make a step's batch, or this process's part of it.
-
-        Args:
-            step: number of the step.
-            apply: a map that may work in threads.
 
         Returns:
             (B, crop, crop, 3) uint8 RGB and (B, crop, crop) bool labels.
@@ -68,51 +60,21 @@ class Batches:
         numbers = range(position.sample, position.sample + stage.batch)[
             self.place.share(stage.batch)
         ]
-        crops = apply(lambda k: self._crop(position.epoch_offset, k, stage.crop), numbers)
+        crops = [self._crop(position.epoch_offset, k, stage.crop) for k in numbers]
         images, masks = zip(*crops, strict=True)
         return np.stack(images), np.stack(masks)
 
     def stream(
-        self, first: int, last: int | None = None, ahead: int = 4
+        self, first: int, last: int | None = None
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Yield the batches of the steps from `first` to before `last`, made ahead by threads.
 
         Args:
             first: the first step.
             last: the step after the last one; default: the end of the schedule.
-            ahead: how many batches are held ready.
         """
         end = self.schedule.steps if last is None else last
-        ready: queue.Queue = queue.Queue(maxsize=ahead)
-        stopped = threading.Event()
-
-        def hand_over(item: object) -> None:
-            while not stopped.is_set():
-                try:
-                    return ready.put(item, timeout=0.5)
-                except queue.Full:
-                    continue
-
-        def make() -> None:
-            try:
-                with ThreadPoolExecutor(self.loaders, "crops") as pool:
-                    apply = map if self.loaders == 1 else pool.map
-                    for step in range(first, end):
-                        if stopped.is_set():
-                            return
-                        hand_over(self.batch(step, apply))
-            except BaseException as error:  # handed to the thread that trains
-                hand_over(error)
-
-        threading.Thread(target=make, daemon=True, name="batches").start()
-        try:
-            for _ in range(first, end):
-                item = ready.get()
-                if isinstance(item, BaseException):
-                    raise item
-                yield item
-        finally:
-            stopped.set()
+        yield from prefetched(self.batch, range(first, end), self.loaders, self.loaders + 3)
 
     def _crop(self, epoch_offset: int, sample: int, side: int) -> tuple[np.ndarray, np.ndarray]:
         """Cut the crop of one sample, flipped by chance."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import datetime
 import os
 from dataclasses import dataclass
 
 from ..errors import OptionError
+
+PATIENCE = datetime.timedelta(hours=24)
 
 
 @dataclass(frozen=True)
@@ -16,13 +19,20 @@ class Place:
         rank: its number among all.
         processes: how many there are in all.
         local_rank: its number among those of this machine.
-        local_processes: how many run on this machine.
+        local_processes: how many run on this machine, as many as on the others.
     """
 
     rank: int = 0
     processes: int = 1
     local_rank: int = 0
     local_processes: int = 1
+
+    def __post_init__(self) -> None:
+        if self.processes % self.local_processes:
+            raise OptionError(
+                "there must be as many processes on each machine: "
+                "give torchrun the same --nproc-per-node everywhere"
+            )
 
     @property
     def is_first(self) -> bool:
@@ -35,10 +45,10 @@ class Place:
         return self.processes // self.local_processes
 
     def share(self, count: int) -> slice:
-        """Return this process's part of `count` things, all parts being of one size.
+        """Return this process's part of a batch, all parts being of one size.
 
         Raises:
-            OptionError: they cannot be shared evenly.
+            OptionError: it cannot be shared evenly.
 
         Example:
             >>> Place(rank=1, processes=2, local_rank=1, local_processes=2).share(8)
@@ -56,6 +66,9 @@ class Place:
 def place_in_cluster() -> Place:
     """Read this process's place; without `torchrun` it is the only one.
 
+    Raises:
+        OptionError: the machines have different numbers of processes.
+
     Example:
         >>> place_in_cluster().processes >= 1
         True
@@ -64,3 +77,24 @@ def place_in_cluster() -> Place:
         return Place()
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
     return Place(*(int(os.environ[name]) for name in names))
+
+
+def wait_for_all(place: Place, word: str) -> None:
+    """Wait until every process has come here, for hours if need be.
+
+    Through torchrun's own store, so that the time limits of the training itself, within
+    which a dead process is noticed, stay short.
+
+    Args:
+        place: this process.
+        word: names the meeting, once a run.
+    """
+    if place.processes == 1:
+        return
+    from torch.distributed import PrefixStore, rendezvous
+
+    store, _, _ = next(iter(rendezvous("env://", place.rank, place.processes)))
+    restart = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
+    meeting = PrefixStore(f"deepdetect-{restart}-{word}", store)
+    meeting.set(str(place.rank), "here")
+    meeting.wait([str(rank) for rank in range(place.processes)], PATIENCE)

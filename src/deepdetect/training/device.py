@@ -6,9 +6,8 @@ and sets the precision; `torchrun` starts the processes.
 
 from __future__ import annotations
 
-import datetime
+import contextlib
 import logging
-import os
 import shutil
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,6 +17,7 @@ import torch
 from torch import nn
 
 from ..errors import OptionError, unknown_name
+from ..processes import processor_count
 from .batch_norm import synchronize_batch_norm
 from .cluster import Place, place_in_cluster
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
 PRECISIONS = ("auto", "float32", "bfloat16")
-PATIENCE = datetime.timedelta(hours=12)  # the first process of a machine makes the labels first
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,6 @@ class Engine:
     """
 
     def __init__(self, network: nn.Module, options: DeviceOptions) -> None:
-        if options.threads is not None:
-            torch.set_num_threads(options.threads)
         self.place = place_in_cluster()
         kind = options.device
         if kind == "auto":
@@ -79,8 +76,10 @@ class Engine:
         self.bfloat16 = options.precision == "bfloat16" or (
             options.precision == "auto" and _computes_bfloat16(kind)
         )
-        self.fabric = _fabric(kind, self.bfloat16, self.place)
+        self.fabric = _fabric(kind, self.place)
         self.fabric.launch()
+        if options.threads is not None:
+            torch.set_num_threads(options.threads)  # launching sets its own
         self.device = self.fabric.device
         # channels_last is faster by 40 % on CPUs, and what tensor cores want.
         self.network = network.to(self.device, memory_format=torch.channels_last)
@@ -88,9 +87,9 @@ class Engine:
             synchronize_batch_norm(self.network, self.device)
         compiled = options.compile
         if compiled is None:
-            has_compiler = any(shutil.which(name) for name in ("g++", "clang++"))
-            # The sums over CPU processes inside the batch normalisation break the graph.
-            compiled = kind == "cuda" or (has_compiler and self.place.processes == 1)
+            has_compiler = kind == "cuda" or any(map(shutil.which, ("g++", "clang++")))
+            # Sums over processes, inside the batch normalisation, break the graph.
+            compiled = has_compiler and self.place.processes == 1
         self.compiled = bool(compiled)
         self.loaders = options.loaders or _loaders(kind, self.place)
         self._may_fall_back = options.compile is None
@@ -114,10 +113,20 @@ class Engine:
             return tensor.pin_memory().to(self.device, non_blocking=True)
         return tensor
 
+    def autocast(self) -> contextlib.AbstractContextManager:
+        """Return the context that the forward pass of training runs in.
+
+        Not Fabric's own precision, which would round the images to bfloat16 as well.
+        """
+        if not self.bfloat16:
+            return contextlib.nullcontext()
+        return torch.autocast(self.device.type, dtype=torch.bfloat16)
+
     def logits(self, images: torch.Tensor) -> torch.Tensor:
         """Run the network for training; logits are float32."""
         try:
-            return self._forward(images)
+            with self.autocast():
+                return self._forward(images).float()
         except torch._dynamo.exc.TorchDynamoException as error:
             # A compiler on the path may still lack headers, and CUDA its Triton.
             if not self._may_fall_back:
@@ -137,7 +146,9 @@ class Engine:
         """Average a tensor over all processes."""
         if self.place.processes == 1:
             return value
-        return self.fabric.all_reduce(value, reduce_op="mean")
+        total = value.clone()
+        torch.distributed.all_reduce(total)
+        return total / self.place.processes
 
     def gather(self, values: Any) -> list[Any]:
         """Return every process's values, in the order of the processes, to all of them."""
@@ -152,7 +163,10 @@ class Engine:
         return self.fabric.broadcast(values)
 
     def close(self) -> None:
-        """Part from the other processes."""
+        """Part from the other processes, at the end of a run that went well.
+
+        After an error nobody can be waited for: the process ends, and torchrun the others.
+        """
         if self.place.processes > 1:
             torch.distributed.destroy_process_group()
 
@@ -167,19 +181,24 @@ class Engine:
         return ", ".join(words)
 
 
-def _fabric(kind: str, bfloat16: bool, place: Place) -> Fabric:
+def _fabric(kind: str, place: Place) -> Fabric:
     from lightning_fabric import Fabric
     from lightning_fabric.plugins.environments import LightningEnvironment, TorchElasticEnvironment
     from lightning_fabric.strategies import DDPStrategy
 
+    if kind == "cuda" and place.local_processes > torch.cuda.device_count():
+        raise OptionError(
+            f"{place.local_processes} processes on this machine need as many GPUs, "
+            f"there are {torch.cuda.device_count()}: lower --nproc-per-node"
+        )
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     alone = place.processes == 1
     return Fabric(
         accelerator=kind,
         devices=place.local_processes,
         num_nodes=place.machines,
-        strategy="auto" if alone else DDPStrategy(timeout=PATIENCE),
-        precision="bf16-mixed" if bfloat16 else "32-true",
+        # Buffers are the same everywhere: the batch normalisation sees to it.
+        strategy="auto" if alone else DDPStrategy(broadcast_buffers=False),
         # Named, so that a batch system's variables in the environment change nothing.
         plugins=[LightningEnvironment() if alone else TorchElasticEnvironment()],
     )
@@ -189,11 +208,11 @@ def _loaders(kind: str, place: Place) -> int:
     """Return how many threads make batches: a CPU that trains has none to spare."""
     if kind == "cpu":
         return 1
-    return max(1, (os.cpu_count() or 2) // place.local_processes - 1)
+    return max(1, processor_count() // place.local_processes - 1)
 
 
 def _computes_bfloat16(kind: str) -> bool:
     if kind == "cuda":
-        return torch.cuda.is_bf16_supported()
+        return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
     return bool(capabilities and capabilities())

@@ -9,11 +9,8 @@ import torch
 from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from ..errors import OptionError
 from .device import DeviceOptions, Engine
-
-
-class NotFiniteError(Exception):
-    """The loss or its gradients are infinite or not a number."""
 
 
 class Learner:
@@ -29,19 +26,20 @@ class Learner:
         self.network = self.engine.network
         self.optimizer = torch.optim.Adam(self.network.parameters(), fused=True)
 
-    def learn(self, rgb: np.ndarray, masks: np.ndarray, rate: float) -> float:
+    def learn(self, rgb: np.ndarray, masks: np.ndarray, rate: float, step: int) -> float:
         """Make one optimiser step.
 
         Args:
             rgb: (B, crop, crop, 3) uint8, this process's part of the batch.
             masks: (B, crop, crop) bool, its labels.
             rate: the learning rate.
+            step: number of the step, for the error.
 
         Returns:
             The loss over the whole batch.
 
         Raises:
-            NotFiniteError: the loss or its gradients are not finite.
+            OptionError: the loss or its gradients are not finite.
         """
         self.network.train()
         for group in self.optimizer.param_groups:
@@ -55,6 +53,9 @@ class Learner:
         value = self.engine.mean_over_processes(loss.detach()).item()
         # A finite loss can have gradients that are not, in bfloat16.
         if not (math.isfinite(value) and torch.nn.utils.get_total_norm(gradients).isfinite()):
-            raise NotFiniteError
+            raise OptionError(
+                f"the loss or its gradients are not finite at step {step}: start again with "
+                "--precision float32, or with a lower --learning-rate"
+            )
         self.optimizer.step()
         return value

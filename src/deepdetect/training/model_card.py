@@ -47,13 +47,11 @@ def write_model_card(
         "",
         f"- git commit: {notes['commit'] or 'not known'}",
         f"- versions: {notes['versions']}",
-        f"- machine: {notes['machine']}",
+        f"- machine: {notes['machine']}; run on {notes['run_on']}",
         f"- photographs to train on: {int(notes['photographs']):,}; "
         f"digest of all photographs: {notes['photographs_digest']}",
         f"- SHA-256 of the state it started from: {notes['start']}",
         f"- step {best.step:,}, {best.images:,} images seen",
-        "",
-        "The same command over the same photographs gives the same weights on the same machine.",
         "",
         "## Recipe",
         "",
@@ -82,6 +80,9 @@ def _table(points: Sequence[CurvePoint]) -> list[str]:
         "|---" * len(names) + "|",
     ]
     for point in points:
-        values = [f"{getattr(point, name):.6g}" for name in names]
+        values = [
+            f"{value:.6g}" if isinstance(value, float) else f"{value:,}"
+            for value in (getattr(point, name) for name in names)
+        ]
         rows.append(f"| {' | '.join(values)} |")
     return rows

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from .cluster import place_in_cluster
+from .cluster import place_in_cluster, wait_for_all
 from .label_cache import LabelCache
 from .photos import Photo, hold_out, list_photos, photos_digest
 from .recipe import TrainingOptions
@@ -46,8 +46,7 @@ def prepare(
 ) -> Photographs:
     """List the photographs of a run and make the labels of all their views.
 
-    The first process of each machine makes the labels; the others go ahead, and wait for
-    it where the processes meet.
+    The first process of each machine makes the labels, the others wait for it.
 
     Args:
         photos: folder of photographs.
@@ -60,8 +59,11 @@ def prepare(
 
     Raises:
         ImageError: a folder is missing or empty.
+        OptionError: a batch cannot be shared evenly by the processes.
         DeepDetectError: a photograph cannot be read.
     """
+    for stage in options.stages:
+        place_in_cluster().share(stage.batch)  # an uneven share is told before the labels
     cache = Path(labels) if labels is not None else Path(output) / "labels"
     exclude = (Path(output), cache)
     training = list_photos(Path(photos), options, exclude, options.max_photos)
@@ -72,8 +74,10 @@ def prepare(
     store = ViewStore(LabelCache(cache, options.label_options))
     wanted = [(photo, photo.normal + photo.dark) for photo in training]
     wanted += [(photo, (largest(photo.normal), largest(photo.dark))) for photo in held]
-    if place_in_cluster().local_rank == 0:
-        store.labels.make(wanted, workers, quiet)
+    place = place_in_cluster()
+    if place.local_rank == 0:
+        store.labels.make(wanted, workers, quiet or not place.is_first)
+    wait_for_all(place, "labels")
     return Photographs(training, held, store)
 
 

@@ -19,7 +19,7 @@ PRESETS: dict[str, TrainingOptions] = {
         dark_fraction=0.25,
         learning_rate=1e-3,
         final_learning_rate=1e-6,
-        validations=100,
+        validations=20,
     ),
 }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -27,7 +26,8 @@ class StageProfile:
         images_per_second: crops a second.
         full_images_per_second: the same in 480x480 images' worth of pixels.
         waiting_share: share of the time in which the first process waited for data.
-        memory: peak resident memory of the first process, in bytes.
+        memory: peak resident memory of the first process up to here, in bytes, or None
+            where the system does not tell.
         device_memory: peak memory that torch took on the first process's GPU, in bytes, or None.
     """
 
@@ -36,7 +36,7 @@ class StageProfile:
     images_per_second: float
     full_images_per_second: float
     waiting_share: float
-    memory: int
+    memory: int | None
     device_memory: int | None
 
 
@@ -74,6 +74,9 @@ def _profile(
     done: Callable[[int], object],
 ) -> StageProfile:
     warm = min(WARM_UP_STEPS, last - first - 1)
+    on_gpu = learner.engine.device.type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats()
     stream = batches.stream(first, last)
     waited = 0.0
     started = time.perf_counter()
@@ -83,12 +86,11 @@ def _profile(
             waited, started = 0.0, asked
         rgb, masks = next(stream)
         waited += time.perf_counter() - asked
-        learner.learn(rgb, masks, batches.schedule.learning_rate(step))
+        learner.learn(rgb, masks, batches.schedule.learning_rate(step), step)
         done(1)
     # Reading the loss has waited for the GPU at each step.
     seconds = time.perf_counter() - started
     rate = (last - first - warm) * stage.batch / seconds
-    on_gpu = learner.engine.device.type == "cuda"
     return StageProfile(
         stage=stage,
         steps=last - first - warm,
@@ -100,7 +102,11 @@ def _profile(
     )
 
 
-def _peak_memory() -> int:
+def _peak_memory() -> int | None:
     """Return this process's peak resident memory in bytes."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from ..processes import processor_count
+
 PACKAGES = ("numpy", "opencv-contrib-python-headless", "pillow", "torch", "lightning-fabric")
 """The packages that pixels, labels and weights go through."""
 
@@ -23,7 +25,7 @@ def provenance() -> dict[str, str]:
     return {
         "command": _command(),
         "commit": _commit(),
-        "machine": f"{platform.system()} {platform.machine()}",
+        "machine": f"{platform.system()} {platform.machine()}, {processor_count()} processors",
         "versions": ", ".join(_versions()),
     }
 

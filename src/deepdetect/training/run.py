@@ -9,20 +9,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from ..errors import OptionError
+from ..errors import OptionError, WeightsError
 from ..mask_scores import MaskScore, mean_score
 from ..network.espnet import ESPNet
 from ..network.onnx_export import export_onnx
 from ..network.weights import load_network, read_notes, save_weights, weights_digest
 from ..progress import progress
 from .batches import Batches
-from .checkpoint import read_checkpoint, restore, save_checkpoint
+from .checkpoint import Checkpoint, read_checkpoint, restore, save_checkpoint
 from .curves import CurvePoint, save_curves
 from .device import DeviceOptions
-from .learner import Learner, NotFiniteError
+from .learner import Learner
 from .model_card import write_model_card
+from .prefetch import prefetched
 from .preparation import Photographs, largest
 from .provenance import provenance
 from .recipe import Schedule, TrainingOptions
@@ -95,7 +94,8 @@ class Run:
             self.place,
             self.engine.loaders,
         )
-        self.origin = provenance()
+        self.origin = {**provenance(), "run_on": self.engine.describe()}
+        self._check_agreement()
         self.step = 0
         self.images = 0
         self.loss_sum, self.loss_count = 0.0, 0
@@ -115,7 +115,8 @@ class Run:
         bar = progress(self.schedule.steps, "training", "step", self.say is None, self.step)
         with bar:
             for rgb, masks in self.batches.stream(self.step):
-                loss = self._learn(rgb, masks)
+                rate = self.schedule.learning_rate(self.step)
+                loss = self.learner.learn(rgb, masks, rate, self.step)
                 batch = len(masks) * self.place.processes
                 pixels += batch * masks[0].size
                 self.loss_sum += loss
@@ -141,16 +142,6 @@ class Run:
             write_model_card(self.folder / CARD, self.folder / BEST, notes, self.points)
         rate = pixels / (480 * 480) / seconds
         return TrainingResult(self.folder / BEST, self.folder / ONNX, self.points, best, rate)
-
-    def _learn(self, rgb: np.ndarray, masks: np.ndarray) -> float:
-        """Make one optimiser step; return the loss."""
-        try:
-            return self.learner.learn(rgb, masks, self.schedule.learning_rate(self.step))
-        except NotFiniteError:
-            raise OptionError(
-                f"the loss or its gradients are not finite at step {self.step}: start again with "
-                "--precision float32, or with a lower --learning-rate"
-            ) from None
 
     def _validate(self) -> None:
         """Take the validation losses; keep the weights when they are the best so far."""
@@ -178,11 +169,22 @@ class Run:
                 save_weights(self.network, self.folder / BEST, self._provenance(point))
             save_curves(self.points, self.folder)
 
+    def _check_agreement(self) -> None:
+        """Make sure that all processes do the same run: each has read its own files."""
+        mine = (self.photographs.digest, self.options.to_json(), self.start)
+        if any(theirs != mine for theirs in self.engine.gather(mine)):
+            raise OptionError(
+                "the processes do not train on the same photographs with the same options: "
+                "every machine needs the same files and the same command"
+            )
+
     def _score(self, views: list[View]) -> MaskScore:
         """Score the network on views of the photographs held out, shared by the processes."""
         photos_and_views = list(zip(self.photographs.held, views, strict=True))
         mine = photos_and_views[self.place.rank :: self.place.processes]
-        pairs = (self.photographs.store.load(photo, view) for photo, view in mine)
+        loaders = self.engine.loaders
+        load = self.photographs.store.load
+        pairs = prefetched(lambda task: load(*task), mine, loaders, loaders + 1)
         scores = score_network(self.network, pairs, self.engine.device)
         return mean_score(self.engine.gather(scores))
 
@@ -216,8 +218,15 @@ class Run:
     def _resume(self) -> None:
         """Go on from the checkpoint that the first process finds."""
         path = self.folder / CHECKPOINT
-        found = read_checkpoint(path) if self.place.is_first and path.exists() else None
+        found: Checkpoint | WeightsError | None = None
+        if self.place.is_first and path.exists():
+            try:
+                found = read_checkpoint(path)
+            except WeightsError as error:
+                found = error
         found = self.engine.broadcast(found)
+        if isinstance(found, WeightsError):
+            raise found  # by all processes, so that none waits for another
         if found is None:
             return
         state = found.state

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -75,8 +74,9 @@ def train(
         quiet=say is None,
     )
     run = Run(made, Path(output), options, device, network, say)
-    with contextlib.closing(run.engine):
-        return run.finish()
+    result = run.finish()
+    run.engine.close()
+    return result
 
 
 def profile(
@@ -122,9 +122,10 @@ def profile(
     shown = say is not None and run.place.is_first
     if shown:
         say(f"timing {run.engine.describe()}")
-    bar = progress(total, "timing", "step", not shown)
-    with bar, contextlib.closing(run.engine):
-        return profile_stages(run.learner, run.batches, steps, bar.update)
+    with progress(total, "timing", "step", not shown) as bar:
+        profiles = profile_stages(run.learner, run.batches, steps, bar.update)
+    run.engine.close()
+    return profiles
 
 
 def _first_network(options: TrainingOptions, start: str | Path | None) -> ESPNet:

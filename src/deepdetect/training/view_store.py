@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
 
 import numpy as np
 
 from ..errors import ImageError
 from ..memory import free_memory
+from .cluster import place_in_cluster
 from .label_cache import LabelCache
 from .photos import Photo
 from .views import View, render
@@ -18,19 +20,21 @@ class ViewStore:
 
     Args:
         labels: the label cache.
-        memory: bytes that may be kept, default half of the free memory; views beyond it
-            are made anew each time.
+        memory: bytes that may be kept, default half of the free memory, shared by the
+            processes of this machine; views beyond it are made anew each time.
     """
 
     def __init__(self, labels: LabelCache, memory: int | None = None) -> None:
         self.labels = labels
-        self.memory = free_memory() // 2 if memory is None else memory
-        self._kept: dict[tuple[str, View], tuple[np.ndarray, np.ndarray]] = {}
+        if memory is None:
+            memory = free_memory() // (2 * place_in_cluster().local_processes)
+        self.memory = memory
+        self._kept: dict[tuple[Path, View], tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
 
     def load(self, photo: Photo, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool."""
-        key = (photo.digest, view)
+        key = (photo.path, view)
         if key in self._kept:
             return self._kept[key]
         image = render(photo.path, view)
@@ -41,7 +45,7 @@ class ViewStore:
                 f"delete {self.labels.folder} and start again"
             )
         with self._lock:
-            if self.memory >= image.nbytes + mask.nbytes:
+            if key not in self._kept and self.memory >= image.nbytes + mask.nbytes:
                 self.memory -= image.nbytes + mask.nbytes
                 self._kept[key] = image, mask
         return image, mask
