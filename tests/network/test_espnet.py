@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="needs torch, which is for training 
 
 from deepdetect import DeepDetect, WeightsError  # noqa: E402
 from deepdetect.mask_scores import score_samples  # noqa: E402
-from deepdetect.network.espnet import ESPNet, ResidualPyramid  # noqa: E402
+from deepdetect.network.espnet import DilatedConvolution, ESPNet, ResidualPyramid  # noqa: E402
 from deepdetect.network.onnx_export import export_onnx  # noqa: E402
 from deepdetect.network.weights import load_network, save_weights  # noqa: E402
 
@@ -96,3 +96,20 @@ def test_onnx_gives_the_same_probabilities_at_any_size(tmp_path: Path) -> None:
         with torch.inference_mode():
             expected = torch.sigmoid(network(torch.from_numpy(image))).numpy()
         np.testing.assert_allclose(session.run(None, {"image": image})[0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("dilation", [1, 2, 4, 8, 16])
+@pytest.mark.parametrize("layout", [torch.channels_last, torch.contiguous_format])
+def test_dilated_gradients_in_bfloat16(dilation: int, layout: torch.memory_format) -> None:
+    torch.manual_seed(dilation)
+    layer = DilatedConvolution(12, 16, dilation).to(memory_format=layout)
+    x = torch.randn(2, 12, 40, 36).to(memory_format=layout).requires_grad_()
+    wanted = torch.randn(2, 16, 40, 36)
+    expected = torch.autograd.grad((layer(x) * wanted).sum(), (x, layer.conv.weight))
+    with torch.autocast("cpu", torch.bfloat16):
+        made = layer(x)
+    assert made.dtype == torch.bfloat16
+    found = torch.autograd.grad((made.float() * wanted).sum(), (x, layer.conv.weight))
+    for a, b in zip(expected, found, strict=True):
+        assert a.dtype == b.dtype
+        assert (a - b).norm() / a.norm() < 0.01, "bfloat16 keeps eight bits"

@@ -6,8 +6,11 @@ follow the published state dict, so that its weights load unchanged.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import conv2d
 
 EPSILON = 1e-3  # of every batch normalisation, as published
 DILATIONS = (1, 2, 4, 8, 16)
@@ -26,21 +29,45 @@ class Convolution(nn.Module):
         return self.conv(x)
 
 
-class DilatedConvolution(nn.Module):
-    """A 3x3 convolution with holes, kept in float32 under autocast.
+class _DilatedBfloat16(torch.autograd.Function):
+    """A dilated 3x3 convolution in bfloat16 on the CPU, with gradients that are right.
 
-    In bfloat16 with channels_last the CPU gradients of dilated convolutions
-    are NaN (torch 2.13), so autocast is switched off around them.
+    In bfloat16 with channels_last PyTorch's own gradients of dilated convolutions are NaN
+    (torch 2.13). The gradient of the input is a convolution again, with the kernel turned
+    round, and may be computed in bfloat16; that of the weights is computed in float32.
     """
+
+    @staticmethod
+    def forward(context: Any, x: Tensor, weight: Tensor, dilation: int) -> Tensor:
+        rounded = weight.bfloat16()
+        context.save_for_backward(x, rounded)
+        context.dilation = dilation
+        return conv2d(x, rounded, padding=dilation, dilation=dilation)
+
+    @staticmethod
+    def backward(context: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
+        x, weight = context.saved_tensors
+        d = context.dilation
+        turned = weight.flip(2, 3).transpose(0, 1).contiguous(memory_format=torch.channels_last)
+        of_input = conv2d(gradient, turned, padding=d, dilation=d)
+        of_weight = torch.ops.aten.convolution_backward(
+            *(gradient.float(), x.float(), weight.float(), None),
+            *([1, 1], [d, d], [d, d], False, [0, 0], 1, [False, True, False]),
+        )[1]
+        return of_input, of_weight, None
+
+
+class DilatedConvolution(nn.Module):
+    """A 3x3 convolution with holes; under autocast on the CPU with gradients of its own."""
 
     def __init__(self, inputs: int, outputs: int, dilation: int) -> None:
         super().__init__()
         self.conv = nn.Conv2d(inputs, outputs, 3, padding=dilation, dilation=dilation, bias=False)
+        self.dilation = dilation
 
     def forward(self, x: Tensor) -> Tensor:
-        if torch.is_autocast_enabled(x.device.type) and x.device.type == "cpu":
-            with torch.autocast(x.device.type, enabled=False):
-                return self.conv(x.float())
+        if x.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
+            return _DilatedBfloat16.apply(x.bfloat16(), self.conv.weight, self.dilation)
         return self.conv(x)
 
 

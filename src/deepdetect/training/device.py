@@ -33,8 +33,8 @@ class DeviceOptions:
 
     Attributes:
         device: "auto" (CUDA when there is one, else the CPU), "cpu" or "cuda".
-        precision: "bfloat16" runs in bfloat16, but on the CPU the dilated convolutions;
-            "auto" takes it where the processor computes with it.
+        precision: "bfloat16" runs in bfloat16; "auto" takes it where the processor
+            computes with it.
         compile: torch.compile; None means when a C++ compiler is at hand.
         threads: CPU threads of torch; None leaves torch's choice.
         loaders: threads that make batches; None means one beside a CPU that trains, and
@@ -173,8 +173,6 @@ class Engine:
     def describe(self) -> str:
         """Say in words how the network is run."""
         precision = "bfloat16" if self.bfloat16 else "float32"
-        if self.bfloat16 and self.device.type == "cpu":
-            precision += " (dilated convolutions float32)"
         words = [self.device.type, precision, "compiled" if self.compiled else "eager"]
         if self.place.processes > 1:
             words.append(f"{self.place.processes} processes on {self.place.machines} machine(s)")
