@@ -73,6 +73,14 @@ CASES = {
     "train missing": "train {bad}/nowhere -o {bad}/out",
     "train stage": "train {bad} -o {bad}/out --stage 240",
     "train device": "train {bad} -o {bad}/out --device tpu",
+    "train preset": "train {bad} -o {bad}/out --preset papers",
+    "train start": "train {bad} -o {bad}/out --start {bad}/weights.safetensors",
+    "train loaders": "train {bad} -o {bad}/out --loaders 0",
+    "train label settings": "train {bad} -o {bad}/out --label-settings {bad}/matrix.txt",
+    "label settings": "label {bad}/good.png -o {bad}/out --label-settings {bad}/no.toml",
+    "evaluate oxford": "evaluate {bad} --oxford {bad}/empty",
+    "evaluate against": "evaluate {bad} --against {bad}/weights.onnx",
+    "data set": "datasets get cocoo",
     "evaluate nothing": "evaluate {bad}/empty",
 }
 
@@ -133,7 +141,9 @@ def test_a_process_of_its_own_ends_the_same_way(tmp_path: Path) -> None:
     assert done.stdout == ""
 
 
-@pytest.mark.parametrize("command", ["", "detect", "match", "label", "train", "evaluate", "demo"])
+@pytest.mark.parametrize(
+    "command", ["", "detect", "match", "label", "train", "datasets", "evaluate", "demo"]
+)
 def test_help_has_words_for_every_option(run, command: str) -> None:
     result = run(*command.split(), "--help")
     assert result.exit_code == 0
