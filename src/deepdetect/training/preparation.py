@@ -34,26 +34,38 @@ class Photographs:
         return photos_digest(self.training, self.held)
 
 
+@dataclass(frozen=True)
+class Sources:
+    """The folders of a run.
+
+    Attributes:
+        photos: folder of photographs.
+        output: folder of the run, which is left out when it lies below the photographs.
+        validation: folder of other photographs; None holds some of the first out.
+        labels: folder for the label cache; None means one in `output`.
+    """
+
+    photos: Path
+    output: Path
+    validation: str | Path | None = None
+    labels: str | Path | None = None
+
+    @property
+    def label_cache(self) -> Path:
+        """The folder for the label cache."""
+        return self.output / "labels" if self.labels is None else Path(self.labels)
+
+
 def prepare(
-    photos: str | Path,
-    output: str | Path,
-    options: TrainingOptions,
-    *,
-    validation: str | Path | None = None,
-    labels: str | Path | None = None,
-    workers: int | None = None,
-    quiet: bool = True,
+    sources: Sources, options: TrainingOptions, workers: int | None = None, quiet: bool = True
 ) -> Photographs:
     """List the photographs of a run and make the labels of all their views.
 
     The first process of each machine makes the labels, the others wait for it.
 
     Args:
-        photos: folder of photographs.
-        output: folder of the run, which is left out when it lies below.
+        sources: the folders.
         options: the recipe.
-        validation: folder of other photographs; default: some are held out.
-        labels: folder for the label cache; default: in `output`.
         workers: processes that make labels; default one for each processor.
         quiet: show no progress bar.
 
@@ -64,14 +76,13 @@ def prepare(
     """
     for stage in options.stages:
         place_in_cluster().share(stage.batch)  # an uneven share is told before the labels
-    cache = Path(labels) if labels is not None else Path(output) / "labels"
-    exclude = (Path(output), cache)
-    training = list_photos(Path(photos), options, exclude, options.max_photos)
-    if validation is None:
+    exclude = (sources.output, sources.label_cache)
+    training = list_photos(sources.photos, options, exclude, options.max_photos)
+    if sources.validation is None:
         training, held = hold_out(training, options.held_out)
     else:
-        held = list_photos(Path(validation), options, exclude)
-    store = ViewStore(LabelCache(cache, options.label_options))
+        held = list_photos(Path(sources.validation), options, exclude)
+    store = ViewStore(LabelCache(sources.label_cache, options.label_options))
     wanted = [(photo, photo.normal + photo.dark) for photo in training]
     wanted += [(photo, (largest(photo.normal), largest(photo.dark))) for photo in held]
     place = place_in_cluster()

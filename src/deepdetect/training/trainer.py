@@ -12,7 +12,7 @@ from ..network.espnet import ESPNet
 from ..network.weights import load_network
 from ..progress import progress
 from .device import DeviceOptions
-from .preparation import prepare
+from .preparation import Sources, prepare
 from .profile import WARM_UP_STEPS, StageProfile, profile_stages
 from .recipe import TrainingOptions
 from .run import Run, TrainingResult
@@ -64,15 +64,8 @@ def train(
         >>> train("photographs", "run")  # doctest: +SKIP
     """
     network = _first_network(options, start)  # before the labels, which take minutes
-    made = prepare(
-        photos,
-        output,
-        options,
-        validation=validation,
-        labels=labels,
-        workers=workers,
-        quiet=say is None,
-    )
+    sources = Sources(Path(photos), Path(output), validation, labels)
+    made = prepare(sources, options, workers, quiet=say is None)
     run = Run(made, Path(output), options, device, network, say)
     result = run.finish()
     run.engine.close()
@@ -108,15 +101,8 @@ def profile(
         >>> profile("photographs", "run")[0].images_per_second  # doctest: +SKIP
     """
     network = _first_network(options, start)
-    made = prepare(
-        photos,
-        output,
-        options,
-        validation=validation,
-        labels=labels,
-        workers=workers,
-        quiet=say is None,
-    )
+    sources = Sources(Path(photos), Path(output), validation, labels)
+    made = prepare(sources, options, workers, quiet=say is None)
     run = Run(made, Path(output), options, device, network, resume=False)
     total = sum(min(n, steps + WARM_UP_STEPS) for n in run.schedule.steps_of_stage)
     shown = say is not None and run.place.is_first
