@@ -22,7 +22,7 @@ from deepdetect.network.weights import load_network, weights_digest  # noqa: E40
 from deepdetect.training.checkpoint import read_checkpoint, restore, save_checkpoint  # noqa: E402
 from deepdetect.training.device import DeviceOptions, Engine  # noqa: E402
 from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
-from deepdetect.training.trainer import train  # noqa: E402
+from deepdetect.training.trainer import BUNDLED, train  # noqa: E402
 
 PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
 RECIPE = ["--stage", "64x4x8", "--stage", "96x2x2", "--short-side", "96", "--short-side", "64"]
@@ -53,13 +53,22 @@ def unbroken(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return run
 
 
+@pytest.fixture(scope="module")
+def unbroken_soap(photographs: Path, unbroken: Path) -> Path:
+    run = unbroken.parent / "unbroken_soap"
+    arguments = [*command(photographs, run, unbroken.parent / "labels"), "--optimizer", "soap"]
+    subprocess.run(arguments, check=True, capture_output=True)
+    return run
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "soap"])
 def test_a_killed_run_ends_with_the_same_weights(
-    photographs: Path, unbroken: Path, tmp_path: Path
+    optimizer: str, photographs: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
+    unbroken = request.getfixturevalue("unbroken" if optimizer == "adam" else "unbroken_soap")
     run, labels = tmp_path / "killed", unbroken.parent / "labels"
-    process = subprocess.Popen(
-        command(photographs, run, labels), stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    arguments = [*command(photographs, run, labels), "--optimizer", optimizer]
+    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     deadline = time.monotonic() + 120
     while not (run / "checkpoint.safetensors").exists() and time.monotonic() < deadline:
         time.sleep(0.005)
@@ -69,7 +78,7 @@ def test_a_killed_run_ends_with_the_same_weights(
     steps_done = _steps(run)
     assert 0 < steps_done < _steps(unbroken)
 
-    subprocess.run(command(photographs, run, labels), check=True, capture_output=True)
+    subprocess.run(arguments, check=True, capture_output=True)
     assert tensors_equal(run / "best.safetensors", unbroken / "best.safetensors")
     assert tensors_equal(run / "checkpoint.safetensors", unbroken / "checkpoint.safetensors")
     assert (run / "curves.csv").read_text() == (unbroken / "curves.csv").read_text()
@@ -77,7 +86,7 @@ def test_a_killed_run_ends_with_the_same_weights(
 
 def _steps(run: Path) -> int:
     tensors = load_file(run / "checkpoint.safetensors")
-    return int(next(value for name, value in tensors.items() if name.startswith("adam.step.")))
+    return int(next(value for name, value in tensors.items() if name.startswith("optimizer.step.")))
 
 
 def test_a_run_writes_weights_and_curves(unbroken: Path) -> None:
@@ -181,6 +190,27 @@ def test_own_photographs_and_settings_from_the_shipped_weights(
     assert 0 < len(tuned) < len(DeepDetect().detect(image)), "fewer corners are wanted"
 
 
+def test_frozen_batch_norm_keeps_the_statistics_and_trains_the_rest(
+    photographs: Path, tmp_path: Path
+) -> None:
+    arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels")]
+    arguments += ["--start", "bundled", "--frozen-batch-norm"]
+    subprocess.run(arguments, check=True, capture_output=True)
+    before = load_network(BUNDLED).state_dict()
+    after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
+    kept = {name for name in before if torch.equal(before[name], after[name])}
+    statistics = {name for name in before if name.rpartition(".")[2].startswith(("running", "num"))}
+    assert kept == statistics
+
+
+def test_frozen_batch_norm_needs_trained_weights(photographs: Path, tmp_path: Path) -> None:
+    arguments = command(photographs, tmp_path / "run", tmp_path / "labels")
+    done = subprocess.run([*arguments, "--frozen-batch-norm"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "--start" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_other_options_are_refused_in_the_same_folder(photographs: Path, unbroken: Path) -> None:
     changed = [*command(photographs, unbroken, unbroken.parent / "labels"), "--seed", "5"]
     done = subprocess.run(changed, capture_output=True, text=True)
@@ -231,9 +261,9 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None
 def test_a_checkpoint_of_another_network_is_refused(tmp_path: Path) -> None:
     network, other = ESPNet(), ESPNet(p=2)
     path = tmp_path / "c.safetensors"
-    save_checkpoint(path, other, torch.optim.Adam(other.parameters()), {})
+    save_checkpoint(path, other, [torch.optim.Adam(other.parameters())], {})
     with pytest.raises(WeightsError, match="delete it"):
-        restore(read_checkpoint(path), path, network, torch.optim.Adam(network.parameters()))
+        restore(read_checkpoint(path), path, network, [torch.optim.Adam(network.parameters())])
 
 
 def test_checkpoints_hold_everything_and_stay_small(tmp_path: Path) -> None:
@@ -243,14 +273,14 @@ def test_checkpoints_hold_everything_and_stay_small(tmp_path: Path) -> None:
     network(torch.rand(2, 3, 32, 32)).mean().backward()
     optimizer.step()
     path = tmp_path / "c.safetensors"
-    save_checkpoint(path, network, optimizer, {"step": 1})
+    save_checkpoint(path, network, [optimizer], {"step": 1})
     assert path.stat().st_size < 10_000_000
 
     other = ESPNet()
     other_optimizer = torch.optim.Adam(other.parameters(), fused=True)
     found = read_checkpoint(path)
     assert found.state == {"step": 1}
-    restore(found, path, other, other_optimizer)
+    restore(found, path, other, [other_optimizer])
     for a, b in zip(network.parameters(), other.parameters(), strict=True):
         assert torch.equal(a, b)
         for moment in ("step", "exp_avg", "exp_avg_sq"):

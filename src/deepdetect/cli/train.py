@@ -63,8 +63,14 @@ if TYPE_CHECKING:
     "[default: 480 360 240]",
 )
 @click.option("--dark-fraction", type=float, help="Share of darkened images.  [default: 0.25]")
-@click.option("--learning-rate", type=float, help="Of Adam, at the start.  [default: 0.001]")
+@click.option("--optimizer", help="adam or soap.  [default: adam]")
+@click.option("--learning-rate", type=float, help="At the start.  [default: 0.001]")
 @click.option("--warm-up", type=int, help="Steps to that rate.  [default: 0]")
+@click.option(
+    "--frozen-batch-norm/--batch-norm",
+    default=None,
+    help="Keep the start weights' batch statistics; only with --start.  [default: batch-norm]",
+)
 @click.option("--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]")
 @label_settings_option
 @click.option("--validations", type=int, help="How often the loss is validated.  [default: 12]")

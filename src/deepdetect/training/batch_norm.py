@@ -1,4 +1,4 @@
-"""Batch normalisation over the batches of all processes."""
+"""Batch normalisation in training: over the batches of all processes, or frozen."""
 
 from __future__ import annotations
 
@@ -59,3 +59,14 @@ def synchronize_batch_norm(network: nn.Module, device: torch.device) -> None:
     for module in network.modules():
         if type(module) is nn.BatchNorm2d:
             module.__class__ = SynchronizedBatchNorm
+
+
+def freeze_batch_norm(network: nn.Module) -> None:
+    """Make the batch normalisations of a network that trains use the statistics they have.
+
+    To be called after every `network.train()`, which thaws them. Their scales and biases
+    are trained on.
+    """
+    for module in network.modules():
+        if isinstance(module, nn.modules.batchnorm._BatchNorm):
+            module.eval()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
+from torch.optim import Optimizer
 
 from ..atomic import atomic_path
 from ..errors import WeightsError
@@ -19,21 +21,22 @@ MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam, for each parameter
 
 
 def save_checkpoint(
-    path: Path, network: nn.Module, optimizer: torch.optim.Adam, state: dict[str, Any]
+    path: Path, network: nn.Module, optimizers: Sequence[Optimizer], state: dict[str, Any]
 ) -> None:
-    """Write the network, Adam's moments and the run's state.
+    """Write the network, the optimisers' moments and the run's state.
 
     Args:
         path: the file.
         network: its state dict is stored under "network.".
-        optimizer: its moments are stored under "adam.MOMENT.PARAMETER".
+        optimizers: of its parameters; what they hold is stored under
+            "optimizer.MOMENT.PARAMETER".
         state: anything JSON can hold.
     """
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
     for name, parameter in network.named_parameters():
-        for moment in MOMENTS:
-            if parameter in optimizer.state:
-                tensors[f"adam.{moment}.{name}"] = optimizer.state[parameter][moment]
+        for optimizer in optimizers:
+            for moment, value in optimizer.state.get(parameter, {}).items():
+                tensors[f"optimizer.{moment}.{name}"] = value
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with atomic_path(path) as temporary:
         save_file(contiguous, temporary, metadata={"state": json.dumps(state)})
@@ -45,7 +48,7 @@ class Checkpoint:
 
     Attributes:
         state: the run's state.
-        tensors: the network's and Adam's, by name.
+        tensors: the network's and the optimisers', by name.
     """
 
     state: dict[str, Any]
@@ -68,9 +71,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 
 def restore(
-    checkpoint: Checkpoint, path: Path, network: nn.Module, optimizer: torch.optim.Adam
+    checkpoint: Checkpoint, path: Path, network: nn.Module, optimizers: Sequence[Optimizer]
 ) -> None:
-    """Bring the network and Adam to a checkpoint's state.
+    """Bring the network and its optimisers to a checkpoint's state.
 
     Raises:
         WeightsError: the checkpoint does not fit the network.
@@ -81,18 +84,38 @@ def restore(
         network.load_state_dict(
             {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
         )
-        for name, parameter in network.named_parameters():
-            if f"adam.step.{name}" in tensors:
-                optimizer.state[parameter] = {
-                    "step": tensors[f"adam.step.{name}"].to(parameter.device, copy=True),
-                    # Laid out in memory as the parameter is: fused Adam walks them in parallel.
-                    **{
-                        moment: torch.empty_like(parameter).copy_(tensors[f"adam.{moment}.{name}"])
-                        for moment in MOMENTS[1:]
-                    },
-                }
+        moments = _moments(tensors)
+        names = {parameter: name for name, parameter in network.named_parameters()}
+        for optimizer in optimizers:
+            for group in optimizer.param_groups:
+                for parameter in group["params"]:
+                    held = moments[names[parameter]]
+                    optimizer.state[parameter] = {
+                        moment: _placed(value, parameter) for moment, value in held.items()
+                    }
     except (KeyError, ValueError, RuntimeError) as error:
         raise _unfit(path, error) from None
+
+
+def _moments(tensors: dict[str, torch.Tensor]) -> dict[str, dict[str, torch.Tensor]]:
+    """Return what the optimisers hold, by parameter and moment."""
+    found: dict[str, dict[str, torch.Tensor]] = {}
+    for key, value in tensors.items():
+        kind, _, rest = key.partition(".")
+        if kind == "optimizer":
+            moment, _, name = rest.partition(".")
+            found.setdefault(name, {})[moment] = value
+    return found
+
+
+def _placed(value: torch.Tensor, parameter: nn.Parameter) -> torch.Tensor:
+    """Bring a moment to its parameter's device.
+
+    Laid out in memory as the parameter is: fused Adam walks them in parallel.
+    """
+    if value.shape == parameter.shape:
+        return torch.empty_like(parameter).copy_(value)
+    return value.to(parameter.device, copy=True)
 
 
 def _unfit(path: Path, error: Exception) -> WeightsError:

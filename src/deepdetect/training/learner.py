@@ -1,4 +1,4 @@
-"""The network and its optimiser: one step at a time."""
+"""The network and its optimisers: one step at a time."""
 
 from __future__ import annotations
 
@@ -10,21 +10,32 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ..errors import OptionError
+from .batch_norm import freeze_batch_norm
 from .device import DeviceOptions, Engine
+from .optimizers import make_optimizers
 
 
 class Learner:
-    """A network on its device, with Adam.
+    """A network on its device, with what optimises it.
 
     Args:
         network: the network, with its start weights.
         device: how it is run.
+        optimizer: name of the optimiser.
+        frozen_batch_norm: keep the statistics of the batch normalisation as they are.
     """
 
-    def __init__(self, network: nn.Module, device: DeviceOptions) -> None:
+    def __init__(
+        self,
+        network: nn.Module,
+        device: DeviceOptions,
+        optimizer: str = "adam",
+        frozen_batch_norm: bool = False,
+    ) -> None:
+        self.frozen_batch_norm = frozen_batch_norm
         self.engine = Engine(network, device)
         self.network = self.engine.network
-        self.optimizer = torch.optim.Adam(self.network.parameters(), fused=True)
+        self.optimizers = make_optimizers(optimizer, self.network)
 
     def learn(self, rgb: np.ndarray, masks: np.ndarray, rate: float, step: int) -> float:
         """Make one optimiser step.
@@ -42,11 +53,14 @@ class Learner:
             OptionError: the loss or its gradients are not finite.
         """
         self.network.train()
-        for group in self.optimizer.param_groups:
-            group["lr"] = rate
+        if self.frozen_batch_norm:
+            freeze_batch_norm(self.network)
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+            for group in optimizer.param_groups:
+                group["lr"] = rate
         images = self.engine.images(rgb)
         truth = self.engine.place_tensor(masks)[:, None].float()
-        self.optimizer.zero_grad(set_to_none=True)
         loss = binary_cross_entropy_with_logits(self.engine.logits(images), truth)
         self.engine.backward(loss)
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
@@ -57,5 +71,6 @@ class Learner:
                 f"the loss or its gradients are not finite at step {step}: start again with "
                 "--precision float32, or with a lower --learning-rate"
             )
-        self.optimizer.step()
+        for optimizer in self.optimizers:
+            optimizer.step()
         return value

@@ -7,9 +7,10 @@ import json
 import math
 from dataclasses import dataclass, field
 
-from ..errors import OptionError
+from ..errors import OptionError, look_up
 from ..labels import DETECTOR_NAMES, LabelOptions, SettingChange
 from .darkening import DarkeningRange
+from .optimizers import OPTIMIZERS
 
 
 @dataclass(frozen=True)
@@ -66,9 +67,14 @@ class TrainingOptions:
         dark_fraction: share of darkened images (paper: a quarter).
         dark_variants: darkened versions of each photograph at each size.
         darkening: ranges of the darkening.
-        learning_rate, final_learning_rate: ends of the cosine annealing of Adam.
+        optimizer: "adam", or "soap", which learns about twice as much from an image for a
+            twentieth more time.
+        learning_rate, final_learning_rate: ends of its cosine annealing.
         warm_up: steps over which the rate rises from zero. A run that starts from trained
             weights needs them: Adam's first steps, without moments, would undo a good deal.
+        frozen_batch_norm: normalise by the statistics that the start weights bring along, as
+            the finished network does, not by those of each batch, which vary much from one
+            batch of a few images to the next. For a run that starts from trained weights.
         detectors: label detectors to fuse.
         label_changes: settings of label detectors that differ from the paper's.
         validations: how often the validation loss is taken.
@@ -86,9 +92,11 @@ class TrainingOptions:
     dark_fraction: float = 0.25
     dark_variants: int = 1
     darkening: DarkeningRange = field(default_factory=DarkeningRange)
+    optimizer: str = "adam"
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-6
     warm_up: int = 0
+    frozen_batch_norm: bool = False
     detectors: tuple[str, ...] = DETECTOR_NAMES
     label_changes: tuple[SettingChange, ...] = ()
     validations: int = 12
@@ -96,6 +104,7 @@ class TrainingOptions:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "detectors", LabelOptions(self.detectors).detectors)
+        look_up("optimizer", self.optimizer, OPTIMIZERS)
         if not self.stages:
             raise OptionError("a training run needs at least one stage")
         if not self.short_sides or min(self.short_sides) < 16:

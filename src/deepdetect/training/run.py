@@ -83,7 +83,7 @@ class Run:
         self.photographs, self.folder, self.options = photographs, folder, options
         self.start = weights_digest(network)
         self.schedule = Schedule(options, len(photographs.training))
-        self.learner = Learner(network, device)
+        self.learner = Learner(network, device, options.optimizer, options.frozen_batch_norm)
         self.engine, self.network = self.learner.engine, self.learner.network
         self.place = self.engine.place
         self.say = say if self.place.is_first else None
@@ -213,7 +213,7 @@ class Run:
             "points": [dataclasses.asdict(point) for point in self.points],
             **self.origin,
         }
-        save_checkpoint(self.folder / CHECKPOINT, self.network, self.learner.optimizer, state)
+        save_checkpoint(self.folder / CHECKPOINT, self.network, self.learner.optimizers, state)
 
     def _resume(self) -> None:
         """Go on from the checkpoint that the first process finds."""
@@ -246,7 +246,7 @@ class Run:
                 f"{self.folder} holds a run that started from other weights: "
                 "start from the same ones to continue it, or use another folder with -o"
             )
-        restore(found, path, self.network, self.learner.optimizer)
+        restore(found, path, self.network, self.learner.optimizers)
         self.step, self.images = state["step"], state["images"]
         self.loss_sum, self.loss_count = state["loss_sum"], state["loss_count"]
         self.points = [CurvePoint(**point) for point in state["points"]]

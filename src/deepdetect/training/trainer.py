@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 
 from ..detector import bundled_weights
+from ..errors import OptionError
 from ..network.espnet import ESPNet
 from ..network.weights import load_network
 from ..progress import progress
@@ -57,7 +58,8 @@ def train(
 
     Raises:
         ImageError: a folder is missing or empty, or a photograph cannot be read.
-        OptionError: the folder holds a run with other options.
+        OptionError: the folder holds a run with other options, or the batch normalisation
+            of random weights is to be frozen.
         WeightsError: the weights to start from are missing or do not fit.
 
     Example:
@@ -118,5 +120,10 @@ def _first_network(options: TrainingOptions, start: str | Path | None) -> ESPNet
     """Make the network with the weights that the run starts from."""
     if start is not None:
         return load_network(BUNDLED if str(start) == "bundled" else start)
+    if options.frozen_batch_norm:
+        raise OptionError(
+            "random weights have no batch statistics to keep: name trained ones with --start, "
+            "or leave out --frozen-batch-norm"
+        )
     torch.manual_seed(options.seed)
     return ESPNet()
