@@ -24,6 +24,7 @@ from .shared import (
 
 if TYPE_CHECKING:
     from ..training.profile import StageProfile
+    from ..training.run import TrainingResult
 
 
 @click.command(short_help="Train the network on photographs.")
@@ -139,7 +140,6 @@ def train(
                 "run pip install torch lightning-fabric safetensors onnx matplotlib"
             )
     from ..training import trainer
-    from ..training.cluster import place_in_cluster
     from ..training.device import DeviceOptions
     from ..training.presets import training_preset
     from ..training.recipe import Stage
@@ -163,7 +163,39 @@ def train(
         if timed:
             _print_profiles(trainer.profile(photos, output, options, **arguments), as_json)
             return
-        result = trainer.train(photos, output, options, **arguments)
+        _print_result(trainer.train(photos, output, options, **arguments), as_json)
+
+
+@contextlib.contextmanager
+def _ending_all_processes() -> Iterator[None]:
+    """End one of several processes at once, when all is written.
+
+    After an error, torchrun ends the others; the usual way out would first wait for them,
+    which wait for this one. And Python's own end can meet gloo's threads, and hang with
+    them (pytorch#190489).
+    """
+    from ..errors import DeepDetectError
+    from ..training.cluster import place_in_cluster
+
+    try:
+        yield
+    except DeepDetectError as error:
+        if place_in_cluster().processes == 1:
+            raise
+        click.echo(f"deepdetect: {error}", err=True)
+        status = 2
+    else:
+        if place_in_cluster().processes == 1:
+            return
+        status = 0
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+def _print_result(result: TrainingResult, as_json: bool) -> None:
+    from ..training.cluster import place_in_cluster
+
     if not place_in_cluster().is_first:
         return
     best = result.best
@@ -190,26 +222,6 @@ def train(
             ("written", f"{result.weights}, {result.onnx}"),
         ]
     )
-
-
-@contextlib.contextmanager
-def _ending_all_processes() -> Iterator[None]:
-    """End at once after an error of one of several processes, and torchrun ends the others.
-
-    The usual way out would first wait for the others, which wait for this one.
-    """
-    from ..errors import DeepDetectError
-    from ..training.cluster import place_in_cluster
-
-    try:
-        yield
-    except DeepDetectError as error:
-        if place_in_cluster().processes == 1:
-            raise
-        click.echo(f"deepdetect: {error}", err=True)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(2)
 
 
 def _print_profiles(profiles: list[StageProfile], as_json: bool) -> None:

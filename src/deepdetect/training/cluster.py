@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 import os
 from dataclasses import dataclass
 
 from ..errors import OptionError
 
 PATIENCE = datetime.timedelta(hours=24)
+_meetings = itertools.count()  # each has its own name in the store
 
 
 @dataclass(frozen=True)
@@ -79,15 +81,16 @@ def place_in_cluster() -> Place:
     return Place(*(int(os.environ[name]) for name in names))
 
 
-def wait_for_all(place: Place, word: str) -> None:
+def wait_for_all(place: Place) -> None:
     """Wait until every process has come here, for hours if need be.
 
     Through torchrun's own store, so that the time limits of the training itself, within
     which a dead process is noticed, stay short.
 
+    All processes must call it equally often.
+
     Args:
         place: this process.
-        word: names the meeting, once a run.
     """
     if place.processes == 1:
         return
@@ -95,6 +98,6 @@ def wait_for_all(place: Place, word: str) -> None:
 
     store, _, _ = next(iter(rendezvous("env://", place.rank, place.processes)))
     restart = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
-    meeting = PrefixStore(f"deepdetect-{restart}-{word}", store)
+    meeting = PrefixStore(f"deepdetect-{restart}-{next(_meetings)}", store)
     meeting.set(str(place.rank), "here")
     meeting.wait([str(rank) for rank in range(place.processes)], PATIENCE)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import shutil
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,14 +18,16 @@ import torch
 from torch import nn
 
 from ..errors import OptionError, unknown_name
+from ..memory import keep_freed_memory
 from ..processes import processor_count
 from .batch_norm import synchronize_batch_norm
-from .cluster import Place, place_in_cluster
+from .cluster import Place, place_in_cluster, wait_for_all
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
 PRECISIONS = ("auto", "float32", "bfloat16")
+LETTING_GO = 0.2  # seconds
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,8 @@ class Engine:
         kind = options.device
         if kind == "auto":
             kind = "cuda" if torch.cuda.is_available() else "cpu"
+        if kind == "cpu":
+            keep_freed_memory()
         self.bfloat16 = options.precision == "bfloat16" or (
             options.precision == "auto" and _computes_bfloat16(kind)
         )
@@ -168,6 +173,10 @@ class Engine:
         After an error nobody can be waited for: the process ends, and torchrun the others.
         """
         if self.place.processes > 1:
+            # gloo's threads need the interpreter once more after the last sum, to let go of
+            # it, and destroying joins them without letting them have it (pytorch#190489).
+            wait_for_all(self.place)
+            time.sleep(LETTING_GO)
             torch.distributed.destroy_process_group()
 
     def describe(self) -> str:

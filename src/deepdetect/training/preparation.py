@@ -88,7 +88,7 @@ def prepare(
     place = place_in_cluster()
     if place.local_rank == 0:
         store.labels.make(wanted, workers, quiet or not place.is_first)
-    wait_for_all(place, "labels")
+    wait_for_all(place)
     return Photographs(training, held, store)
 
 
