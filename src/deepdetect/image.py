@@ -5,6 +5,7 @@ Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,10 @@ def load_image(image: Any) -> np.ndarray:
     """Read an image of any usual kind as 8-bit RGB.
 
     Args:
-        image: a path; a PIL image; or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4)
-            in the order RGB(A): uint8, uint16 (full range 0..65535) or float in [0, 1].
-            The alpha channel is dropped. Files are turned upright by their EXIF tag.
+        image: a path; the content of an image file as bytes; a PIL image; or an array
+            (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) in the order RGB(A): uint8, uint16 (full
+            range 0..65535) or float in [0, 1]. The alpha channel is dropped. Files, also as
+            bytes, are turned upright by their EXIF tag.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -41,7 +43,9 @@ def load_image(image: Any) -> np.ndarray:
         (20, 30, 3)
     """
     if isinstance(image, (str, Path)):
-        rgb, name = _read_file(Path(image)), str(image)
+        rgb, name = _read_file(Path(image), str(image)), str(image)
+    elif isinstance(image, bytes):
+        rgb, name = _read_file(io.BytesIO(image), "the image"), "the image"
     elif hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
         rgb, name = _from_pil(image), "the image"
     else:
@@ -90,26 +94,26 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     return found
 
 
-def _read_file(path: Path) -> np.ndarray:
+def _read_file(file: Path | io.BytesIO, name: str) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(path) as opened:
-            return _from_pil(_upright(opened), str(path))
+        with Image.open(file) as opened:
+            return _from_pil(_upright(opened), name)
     except FileNotFoundError:
-        raise ImageError(f"there is no file {path}: check the path") from None
+        raise ImageError(f"there is no file {name}: check the path") from None
     except IsADirectoryError:
-        raise ImageError(f"{path} is a folder: name an image file") from None
+        raise ImageError(f"{name} is a folder: name an image file") from None
     except UnidentifiedImageError:
-        raise ImageError(f"{path} is not an image that can be read: use PNG or JPEG") from None
+        raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG") from None
     except Image.DecompressionBombError:
-        raise ImageError(f"{path} has over 178 million pixels: make it smaller") from None
+        raise ImageError(f"{name} has over 178 million pixels: make it smaller") from None
     except PermissionError:
-        raise ImageError(f"{path} may not be read: check its rights") from None
+        raise ImageError(f"{name} may not be read: check its rights") from None
     except ImageError:
         raise
     except Exception as error:  # Pillow's decoders raise many kinds
-        raise _damaged(str(path), error) from None
+        raise _damaged(name, error) from None
 
 
 def _upright(image: Any) -> Any:

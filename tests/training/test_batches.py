@@ -8,6 +8,7 @@ import pytest
 from deepdetect.image import luma
 from deepdetect.labels import LabelOptions, fuse
 from deepdetect.training.batches import Batches
+from deepdetect.training.feed import FileFeed
 from deepdetect.training.label_cache import LabelCache
 from deepdetect.training.photos import list_photos
 from deepdetect.training.recipe import Schedule, Stage, TrainingOptions
@@ -28,11 +29,12 @@ def batches(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Batc
     wanted = [(photo, photo.normal + photo.dark) for photo in photos]
     assert cache.make(wanted, 1, quiet=True) == 12 * 4
     assert cache.make(wanted, 1, quiet=True) == 0, "labels are made once"
-    return Batches(photos, ViewStore(cache), Schedule(OPTIONS, len(photos)))
+    feed = FileFeed(photos, ViewStore(cache), OPTIONS.seed)
+    return Batches(feed, Schedule(OPTIONS, len(photos)))
 
 
 def test_a_batch_is_a_pure_function_of_the_step(batches: Batches) -> None:
-    fresh = Batches(batches.photos, batches.store, batches.schedule)
+    fresh = Batches(batches.feed, batches.schedule)
     for step in (7, 0, 3, 7):
         for ours, theirs in zip(batches.batch(step), fresh.batch(step), strict=True):
             np.testing.assert_array_equal(ours, theirs)
@@ -55,9 +57,11 @@ def test_shapes_follow_the_stage(batches: Batches) -> None:
 
 
 def test_each_photograph_is_seen_once_an_epoch(batches: Batches) -> None:
-    for epoch in range(3):
-        assert sorted(batches._order(epoch)) == list(range(12))
-    assert batches._order(0).tolist() != batches._order(1).tolist()
+    orders = [[e.photo.path.name for e in batches.feed.epoch(number)] for number in range(3)]
+    for order in orders:
+        assert len(set(order)) == len(order) == 12
+    assert orders[0] != orders[1]
+    assert [e.photo.path.name for e in batches.feed.epoch(1, 5)] == orders[1][5:]
 
 
 def test_about_a_quarter_is_dark(batches: Batches) -> None:
@@ -74,8 +78,8 @@ def test_about_a_quarter_is_dark(batches: Batches) -> None:
 def test_crops_and_labels_belong_together(batches: Batches) -> None:
     """Each crop lies in one of the views, and its mask at the same place of the view's label."""
     photo_views = [
-        (render(photo.path, view), batches.store.labels.load(photo, view))
-        for photo in batches.photos
+        (render(photo.path, view), batches.feed.store.labels.load(photo, view))
+        for photo in batches.feed.photos
         for view in photo.normal + photo.dark
     ]
     images, masks = batches.batch(2)
@@ -97,10 +101,10 @@ def _found(image: np.ndarray, mask: np.ndarray, view: np.ndarray, label: np.ndar
 
 
 def test_dark_labels_use_the_low_visibility_settings(batches: Batches) -> None:
-    photo = batches.photos[0]
+    photo = batches.feed.photos[0]
     view = photo.dark[0]
     expected = fuse(luma(render(photo.path, view)), LabelOptions(OPTIONS.detectors, "low"))
-    np.testing.assert_array_equal(batches.store.labels.load(photo, view), expected.mask)
+    np.testing.assert_array_equal(batches.feed.store.labels.load(photo, view), expected.mask)
 
 
 def test_an_error_of_the_thread_reaches_the_trainer(batches: Batches) -> None:
@@ -108,12 +112,14 @@ def test_an_error_of_the_thread_reaches_the_trainer(batches: Batches) -> None:
         def load(self, photo, view):
             raise ValueError("broken on purpose")
 
-    broken = Batches(batches.photos, Broken(batches.store.labels), batches.schedule)
+    store = Broken(batches.feed.store.labels)
+    broken = Batches(FileFeed(batches.feed.photos, store, 0), batches.schedule)
     with pytest.raises(ValueError, match="on purpose"):
         next(broken.stream(0))
 
 
 def test_memory_limit_changes_nothing_but_the_time(batches: Batches) -> None:
-    frugal = Batches(batches.photos, ViewStore(batches.store.labels, memory=0), batches.schedule)
+    store = ViewStore(batches.feed.store.labels, memory=0)
+    frugal = Batches(FileFeed(batches.feed.photos, store, OPTIONS.seed), batches.schedule)
     np.testing.assert_array_equal(frugal.batch(4)[0], batches.batch(4)[0])
-    assert not frugal.store._kept
+    assert not store._kept

@@ -1,4 +1,4 @@
-"""The command line: `deepdetect detect | match | label | train | evaluate | demo`."""
+"""The command line `deepdetect`: one module a command."""
 
 from .main import main
 

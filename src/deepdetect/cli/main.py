@@ -15,6 +15,7 @@ from .detect import detect
 from .evaluate import evaluate
 from .label import label
 from .match import match
+from .shards import shards
 from .train import train
 
 
@@ -59,5 +60,5 @@ def main() -> None:
     """
 
 
-for command in (detect, match, label, train, datasets, evaluate, demo):
+for command in (detect, match, label, shards, train, datasets, evaluate, demo):
     main.add_command(command)

@@ -14,11 +14,14 @@ import click
 
 from .shared import (
     PATH,
-    chosen_label_settings,
+    chosen_recipe,
+    detectors_option,
     json_option,
     label_settings_option,
+    preset_option,
     print_json,
     print_table,
+    short_sides_option,
     workers_option,
 )
 
@@ -30,13 +33,7 @@ if TYPE_CHECKING:
 @click.command(short_help="Train the network on photographs.")
 @click.argument("photos", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="Folder of the run.")
-@click.option(
-    "--preset",
-    default="default",
-    show_default=True,
-    help="Recipe that the other options change: default (its values are shown below), or "
-    "paper (the paper's own).",
-)
+@preset_option
 @click.option(
     "--validation",
     type=PATH,
@@ -55,14 +52,7 @@ if TYPE_CHECKING:
     metavar="CROPxBATCHxEPOCHS",
     help="What is trained on; repeat it for several in turn.  [default: 240x16x44 480x8x10]",
 )
-@click.option(
-    "--short-side",
-    "short_sides",
-    type=int,
-    multiple=True,
-    help="Size of the photographs' shorter side in pixels; may be repeated.  "
-    "[default: 480 360 240]",
-)
+@short_sides_option
 @click.option("--dark-fraction", type=float, help="Share of darkened images.  [default: 0.25]")
 @click.option("--optimizer", help="adam or soap.  [default: adam]")
 @click.option("--learning-rate", type=float, help="At the start.  [default: 0.001]")
@@ -72,7 +62,7 @@ if TYPE_CHECKING:
     default=None,
     help="Keep the start weights' batch statistics; only with --start.  [default: batch-norm]",
 )
-@click.option("--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]")
+@detectors_option
 @label_settings_option
 @click.option("--validations", type=int, help="How often the loss is validated.  [default: 12]")
 @click.option("--seed", type=int, help="Of all random choices.  [default: 0]")
@@ -119,7 +109,7 @@ def train(
     as_json: bool,
     **values: Any,
 ) -> None:
-    r"""Train the network on the photographs in the folder PHOTOS.
+    r"""Train the network on the photographs, or the shards, in the folder PHOTOS.
 
     Labels are made first, once, by `deepdetect label`'s detectors. The run's folder gets
     checkpoint.safetensors, best.safetensors and deepdetect.onnx (the weights of the
@@ -131,7 +121,6 @@ def train(
     deepdetect detect photo.jpg --weights run/deepdetect.onnx
     """
     from ..errors import MissingExtraError
-    from ..options import changed
 
     for package in ("torch", "lightning_fabric", "safetensors", "onnx"):
         if importlib.util.find_spec(package) is None:
@@ -141,15 +130,9 @@ def train(
             )
     from ..training import trainer
     from ..training.device import DeviceOptions
-    from ..training.presets import training_preset
     from ..training.recipe import Stage
 
-    given = {name: value for name, value in values.items() if value not in (None, ())}
-    if "stages" in given:
-        given["stages"] = tuple(Stage.parse(text) for text in given["stages"])
-    if detectors is not None or label_settings is not None:
-        settings = chosen_label_settings(detectors, label_settings)
-        given["detectors"], given["label_changes"] = settings.detectors, settings.changes
+    values["stages"] = tuple(Stage.parse(text) for text in values["stages"])
     arguments = {
         "validation": validation,
         "labels": labels,
@@ -158,7 +141,7 @@ def train(
         "workers": workers,
         "say": None if as_json else click.echo,
     }
-    options = changed(training_preset(preset), **given)
+    options = chosen_recipe(preset, detectors, label_settings, values)
     with _ending_all_processes():
         if timed:
             _print_profiles(trainer.profile(photos, output, options, **arguments), as_json)

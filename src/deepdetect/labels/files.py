@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -63,19 +64,29 @@ def save_mask(mask: np.ndarray, path: str | Path, settings: str = "") -> None:
         path: file ending in .png.
         settings: text kept in the file, by which `mask_settings` tells how it was made.
     """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encode_mask(mask, settings))
+
+
+def encode_mask(mask: np.ndarray, settings: str = "") -> bytes:
+    """Return a (H, W) bool mask as the content of a 1-bit PNG file."""
     from PIL import Image, PngImagePlugin
 
     notes = PngImagePlugin.PngInfo()
     if settings:
         notes.add_text(SETTINGS_KEY, settings)
-    with atomic_path(path) as temporary:
-        Image.fromarray(mask).save(temporary, format="PNG", pnginfo=notes)
+    content = io.BytesIO()
+    Image.fromarray(mask).save(content, format="PNG", pnginfo=notes)
+    return content.getvalue()
 
 
-def load_mask(path: str | Path) -> np.ndarray:
+def load_mask(path: str | Path | bytes) -> np.ndarray:
     """Read a mask of any bit depth: True where a pixel is brighter than half.
 
     In a file that holds zeros and ones only, the ones are True.
+
+    Args:
+        path: the file, or its content.
 
     Returns:
         (H, W) bool.
@@ -85,15 +96,16 @@ def load_mask(path: str | Path) -> np.ndarray:
     """
     from PIL import Image
 
+    name = "the mask" if isinstance(path, bytes) else path
     try:
-        with Image.open(path) as opened:
+        with Image.open(io.BytesIO(path) if isinstance(path, bytes) else path) as opened:
             deep = opened.mode.startswith("I")  # 16 bits a pixel
             values = np.asarray(opened if deep else opened.convert("L"))
         return values > (0 if values.max() <= 1 else 32767 if deep else 127)
     except FileNotFoundError:
-        raise ImageError(f"there is no mask {path}: check the path") from None
+        raise ImageError(f"there is no mask {name}: check the path") from None
     except (OSError, SyntaxError, ValueError) as error:
-        raise ImageError(f"{path} is not a mask that can be read ({error})") from None
+        raise ImageError(f"{name} is not a mask that can be read ({error})") from None
 
 
 def mask_settings(path: Path) -> str | None:

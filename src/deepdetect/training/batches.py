@@ -7,24 +7,32 @@ goes on with exactly the batches it would have seen.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from .cluster import Place
+from .feed import Example, Feed
 from .photos import Photo
 from .prefetch import prefetched
-from .recipe import Schedule
-from .view_store import ViewStore
+from .recipe import Schedule, Stage
 from .views import View
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A batch that is to be made: photographs, each with its epoch and its place in that."""
+
+    stage: Stage
+    draws: list[tuple[Example, int, int]]
 
 
 class Batches:
     """The batches of a run.
 
     Args:
-        photos: the photographs.
-        store: their views.
+        feed: the photographs.
         schedule: the steps.
         place: this process's place among those of the run; it makes its part of each batch.
         loaders: threads that make batches, each whole ones.
@@ -34,17 +42,11 @@ class Batches:
     """
 
     def __init__(
-        self,
-        photos: list[Photo],
-        store: ViewStore,
-        schedule: Schedule,
-        place: Place = Place(),
-        loaders: int = 1,
+        self, feed: Feed, schedule: Schedule, place: Place = Place(), loaders: int = 1
     ) -> None:
         for stage in schedule.options.stages:
             place.share(stage.batch)
-        self.photos = photos
-        self.store = store
+        self.feed = feed
         self.schedule = schedule
         self.place = place
         self.loaders = loaders
@@ -55,14 +57,7 @@ class Batches:
         Returns:
             (B, crop, crop, 3) uint8 RGB and (B, crop, crop) bool labels.
         """
-        position = self.schedule.position(step)
-        stage = position.stage
-        numbers = range(position.sample, position.sample + stage.batch)[
-            self.place.share(stage.batch)
-        ]
-        crops = [self._crop(position.epoch_offset, k, stage.crop) for k in numbers]
-        images, masks = zip(*crops, strict=True)
-        return np.stack(images), np.stack(masks)
+        return self._make(next(self._plans(step, step + 1)))
 
     def stream(
         self, first: int, last: int | None = None
@@ -74,17 +69,36 @@ class Batches:
             last: the step after the last one; default: the end of the schedule.
         """
         end = self.schedule.steps if last is None else last
-        yield from prefetched(self.batch, range(first, end), self.loaders, self.loaders + 3)
+        plans = self._plans(first, end)
+        yield from prefetched(self._make, plans, self.loaders, self.loaders + 3)
 
-    def _crop(self, epoch_offset: int, sample: int, side: int) -> tuple[np.ndarray, np.ndarray]:
+    def _plans(self, first: int, last: int) -> Iterator[_Plan]:
+        """Yield what the batches are made of; all processes go through the same photographs."""
+        here = (-1, -1)
+        examples: Iterator[Example] = iter(())
+        for step in range(first, last):
+            position = self.schedule.position(step)
+            draws = []
+            for sample in range(position.sample, position.sample + position.stage.batch):
+                epoch, place = divmod(sample, len(self.feed))
+                wanted = (epoch + position.epoch_offset, place)
+                if wanted != here:
+                    examples = self.feed.epoch(*wanted)
+                draws.append((next(examples), *wanted))
+                here = (wanted[0], place + 1)
+            yield _Plan(position.stage, draws[self.place.share(position.stage.batch)])
+
+    def _make(self, plan: _Plan) -> tuple[np.ndarray, np.ndarray]:
+        crops = [self._crop(*draw, plan.stage.crop) for draw in plan.draws]
+        images, masks = zip(*crops, strict=True)
+        return np.stack(images), np.stack(masks)
+
+    def _crop(
+        self, example: Example, epoch: int, place: int, side: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Cut the crop of one sample, flipped by chance."""
-        seed = self.schedule.options.seed
-        epoch, place = divmod(sample, len(self.photos))
-        epoch += epoch_offset
-        order = self._order(epoch)
-        generator = np.random.default_rng([seed, 2, epoch, place])
-        photo = self.photos[order[place]]
-        image, mask = self.store.load(photo, self._choose_view(photo, side, generator))
+        generator = np.random.default_rng([self.schedule.options.seed, 2, epoch, place])
+        image, mask = example.load(self._choose_view(example.photo, side, generator))
         top = int(generator.integers(image.shape[0] - side + 1))
         left = int(generator.integers(image.shape[1] - side + 1))
         image = image[top : top + side, left : left + side]
@@ -102,11 +116,3 @@ class Batches:
         views = photo.dark if dark else photo.normal
         fitting = [view for view in views if view.short_side >= side]
         return fitting[int(generator.integers(len(fitting)))]
-
-    def _order(self, epoch: int) -> np.ndarray:
-        """Return the epoch's order of the photographs (the latest is kept)."""
-        kept = getattr(self, "_kept_order", None)
-        if kept is None or kept[0] != epoch:
-            generator = np.random.default_rng([self.schedule.options.seed, 1, epoch])
-            kept = self._kept_order = (epoch, generator.permutation(len(self.photos)))
-        return kept[1]

@@ -53,7 +53,7 @@ class LabelCache:
 
     def __init__(self, folder: Path, options: LabelOptions) -> None:
         self.options = options
-        self.folder = folder / _settings_digest(options)
+        self.folder = folder / settings_digest(options)
 
     def path(self, photo: Photo, view: View) -> Path:
         """Return the file of a label."""
@@ -106,17 +106,23 @@ def make_labels(task: PhotoLabelTask) -> tuple[int, str | None]:
     try:
         rgb = load_image(task.photo)
         for view, path in task.views:
-            # A dark view gets the low-visibility settings, a normal one the normal ones.
-            visibility = "normal" if view.darkening is None else "low"
-            options = dataclasses.replace(task.options, visibility=visibility)
-            label = fuse(luma(render(rgb, view)), options)
-            save_mask(label.mask, path)
+            save_mask(label_of_view(rgb, view, task.options), path)
     except DeepDetectError as error:
         return len(task.views), str(error)
     return len(task.views), None
 
 
-def _settings_digest(options: LabelOptions) -> str:
+def label_of_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray:
+    """Make the label of a view of a (H, W, 3) uint8 RGB photograph, (H, W) bool.
+
+    A dark view gets the low-visibility settings, a normal one the normal ones.
+    """
+    visibility = "normal" if view.darkening is None else "low"
+    options = dataclasses.replace(options, visibility=visibility)
+    return fuse(luma(render(rgb, view)), options).mask
+
+
+def settings_digest(options: LabelOptions) -> str:
     """Name a folder by all that a label depends on besides the photograph and the view."""
     used = [
         (detector.name, *(repr(settings_for(detector, v, options.changes)) for v in VISIBILITIES))

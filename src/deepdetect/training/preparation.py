@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .cluster import place_in_cluster, wait_for_all
+from .feed import Example, Feed, FileFeed, StoredExample
 from .label_cache import LabelCache
 from .photos import Photo, hold_out, list_photos, photos_digest
 from .recipe import TrainingOptions
+from .shards import ShardFeed, Shards, has_shards, held_examples
 from .view_store import ViewStore
-from .views import View
+from .views import largest
 
 
 @dataclass(frozen=True)
@@ -21,17 +23,12 @@ class Photographs:
     Attributes:
         training: those to train on.
         held: those to validate with.
-        store: their views and labels.
+        digest: a digest of which photographs there are.
     """
 
-    training: list[Photo]
-    held: list[Photo]
-    store: ViewStore
-
-    @property
-    def digest(self) -> str:
-        """A digest of which photographs there are."""
-        return photos_digest(self.training, self.held)
+    training: Feed
+    held: Sequence[Example]
+    digest: str
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class Sources:
     """The folders of a run.
 
     Attributes:
-        photos: folder of photographs.
+        photos: folder of photographs, or of shards (`deepdetect shards`).
         output: folder of the run, which is left out when it lies below the photographs.
         validation: folder of other photographs; None holds some of the first out.
         labels: folder for the label cache; None means one in `output`.
@@ -76,12 +73,46 @@ def prepare(
     """
     for stage in options.stages:
         place_in_cluster().share(stage.batch)  # an uneven share is told before the labels
+    if has_shards(sources.photos):
+        return _sharded(sources, options, workers, quiet)
     exclude = (sources.output, sources.label_cache)
     training = list_photos(sources.photos, options, exclude, options.max_photos)
     if sources.validation is None:
         training, held = hold_out(training, options.held_out)
     else:
         held = list_photos(Path(sources.validation), options, exclude)
+    store = _stored(sources, options, training, held, workers, quiet)
+    return Photographs(
+        FileFeed(training, store, options.seed),
+        [StoredExample(photo, store) for photo in held],
+        photos_digest(training, held),
+    )
+
+
+def _sharded(
+    sources: Sources, options: TrainingOptions, workers: int | None, quiet: bool
+) -> Photographs:
+    """Take the photographs from shards; those to validate with, too, unless a folder is named."""
+    shards = Shards.open(sources.photos, options)
+    training = ShardFeed(shards, options)
+    if sources.validation is None:
+        wait_for_all(place_in_cluster())
+        return Photographs(training, held_examples(shards, options), shards.digest)
+    held = list_photos(Path(sources.validation), options, (sources.output, sources.label_cache))
+    store = _stored(sources, options, [], held, workers, quiet)
+    digest = f"{shards.digest} {photos_digest([], held)}"
+    return Photographs(training, [StoredExample(photo, store) for photo in held], digest)
+
+
+def _stored(
+    sources: Sources,
+    options: TrainingOptions,
+    training: list[Photo],
+    held: list[Photo],
+    workers: int | None,
+    quiet: bool,
+) -> ViewStore:
+    """Make the labels of photographs in files."""
     store = ViewStore(LabelCache(sources.label_cache, options.label_options))
     wanted = [(photo, photo.normal + photo.dark) for photo in training]
     wanted += [(photo, (largest(photo.normal), largest(photo.dark))) for photo in held]
@@ -89,9 +120,4 @@ def prepare(
     if place.local_rank == 0:
         store.labels.make(wanted, workers, quiet or not place.is_first)
     wait_for_all(place)
-    return Photographs(training, held, store)
-
-
-def largest(views: Sequence[View]) -> View:
-    """Return the first view of the largest size, which validation takes."""
-    return max(views, key=lambda view: view.short_side)
+    return store

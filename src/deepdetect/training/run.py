@@ -19,14 +19,15 @@ from .batches import Batches
 from .checkpoint import Checkpoint, read_checkpoint, restore, save_checkpoint
 from .curves import CurvePoint, save_curves
 from .device import DeviceOptions
+from .feed import Example
 from .learner import Learner
 from .model_card import write_model_card
 from .prefetch import prefetched
-from .preparation import Photographs, largest
+from .preparation import Photographs
 from .provenance import provenance
 from .recipe import Schedule, TrainingOptions
 from .validation import score_network
-from .views import View
+from .views import View, largest
 
 CHECKPOINT = "checkpoint.safetensors"
 BEST = "best.safetensors"
@@ -87,13 +88,7 @@ class Run:
         self.engine, self.network = self.learner.engine, self.learner.network
         self.place = self.engine.place
         self.say = say if self.place.is_first else None
-        self.batches = Batches(
-            photographs.training,
-            photographs.store,
-            self.schedule,
-            self.place,
-            self.engine.loaders,
-        )
+        self.batches = Batches(photographs.training, self.schedule, self.place, self.engine.loaders)
         self.origin = {**provenance(), "run_on": self.engine.describe()}
         self._check_agreement()
         self.step = 0
@@ -146,8 +141,8 @@ class Run:
     def _validate(self) -> None:
         """Take the validation losses; keep the weights when they are the best so far."""
         held = self.photographs.held
-        normal = self._score([largest(photo.normal) for photo in held])
-        dark = self._score([largest(photo.dark) for photo in held])
+        normal = self._score([(example, largest(example.photo.normal)) for example in held])
+        dark = self._score([(example, largest(example.photo.dark)) for example in held])
         share = self.options.dark_fraction
         point = CurvePoint(
             step=self.step,
@@ -178,13 +173,11 @@ class Run:
                 "every machine needs the same files and the same command"
             )
 
-    def _score(self, views: list[View]) -> MaskScore:
+    def _score(self, views: list[tuple[Example, View]]) -> MaskScore:
         """Score the network on views of the photographs held out, shared by the processes."""
-        photos_and_views = list(zip(self.photographs.held, views, strict=True))
-        mine = photos_and_views[self.place.rank :: self.place.processes]
+        mine = views[self.place.rank :: self.place.processes]
         loaders = self.engine.loaders
-        load = self.photographs.store.load
-        pairs = prefetched(lambda task: load(*task), mine, loaders, loaders + 1)
+        pairs = prefetched(lambda pair: pair[0].load(pair[1]), mine, loaders, loaders + 1)
         scores = score_network(self.network, pairs, self.engine.device)
         return mean_score(self.engine.gather(scores))
 

@@ -1,0 +1,12 @@
+"""Photographs with their labels in shards, for sets too big for the memory.
+
+A shard is a tar file in WebDataset's layout: of every photograph the file as it was, its
+name, and the labels of its views. Shards are read one after the other, in an order of their
+own each epoch, some at a time, whose photographs are mixed.
+"""
+
+from .index import Shards, has_shards
+from .reading import ShardFeed, held_examples
+from .writing import write_shards
+
+__all__ = ["ShardFeed", "Shards", "has_shards", "held_examples", "write_shards"]
