@@ -56,3 +56,27 @@ def one_line() -> Callable[[BaseException], str]:
         return message
 
     return check
+
+
+@pytest.fixture
+def run_evaluate(tmp_path: Path) -> Callable[..., str]:
+    """Run `deepdetect evaluate` on one sample and return what it prints."""
+    from click.testing import CliRunner
+    from PIL import Image
+
+    from deepdetect.cli import main
+    from deepdetect.detector import bundled_weights
+
+    generator = np.random.default_rng(0)
+    Image.fromarray(generator.integers(0, 256, (64, 64, 3), np.uint8)).save(
+        tmp_path / "image_1.png"
+    )
+    Image.fromarray(generator.random((64, 64)) > 0.5).save(tmp_path / "mask_image_1.png")
+
+    def run(*arguments: object) -> str:
+        given = [bundled_weights() if str(a).endswith(".onnx") else a for a in arguments]
+        result = CliRunner().invoke(main, ["evaluate", str(tmp_path), *map(str, given)])
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    return run

@@ -87,7 +87,7 @@ def score_samples(
         ImageError: there are no samples, or a mask is missing or of another size.
     """
     scores: dict[str, list[MaskScore]] = {"normal": [], "low": []}
-    paths = sorted(Path(folder).glob("image_*.png"))
+    paths = sample_images(folder)
     with progress(len(paths), "scoring", "image", quiet) as bar:
         for path in paths:
             rgb = load_image(path)
@@ -101,3 +101,8 @@ def score_samples(
             f"there are no samples in {folder}: it must hold image_NAME.png and mask_image_NAME.png"
         )
     return {name: mean_score(listed) for name, listed in scores.items() if listed}
+
+
+def sample_images(folder: str | Path) -> list[Path]:
+    """List the images of a folder of samples."""
+    return sorted(Path(folder).glob("image_*.png"))

@@ -7,6 +7,7 @@ import pytest
 
 from deepdetect.image import luma
 from deepdetect.labels import LabelOptions, fuse
+from deepdetect.options import changed
 from deepdetect.training.batches import Batches
 from deepdetect.training.feed import FileFeed
 from deepdetect.training.label_cache import LabelCache
@@ -123,3 +124,14 @@ def test_memory_limit_changes_nothing_but_the_time(batches: Batches) -> None:
     frugal = Batches(FileFeed(batches.feed.photos, store, OPTIONS.seed), batches.schedule)
     np.testing.assert_array_equal(frugal.batch(4)[0], batches.batch(4)[0])
     assert not store._kept
+
+
+def test_interleaved_batches_are_those_of_the_stages_in_turn(batches: Batches) -> None:
+    schedule = Schedule(changed(OPTIONS, interleave=True), len(batches.feed))
+    mixed = Batches(batches.feed, schedule)
+    sums = sorted(int(images.sum()) for images, _ in mixed.stream(0))
+    assert sums == sorted(int(images.sum()) for images, _ in batches.stream(0))
+    sizes = [len(masks[0]) for _, masks in mixed.stream(0)]
+    assert set(sizes[:6]) == set(sizes[-6:]) == {64, 96}
+    for (ours, _), (theirs, _) in zip(mixed.stream(9), list(mixed.stream(0))[9:], strict=True):
+        np.testing.assert_array_equal(ours, theirs)

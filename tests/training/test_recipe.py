@@ -86,3 +86,24 @@ def test_the_last_step_is_a_milestone(steps: int, count: int) -> None:
     milestones = Schedule(options, steps).milestones(count)
     assert max(milestones) == steps
     assert min(milestones) > 0
+
+
+@given(
+    photos=st.integers(1, 50),
+    stages=st.lists(st.tuples(st.integers(1, 8), st.integers(1, 4)), min_size=1, max_size=3),
+)
+def test_interleaved_stages_advance_together(photos: int, stages: list[tuple[int, int]]) -> None:
+    made = tuple(Stage(16, batch, epochs) for batch, epochs in stages)
+    options = TrainingOptions(stages=made, short_sides=(16,))
+    mixed = Schedule(changed(options, interleave=True), photos)
+    plain = Schedule(options, photos)
+    positions = [mixed.position(step) for step in range(mixed.steps)]
+    expected = [plain.position(step) for step in range(plain.steps)]
+    key = lambda position: (position.number, position.sample)  # noqa: E731
+    assert sorted(positions, key=key) == sorted(expected, key=key)
+    done = [0] * len(made)
+    for step, position in enumerate(positions, start=1):
+        assert position.sample == done[position.number] * position.stage.batch
+        done[position.number] += 1
+        for number, total in enumerate(mixed.steps_of_stage):
+            assert abs(done[number] - total * step / mixed.steps) < len(made) + 1

@@ -52,6 +52,11 @@ if TYPE_CHECKING:
     metavar="CROPxBATCHxEPOCHS",
     help="What is trained on; repeat it for several in turn.  [default: 240x16x44 480x8x10]",
 )
+@click.option(
+    "--interleave/--in-turn",
+    default=None,
+    help="Mix the stages' steps evenly.  [default: in turn]",
+)
 @short_sides_option
 @click.option("--dark-fraction", type=float, help="Share of darkened images.  [default: 0.25]")
 @click.option("--optimizer", help="adam or soap.  [default: adam]")

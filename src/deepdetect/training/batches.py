@@ -74,18 +74,19 @@ class Batches:
 
     def _plans(self, first: int, last: int) -> Iterator[_Plan]:
         """Yield what the batches are made of; all processes go through the same photographs."""
-        here = (-1, -1)
-        examples: Iterator[Example] = iter(())
+        # Of each stage the place that it has come to, and the photographs from there on.
+        running: dict[int, tuple[tuple[int, int], Iterator[Example]]] = {}
         for step in range(first, last):
             position = self.schedule.position(step)
             draws = []
             for sample in range(position.sample, position.sample + position.stage.batch):
                 epoch, place = divmod(sample, len(self.feed))
-                wanted = (epoch + position.epoch_offset, place)
-                if wanted != here:
-                    examples = self.feed.epoch(*wanted)
-                draws.append((next(examples), *wanted))
-                here = (wanted[0], place + 1)
+                epoch += position.epoch_offset
+                there, examples = running.get(position.number, (None, None))
+                if there != (epoch, place):
+                    examples = self.feed.epoch(epoch, place)
+                draws.append((next(examples), epoch, place))
+                running[position.number] = (epoch, place + 1), examples
             yield _Plan(position.stage, draws[self.place.share(position.stage.batch)])
 
     def _make(self, plan: _Plan) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,6 @@ from .photos import Photo, hold_out, list_photos, photos_digest
 from .recipe import TrainingOptions
 from .shards import ShardFeed, Shards, has_shards, held_examples
 from .view_store import ViewStore
-from .views import largest
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ def _stored(
     """Make the labels of photographs in files."""
     store = ViewStore(LabelCache(sources.label_cache, options.label_options))
     wanted = [(photo, photo.normal + photo.dark) for photo in training]
-    wanted += [(photo, (largest(photo.normal), largest(photo.dark))) for photo in held]
+    wanted += [(photo, (photo.normal[0], photo.dark[0])) for photo in held]
     place = place_in_cluster()
     if place.local_rank == 0:
         store.labels.make(wanted, workers, quiet or not place.is_first)

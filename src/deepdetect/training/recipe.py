@@ -7,6 +7,8 @@ import json
 import math
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from ..errors import OptionError, look_up
 from ..labels import DETECTOR_NAMES, LabelOptions, SettingChange
 from .darkening import DarkeningRange
@@ -58,8 +60,10 @@ class TrainingOptions:
         stages: what is trained on, one after the other. Small crops give many cheap
             steps first; whole images last teach what depends on the whole image
             (Harris and Sobel labels are relative to the image's largest response).
+        interleave: go through all stages at the same time, their steps evenly mixed, not
+            one after the other: every size is seen until the end.
         short_sides: sizes in pixels that the photographs' shorter side is scaled to;
-            a crop is taken from those that are large enough.
+            a crop is taken from those that are large enough. The first is that of validation.
         square: squash the photographs to squares, as the paper does, instead.
         max_photos: use no more photographs than so many, those held out among them; None
             uses all.
@@ -85,6 +89,7 @@ class TrainingOptions:
     """
 
     stages: tuple[Stage, ...] = (Stage(240, 16, 44), Stage(480, 8, 10))
+    interleave: bool = False
     short_sides: tuple[int, ...] = (480, 360, 240)
     square: bool = False
     max_photos: int | None = None
@@ -142,8 +147,15 @@ class TrainingOptions:
 
 @dataclass(frozen=True)
 class Position:
-    """Where a step lies: its stage, its first crop's number in the stage, the epochs before it."""
+    """Where a step lies.
 
+    Attributes:
+        number, stage: its stage.
+        sample: its first crop's number in the stage.
+        epoch_offset: the epochs of the stages before.
+    """
+
+    number: int
     stage: Stage
     sample: int
     epoch_offset: int
@@ -164,16 +176,24 @@ class Schedule:
             max(1, stage.epochs * photos // stage.batch) for stage in options.stages
         ]
         self.steps = sum(self.steps_of_stage)
+        stages = [np.full(steps, k) for k, steps in enumerate(self.steps_of_stage)]
+        within = [np.arange(steps) for steps in self.steps_of_stage]
+        self._stages, self._within = np.concatenate(stages), np.concatenate(within)
+        if options.interleave:
+            shares = [(each + 0.5) / len(each) for each in within]
+            order = np.argsort(np.concatenate(shares), kind="stable")
+            self._stages, self._within = self._stages[order], self._within[order]
 
     def position(self, step: int) -> Position:
-        """Find a step's stage and place in it."""
-        epochs = 0
-        for stage, steps in zip(self.options.stages, self.steps_of_stage, strict=True):
-            if step < steps:
-                return Position(stage, step * stage.batch, epochs)
-            step -= steps
-            epochs += stage.epochs
-        raise IndexError("the step lies behind the last one")
+        """Find a step's stage and place in it.
+
+        Raises:
+            IndexError: the step lies behind the last one.
+        """
+        number = int(self._stages[step])
+        stage = self.options.stages[number]
+        before = sum(each.epochs for each in self.options.stages[:number])
+        return Position(number, stage, int(self._within[step]) * stage.batch, before)
 
     def learning_rate(self, step: int) -> float:
         """Return Adam's rate at a step: a linear warm-up into cosine annealing."""

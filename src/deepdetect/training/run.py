@@ -27,7 +27,7 @@ from .preparation import Photographs
 from .provenance import provenance
 from .recipe import Schedule, TrainingOptions
 from .validation import score_network
-from .views import View, largest
+from .views import View
 
 CHECKPOINT = "checkpoint.safetensors"
 BEST = "best.safetensors"
@@ -141,8 +141,8 @@ class Run:
     def _validate(self) -> None:
         """Take the validation losses; keep the weights when they are the best so far."""
         held = self.photographs.held
-        normal = self._score([(example, largest(example.photo.normal)) for example in held])
-        dark = self._score([(example, largest(example.photo.dark)) for example in held])
+        normal = self._score([(example, example.photo.normal[0]) for example in held])
+        dark = self._score([(example, example.photo.dark[0]) for example in held])
         share = self.options.dark_fraction
         point = CurvePoint(
             step=self.step,

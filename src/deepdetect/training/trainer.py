@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -102,6 +103,7 @@ def profile(
     Example:
         >>> profile("photographs", "run")[0].images_per_second  # doctest: +SKIP
     """
+    options = dataclasses.replace(options, interleave=False)  # each stage by itself
     network = _first_network(options, start)
     sources = Sources(Path(photos), Path(output), validation, labels)
     made = prepare(sources, options, workers, quiet=say is None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -63,11 +62,6 @@ def views_of(
         for _ in range(variants)
     )
     return normal, dark
-
-
-def largest(views: Sequence[View]) -> View:
-    """Return the first view of the largest size, which validation takes."""
-    return max(views, key=lambda view: view.short_side)
 
 
 def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from ...progress import progress
 from ..label_cache import label_of_view
 from ..photos import Photo, hold_out, list_photos, photos_digest
 from ..recipe import TrainingOptions
-from ..views import View, largest
+from ..views import View
 from .index import INDEX, Shards, claim_folder, fixed_options, write_json
 from .library import webdataset
 
@@ -136,5 +136,5 @@ def _sample(
 
 def _views(photo: Photo, kind: str) -> tuple[View, ...]:
     if kind == "validation":
-        return largest(photo.normal), largest(photo.dark)
+        return photo.normal[0], photo.dark[0]
     return photo.normal + photo.dark

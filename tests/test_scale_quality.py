@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deepdetect import ImageError, OptionError
+from deepdetect.image import luma
+from deepdetect.labels import fuse
+from deepdetect.scale_quality import scale_quality
+
+
+class Labels:
+    """A detector that knows the labels."""
+
+    def __init__(self) -> None:
+        self.sizes: list[tuple[int, int]] = []
+
+    def heatmap(self, rgb: np.ndarray) -> np.ndarray:
+        self.sizes.append(rgb.shape[:2])
+        return fuse(luma(rgb)).mask.astype(np.float32)
+
+
+def test_a_detector_that_knows_the_labels_has_full_marks(photo: np.ndarray) -> None:
+    dark = (photo * 0.15).astype(np.uint8)
+    detector, steps = Labels(), []
+    rows = scale_quality(detector, [photo, dark], (0.5, 2), done=steps.append)
+    assert [(row.scale, row.visibility) for row in rows] == [
+        (scale, visibility) for scale in (0.5, 2) for visibility in ("normal", "low")
+    ]
+    assert len(steps) == 4
+    height, width = photo.shape[:2]
+    assert detector.sizes[0] == (round(height / 2), round(width / 2))
+    assert detector.sizes[2] == (2 * height, 2 * width)
+    for row in rows:
+        assert row.score.iou == 1
+        assert row.score.loss < 1e-6
+        assert row.density == pytest.approx(row.label_density)
+        assert 0 < row.density < 1
+
+
+def test_nonsense_is_refused(photo: np.ndarray) -> None:
+    with pytest.raises(OptionError, match="above 0"):
+        scale_quality(Labels(), [photo], (1, 0))
+    with pytest.raises(ImageError, match="at least 16"):
+        scale_quality(Labels(), [photo], (0.02,))
+
+
+def test_the_command_prints_a_row_for_each_scale(run_evaluate) -> None:
+    text = run_evaluate("--scale", "0.5", "--scale", "2")
+    lines = [line.split() for line in text.splitlines()]
+    assert any(line[:2] == ["x0.5", "normal"] for line in lines)
+    assert any(line[:2] == ["x2", "normal"] for line in lines)
