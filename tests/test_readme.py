@@ -91,6 +91,9 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
             "1",
         ]
         words += ["--no-compile", "--workers", "1", "--validation", "PHOTOS"]
+    if "shards" in words:
+        pytest.importorskip("webdataset", reason="needs webdataset, of the extra data")
+        words += ["--detectors", "fast", "--short-side", "32", "--workers", "1"]
     if "evaluate" in words:
         (folder / "samples").mkdir()
         shutil.copy("left.png", "samples/image_1.png")
@@ -98,6 +101,7 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
         Image.fromarray(mask).save("samples/mask_image_1.png")
     (folder / "photos").mkdir()
     shutil.copy("left.png", "photos")
+    shutil.copy("right.png", "photos")
     shutil.copy("right.png", "photos")
     places = {
         "IMAGES": "left.png",
