@@ -101,8 +101,7 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
         Image.fromarray(mask).save("samples/mask_image_1.png")
     (folder / "photos").mkdir()
     shutil.copy("left.png", "photos")
-    shutil.copy("right.png", "photos")
-    shutil.copy("right.png", "photos")
+    shutil.copy("right.png", "photos/another.png")
     places = {
         "IMAGES": "left.png",
         "IMAGE0": "left.png",

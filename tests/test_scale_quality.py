@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from deepdetect import ImageError, OptionError
+from deepdetect.heatmap import HeatmapOptions
 from deepdetect.image import luma
 from deepdetect.labels import fuse
 from deepdetect.scale_quality import scale_quality
@@ -15,6 +16,10 @@ class Labels:
     def __init__(self) -> None:
         self.sizes: list[tuple[int, int]] = []
 
+    def configured(self, options: HeatmapOptions) -> Labels:
+        assert options == HeatmapOptions(), "native resolution"
+        return self
+
     def heatmap(self, rgb: np.ndarray) -> np.ndarray:
         self.sizes.append(rgb.shape[:2])
         return fuse(luma(rgb)).mask.astype(np.float32)
@@ -23,7 +28,7 @@ class Labels:
 def test_a_detector_that_knows_the_labels_has_full_marks(photo: np.ndarray) -> None:
     dark = (photo * 0.15).astype(np.uint8)
     detector, steps = Labels(), []
-    rows = scale_quality(detector, [photo, dark], (0.5, 2), done=steps.append)
+    (rows,) = scale_quality([detector], [photo, dark], (0.5, 2), done=steps.append)
     assert [(row.scale, row.visibility) for row in rows] == [
         (scale, visibility) for scale in (0.5, 2) for visibility in ("normal", "low")
     ]
@@ -38,11 +43,16 @@ def test_a_detector_that_knows_the_labels_has_full_marks(photo: np.ndarray) -> N
         assert 0 < row.density < 1
 
 
-def test_nonsense_is_refused(photo: np.ndarray) -> None:
+@pytest.mark.parametrize("scale", [0, -1, float("nan"), float("inf")])
+def test_nonsense_is_refused(photo: np.ndarray, scale: float) -> None:
     with pytest.raises(OptionError, match="above 0"):
-        scale_quality(Labels(), [photo], (1, 0))
+        scale_quality([Labels()], [photo], (1, scale))
+
+
+@pytest.mark.parametrize("scale", [0.02, 1e-6])
+def test_an_image_must_not_vanish(photo: np.ndarray, scale: float) -> None:
     with pytest.raises(ImageError, match="at least 16"):
-        scale_quality(Labels(), [photo], (0.02,))
+        scale_quality([Labels()], [photo], (scale,))
 
 
 def test_the_command_prints_a_row_for_each_scale(run_evaluate) -> None:

@@ -64,6 +64,18 @@ def luma(rgb: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
 
 
+def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
+    """Scale an image so that its shorter side has the given length in pixels."""
+    height, width = rgb.shape[:2]
+    factor = short_side / min(height, width)
+    if factor == 1:
+        return rgb
+    size = (max(round(width * factor), short_side), max(round(height * factor), short_side))
+    # Area averaging does not alias when shrinking; cubic keeps edges when enlarging.
+    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+    return cv2.resize(rgb, size, interpolation=method)
+
+
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     """List the image files below a folder, sorted by path.
 

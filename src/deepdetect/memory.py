@@ -10,8 +10,8 @@ from pathlib import Path
 UNKNOWN = 4_000_000_000
 """Bytes assumed where the system does not tell."""
 
-# Of malloc.h: no block of its own mapping, none given back at the end, room for more.
-_KEEP = ((-4, 0), (-1, 2**31 - 1), (-2, 2**28))
+# Of malloc.h: no block of its own mapping, nothing given back at the end, room for more.
+_KEEP = ((-4, 0), (-1, -1), (-2, 2**28))
 
 
 def free_memory() -> int:
@@ -29,7 +29,7 @@ def keep_freed_memory() -> bool:
 
     The GNU library gives large blocks back at once, and the system clears each page of the
     next ones anew: a training step on the CPU, which makes and frees gigabytes, spends a fifth
-    of its time on that. For a program that does one thing only: the memory of its peak stays.
+    of its time on that. It holds for the whole process, whose memory stays at its peak.
 
     Returns:
         Whether it will be so.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from .detector import DeepDetect
-from .errors import OptionError
-from .image import load_image, luma
+from .errors import ImageError, OptionError
+from .heatmap import HeatmapOptions
+from .image import MINIMUM_SIDE, load_image, luma, scale_short_side
 from .labels import LabelOptions, fuse
 from .mask_scores import MaskScore, mean_score, score_heatmap
-from .training.views import scale_short_side
 
 
 @dataclass(frozen=True)
@@ -35,24 +36,35 @@ class ScaleQuality:
     density: float
 
 
+def check_scales(scales: Sequence[float]) -> None:
+    """Make sure that images can be scaled by these factors.
+
+    Raises:
+        OptionError: one is not above 0, or not finite.
+    """
+    for scale in scales:
+        if not (math.isfinite(scale) and scale > 0):
+            raise OptionError(f"a scale must be a number above 0, not {scale:g}")
+
+
 def scale_quality(
-    detector: DeepDetect,
+    detectors: Sequence[DeepDetect],
     images: Sequence[Any],
     scales: Sequence[float],
     options: LabelOptions = LabelOptions(),
     done: Callable[[int], object] = lambda _: None,
-) -> list[ScaleQuality]:
-    """Score a detector on images scaled by several factors, each with labels of its own.
+) -> list[list[ScaleQuality]]:
+    """Score detectors on images scaled by several factors, each with labels of its own.
 
     Args:
-        detector: its weights are measured, at native resolution.
+        detectors: their weights are measured, at native resolution, whatever theirs is.
         images: anything `load_image` takes.
         scales: factors above 0; images are shrunk by area averaging and enlarged cubically.
         options: how labels are made; the visibility of each image decides the settings.
         done: called with 1 after each image at each scale.
 
     Returns:
-        A row for each scale and each visibility that occurs.
+        For each detector a row for each scale and each visibility that occurs.
 
     Raises:
         OptionError: a scale is not above 0.
@@ -61,36 +73,37 @@ def scale_quality(
     Example:
         >>> rng = np.random.default_rng(0)
         >>> image = rng.integers(0, 256, (64, 64, 3), np.uint8)
-        >>> [row.scale for row in scale_quality(DeepDetect(), [image], (0.5, 1, 2))]
+        >>> (rows,) = scale_quality([DeepDetect()], [image], (0.5, 1, 2))
+        >>> [row.scale for row in rows]
         [0.5, 1, 2]
     """
-    if not all(scale > 0 for scale in scales):
-        raise OptionError(f"scales must be above 0, not {min(scales):g}")
-    rows = []
+    check_scales(scales)
+    native = [detector.configured(HeatmapOptions()) for detector in detectors]
+    rows: list[list[ScaleQuality]] = [[] for _ in detectors]
     for scale in scales:
-        found: dict[str, list[tuple[MaskScore, float, float]]] = {}
+        found: dict[str, list[tuple[float, list[tuple[MaskScore, float]]]]] = {}
         for image in images:
-            rgb = load_image(image)
-            scaled = scale_short_side(rgb, round(scale * min(rgb.shape[:2])))
-            label = fuse(luma(load_image(scaled)), options)
-            heatmap = detector.heatmap(scaled)
-            found.setdefault(label.visibility, []).append(
-                (
-                    score_heatmap(heatmap, label.mask),
-                    float(label.mask.mean()),
-                    float((heatmap > 0.5).mean()),
-                )
-            )
+            scaled = _scaled(load_image(image), scale)
+            label = fuse(luma(scaled), options)
+            heatmaps = [detector.heatmap(scaled) for detector in native]
+            scores = [(score_heatmap(h, label.mask), float((h > 0.5).mean())) for h in heatmaps]
+            found.setdefault(label.visibility, []).append((float(label.mask.mean()), scores))
             done(1)
         for visibility in sorted(found, reverse=True):
-            scores, label_densities, densities = zip(*found[visibility], strict=True)
-            rows.append(
-                ScaleQuality(
-                    scale,
-                    visibility,
-                    mean_score(scores),
-                    float(np.mean(label_densities)),
-                    float(np.mean(densities)),
-                )
-            )
+            label_density = float(np.mean([density for density, _ in found[visibility]]))
+            for k, own in enumerate(rows):
+                mine = [scores[k] for _, scores in found[visibility]]
+                score = mean_score(score for score, _ in mine)
+                density = float(np.mean([density for _, density in mine]))
+                own.append(ScaleQuality(scale, visibility, score, label_density, density))
     return rows
+
+
+def _scaled(rgb: np.ndarray, scale: float) -> np.ndarray:
+    short_side = round(scale * min(rgb.shape[:2]))
+    if short_side < MINIMUM_SIDE:
+        raise ImageError(
+            f"an image scaled by {scale:g} has a side of {short_side} pixels: "
+            f"it needs at least {MINIMUM_SIDE}, use larger scales"
+        )
+    return scale_short_side(rgb, short_side)

@@ -12,7 +12,8 @@ from deepdetect.training.batches import Batches
 from deepdetect.training.feed import FileFeed
 from deepdetect.training.label_cache import LabelCache
 from deepdetect.training.photos import list_photos
-from deepdetect.training.recipe import Schedule, Stage, TrainingOptions
+from deepdetect.training.recipe import Stage, TrainingOptions
+from deepdetect.training.schedule import Schedule
 from deepdetect.training.view_store import ViewStore
 from deepdetect.training.views import render
 

@@ -4,7 +4,8 @@ import pytest
 
 from deepdetect import OptionError
 from deepdetect.training.presets import training_preset
-from deepdetect.training.recipe import Schedule, Stage, TrainingOptions
+from deepdetect.training.recipe import Stage, TrainingOptions
+from deepdetect.training.schedule import Schedule
 
 
 def test_the_papers_recipe() -> None:

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from deepdetect.errors import OptionError
 from deepdetect.options import changed
-from deepdetect.training.recipe import Schedule, Stage, TrainingOptions
+from deepdetect.training.recipe import Stage, TrainingOptions
+from deepdetect.training.schedule import Schedule
 
 
 @pytest.mark.parametrize("text", ["240x16", "axbxc", "240x16x0", "0x1x1", "241x1x1", "240x0x1"])

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -19,9 +21,11 @@ from deepdetect.image import luma
 from deepdetect.labels import LabelOptions, fuse
 from deepdetect.training.batches import Batches
 from deepdetect.training.cluster import Place
-from deepdetect.training.recipe import Schedule, Stage, TrainingOptions
-from deepdetect.training.shards import ShardFeed, Shards, write_shards
-from deepdetect.training.shards.reading import held_examples
+from deepdetect.training.preparation import Sources, prepare
+from deepdetect.training.recipe import Stage, TrainingOptions
+from deepdetect.training.schedule import Schedule
+from deepdetect.training.shards import HeldExamples, ShardFeed, Shards, has_shards, write_shards
+from deepdetect.training.shards.reading import read_shard
 from deepdetect.training.views import render
 
 OPTIONS = TrainingOptions(
@@ -50,7 +54,7 @@ def names(feed: ShardFeed, number: int, first: int = 0) -> list[str]:
 def test_every_photograph_is_in_one_place(
     photographs: Path, shards: Shards, feed: ShardFeed
 ) -> None:
-    held = [example.photo.path.name for example in held_examples(shards, OPTIONS)]
+    held = [example.photo.path.name for example in HeldExamples(shards, OPTIONS)]
     assert held
     assert len(feed) == len(names(feed, 0))
     assert sorted(held + names(feed, 0)) == sorted(path.name for path in photographs.iterdir())
@@ -66,12 +70,10 @@ def test_each_epoch_has_an_order_of_its_own_from_any_place(feed: ShardFeed) -> N
 
 def test_shards_are_mixed_and_not_only_ordered(feed: ShardFeed, shards: Shards) -> None:
     """Photographs of one shard need not follow each other."""
-    from deepdetect.training.shards.reading import read_shard
-
     shard_of = {
         example.photo.path.name: path
-        for path, _ in shards.training
-        for example in read_shard(path, OPTIONS)
+        for path, count in shards.training
+        for example in read_shard(path, count, OPTIONS)
     }
     order = [shard_of[name] for name in names(feed, 0)]
     changes = sum(a != b for a, b in itertools.pairwise(order))
@@ -115,7 +117,10 @@ def test_a_broken_off_call_goes_on(photographs: Path, tmp_path: Path) -> None:
     content, written = lost.read_bytes(), kept.stat().st_mtime_ns
     lost.unlink()
     (tmp_path / "shards.json").unlink()
+    with pytest.raises(ImageError, match="not finished"):
+        has_shards(tmp_path)
     write_shards(photographs, tmp_path, OPTIONS, photos_a_shard=2, workers=1)
+    assert has_shards(tmp_path)
     assert lost.read_bytes() == content
     assert kept.stat().st_mtime_ns == written
 
@@ -124,47 +129,101 @@ def test_other_options_are_refused(photographs: Path, shards: Shards) -> None:
     other = TrainingOptions(stages=OPTIONS.stages, short_sides=(96,), detectors=("fast",))
     with pytest.raises(OptionError, match="short_sides, held_out, labels"):
         Shards.open(shards.folder, other)
-    with pytest.raises(OptionError, match="another folder with -o"):
+    with pytest.raises(OptionError, match="another folder"):
         write_shards(photographs, shards.folder, other)
+    with pytest.raises(OptionError, match="holds the photographs"):
+        write_shards(photographs, photographs, OPTIONS)
 
 
-def test_an_unreadable_photograph_leaves_no_half_shard(photographs: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "photos"
+def test_other_packing_is_another_set(photographs: Path, shards: Shards, tmp_path: Path) -> None:
+    """The order of the photographs depends on it, so a run must not go on with it."""
+    other = write_shards(photographs, tmp_path, OPTIONS, photos_a_shard=3, workers=1)
+    assert other.digest != shards.digest
+
+
+def copies(photographs: Path, folder: Path) -> Path:
     folder.mkdir()
-    for path in sorted(photographs.iterdir())[:6]:
+    for path in photographs.iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
-    (folder / "photo99.png").write_bytes(b"no image")
-    with pytest.raises(DeepDetectError, match=r"photo99\.png is not an image"):
-        write_shards(folder, tmp_path / "out", OPTIONS, photos_a_shard=2, workers=1)
-    left = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert "shards.json" not in left
-    for name in left:
-        assert name.endswith((".tar", "plan.json")), name
-        if name.endswith(".tar"):
-            with tarfile.open(tmp_path / "out" / name) as tar:
-                assert tar.getmembers()
-    (folder / "photo99.png").unlink()
-    with pytest.raises(OptionError, match="other photographs"):
-        write_shards(folder, tmp_path / "out", OPTIONS, photos_a_shard=2, workers=1)
+    return folder
 
 
-@pytest.mark.parametrize("damage", ["cut", "missing", "fewer", "index"])
-def test_damaged_shards_are_told(damage: str, photographs: Path, tmp_path: Path) -> None:
-    made = write_shards(photographs, tmp_path, OPTIONS, photos_a_shard=4, workers=1)
-    path = made.training[0][0]
+def test_an_unreadable_photograph_can_be_mended(photographs: Path, tmp_path: Path) -> None:
+    folder, output = copies(photographs, tmp_path / "photos"), tmp_path / "out"
+    bad = folder / "photo05.png"
+    bad.write_bytes(b"no image")
+    with pytest.raises(DeepDetectError, match=r"1 of \d shards .*photo05\.png is not an image"):
+        write_shards(folder, output, OPTIONS, photos_a_shard=2, workers=1)
+    left = {path: path.stat().st_mtime_ns for path in output.iterdir()}
+    assert left
+    for path in left:
+        with tarfile.open(path) as tar:
+            assert tar.getmembers(), "only whole shards are there"
+    bad.write_bytes((folder / "photo06.png").read_bytes())
+    made = write_shards(folder, output, OPTIONS, photos_a_shard=2, workers=1)
+    for path, written in left.items():
+        assert path.stat().st_mtime_ns == written, "what was done is not done again"
+    assert len(made.training) + len(made.validation) == len(left) + 1
+
+
+def test_few_shards_change_when_a_photograph_goes(photographs: Path, tmp_path: Path) -> None:
+    folder = copies(photographs, tmp_path / "photos")
+    before = write_shards(folder, tmp_path / "out", OPTIONS, photos_a_shard=2, workers=1)
+    (folder / next(iter(ShardFeed(before, OPTIONS).epoch(0))).photo.path).unlink()
+    after = write_shards(folder, tmp_path / "out", OPTIONS, photos_a_shard=2, workers=1)
+    assert len(set(before.training) - set(after.training)) == 1
+
+
+@pytest.mark.parametrize("kind", ["training", "validation"])
+@pytest.mark.parametrize("damage", ["cut", "missing", "other", "index"])
+def test_damaged_shards_are_told(
+    damage: str, kind: str, photographs: Path, shards: Shards, tmp_path: Path
+) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(shards.folder, folder)
+    path = folder / getattr(shards, kind)[0][0].name
     if damage == "cut":
         path.write_bytes(path.read_bytes()[:5000])
     elif damage == "missing":
         path.unlink()
-    elif damage == "fewer":
-        path.write_bytes(made.training[-1][0].read_bytes())
-        other = made.validation[0][0] if made.training[-1][1] == made.training[0][1] else None
-        if other is not None:
-            path.write_bytes(other.read_bytes())
+    elif damage == "other":  # ends between two photographs
+        with tarfile.open(path, "w"):
+            pass
     else:
-        (tmp_path / "shards.json").write_text("{")
+        (folder / "shards.json").write_text("{")
     with pytest.raises(ImageError, match="deepdetect shards"):
-        list(ShardFeed(Shards.open(tmp_path, OPTIONS), OPTIONS).epoch(0))
+        read_all(folder, kind)
+
+
+def read_all(folder: Path, kind: str) -> None:
+    found = Shards.open(folder, OPTIONS)
+    if kind == "training":
+        list(ShardFeed(found, OPTIONS).epoch(0))
+    else:
+        list(HeldExamples(found, OPTIONS))
+
+
+def test_a_damaged_photograph_is_named(feed: ShardFeed) -> None:
+    example = next(iter(feed.epoch(0)))
+    view = example.photo.normal[0]
+    broken = dataclasses.replace(example, content=example.content[:200])
+    with pytest.raises(ImageError, match=f"{example.shard.name} .*{example.photo.path}"):
+        broken.load(view)
+    with pytest.raises(ImageError, match=f"{example.shard.name} .*{example.photo.path}"):
+        dataclasses.replace(example, labels={}).load(view)
+
+
+def test_validation_can_come_from_a_folder(
+    photographs: Path, shards: Shards, tmp_path: Path
+) -> None:
+    made = prepare(Sources(shards.folder, tmp_path, photographs), OPTIONS, workers=1)
+    assert len(list(made.held)) == 12
+    own = prepare(Sources(shards.folder, tmp_path), OPTIONS, workers=1)
+    assert len(list(own.held)) == sum(count for _, count in shards.validation)
+    assert made.digest != own.digest
+    for example in own.held:
+        image, mask = example.load(example.photo.dark[0])
+        assert mask.shape == image.shape[:2]
 
 
 def test_the_two_commands(photographs: Path, tmp_path: Path) -> None:

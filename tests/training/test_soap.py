@@ -112,3 +112,32 @@ def test_every_parameter_of_the_network_is_moved_by_one_optimiser(name: str) -> 
 def test_an_unknown_optimiser_is_an_error() -> None:
     with pytest.raises(OptionError, match="did you mean 'soap'"):
         make_optimizers("sopa", ESPNet())
+
+
+def test_processes_with_other_rounding_stay_together() -> None:
+    """What the first one's `share` sends, the second one takes."""
+    sent: list[torch.Tensor] = []
+    generator = torch.Generator().manual_seed(8)
+    gradients = torch.randn(60, 8, 20, generator=generator)
+    gradients[:10] = gradients[0]  # of rank one: most of the basis is rounding
+    weights = [torch.nn.Parameter(torch.zeros(8, 20)) for _ in range(3)]
+    first = Soap([weights[0]], lr=0.01, share=lambda tensor: sent.append(tensor.clone()))
+    second = Soap([weights[1]], lr=0.01, share=lambda tensor: tensor.copy_(sent.pop(0)))
+    alone = Soap([weights[2]], lr=0.01)
+    for k, gradient in enumerate(gradients):
+        weights[0].grad = gradient.clone()
+        weights[1].grad = gradient.clone()
+        weights[2].grad = gradient.clone()
+        if k:
+            for optimizer, weight in ((second, weights[1]), (alone, weights[2])):
+                noise = torch.randn(8, 8, generator=torch.Generator().manual_seed(k))
+                matrix = optimizer.state[weight]["left"]
+                matrix += 1e-7 * matrix.norm() * (noise + noise.T)
+        for optimizer in (first, second, alone):
+            optimizer.step()
+        assert not sent, "both share the same tensors"
+    ends = [weight.detach() for weight in weights]
+    apart = (ends[2] - ends[0]).norm() / ends[0].norm()
+    together = (ends[1] - ends[0]).norm() / ends[0].norm()
+    assert 10 * together < apart
+    assert together < 1e-3

@@ -68,7 +68,9 @@ def evaluate(
     """
     from ..datasets.oxford import load_oxford
     from ..mask_scores import score_samples
+    from ..scale_quality import check_scales
 
+    check_scales(scales)
     scenes = load_oxford(oxford) if oxford is not None else []
     weights = [values["weights"], *against]
     detectors = [make_detector({**values, "weights": path}) for path in weights]
@@ -119,9 +121,8 @@ def _measure_scales(
     from ..scale_quality import scale_quality
 
     images = sample_images(samples)
-    total = len(images) * len(scales) * len(detectors)
-    with progress(total, "scales", "image", quiet) as bar:
-        return [scale_quality(detector, images, scales, done=bar.update) for detector in detectors]
+    with progress(len(images) * len(scales), "scales", "image", quiet) as bar:
+        return scale_quality(detectors, images, scales, done=bar.update)
 
 
 def _short_names(paths: Sequence[Path]) -> list[str]:

@@ -33,7 +33,7 @@ from .shared import (
     type=click.IntRange(min=1),
     default=256,
     show_default=True,
-    help="Eight shards must fit into the memory.",
+    help="About so many; each process holds eight shards in memory.",
 )
 @workers_option
 @json_option

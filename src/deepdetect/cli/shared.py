@@ -138,7 +138,8 @@ short_sides_option = click.option(
     "short_sides",
     type=int,
     multiple=True,
-    help="Size of the photographs' shorter side in pixels; may be repeated.  "
+    help="Size of the photographs' shorter side in pixels; may be repeated, validation takes "
+    "the first.  "
     "[default: 480 360 240]",
 )
 detectors_option = click.option(

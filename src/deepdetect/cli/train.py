@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-import os
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from .cluster import ending_all_processes
 from .shared import (
     PATH,
     chosen_recipe,
@@ -147,38 +144,11 @@ def train(
         "say": None if as_json else click.echo,
     }
     options = chosen_recipe(preset, detectors, label_settings, values)
-    with _ending_all_processes():
+    with ending_all_processes():
         if timed:
             _print_profiles(trainer.profile(photos, output, options, **arguments), as_json)
             return
         _print_result(trainer.train(photos, output, options, **arguments), as_json)
-
-
-@contextlib.contextmanager
-def _ending_all_processes() -> Iterator[None]:
-    """End one of several processes at once, when all is written.
-
-    After an error, torchrun ends the others; the usual way out would first wait for them,
-    which wait for this one. And Python's own end can meet gloo's threads, and hang with
-    them (pytorch#190489).
-    """
-    from ..errors import DeepDetectError
-    from ..training.cluster import place_in_cluster
-
-    try:
-        yield
-    except DeepDetectError as error:
-        if place_in_cluster().processes == 1:
-            raise
-        click.echo(f"deepdetect: {error}", err=True)
-        status = 2
-    else:
-        if place_in_cluster().processes == 1:
-            return
-        status = 0
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
 
 
 def _print_result(result: TrainingResult, as_json: bool) -> None:

@@ -16,7 +16,8 @@ from .cluster import Place
 from .feed import Example, Feed
 from .photos import Photo
 from .prefetch import prefetched
-from .recipe import Schedule, Stage
+from .recipe import Stage
+from .schedule import Schedule
 from .views import View
 
 

@@ -17,8 +17,6 @@ from torch.optim import Optimizer
 from ..atomic import atomic_path
 from ..errors import WeightsError
 
-MOMENTS = ("step", "exp_avg", "exp_avg_sq")  # of Adam, for each parameter
-
 
 def save_checkpoint(
     path: Path, network: nn.Module, optimizers: Sequence[Optimizer], state: dict[str, Any]

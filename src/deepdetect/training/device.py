@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import shutil
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
 PRECISIONS = ("auto", "float32", "bfloat16")
-LETTING_GO = 0.2  # seconds
 
 
 @dataclass(frozen=True)
@@ -167,16 +165,20 @@ class Engine:
         """Return the first process's values to all."""
         return self.fabric.broadcast(values)
 
+    def share(self, tensor: torch.Tensor) -> None:
+        """Bring the first process's tensor to all, in place."""
+        if self.place.processes > 1:
+            torch.distributed.broadcast(tensor, 0)
+
     def close(self) -> None:
         """Part from the other processes, at the end of a run that went well.
 
         After an error nobody can be waited for: the process ends, and torchrun the others.
         """
-        if self.place.processes > 1:
-            # gloo's threads need the interpreter once more after the last sum, to let go of
-            # it, and destroying joins them without letting them have it (pytorch#190489).
-            wait_for_all(self.place)
-            time.sleep(LETTING_GO)
+        wait_for_all(self.place)
+        # Not gloo's: its threads need the interpreter to let go of the last sum, and destroying
+        # joins them without letting them have it (pytorch#190489).
+        if self.place.processes > 1 and self.device.type == "cuda":
             torch.distributed.destroy_process_group()
 
     def describe(self) -> str:

@@ -35,7 +35,7 @@ class Learner:
         self.frozen_batch_norm = frozen_batch_norm
         self.engine = Engine(network, device)
         self.network = self.engine.network
-        self.optimizers = make_optimizers(optimizer, self.network)
+        self.optimizers = make_optimizers(optimizer, self.network, self.engine.share)
 
     def learn(self, rgb: np.ndarray, masks: np.ndarray, rate: float, step: int) -> float:
         """Make one optimiser step.

@@ -8,18 +8,20 @@ from typing import TYPE_CHECKING
 from ..errors import look_up
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
     from torch.optim import Optimizer
 
+    Share = Callable[[Tensor], object]
 
-def adam(network: nn.Module) -> list[Optimizer]:
+
+def adam(network: nn.Module, share: Share) -> list[Optimizer]:
     """Adam for everything."""
     import torch
 
     return [torch.optim.Adam(network.parameters(), fused=True)]
 
 
-def soap(network: nn.Module) -> list[Optimizer]:
+def soap(network: nn.Module, share: Share) -> list[Optimizer]:
     """SOAP for the kernels, Adam for biases and the like."""
     import torch
 
@@ -27,14 +29,21 @@ def soap(network: nn.Module) -> list[Optimizer]:
 
     kernels = [parameter for parameter in network.parameters() if parameter.ndim > 1]
     vectors = [parameter for parameter in network.parameters() if parameter.ndim <= 1]
-    return [Soap(kernels), torch.optim.Adam(vectors, fused=True)]
+    return [Soap(kernels, share=share), torch.optim.Adam(vectors, fused=True)]
 
 
-OPTIMIZERS: dict[str, Callable[[nn.Module], list[Optimizer]]] = {"adam": adam, "soap": soap}
+OPTIMIZERS: dict[str, Callable[[nn.Module, Share], list[Optimizer]]] = {"adam": adam, "soap": soap}
 
 
-def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
+def make_optimizers(
+    name: str, network: nn.Module, share: Share = lambda tensor: None
+) -> list[Optimizer]:
     """Make the optimisers that together move all parameters of a network.
+
+    Args:
+        name: as in `OPTIMIZERS`.
+        network: the network.
+        share: brings the first process's tensor to all of them, in place.
 
     Raises:
         OptionError: the name is unknown (the nearest right one is named).
@@ -44,4 +53,4 @@ def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
         >>> len(make_optimizers("adam", nn.Linear(2, 1)))
         1
     """
-    return look_up("optimizer", name, OPTIMIZERS)(network)
+    return look_up("optimizer", name, OPTIMIZERS)(network, share)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from .feed import Example, Feed, FileFeed, StoredExample
 from .label_cache import LabelCache
 from .photos import Photo, hold_out, list_photos, photos_digest
 from .recipe import TrainingOptions
-from .shards import ShardFeed, Shards, has_shards, held_examples
+from .shards import HeldExamples, ShardFeed, Shards, has_shards
 from .view_store import ViewStore
 
 
@@ -26,7 +26,7 @@ class Photographs:
     """
 
     training: Feed
-    held: Sequence[Example]
+    held: Iterable[Example]
     digest: str
 
 
@@ -95,8 +95,7 @@ def _sharded(
     shards = Shards.open(sources.photos, options)
     training = ShardFeed(shards, options)
     if sources.validation is None:
-        wait_for_all(place_in_cluster())
-        return Photographs(training, held_examples(shards, options), shards.digest)
+        return Photographs(training, HeldExamples(shards, options), shards.digest)
     held = list_photos(Path(sources.validation), options, (sources.output, sources.label_cache))
     store = _stored(sources, options, [], held, workers, quiet)
     digest = f"{shards.digest} {photos_digest([], held)}"

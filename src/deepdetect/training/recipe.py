@@ -1,13 +1,10 @@
-"""What a training run does: all its options, and the schedule that follows from them."""
+"""What a training run does: all its options."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from dataclasses import dataclass, field
-
-import numpy as np
 
 from ..errors import OptionError, look_up
 from ..labels import DETECTOR_NAMES, LabelOptions, SettingChange
@@ -143,67 +140,3 @@ class TrainingOptions:
     def to_json(self) -> str:
         """Return the options as JSON text, to be kept beside the weights."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
-
-
-@dataclass(frozen=True)
-class Position:
-    """Where a step lies.
-
-    Attributes:
-        number, stage: its stage.
-        sample: its first crop's number in the stage.
-        epoch_offset: the epochs of the stages before.
-    """
-
-    number: int
-    stage: Stage
-    sample: int
-    epoch_offset: int
-
-
-class Schedule:
-    """The steps of a run over a number of photographs.
-
-    Args:
-        options: the recipe.
-        photos: number of photographs.
-    """
-
-    def __init__(self, options: TrainingOptions, photos: int) -> None:
-        self.options = options
-        self.photos = photos
-        self.steps_of_stage = [
-            max(1, stage.epochs * photos // stage.batch) for stage in options.stages
-        ]
-        self.steps = sum(self.steps_of_stage)
-        stages = [np.full(steps, k) for k, steps in enumerate(self.steps_of_stage)]
-        within = [np.arange(steps) for steps in self.steps_of_stage]
-        self._stages, self._within = np.concatenate(stages), np.concatenate(within)
-        if options.interleave:
-            shares = [(each + 0.5) / len(each) for each in within]
-            order = np.argsort(np.concatenate(shares), kind="stable")
-            self._stages, self._within = self._stages[order], self._within[order]
-
-    def position(self, step: int) -> Position:
-        """Find a step's stage and place in it.
-
-        Raises:
-            IndexError: the step lies behind the last one.
-        """
-        number = int(self._stages[step])
-        stage = self.options.stages[number]
-        before = sum(each.epochs for each in self.options.stages[:number])
-        return Position(number, stage, int(self._within[step]) * stage.batch, before)
-
-    def learning_rate(self, step: int) -> float:
-        """Return Adam's rate at a step: a linear warm-up into cosine annealing."""
-        options = self.options
-        share = (1 + math.cos(math.pi * step / self.steps)) / 2
-        rate = options.final_learning_rate + share * (
-            options.learning_rate - options.final_learning_rate
-        )
-        return rate * min(1.0, (step + 1) / (options.warm_up + 1))
-
-    def milestones(self, count: int) -> set[int]:
-        """Return the numbers of steps done at `count` evenly spaced points, the end among them."""
-        return {round(self.steps * part / count) for part in range(1, count + 1)} - {0}

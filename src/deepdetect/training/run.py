@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import time
 from collections.abc import Callable
@@ -19,13 +20,14 @@ from .batches import Batches
 from .checkpoint import Checkpoint, read_checkpoint, restore, save_checkpoint
 from .curves import CurvePoint, save_curves
 from .device import DeviceOptions
-from .feed import Example
 from .learner import Learner
 from .model_card import write_model_card
+from .photos import Photo
 from .prefetch import prefetched
 from .preparation import Photographs
 from .provenance import provenance
-from .recipe import Schedule, TrainingOptions
+from .recipe import TrainingOptions
+from .schedule import Schedule
 from .validation import score_network
 from .views import View
 
@@ -140,9 +142,8 @@ class Run:
 
     def _validate(self) -> None:
         """Take the validation losses; keep the weights when they are the best so far."""
-        held = self.photographs.held
-        normal = self._score([(example, example.photo.normal[0]) for example in held])
-        dark = self._score([(example, example.photo.dark[0]) for example in held])
+        normal = self._score(lambda photo: photo.normal[0])
+        dark = self._score(lambda photo: photo.dark[0])
         share = self.options.dark_fraction
         point = CurvePoint(
             step=self.step,
@@ -173,11 +174,14 @@ class Run:
                 "every machine needs the same files and the same command"
             )
 
-    def _score(self, views: list[tuple[Example, View]]) -> MaskScore:
-        """Score the network on views of the photographs held out, shared by the processes."""
-        mine = views[self.place.rank :: self.place.processes]
+    def _score(self, view_of: Callable[[Photo], View]) -> MaskScore:
+        """Score the network on a view of the photographs held out, shared by the processes."""
+        held = iter(self.photographs.held)
+        mine = itertools.islice(held, self.place.rank, None, self.place.processes)
         loaders = self.engine.loaders
-        pairs = prefetched(lambda pair: pair[0].load(pair[1]), mine, loaders, loaders + 1)
+        pairs = prefetched(
+            lambda example: example.load(view_of(example.photo)), mine, loaders, loaders + 1
+        )
         scores = score_network(self.network, pairs, self.engine.device)
         return mean_score(self.engine.gather(scores))
 
@@ -223,7 +227,7 @@ class Run:
         if found is None:
             return
         state = found.state
-        if state["options"] != self.options.to_json():
+        if _completed(state["options"]) != json.loads(self.options.to_json()):
             raise OptionError(
                 f"{self.folder} holds a run with other options "
                 f"({_difference(state, self.options)}): "
@@ -245,8 +249,13 @@ class Run:
         self.points = [CurvePoint(**point) for point in state["points"]]
 
 
+def _completed(options: str) -> dict:
+    """Read stored options; those that came later had their defaults' effect."""
+    return {**json.loads(TrainingOptions().to_json()), **json.loads(options)}
+
+
 def _difference(state: dict, options: TrainingOptions) -> str:
     """Name the options that differ between a checkpoint and this run."""
-    before, now = json.loads(state["options"]), json.loads(options.to_json())
+    before, now = _completed(state["options"]), json.loads(options.to_json())
     names = [name for name in now if before.get(name) != now[name]]
     return ", ".join(names) or "an older version"

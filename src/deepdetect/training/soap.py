@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,9 @@ class Soap(torch.optim.Optimizer):
         basis_beta: decay of the two matrices whose eigenvectors are the basis.
         eps: keeps the division finite.
         basis_every: steps from one update of the basis to the next.
+        share: brings the first process's tensor to all of them, in place. Each process takes
+            the same steps, but bases differ by the rounding of their processors, and more and
+            more so: the eigenvectors of small eigenvalues are rounding noise.
 
     Example:
         >>> weight = nn.Parameter(torch.ones(3, 2))
@@ -44,10 +47,12 @@ class Soap(torch.optim.Optimizer):
         basis_beta: float = 0.95,
         eps: float = 1e-8,
         basis_every: int = 10,
+        share: Callable[[Tensor], object] = lambda tensor: None,
     ) -> None:
         super().__init__(parameters, {"lr": lr})
         self.betas, self.basis_beta, self.eps = betas, basis_beta, eps
         self.basis_every = basis_every
+        self.share = share
 
     @torch.no_grad()
     def step(self) -> None:
@@ -62,8 +67,10 @@ class Soap(torch.optim.Optimizer):
         state = self.state[parameter]
         if not state:
             state.update(_first_state(gradient))
+            for side in ("left", "right"):
+                self.share(state[f"{side}_basis"])
             return
-        state["step"] += 1
+        state["step"] = state["step"].cpu() + 1  # a checkpoint gives it back on the GPU
         left, right = state["left_basis"], state["right_basis"]
         mean, square = state["exp_avg"], state["exp_avg_sq"]
         mean.lerp_(gradient, 1 - self.betas[0])
@@ -79,13 +86,14 @@ class Soap(torch.optim.Optimizer):
             for axis, side in enumerate(("left", "right")):
                 self._turn(state, side, axis)
 
-    @staticmethod
-    def _turn(state: dict[str, Tensor], side: str, axis: int) -> None:
+    def _turn(self, state: dict[str, Tensor], side: str, axis: int) -> None:
         """Follow the eigenvectors of one side by a step of the power iteration."""
         matrix, basis = state[side], state[f"{side}_basis"]
         order = (basis.T @ matrix @ basis).diagonal().argsort(descending=True)
+        self.share(order)
         state["exp_avg_sq"].copy_(state["exp_avg_sq"].index_select(axis, order))
         basis.copy_(torch.linalg.qr(matrix @ basis[:, order])[0])
+        self.share(basis)
 
 
 def _first_state(gradient: Tensor) -> dict[str, Tensor]:

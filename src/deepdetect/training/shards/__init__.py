@@ -6,7 +6,7 @@ own each epoch, some at a time, whose photographs are mixed.
 """
 
 from .index import Shards, has_shards
-from .reading import ShardFeed, held_examples
+from .reading import HeldExamples, ShardFeed
 from .writing import write_shards
 
-__all__ = ["ShardFeed", "Shards", "has_shards", "held_examples", "write_shards"]
+__all__ = ["HeldExamples", "ShardFeed", "Shards", "has_shards", "write_shards"]

@@ -27,18 +27,30 @@ class ShardExample:
     """A photograph of a shard.
 
     Attributes:
+        shard: the shard's file.
         photo: its views; the path is its name in the folder it came from.
         content: the photograph's file.
         labels: the files of the labels, by the name of the view.
     """
 
+    shard: Path
     photo: Photo
     content: bytes
     labels: dict[str, bytes]
 
     def load(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool."""
-        return render(self.content, view), load_mask(self.labels[view.name])
+        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool.
+
+        Raises:
+            ImageError: the photograph or its label is damaged.
+        """
+        try:
+            image, mask = render(self.content, view), load_mask(self.labels[view.name])
+        except (ImageError, KeyError) as error:
+            raise _damaged(self.shard, f"{self.photo.path}: {error}") from None
+        if mask.shape != image.shape[:2]:
+            raise _damaged(self.shard, f"the label of {self.photo.path} has another size")
+        return image, mask
 
 
 class ShardFeed:
@@ -76,43 +88,59 @@ class ShardFeed:
         self, number: int, k: int, files: Sequence[tuple[Path, int]], first: int
     ) -> list[ShardExample]:
         """Read some shards and mix their photographs; leave out the first so many."""
-        examples: list[ShardExample] = []
-        for path, count in files:
-            found = list(read_shard(path, self.options))
-            if len(found) != count:
-                raise ImageError(
-                    f"{path} has {len(found)} photographs instead of {count}: "
-                    "delete it and run deepdetect shards again"
-                )
-            examples += found
+        examples = [example for file in files for example in read_shard(*file, self.options)]
         generator = np.random.default_rng([self.options.seed, 4, number, k])
         return [examples[place] for place in generator.permutation(len(examples))[first:]]
 
 
-def held_examples(shards: Shards, options: TrainingOptions) -> list[ShardExample]:
-    """Read the photographs to validate with."""
-    return [example for path, _ in shards.validation for example in read_shard(path, options)]
+class HeldExamples:
+    """The photographs to validate with, read anew each time, one after the other.
+
+    Args:
+        shards: the shards.
+        options: the recipe.
+    """
+
+    def __init__(self, shards: Shards, options: TrainingOptions) -> None:
+        self.shards, self.options = shards, options
+
+    def __iter__(self) -> Iterator[ShardExample]:
+        for path, count in self.shards.validation:
+            yield from read_shard(path, count, self.options)
 
 
-def read_shard(path: Path, options: TrainingOptions) -> Iterator[ShardExample]:
+def read_shard(path: Path, count: int, options: TrainingOptions) -> Iterator[ShardExample]:
     """Read the photographs of a shard in turn.
+
+    Args:
+        path: its file.
+        count: how many there are.
+        options: the recipe, by which the views are drawn.
 
     Raises:
         ImageError: it is damaged.
     """
     iterators = webdataset().tariterators
+    found = 0
     try:
         with path.open("rb") as file:
             files = iterators.tar_file_expander([{"url": str(path), "stream": file}])
             for sample in iterators.group_by_keys(files):
-                yield _example(sample, options)
+                yield _example(path, sample, options)
+                found += 1
     except Exception as error:  # tar, WebDataset and the system raise many kinds
-        raise ImageError(
-            f"the shard {path} is damaged ({error}): delete it and run deepdetect shards again"
-        ) from None
+        raise _damaged(path, str(error)) from None
+    if found != count:
+        raise _damaged(path, f"{found} photographs instead of {count}")
 
 
-def _example(sample: dict[str, Any], options: TrainingOptions) -> ShardExample:
+def _damaged(shard: Path, reason: str) -> ImageError:
+    return ImageError(
+        f"the shard {shard} is damaged ({reason}): delete it and run deepdetect shards again"
+    )
+
+
+def _example(shard: Path, sample: dict[str, Any], options: TrainingOptions) -> ShardExample:
     """Return the photograph of one sample, a dictionary of files by their endings."""
     name = sample["name.txt"].decode()
     (content,) = (value for ending, value in sample.items() if ending.startswith("photo."))
@@ -125,4 +153,4 @@ def _example(sample: dict[str, Any], options: TrainingOptions) -> ShardExample:
         name, options.short_sides, options.darkening, options.dark_variants, options.square
     )
     photo = Photo(Path(name), sample["__key__"].rpartition("_")[2], *views)
-    return ShardExample(photo, content, labels)
+    return ShardExample(shard, photo, content, labels)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from ...atomic import atomic_path
 from ...errors import DeepDetectError, ImageError, OptionError
@@ -15,12 +14,27 @@ from ...labels import LabelOptions
 from ...labels.files import encode_mask
 from ...processes import map_in_processes
 from ...progress import progress
-from ..label_cache import label_of_view
-from ..photos import Photo, hold_out, list_photos, photos_digest
+from ..label_cache import label_of_view, settings_digest
+from ..photos import Photo, hold_out, list_photos
 from ..recipe import TrainingOptions
 from ..views import View
-from .index import INDEX, Shards, claim_folder, fixed_options, write_json
+from .index import Shards, check_index, write_index
 from .library import webdataset
+
+
+@dataclass(frozen=True)
+class Member:
+    """A photograph that goes into a shard.
+
+    Attributes:
+        photo: the photograph.
+        name: its path in the folder, from which its dark views are drawn.
+        views: those whose labels are wanted.
+    """
+
+    photo: Photo
+    name: str
+    views: tuple[View, ...]
 
 
 @dataclass(frozen=True)
@@ -29,12 +43,12 @@ class ShardTask:
 
     Attributes:
         path: its file.
-        photos: what goes into it, each with the views whose labels are wanted.
+        members: what goes into it.
         options: how labels are made.
     """
 
     path: Path
-    photos: tuple[tuple[Photo, str, tuple[View, ...]], ...]
+    members: tuple[Member, ...]
     options: LabelOptions
 
 
@@ -49,55 +63,58 @@ def write_shards(
 ) -> Shards:
     """Write photographs with their labels into shards, in parallel over processes.
 
-    Shards that are there already, from a call that was broken off, stay.
+    Shards that are there already and hold the same, stay: a call that was broken off goes on,
+    and when some photographs have changed, their shards are written anew.
 
     Args:
         photos: folder of photographs.
-        output: folder for the shards.
+        output: another folder, for the shards.
         options: the recipe of the runs to come; some of its photographs are held out.
-        photos_a_shard: photographs in a shard.
+        photos_a_shard: about so many photographs go into a shard.
         workers: number of processes; default one for each processor.
         quiet: show no progress bar.
 
     Raises:
         ImageError: the folder is missing, or has too few photographs.
-        OptionError: the folder has shards that were made otherwise.
-        DeepDetectError: a photograph cannot be read; the other shards are kept.
+        OptionError: the folder has shards that were made with other options.
+        DeepDetectError: photographs cannot be read; the other shards are kept.
+
+    Example:
+        >>> write_shards(Path("photos"), Path("shards"), TrainingOptions())  # doctest: +SKIP
     """
     if photos_a_shard < 1:
         raise OptionError(f"a shard needs at least one photograph, not {photos_a_shard}")
+    if photos.resolve() == output.resolve():
+        raise OptionError(f"{output} holds the photographs: choose another folder with -o")
     webdataset()  # missing, it is missed before the work
+    check_index(output, options)
     listed = list_photos(photos, options, (output,), options.max_photos)
-    training, held = hold_out(listed, options.held_out)
-    # Mixed once for all, so that no shard holds one kind of photograph only.
-    order = np.random.default_rng(0).permutation(len(training))
-    training = [training[k] for k in order]
-    plan = {
-        "options": fixed_options(options),
-        "photographs": photos_digest(training, held),
-        "photos_a_shard": photos_a_shard,
-    }
-    claim_folder(output, plan)
-    files: dict[str, list[dict[str, Any]]] = {"training": [], "validation": []}
+    files: dict[str, list[tuple[Path, int]]] = {}
     tasks = []
-    for kind, members in (("training", training), ("validation", held)):
-        for k in range(0, len(members), photos_a_shard):
-            part = members[k : k + photos_a_shard]
-            path = output / f"{kind}-{k // photos_a_shard:06d}.tar"
-            files[kind].append({"file": path.name, "photographs": len(part)})
-            wanted = tuple(
-                (photo, photo.path.relative_to(photos).as_posix(), _views(photo, kind))
-                for photo in part
-            )
+    training, held = hold_out(listed, options.held_out)
+    for kind, part in (("training", training), ("validation", held)):
+        members = [_member(photo, photos, kind) for photo in part]
+        files[kind] = []
+        for number, shard in enumerate(_dealt(members, photos_a_shard)):
+            path = output / f"{kind}-{number:06d}-{_digest(shard, options)}.tar"
+            files[kind].append((path, len(shard)))
             if not path.exists():
-                tasks.append(ShardTask(path, wanted, options.label_options))
-    with progress(sum(len(task.photos) for task in tasks), "shards", "photo", quiet) as bar:
+                tasks.append(ShardTask(path, tuple(shard), options.label_options))
+    failures = []
+    with progress(sum(len(task.members) for task in tasks), "shards", "photo", quiet) as bar:
         for done in map_in_processes(write_shard, tasks, workers):
             if isinstance(done, str):
-                raise DeepDetectError(f"{done}; the shards that are whole are kept")
-            bar.update(done)
-    write_json(output / INDEX, {**plan, **files})
-    return Shards.open(output, options)
+                failures.append(done)
+            else:
+                bar.update(done)
+    if failures:
+        raise DeepDetectError(
+            f"{len(failures)} of {len(tasks)} shards cannot be written, the others are kept; "
+            f"the first: {failures[0]}"
+        )
+    made = Shards(output, tuple(files["training"]), tuple(files["validation"]))
+    write_index(made, options)
+    return made
 
 
 def write_shard(task: ShardTask) -> int | str:
@@ -109,32 +126,53 @@ def write_shard(task: ShardTask) -> int | str:
             # No time of writing: the same photographs give the same file.
             webdataset().TarWriter(file, encoder=False, mtime=0) as writer,
         ):
-            for k, (photo, name, views) in enumerate(task.photos):
-                sample = _sample(photo, name, views, task.options)
-                writer.write({"__key__": f"{k:06d}_{photo.digest}", **sample})
+            for k, member in enumerate(task.members):
+                key = f"{k:06d}_{member.photo.digest}"
+                writer.write({"__key__": key, **_sample(member, task.options)})
     except DeepDetectError as error:
         return str(error)
-    return len(task.photos)
+    return len(task.members)
 
 
-def _sample(
-    photo: Photo, name: str, views: tuple[View, ...], options: LabelOptions
-) -> dict[str, bytes]:
+def _member(photo: Photo, root: Path, kind: str) -> Member:
+    views = photo.normal + photo.dark
+    if kind == "validation":
+        views = (photo.normal[0], photo.dark[0])
+    return Member(photo, photo.path.relative_to(root).as_posix(), views)
+
+
+def _dealt(members: Sequence[Member], photos_a_shard: int) -> list[list[Member]]:
+    """Deal photographs to shards by the checksums of their names.
+
+    So no shard holds one kind of photograph only, and most shards stay as they are when a
+    photograph goes or comes.
+    """
+    shards: list[list[Member]] = [[] for _ in range(-(-len(members) // photos_a_shard))]
+    for member in members:
+        checksum = hashlib.sha256(member.name.encode()).digest()
+        shards[int.from_bytes(checksum[:8], "big") % len(shards)].append(member)
+    return [shard for shard in shards if shard]
+
+
+def _digest(members: Sequence[Member], options: TrainingOptions) -> str:
+    """Return a digest of all that a shard's content depends on."""
+    parts = [settings_digest(options.label_options)]
+    for member in members:
+        parts += [member.name, member.photo.digest, *(view.name for view in member.views)]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+
+
+def _sample(member: Member, options: LabelOptions) -> dict[str, bytes]:
     """Return the files of a photograph by their endings."""
+    path = member.photo.path
     try:
-        content = photo.path.read_bytes()
+        content = path.read_bytes()
         rgb = load_image(content)
     except OSError as error:
-        raise ImageError(f"{photo.path} cannot be read ({error.strerror}): check it") from None
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check its rights") from None
     except ImageError as error:
-        raise ImageError(str(error).replace("the image", str(photo.path), 1)) from None
-    sample = {"name.txt": name.encode(), f"photo{photo.path.suffix.lower()}": content}
-    for view in views:
+        raise ImageError(str(error).replace("the image", str(path), 1)) from None
+    sample = {"name.txt": member.name.encode(), f"photo{path.suffix.lower()}": content}
+    for view in member.views:
         sample[f"label.{view.name}.png"] = encode_mask(label_of_view(rgb, view, options))
     return sample
-
-
-def _views(photo: Photo, kind: str) -> tuple[View, ...]:
-    if kind == "validation":
-        return photo.normal[0], photo.dark[0]
-    return photo.normal + photo.dark
