@@ -127,6 +127,32 @@ def test_memory_limit_changes_nothing_but_the_time(batches: Batches) -> None:
     assert not store._kept
 
 
+def test_a_stage_can_take_some_views_only(batches: Batches) -> None:
+    options = changed(OPTIONS, stages=(Stage(64, 12, 1, sides=(64,)),))
+    small = Batches(batches.feed, Schedule(options, len(batches.feed)))
+    views = [
+        render(photo.path, view)
+        for photo in batches.feed.photos
+        for view in photo.normal + photo.dark
+        if view.short_side == 64
+    ]
+    images, masks = small.batch(0)
+    for image, mask in zip(images, masks, strict=True):
+        assert mask.shape == (64, 64)
+        assert any(_inside(image, view) for view in views)
+
+
+def _inside(image: np.ndarray, view: np.ndarray) -> bool:
+    """Whether a flipped crop is part of a view."""
+    side = len(image)
+    flipped = [image[::a, ::b] for a in (1, -1) for b in (1, -1)]
+    return any(
+        np.array_equal(view[:side, left : left + side], crop)
+        for crop in flipped
+        for left in range(view.shape[1] - side + 1)
+    )
+
+
 def test_interleaved_batches_are_those_of_the_stages_in_turn(batches: Batches) -> None:
     schedule = Schedule(changed(OPTIONS, interleave=True), len(batches.feed))
     mixed = Batches(batches.feed, schedule)

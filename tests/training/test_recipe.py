@@ -12,7 +12,10 @@ from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.schedule import Schedule
 
 
-@pytest.mark.parametrize("text", ["240x16", "axbxc", "240x16x0", "0x1x1", "241x1x1", "240x0x1"])
+@pytest.mark.parametrize(
+    "text",
+    ["240x16", "axbxc", "240x16x0", "0x1x1", "241x1x1", "240x0x1", "64x2x1@32", "64x2x1@", "64@64"],
+)
 def test_bad_stages_are_refused(text: str) -> None:
     with pytest.raises(OptionError):
         Stage.parse(text)
@@ -23,6 +26,7 @@ def test_bad_stages_are_refused(text: str) -> None:
     [
         {"stages": ()},
         {"stages": (Stage(480, 8, 1),), "short_sides": (240,)},
+        {"stages": (Stage(64, 8, 1, (96,)),), "short_sides": (240, 64)},
         {"dark_fraction": 1.5},
         {"dark_variants": 0},
         {"validations": 0},

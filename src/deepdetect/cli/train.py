@@ -46,8 +46,9 @@ if TYPE_CHECKING:
     "--stage",
     "stages",
     multiple=True,
-    metavar="CROPxBATCHxEPOCHS",
-    help="What is trained on; repeat it for several in turn.  [default: 240x16x44 480x8x10]",
+    metavar="CROPxBATCHxEPOCHS[@SIDE,...]",
+    help="What is trained on, if you like with views of some short sides only; repeat it for "
+    "several in turn.  [default: 240x16x44 480x8x10]",
 )
 @click.option(
     "--interleave/--in-turn",

@@ -91,16 +91,17 @@ class Batches:
             yield _Plan(position.stage, draws[self.place.share(position.stage.batch)])
 
     def _make(self, plan: _Plan) -> tuple[np.ndarray, np.ndarray]:
-        crops = [self._crop(*draw, plan.stage.crop) for draw in plan.draws]
+        crops = [self._crop(*draw, plan.stage) for draw in plan.draws]
         images, masks = zip(*crops, strict=True)
         return np.stack(images), np.stack(masks)
 
     def _crop(
-        self, example: Example, epoch: int, place: int, side: int
+        self, example: Example, epoch: int, place: int, stage: Stage
     ) -> tuple[np.ndarray, np.ndarray]:
         """Cut the crop of one sample, flipped by chance."""
         generator = np.random.default_rng([self.schedule.options.seed, 2, epoch, place])
-        image, mask = example.load(self._choose_view(example.photo, side, generator))
+        image, mask = example.load(self._choose_view(example.photo, stage, generator))
+        side = stage.crop
         top = int(generator.integers(image.shape[0] - side + 1))
         left = int(generator.integers(image.shape[1] - side + 1))
         image = image[top : top + side, left : left + side]
@@ -112,9 +113,13 @@ class Batches:
                 mask = cv2.flip(mask.view(np.uint8), axis).view(bool)
         return image, mask
 
-    def _choose_view(self, photo: Photo, side: int, generator: np.random.Generator) -> View:
-        """Choose the light by the dark fraction, then a size that holds the crop."""
+    def _choose_view(self, photo: Photo, stage: Stage, generator: np.random.Generator) -> View:
+        """Choose the light by the dark fraction, then a size of the stage's."""
         dark = generator.random() < self.schedule.options.dark_fraction
         views = photo.dark if dark else photo.normal
-        fitting = [view for view in views if view.short_side >= side]
+        fitting = [
+            view
+            for view in views
+            if view.short_side >= stage.crop and (not stage.sides or view.short_side in stage.sides)
+        ]
         return fitting[int(generator.integers(len(fitting)))]

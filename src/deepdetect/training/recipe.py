@@ -20,33 +20,43 @@ class Stage:
         crop: side of the square crops, in pixels, a multiple of 8.
         batch: crops in a batch.
         epochs: how often each photograph is seen.
+        sides: shorter sides of the views that it takes crops from; default: all that are
+            large enough.
     """
 
     crop: int
     batch: int
     epochs: int
+    sides: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.crop < 16 or self.crop % 8:
             raise OptionError(f"crop must be a multiple of 8 from 16 on, not {self.crop}")
         if self.batch < 1 or self.epochs < 1:
             raise OptionError("a stage needs a batch and a number of epochs of at least 1")
+        if self.sides and min(self.sides) < self.crop:
+            raise OptionError(
+                f"a crop of {self.crop} pixels does not fit into views of {min(self.sides)}"
+            )
 
     @classmethod
     def parse(cls, text: str) -> Stage:
-        """Read a stage from its text CROPxBATCHxEPOCHS.
+        """Read a stage from its text CROPxBATCHxEPOCHS, with @SIDE,SIDE for some views only.
 
         Example:
-            >>> Stage.parse("240x16x40")
-            Stage(crop=240, batch=16, epochs=40)
+            >>> Stage.parse("240x16x40@240")
+            Stage(crop=240, batch=16, epochs=40, sides=(240,))
         """
+        numbers, at, sides = text.lower().partition("@")
         try:
-            crop, batch, epochs = (int(part) for part in text.lower().split("x"))
+            crop, batch, epochs = (int(part) for part in numbers.split("x"))
+            chosen = tuple(int(part) for part in sides.split(",")) if at else ()
         except ValueError:
             raise OptionError(
-                f"a stage is written CROPxBATCHxEPOCHS, as 240x16x40, not {text!r}"
+                f"a stage is written CROPxBATCHxEPOCHS, as 240x16x40, or 240x16x40@360 for views "
+                f"of one size, not {text!r}"
             ) from None
-        return cls(crop, batch, epochs)
+        return cls(crop, batch, epochs, chosen)
 
 
 @dataclass(frozen=True)
@@ -111,6 +121,12 @@ class TrainingOptions:
             raise OptionError("a training run needs at least one stage")
         if not self.short_sides or min(self.short_sides) < 16:
             raise OptionError("the short sides must be at least 16 pixels")
+        for side in (side for stage in self.stages for side in stage.sides):
+            if side not in self.short_sides:
+                raise OptionError(
+                    f"a stage takes views of {side} pixels, which the short sides lack "
+                    f"({', '.join(map(str, self.short_sides))}): add it with --short-side"
+                )
         largest = max(stage.crop for stage in self.stages)
         if largest > max(self.short_sides):
             raise OptionError(
