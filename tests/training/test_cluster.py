@@ -142,6 +142,7 @@ def test_gradients_and_statistics_are_those_of_one_process(norm: str, tmp_path: 
         torch.testing.assert_close(together[name], expected, atol=tolerance, rtol=1e-4)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="finds the processes in /proc")
 def test_a_killed_run_of_two_processes_goes_on_with_the_same_losses(
     photographs: Path, two_processes: tuple[Path, str], tmp_path: Path
 ) -> None:
@@ -154,13 +155,30 @@ def test_a_killed_run_of_two_processes_goes_on_with_the_same_losses(
     deadline = time.monotonic() + 120
     while not checkpoint.exists() and time.monotonic() < deadline:
         time.sleep(0.005)
+    workers = children(process.pid)  # torchrun gives each a session of its own
     os.killpg(process.pid, signal.SIGKILL)
+    for worker in workers:
+        os.kill(worker, signal.SIGKILL)
     process.wait()
+    assert len(workers) == 2
     assert not (tmp_path / "killed" / "deepdetect.onnx").exists(), "it was killed before its end"
     subprocess.run(whole, check=True, capture_output=True, timeout=300)
     for expected, found in zip(curves(unbroken), curves(tmp_path / "killed"), strict=True):
         assert found["training_loss"] == pytest.approx(expected["training_loss"], abs=1e-5)
         assert found["validation_loss"] == pytest.approx(expected["validation_loss"], abs=1e-5)
+
+
+def children(parent: int) -> list[int]:
+    """Return the processes that a process has started."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/status"):
+        try:
+            fields = dict(line.split(":\t", 1) for line in status.read_text().splitlines())
+        except (OSError, ValueError):
+            continue  # it has ended meanwhile
+        if int(fields["PPid"]) == parent:
+            found.append(int(fields["Pid"]))
+    return found
 
 
 def test_an_uneven_share_is_told_before_any_work(photographs: Path, tmp_path: Path) -> None:

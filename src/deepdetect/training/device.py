@@ -20,7 +20,7 @@ from ..errors import OptionError, unknown_name
 from ..memory import keep_freed_memory
 from ..processes import processor_count
 from .batch_norm import synchronize_batch_norm
-from .cluster import Place, place_in_cluster, wait_for_all
+from .cluster import Place, place_in_cluster
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -175,9 +175,8 @@ class Engine:
 
         After an error nobody can be waited for: the process ends, and torchrun the others.
         """
-        wait_for_all(self.place)
         # Not gloo's: its threads need the interpreter to let go of the last sum, and destroying
-        # joins them without letting them have it (pytorch#190489).
+        # joins them without letting them have it (pytorch#190489). They end with the process.
         if self.place.processes > 1 and self.device.type == "cuda":
             torch.distributed.destroy_process_group()
 

@@ -96,6 +96,8 @@ def write_shards(
         members = [_member(photo, photos, kind) for photo in part]
         files[kind] = []
         for number, shard in enumerate(_dealt(members, photos_a_shard)):
+            if not shard:
+                continue
             path = output / f"{kind}-{number:06d}-{_digest(shard, options)}.tar"
             files[kind].append((path, len(shard)))
             if not path.exists():
@@ -151,7 +153,7 @@ def _dealt(members: Sequence[Member], photos_a_shard: int) -> list[list[Member]]
     for member in members:
         checksum = hashlib.sha256(member.name.encode()).digest()
         shards[int.from_bytes(checksum[:8], "big") % len(shards)].append(member)
-    return [shard for shard in shards if shard]
+    return shards
 
 
 def _digest(members: Sequence[Member], options: TrainingOptions) -> str:
