@@ -170,7 +170,7 @@ def test_own_photographs_and_settings_from_the_shipped_weights(
     arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
     arguments += [str(tmp_path / "run"), "--start", "bundled", "--label-settings", str(settings)]
     arguments += ["--stage", "96x4x12", "--short-side", "96", "--learning-rate", "0.0005"]
-    arguments += ["--warm-up", "5", "--dark-fraction", "0"]
+    arguments += ["--warm-up", "5", "--dark-fraction", "0", "--frozen-batch-norm"]
     arguments += [
         "--validations",
         "3",
