@@ -32,6 +32,6 @@ def training_preset(name: str) -> TrainingOptions:
 
     Example:
         >>> training_preset("paper").stages
-        (Stage(crop=480, batch=64, epochs=100),)
+        (Stage(crop=480, batch=64, epochs=100, sides=()),)
     """
     return look_up("training preset", name, PRESETS)
