@@ -170,7 +170,7 @@ def test_own_photographs_and_settings_from_the_shipped_weights(
     arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
     arguments += [str(tmp_path / "run"), "--start", "bundled", "--label-settings", str(settings)]
     arguments += ["--stage", "96x4x12", "--short-side", "96", "--learning-rate", "0.0005"]
-    arguments += ["--warm-up", "5", "--dark-fraction", "0", "--frozen-batch-norm"]
+    arguments += ["--warm-up", "5", "--dark-fraction", "0"]
     arguments += [
         "--validations",
         "3",
@@ -194,13 +194,16 @@ def test_frozen_batch_norm_keeps_the_statistics_and_trains_the_rest(
     photographs: Path, tmp_path: Path
 ) -> None:
     arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels")]
-    arguments += ["--start", "bundled", "--frozen-batch-norm"]
+    arguments += ["--start", "bundled"]
     subprocess.run(arguments, check=True, capture_output=True)
     before = load_network(BUNDLED).state_dict()
     after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
     kept = {name for name in before if torch.equal(before[name], after[name])}
     statistics = {name for name in before if name.rpartition(".")[2].startswith(("running", "num"))}
     assert kept == statistics
+    again = subprocess.run([*arguments, "--batch-norm"], capture_output=True, text=True)
+    assert again.returncode == 2, "another recipe, which the folder's run does not have"
+    assert "frozen_batch_norm" in again.stderr
 
 
 def test_frozen_batch_norm_needs_trained_weights(photographs: Path, tmp_path: Path) -> None:

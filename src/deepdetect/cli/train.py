@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 @click.option(
     "--frozen-batch-norm/--batch-norm",
     default=None,
-    help="Keep the start weights' batch statistics; only with --start.  [default: batch-norm]",
+    help="Keep the start weights' batch statistics.  [default: with --start]",
 )
 @detectors_option
 @label_settings_option

@@ -85,7 +85,7 @@ class TrainingOptions:
             weights needs them: Adam's first steps, without moments, would undo a good deal.
         frozen_batch_norm: normalise by the statistics that the start weights bring along, as
             the finished network does, not by those of each batch, which vary much from one
-            batch of a few images to the next. For a run that starts from trained weights.
+            batch of a few images to the next. None: when a run starts from trained weights.
         detectors: label detectors to fuse.
         label_changes: settings of label detectors that differ from the paper's.
         validations: how often the validation loss is taken.
@@ -108,7 +108,7 @@ class TrainingOptions:
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-6
     warm_up: int = 0
-    frozen_batch_norm: bool = False
+    frozen_batch_norm: bool | None = None
     detectors: tuple[str, ...] = DETECTOR_NAMES
     label_changes: tuple[SettingChange, ...] = ()
     validations: int = 12

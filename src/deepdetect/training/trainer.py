@@ -66,7 +66,7 @@ def train(
     Example:
         >>> train("photographs", "run")  # doctest: +SKIP
     """
-    network = _first_network(options, start)  # before the labels, which take minutes
+    options, network = _start(options, start)  # before the labels, which take minutes
     sources = Sources(Path(photos), Path(output), validation, labels)
     made = prepare(sources, options, workers, quiet=say is None)
     run = Run(made, Path(output), options, device, network, say)
@@ -104,7 +104,7 @@ def profile(
         >>> profile("photographs", "run")[0].images_per_second  # doctest: +SKIP
     """
     options = dataclasses.replace(options, interleave=False)  # each stage by itself
-    network = _first_network(options, start)
+    options, network = _start(options, start)
     sources = Sources(Path(photos), Path(output), validation, labels)
     made = prepare(sources, options, workers, quiet=say is None)
     run = Run(made, Path(output), options, device, network, resume=False)
@@ -118,14 +118,16 @@ def profile(
     return profiles
 
 
-def _first_network(options: TrainingOptions, start: str | Path | None) -> ESPNet:
-    """Make the network with the weights that the run starts from."""
+def _start(options: TrainingOptions, start: str | Path | None) -> tuple[TrainingOptions, ESPNet]:
+    """Make the network with the weights that the run starts from, and settle what hangs on them."""
     if start is not None:
-        return load_network(BUNDLED if str(start) == "bundled" else start)
+        if options.frozen_batch_norm is None:
+            options = dataclasses.replace(options, frozen_batch_norm=True)
+        return options, load_network(BUNDLED if str(start) == "bundled" else start)
     if options.frozen_batch_norm:
         raise OptionError(
             "random weights have no batch statistics to keep: name trained ones with --start, "
             "or leave out --frozen-batch-norm"
         )
     torch.manual_seed(options.seed)
-    return ESPNet()
+    return dataclasses.replace(options, frozen_batch_norm=False), ESPNet()
