@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +16,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-from safetensors.torch import load_file  # noqa: E402
+from safetensors.torch import load_file, save_file  # noqa: E402
 
 from deepdetect import DeepDetect, ImageError, OptionError, WeightsError  # noqa: E402
 from deepdetect.network.espnet import ESPNet  # noqa: E402
@@ -212,6 +214,24 @@ def test_frozen_batch_norm_needs_trained_weights(photographs: Path, tmp_path: Pa
     assert done.returncode == 2
     assert "--start" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_run_of_an_older_version_goes_on(
+    photographs: Path, unbroken: Path, tmp_path: Path
+) -> None:
+    """Its options lack what came later, which then had the value of today's default."""
+    shutil.copytree(unbroken, tmp_path / "run")
+    path = tmp_path / "run" / "checkpoint.safetensors"
+    found = read_checkpoint(path)
+    options = json.loads(found.state["options"])
+    for name in ("interleave", "optimizer", "frozen_batch_norm"):
+        del options[name]
+    for stage in options["stages"]:
+        del stage["sides"]
+    state = {**found.state, "options": json.dumps(options)}
+    save_file(found.tensors, path, metadata={"state": json.dumps(state)})
+    arguments = command(photographs, tmp_path / "run", unbroken.parent / "labels")
+    subprocess.run(arguments, check=True, capture_output=True)
 
 
 def test_other_options_are_refused_in_the_same_folder(photographs: Path, unbroken: Path) -> None:

@@ -250,8 +250,11 @@ class Run:
 
 
 def _completed(options: str) -> dict:
-    """Read stored options; those that came later had their defaults' effect."""
-    return {**json.loads(TrainingOptions().to_json()), **json.loads(options)}
+    """Read stored options; those that a run of an older version lacks had these values."""
+    older = json.loads(TrainingOptions(frozen_batch_norm=False).to_json())
+    found = {**older, **json.loads(options)}
+    found["stages"] = [{"sides": [], **stage} for stage in found["stages"]]
+    return found
 
 
 def _difference(state: dict, options: TrainingOptions) -> str:
