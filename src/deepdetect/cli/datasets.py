@@ -39,7 +39,7 @@ def list_datasets(as_json: bool) -> None:
 @click.option("-o", "--output", type=PATH, help="Folder for the images.  [default: data/NAME]")
 @json_option
 def get(name: str, output: Path | None, as_json: bool) -> None:
-    r"""Download the data set NAME and unpack it.
+    """Download the data set NAME and unpack it.
 
     Given again, the command goes on where it was broken off.
 

@@ -49,7 +49,7 @@ def detect(
     as_json: bool,
     **values: Any,
 ) -> None:
-    r"""Detect the keypoints of IMAGES (files or folders).
+    """Detect the keypoints of IMAGES (files or folders).
 
     Writes for each image STEM.npz (or .csv) with the positions and probabilities, and
     the pictures STEM_keypoints.png and STEM_heatmap.png.

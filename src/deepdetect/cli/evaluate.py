@@ -54,7 +54,7 @@ def evaluate(
     as_json: bool,
     **values: Any,
 ) -> None:
-    r"""Score the network on a folder SAMPLES of image_NAME.png with mask_image_NAME.png.
+    """Score the network on a folder SAMPLES of image_NAME.png with mask_image_NAME.png.
 
     Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), apart
     for normal and for low-visibility images; with --oxford also what the paper's protocol

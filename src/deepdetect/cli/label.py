@@ -49,7 +49,7 @@ def label(
     workers: int | None,
     as_json: bool,
 ) -> None:
-    r"""Mark the keypoints and edges of IMAGES (files or folders) by nine classical detectors.
+    """Mark the keypoints and edges of IMAGES (files or folders) by nine classical detectors.
 
     Writes a 1-bit PNG mask STEM.png for each image: white where one of the detectors
     marks the pixel. What is already done is skipped.

@@ -50,7 +50,7 @@ class Commands(click.Group):
 )
 @click.version_option(package_name="deepdetect", prog_name="deepdetect")
 def main() -> None:
-    r"""Dense keypoints from a tiny network, and their matches.
+    """Dense keypoints from a tiny network, and their matches.
 
     \b
     deepdetect detect photo.jpg            keypoints of a photograph

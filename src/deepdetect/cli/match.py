@@ -71,7 +71,7 @@ def match(
     as_json: bool,
     **values: Any,
 ) -> None:
-    r"""Match the keypoints of IMAGE0 and IMAGE1.
+    """Match the keypoints of IMAGE0 and IMAGE1.
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their ratios,
     the estimated geometry and which matches agree with it, and a picture of them.

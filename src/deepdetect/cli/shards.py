@@ -7,16 +7,13 @@ from typing import Any
 
 import click
 
+from .recipe import chosen_recipe, detectors_option, preset_option, short_sides_option
 from .shared import (
     PATH,
-    chosen_recipe,
-    detectors_option,
     json_option,
     label_settings_option,
-    preset_option,
     print_json,
     print_table,
-    short_sides_option,
     workers_option,
 )
 
@@ -48,7 +45,7 @@ def shards(
     as_json: bool,
     **values: Any,
 ) -> None:
-    r"""Pack the photographs in the folder PHOTOS with their labels into tar files.
+    """Pack the photographs in the folder PHOTOS with their labels into tar files.
 
     They are in WebDataset's layout. Training reads them one after the other, so they may lie
     on a slow disk or a network. Give both commands the same options. Given again, the

@@ -14,7 +14,6 @@ from ..errors import DeepDetectError, OptionError
 if TYPE_CHECKING:
     from ..detector import DeepDetect
     from ..labels import LabelSettings
-    from ..training.recipe import TrainingOptions
 
 PATH = click.Path(path_type=Path)
 
@@ -126,25 +125,6 @@ label_settings_option = click.option(
     metavar="FILE.toml",
     help="Detectors and their settings.  [default: the paper's]",
 )
-preset_option = click.option(
-    "--preset",
-    default="default",
-    show_default=True,
-    help="Recipe that the other options change: default (its values are shown below), or "
-    "paper (the paper's own).",
-)
-short_sides_option = click.option(
-    "--short-side",
-    "short_sides",
-    type=int,
-    multiple=True,
-    help="Size of the photographs' shorter side in pixels; may be repeated, validation takes "
-    "the first.  "
-    "[default: 480 360 240]",
-)
-detectors_option = click.option(
-    "--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]"
-)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 
 
@@ -164,26 +144,6 @@ def chosen_label_settings(detectors: str | None, path: Path | None) -> LabelSett
         return settings
     names = tuple(name.strip() for name in detectors.split(",") if name.strip())
     return dataclasses.replace(settings, detectors=names)
-
-
-def chosen_recipe(
-    preset: str, detectors: str | None, label_settings: Path | None, values: dict[str, Any]
-) -> TrainingOptions:
-    """Return a preset's training options with the values that are given changed.
-
-    Args:
-        preset: its name.
-        detectors, label_settings: as of `chosen_label_settings`.
-        values: the others, by name; None and () stand for what is not given.
-    """
-    from ..options import changed
-    from ..training.presets import training_preset
-
-    given = {name: value for name, value in values.items() if value not in (None, ())}
-    if detectors is not None or label_settings is not None:
-        settings = chosen_label_settings(detectors, label_settings)
-        given["detectors"], given["label_changes"] = settings.detectors, settings.changes
-    return changed(training_preset(preset), **given)
 
 
 def make_detector(values: dict[str, Any]) -> DeepDetect:

@@ -9,16 +9,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .cluster import ending_all_processes
+from .recipe import chosen_recipe, detectors_option, preset_option, short_sides_option
 from .shared import (
     PATH,
-    chosen_recipe,
-    detectors_option,
     json_option,
     label_settings_option,
-    preset_option,
     print_json,
     print_table,
-    short_sides_option,
     workers_option,
 )
 
@@ -112,7 +109,7 @@ def train(
     as_json: bool,
     **values: Any,
 ) -> None:
-    r"""Train the network on the photographs, or the shards, in the folder PHOTOS.
+    """Train the network on the photographs, or the shards, in the folder PHOTOS.
 
     Labels are made first, once, by `deepdetect label`'s detectors. The run's folder gets
     checkpoint.safetensors, best.safetensors and deepdetect.onnx (the weights of the

@@ -1,0 +1,53 @@
+"""Options of a training recipe that several commands have in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .shared import chosen_label_settings
+
+if TYPE_CHECKING:
+    from ..training.recipe import TrainingOptions
+
+preset_option = click.option(
+    "--preset",
+    default="default",
+    show_default=True,
+    help="Recipe that the other options change: default (its values are shown below), or "
+    "paper (the paper's own).",
+)
+short_sides_option = click.option(
+    "--short-side",
+    "short_sides",
+    type=int,
+    multiple=True,
+    help="Size of the photographs' shorter side in pixels; may be repeated, validation takes "
+    "the first.  "
+    "[default: 480 360 240]",
+)
+detectors_option = click.option(
+    "--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]"
+)
+
+
+def chosen_recipe(
+    preset: str, detectors: str | None, label_settings: Path | None, values: dict[str, Any]
+) -> TrainingOptions:
+    """Return a preset's training options with the values that are given changed.
+
+    Args:
+        preset: its name.
+        detectors, label_settings: as of `chosen_label_settings`.
+        values: the others, by name; None and () stand for what is not given.
+    """
+    from ..options import changed
+    from ..training.presets import training_preset
+
+    given = {name: value for name, value in values.items() if value not in (None, ())}
+    if detectors is not None or label_settings is not None:
+        settings = chosen_label_settings(detectors, label_settings)
+        given["detectors"], given["label_changes"] = settings.detectors, settings.changes
+    return changed(training_preset(preset), **given)

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from deepdetect.cli import main
+
+
+def commands(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Yield every command's words, those of groups among them."""
+    yield words
+    if isinstance(command, click.Group):
+        for name, each in command.commands.items():
+            yield from commands(each, (*words, name))
+
+
+def command_of(words: tuple[str, ...]) -> click.Command:
+    command: click.Command = main
+    for word in words:
+        assert isinstance(command, click.Group)
+        command = command.commands[word]
+    return command
+
+
+@pytest.mark.parametrize("words", list(commands(main)), ids=" ".join)
+def test_the_help_shows_examples_line_by_line(words: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(main, [*words, "--help"])
+    assert result.exit_code == 0
+    assert "\\b" not in result.output, "the mark that keeps click from wrapping is not seen"
+    lines = {line.strip() for line in result.output.splitlines()}
+    text = inspect.cleandoc(command_of(words).help or "")
+    examples = [line.strip() for line in text.splitlines() if line.startswith("deepdetect ")]
+    for example in examples:
+        assert example in lines
+    if words and not isinstance(command_of(words), click.Group) and words != ("demo",):
+        assert examples or words == ("datasets", "list"), "a newcomer wants an example"
+
+
+@pytest.mark.parametrize("words", list(commands(main)), ids=" ".join)
+def test_every_option_says_what_it_is(words: tuple[str, ...]) -> None:
+    for parameter in command_of(words).params:
+        if isinstance(parameter, click.Option) and parameter.name not in ("help", "version"):
+            assert parameter.help, parameter.name
