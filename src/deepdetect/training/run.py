@@ -227,10 +227,12 @@ class Run:
         if found is None:
             return
         state = found.state
-        if _completed(state["options"]) != json.loads(self.options.to_json()):
+        other_start = state["start"] != self.start
+        others = _difference(state["options"], self.options)
+        # Whether the statistics are frozen follows from the start, which is told below.
+        if others and not (other_start and others == ["frozen_batch_norm"]):
             raise OptionError(
-                f"{self.folder} holds a run with other options "
-                f"({_difference(state, self.options)}): "
+                f"{self.folder} holds a run with other options ({', '.join(others)}): "
                 "use the same options to continue it, or another folder with -o"
             )
         if state["photographs"] != self.photographs.digest:
@@ -238,7 +240,7 @@ class Run:
                 f"{self.folder} holds a run over other photographs: use the same ones, to train "
                 "on and to validate with, or another folder with -o"
             )
-        if state["start"] != self.start:
+        if other_start:
             raise OptionError(
                 f"{self.folder} holds a run that started from other weights: "
                 "start from the same ones to continue it, or use another folder with -o"
@@ -249,16 +251,15 @@ class Run:
         self.points = [CurvePoint(**point) for point in state["points"]]
 
 
-def _completed(options: str) -> dict:
-    """Read stored options; those that a run of an older version lacks had these values."""
-    older = json.loads(TrainingOptions(frozen_batch_norm=False).to_json())
-    found = {**older, **json.loads(options)}
-    found["stages"] = [{"sides": [], **stage} for stage in found["stages"]]
-    return found
+def _difference(stored: str, options: TrainingOptions) -> list[str]:
+    """Name the options that differ between a checkpoint and this run.
 
-
-def _difference(state: dict, options: TrainingOptions) -> str:
-    """Name the options that differ between a checkpoint and this run."""
-    before, now = _completed(state["options"]), json.loads(options.to_json())
-    names = [name for name in now if before.get(name) != now[name]]
-    return ", ".join(names) or "an older version"
+    What a run of an older version lacks had the value of today's default.
+    """
+    now = json.loads(options.to_json())
+    before = {
+        **json.loads(TrainingOptions(frozen_batch_norm=False).to_json()),
+        **json.loads(stored),
+    }
+    before["stages"] = [{"sides": [], **stage} for stage in before["stages"]]
+    return [name for name in {**before, **now} if before.get(name) != now.get(name)]
