@@ -78,8 +78,8 @@ class TrainingOptions:
         dark_fraction: share of darkened images (paper: a quarter).
         dark_variants: darkened versions of each photograph at each size.
         darkening: ranges of the darkening.
-        optimizer: "adam", or "soap", which learns about twice as much from an image for a
-            twentieth more time.
+        optimizer: "adam", or "soap", which learns more from an image (measured in the model
+            card of the bundled weights).
         learning_rate, final_learning_rate: ends of its cosine annealing.
         warm_up: steps over which the rate rises from zero. A run that starts from trained
             weights needs them: Adam's first steps, without moments, would undo a good deal.
