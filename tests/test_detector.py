@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, HeatmapOptions, SelectionOptions, select_keypoints
-from deepdetect.detector import bundled_weights
+from deepdetect.bundled import bundled_weights
 from deepdetect.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
 
 # The bundled weights change, so nothing here depends on the values that they give.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, ImageError
-from deepdetect.detector import bundled_weights
+from deepdetect.bundled import bundled_weights
 from deepdetect.mask_scores import MaskScore, mean_score, score_heatmap, score_samples
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -99,6 +100,11 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
         shutil.copy("left.png", "samples/image_1.png")
         mask = np.asarray(Image.open("left.png").convert("L")) > 100
         Image.fromarray(mask).save("samples/mask_image_1.png")
+    if "evaluate-stereo" in words:
+        shutil.copytree(folder, "scene", ignore=shutil.ignore_patterns("scene"))
+        Image.fromarray(np.full((160, 200), 120, np.uint8)).save("scene/disparity.png")
+        truth = {"file": "disparity.png", "value_per_pixel": 4, "unknown": 0}
+        Path("scene/calib.json").write_text(json.dumps({"ground_truth": truth}))
     (folder / "photos").mkdir()
     shutil.copy("left.png", "photos")
     shutil.copy("right.png", "photos/another.png")
@@ -109,6 +115,7 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
         "DIR": "out",
         "PHOTOS": "photos",
         "SAMPLES": "samples",
+        "SCENES": "scene",
     }
     command = [sys.executable, "-m", *(places.get(word, word) for word in words)]
     done = subprocess.run(command, capture_output=True, text=True)
@@ -174,7 +181,7 @@ def test_the_wheel_installs_and_detects(folder: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     weights = target / "deepdetect" / "weights"
-    for name in ("deepdetect.onnx", "deepdetect.safetensors"):
+    for name in ("deepdetect.onnx", "geometry.onnx", "geometry.safetensors"):
         assert 0 < (weights / name).stat().st_size < 2_000_000
     assert (weights / "MODEL_CARD.md").exists()
     code = (

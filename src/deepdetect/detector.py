@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import copy
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from .bundled import find_weights
 from .heatmap import HeatmapOptions, compute_heatmap
 from .image import load_image
 from .keypoints import Keypoints, SelectionOptions, select_keypoints
 from .runtime import RuntimeOptions, open_network
 
 
-def bundled_weights() -> Path:
-    """Return the path of the ONNX weights inside the package."""
-    return Path(str(files("deepdetect") / "weights" / "deepdetect.onnx"))
-
-
 class DeepDetect:
     """The dense keypoint detector of the paper.
 
     Args:
-        weights: an ONNX file, or a safetensors file where torch is installed; default
-            the weights inside the package.
+        weights: "matching" or "geometry", the weights inside the package; or an ONNX file, or
+            a safetensors file where torch is installed.
         resolution: "native" (the image as it is, padded), or a number of pixels: the
             image is squashed to a square of that side, as the paper does with 480.
         backend: "auto" (OpenVINO when it is installed, else ONNX Runtime; torch for
@@ -57,7 +52,7 @@ class DeepDetect:
 
     def __init__(
         self,
-        weights: str | Path | None = None,
+        weights: str | Path = "matching",
         *,
         resolution: Literal["native"] | int = "native",
         backend: str = "auto",
@@ -65,7 +60,7 @@ class DeepDetect:
         threads: int | None = None,
         channels: Literal["rgb", "bgr"] = "rgb",
     ) -> None:
-        self.weights = Path(weights) if weights is not None else bundled_weights()
+        self.weights = find_weights(weights)
         self.heatmap_options = HeatmapOptions(resolution, channels)
         runtime = RuntimeOptions(backend, providers, threads)
         self._network, self.backend = open_network(self.weights, runtime)

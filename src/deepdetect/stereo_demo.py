@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from .controls import RandomPoints
 from .datasets import StereoPair
 from .detector import DeepDetect
 from .geometry import disparity_errors
 from .matching import Matches, match_images
+from .metrics.stereo_matches import TOLERANCE, StereoScore, score_errors
 from .pictures import (
     draw_heatmap,
     draw_keypoints,
@@ -20,29 +22,6 @@ from .pictures import (
     save_picture,
     with_caption,
 )
-
-TOLERANCE = 1.0
-"""Distance from the true match, in pixels, up to which a match counts as right."""
-
-
-@dataclass(frozen=True)
-class StereoScore:
-    """Matches judged by the true disparity.
-
-    Attributes:
-        matches: number of matches.
-        judged: those of them whose true disparity is known.
-        right: those of the judged that are within 1 px of it.
-    """
-
-    matches: int
-    judged: int
-    right: int
-
-    @property
-    def share(self) -> float:
-        """Share of the judged matches that are right."""
-        return self.right / self.judged if self.judged else 0.0
 
 
 @dataclass(frozen=True)
@@ -107,34 +86,18 @@ def run_demo(pair: StereoPair, detector: DeepDetect, folder: Path) -> DemoResult
     return DemoResult(
         keypoints=(len(matches.keypoints0), len(matches.keypoints1)),
         density=(matches.keypoints0.density, matches.keypoints1.density),
-        all_matches=_score(errors),
-        inliers=_score(errors[matches.inliers]),
-        random=_score(random_errors),
+        all_matches=score_errors(errors),
+        inliers=score_errors(errors[matches.inliers]),
+        random=score_errors(random_errors),
         seconds=matches.seconds,
         pictures=_draw(pair, detector, matches, errors, folder),
     )
 
 
-def _score(errors: np.ndarray) -> StereoScore:
-    known = np.isfinite(errors)
-    right = errors[known] <= TOLERANCE
-    return StereoScore(len(errors), int(known.sum()), int(right.sum()))
-
-
-class _RandomPoints:
-    """A detector that knows nothing: the control."""
-
-    def __init__(self) -> None:
-        self._generator = np.random.default_rng(0)
-
-    def heatmap(self, image: np.ndarray) -> np.ndarray:
-        return self._generator.random(image.shape[:2], dtype=np.float32)
-
-
 def _match_random_points(pair: StereoPair, matches: Matches) -> Matches:
     density = (matches.keypoints0.density + matches.keypoints1.density) / 2
     return match_images(
-        pair.left, pair.right, _RandomPoints(), density=max(density, 1e-6), model="none"
+        pair.left, pair.right, RandomPoints(), density=max(density, 1e-6), model="none"
     )
 
 
@@ -142,7 +105,7 @@ def _draw(
     pair: StereoPair, detector: DeepDetect, matches: Matches, errors: np.ndarray, folder: Path
 ) -> list[Path]:
     known = np.isfinite(errors)
-    share = _score(errors).share
+    share = score_errors(errors).share
     lines = draw_matches(
         pair.left,
         pair.right,

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError, Keypoints
-from deepdetect.detector import bundled_weights
+from deepdetect.bundled import bundled_weights
 from deepdetect.storage import save_keypoints
 
 

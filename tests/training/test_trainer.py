@@ -170,7 +170,7 @@ def test_own_photographs_and_settings_from_the_shipped_weights(
     settings = tmp_path / "labels.toml"
     settings.write_text('detectors = ["fast", "sobel"]\n[fast]\nnormal = { threshold = 30 }\n')
     arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
-    arguments += [str(tmp_path / "run"), "--start", "bundled", "--label-settings", str(settings)]
+    arguments += [str(tmp_path / "run"), "--start", "matching", "--label-settings", str(settings)]
     arguments += ["--stage", "96x4x12", "--short-side", "96", "--learning-rate", "0.0005"]
     arguments += ["--warm-up", "5", "--dark-fraction", "0"]
     arguments += [
@@ -196,7 +196,7 @@ def test_frozen_batch_norm_keeps_the_statistics_and_trains_the_rest(
     photographs: Path, tmp_path: Path
 ) -> None:
     arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels")]
-    arguments += ["--start", "bundled"]
+    arguments += ["--start", "matching"]
     subprocess.run(arguments, check=True, capture_output=True)
     before = load_network(BUNDLED).state_dict()
     after = load_network(tmp_path / "run" / "best.safetensors").state_dict()

@@ -42,7 +42,7 @@ def label(
     images: tuple[Path, ...],
     output: Path,
     detectors: str | None,
-    label_settings: Path | None,
+    label_settings: str | None,
     visibility: str,
     explain: bool,
     overwrite: bool,

@@ -13,6 +13,7 @@ from .datasets import datasets
 from .demo import demo
 from .detect import detect
 from .evaluate import evaluate
+from .evaluate_stereo import evaluate_stereo
 from .label import label
 from .match import match
 from .shards import shards
@@ -60,5 +61,5 @@ def main() -> None:
     """
 
 
-for command in (detect, match, label, shards, train, datasets, evaluate, demo):
+for command in (detect, match, label, shards, train, datasets, evaluate, evaluate_stereo, demo):
     main.add_command(command)

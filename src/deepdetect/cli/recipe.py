@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -16,8 +15,8 @@ preset_option = click.option(
     "--preset",
     default="default",
     show_default=True,
-    help="Recipe that the other options change: default (its values are shown below), or "
-    "paper (the paper's own).",
+    help="Recipe that the other options change: default (its values are shown below), paper "
+    "(the paper's own), or geometry (normal light only, denser labels).",
 )
 short_sides_option = click.option(
     "--short-side",
@@ -34,7 +33,7 @@ detectors_option = click.option(
 
 
 def chosen_recipe(
-    preset: str, detectors: str | None, label_settings: Path | None, values: dict[str, Any]
+    preset: str, detectors: str | None, label_settings: str | None, values: dict[str, Any]
 ) -> TrainingOptions:
     """Return a preset's training options with the values that are given changed.
 

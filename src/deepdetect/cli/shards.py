@@ -39,7 +39,7 @@ def shards(
     output: Path,
     preset: str,
     detectors: str | None,
-    label_settings: Path | None,
+    label_settings: str | None,
     photos_a_shard: int,
     workers: int | None,
     as_json: bool,

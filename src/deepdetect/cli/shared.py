@@ -47,7 +47,10 @@ def combined(*options: Decorator) -> Decorator:
 
 detector_options = combined(
     click.option(
-        "--weights", type=PATH, help="ONNX or safetensors file.  [default: the bundled weights]"
+        "--weights",
+        default="matching",
+        show_default=True,
+        help="matching or geometry, the bundled weights; or an ONNX or safetensors file.",
     ),
     click.option(
         "--resolution",
@@ -121,25 +124,24 @@ workers_option = click.option(
 )
 label_settings_option = click.option(
     "--label-settings",
-    type=PATH,
-    metavar="FILE.toml",
-    help="Detectors and their settings.  [default: the paper's]",
+    metavar="NAME|FILE.toml",
+    help="Detectors and their settings: paper or geometry, or a file.  [default: paper]",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 
 
-def chosen_label_settings(detectors: str | None, path: Path | None) -> LabelSettings:
-    """Read the settings file; detectors named on the command line take the place of its own.
+def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelSettings:
+    """Find the settings; detectors named on the command line take the place of theirs.
 
     Args:
         detectors: names with commas between, or None.
-        path: TOML file, or None.
+        chosen: name, TOML file, or None.
     """
     import dataclasses
 
-    from ..labels import LabelSettings, read_label_settings
+    from ..labels import LabelSettings, find_label_settings
 
-    settings = LabelSettings() if path is None else read_label_settings(path)
+    settings = LabelSettings() if chosen is None else find_label_settings(chosen)
     if detectors is None:
         return settings
     names = tuple(name.strip() for name in detectors.split(",") if name.strip())

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 @click.option(
     "--start",
     type=PATH,
-    help="Weights (.safetensors) to start from, or the word bundled.  [default: random ones]",
+    help="Weights to start from: matching or geometry, the bundled ones, or a .safetensors "
+    "file.  [default: random ones]",
 )
 @click.option(
     "--stage",
@@ -104,7 +105,7 @@ def train(
     timed: bool,
     preset: str,
     detectors: str | None,
-    label_settings: Path | None,
+    label_settings: str | None,
     workers: int | None,
     as_json: bool,
     **values: Any,

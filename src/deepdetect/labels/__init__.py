@@ -1,6 +1,7 @@
 """Labels for training: classical detectors, and their fusion into one binary mask."""
 
 from .fusion import Label, LabelOptions, fuse
+from .named_settings import LABEL_SETTINGS, find_label_settings
 from .registry import DETECTOR_NAMES, DETECTORS, LabelDetector
 from .settings import LabelSettings, SettingChange, read_label_settings
 from .visibility import LOW_VISIBILITY_RANGE, luma_range, visibility_of
@@ -8,12 +9,14 @@ from .visibility import LOW_VISIBILITY_RANGE, luma_range, visibility_of
 __all__ = [
     "DETECTORS",
     "DETECTOR_NAMES",
+    "LABEL_SETTINGS",
     "LOW_VISIBILITY_RANGE",
     "Label",
     "LabelDetector",
     "LabelOptions",
     "LabelSettings",
     "SettingChange",
+    "find_label_settings",
     "fuse",
     "luma_range",
     "read_label_settings",

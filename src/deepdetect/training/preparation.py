@@ -112,7 +112,8 @@ def _stored(
 ) -> ViewStore:
     """Make the labels of photographs in files."""
     store = ViewStore(LabelCache(sources.label_cache, options.label_options))
-    wanted = [(photo, photo.normal + photo.dark) for photo in training]
+    dark_ones = options.dark_fraction > 0
+    wanted = [(photo, photo.normal + photo.dark * dark_ones) for photo in training]
     wanted += [(photo, (photo.normal[0], photo.dark[0])) for photo in held]
     place = place_in_cluster()
     if place.local_rank == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..errors import look_up
+from ..labels import LABEL_SETTINGS
 from .recipe import Stage, TrainingOptions
 
 PRESETS: dict[str, TrainingOptions] = {
@@ -20,6 +21,19 @@ PRESETS: dict[str, TrainingOptions] = {
         learning_rate=1e-3,
         final_learning_rate=1e-6,
         validations=20,
+    ),
+    # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser
+    # labels. Meant to go on from trained weights, as --start matching.
+    "geometry": TrainingOptions(
+        stages=(Stage(480, 8, 6, (480,)), Stage(480, 8, 2, (720,)), Stage(240, 32, 4, (240,))),
+        interleave=True,
+        short_sides=(480, 240, 720),
+        dark_fraction=0.0,
+        label_changes=LABEL_SETTINGS["geometry"].changes,
+        optimizer="soap",
+        learning_rate=1.5e-3,
+        warm_up=100,
+        validations=6,
     ),
 }
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from ..detector import bundled_weights
+from ..bundled import find_weights
 from ..errors import OptionError
 from ..network.espnet import ESPNet
 from ..network.weights import load_network
@@ -18,8 +18,6 @@ from .preparation import Sources, prepare
 from .profile import WARM_UP_STEPS, StageProfile, profile_stages
 from .recipe import TrainingOptions
 from .run import Run, TrainingResult
-
-BUNDLED = bundled_weights().with_suffix(".safetensors")
 
 
 def train(
@@ -47,8 +45,8 @@ def train(
         options: the recipe.
         validation: folder of other photographs; default: some are held out.
         labels: folder for the label cache; default: in `output`.
-        start: weights (.safetensors) to start from, or "bundled" for those inside the
-            package; default: random ones, by the seed.
+        start: weights (.safetensors) to start from, or "matching" or "geometry" for those
+            inside the package; default: random ones, by the seed.
         device: how the network is run.
         workers: processes that make labels; default one for each processor.
         say: takes the one line that says how the network is run; without it there is
@@ -123,7 +121,7 @@ def _start(options: TrainingOptions, start: str | Path | None) -> tuple[Training
     if start is not None:
         if options.frozen_batch_norm is None:
             options = dataclasses.replace(options, frozen_batch_norm=True)
-        return options, load_network(BUNDLED if str(start) == "bundled" else start)
+        return options, load_network(find_weights(start, ".safetensors"))
     if options.frozen_batch_norm:
         raise OptionError(
             "random weights have no batch statistics to keep: name trained ones with --start, "

@@ -1,0 +1,54 @@
+"""The weights inside the package: one line each."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+from .errors import look_up
+
+BUNDLED: dict[str, str] = {
+    "matching": "deepdetect",  # photographs in any light
+    "geometry": "geometry",  # two views of a scene in normal light, denser
+}
+"""File names without ending, by the names that users choose them by."""
+
+
+def bundled_weights(name: str = "matching", suffix: str = ".onnx") -> Path:
+    """Return the path of weights inside the package.
+
+    Args:
+        name: "matching", for all purposes and in the dark, or "geometry", for the geometry of
+            scenes in normal light.
+        suffix: ".onnx", or ".safetensors" for training.
+
+    Raises:
+        OptionError: the name is unknown (the nearest right one is named).
+
+    Example:
+        >>> bundled_weights("geometry").name
+        'geometry.onnx'
+    """
+    return Path(
+        str(files("deepdetect") / "weights" / look_up("weights", name, BUNDLED))
+    ).with_suffix(suffix)
+
+
+def find_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
+    """Return the path of weights that are named, or are a file.
+
+    Args:
+        weights: a name of `BUNDLED`, or a path; a file's name has an ending.
+        suffix: as of `bundled_weights`.
+
+    Raises:
+        OptionError: it is a word that is no name.
+
+    Example:
+        >>> find_weights("run/best.safetensors").name
+        'best.safetensors'
+    """
+    path = Path(weights)
+    if path.suffix or len(path.parts) > 1:
+        return path
+    return bundled_weights(path.name, suffix)

@@ -1,0 +1,62 @@
+"""Rectified stereo with ground truth, as of Middlebury 2003 to 2014 (Scharstein and Szeliski).
+
+A scene is a folder with left.png, right.png, disparity.png (of the left view) and a calib.json,
+which says how the grey values of the disparity become pixels::
+
+    {"ground_truth": {"file": "disparity.png", "value_per_pixel": 4.0,
+                      "resolution_factor": 1.0, "unknown": 0}}
+
+A pixel's disparity in the full-size image is its value / value_per_pixel; resolution_factor is
+the width of the map over that of the image.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..errors import ImageError
+from ..image import load_image
+from .stereo import StereoPair
+
+
+def load_middlebury(folder: str | Path) -> StereoPair:
+    """Load a scene; its disparity is at the size of the image, in the image's pixels.
+
+    Args:
+        folder: the scene.
+
+    Raises:
+        ImageError: a file is missing or damaged, or the scene has no ground truth.
+    """
+    root = Path(folder)
+    left, right = load_image(root / "left.png"), load_image(root / "right.png")
+    if left.shape != right.shape:
+        raise ImageError(f"left.png and right.png in {root} differ in size: take a rectified pair")
+    path = root / "calib.json"
+    try:
+        truth = json.loads(path.read_text(encoding="utf-8")).get("ground_truth")
+        if truth is None:
+            raise ImageError(f"{root} has no ground truth: take a scene that has one")
+        value, unknown = float(truth["value_per_pixel"]), truth["unknown"]
+        stored = cv2.imread(str(root / truth["file"]), cv2.IMREAD_UNCHANGED)
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check the path") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ImageError(f"{path} does not say how its ground truth is stored ({error})") from None
+    if stored is None or stored.ndim != 2 or not value > 0:
+        raise ImageError(f"the ground truth of {root} is no grey image with values of disparity")
+    disparity = np.where(stored == unknown, np.nan, stored / value).astype(np.float32)
+    return StereoPair(root.name, left, right, _enlarged(disparity, left.shape[:2]))
+
+
+def _enlarged(disparity: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Read a smaller map at each pixel of the image: the nearest of its values."""
+    row, column = (
+        np.minimum((np.arange(full) + 0.5) * own / full, own - 1).astype(int)
+        for full, own in zip(shape, disparity.shape, strict=True)
+    )
+    return disparity[np.ix_(row, column)]

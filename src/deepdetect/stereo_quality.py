@@ -1,0 +1,100 @@
+"""True matches on rectified stereo pairs: of weights, of label settings, and of controls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .controls import EveryPixel, RandomPoints
+from .datasets.stereo import StereoPair
+from .image import load_image, luma
+from .labels import LabelOptions, fuse
+from .matching import HeatmapDetector, match_images
+from .metrics.stereo_matches import StereoScore, stereo_score
+
+
+@dataclass(frozen=True)
+class StereoQuality:
+    """What one source of keypoints gives on one pair.
+
+    Attributes:
+        source: its name.
+        pair: the pair's name.
+        density: keypoints a pixel of the left view.
+        score: its matches, and how many of them are right.
+    """
+
+    source: str
+    pair: str
+    density: float
+    score: StereoScore
+
+
+class LabelKeypoints:
+    """A detector whose keypoints are the fusion label itself, without a network.
+
+    Args:
+        options: how labels are made.
+
+    Example:
+        >>> image = np.zeros((32, 32), np.uint8)
+        >>> image[8:24, 8:24] = 255
+        >>> float(LabelKeypoints().heatmap(image)[8, 8])
+        1.0
+    """
+
+    def __init__(self, options: LabelOptions = LabelOptions()) -> None:
+        self.options = options
+
+    def heatmap(self, image: Any) -> np.ndarray:
+        """Return the label as (H, W) float32, 0 or 1."""
+        return fuse(luma(load_image(image)), self.options).mask.astype(np.float32)
+
+
+def stereo_quality(
+    sources: Mapping[str, HeatmapDetector],
+    pairs: Sequence[StereoPair],
+    done: Callable[[int], object] = lambda _: None,
+) -> list[StereoQuality]:
+    """Match rectified pairs with several sources of keypoints, and judge the matches.
+
+    Matching is the default one of `match_images` (SIFT descriptors, FLANN, ratio 0.99) over the
+    whole image: neither the rows nor the true disparity are used. Beside each source stand
+    random points at its density, since more keypoints always find more; every pixel is the
+    last row.
+
+    Args:
+        sources: detectors by name.
+        pairs: with their true disparity, for judging only.
+        done: called with 1 after each of (2 sources + 1) x pairs matchings.
+
+    Returns:
+        For each source its rows and then the control's, pair by pair.
+    """
+    rows: list[StereoQuality] = []
+    for name, source in sources.items():
+        own = [_measure(name, source, pair, None, done) for pair in pairs]
+        control = f"random, as {name}"
+        rows += own
+        rows += [
+            _measure(control, RandomPoints(), pair, row.density, done)
+            for pair, row in zip(pairs, own, strict=True)
+        ]
+    return rows + [_measure("every pixel", EveryPixel(), pair, None, done) for pair in pairs]
+
+
+def _measure(
+    name: str,
+    source: HeatmapDetector,
+    pair: StereoPair,
+    density: float | None,
+    done: Callable[[int], object],
+) -> StereoQuality:
+    wanted = {} if density is None else {"density": max(density, 1e-6)}
+    found = match_images(pair.left, pair.right, source, model="none", **wanted)
+    score = stereo_score(found.points0, found.points1, pair.disparity)
+    done(1)
+    return StereoQuality(name, pair.name, found.keypoints0.density, score)

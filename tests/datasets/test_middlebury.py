@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import ImageError
+from deepdetect.datasets.middlebury import load_middlebury
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """Views of 6x4 pixels, and a map of half their size."""
+    for name in ("left", "right"):
+        Image.fromarray(np.zeros((16, 32, 3), np.uint8)).save(tmp_path / f"{name}.png")
+    stored = np.arange(8 * 16, dtype=np.uint8).reshape(8, 16)
+    Image.fromarray(stored).save(tmp_path / "disparity.png")
+    truth = {"file": "disparity.png", "value_per_pixel": 4.0, "unknown": 0}
+    (tmp_path / "calib.json").write_text(json.dumps({"ground_truth": truth}))
+    return tmp_path
+
+
+def test_a_small_map_is_read_at_each_pixel(scene: Path) -> None:
+    disparity = load_middlebury(scene).disparity
+    assert disparity.shape == (16, 32)
+    assert disparity.dtype == np.float32
+    assert np.isnan(disparity[:2, :2]).all()
+    assert np.isfinite(disparity[2:]).all()
+    np.testing.assert_array_equal(disparity[2:4, 4:6], np.full((2, 2), 18 / 4))
+    assert disparity[-1, -1] == 127 / 4
+
+
+@pytest.mark.parametrize("name", ["cones", "teddy", "dolls", "moebius", "art"])
+def test_the_truth_fits_the_photographs(shared: Path, name: str) -> None:
+    """The right view, sampled at x - disparity, looks like the left view; at x + it does not."""
+    pair = load_middlebury(shared / "data" / "middlebury" / name)
+    height, width = pair.disparity.shape
+    assert pair.left.shape == pair.right.shape == (height, width, 3)
+    known = np.isfinite(pair.disparity)
+    assert known.mean() > 0.7
+    rows, columns = np.nonzero(known)
+    shift = np.rint(pair.disparity[known]).astype(int)
+
+    def difference(offset: int) -> float:
+        there = columns - shift - offset
+        inside = (there >= 0) & (there < width)
+        left = pair.left[rows[inside], columns[inside]].astype(int)
+        right = pair.right[rows[inside], there[inside]].astype(int)
+        return float(np.abs(left - right).mean())
+
+    nearest = min(range(-8, 9), key=difference)
+    assert abs(nearest) <= 1
+
+
+def test_what_is_missing_or_wrong_is_named(scene: Path, one_line) -> None:
+    calibration = scene / "calib.json"
+    for text, message in (
+        ("{}", "no ground truth"),
+        ('{"ground_truth": {"file": "disparity.png"}}', "does not say"),
+        ("[]", "does not say"),
+        ("{", "does not say"),
+        (
+            '{"ground_truth": {"file": "no.png", "value_per_pixel": 4, "unknown": 0}}',
+            "no grey image",
+        ),
+    ):
+        calibration.write_text(text)
+        with pytest.raises(ImageError, match=message) as error:
+            load_middlebury(scene)
+        one_line(error.value)
+    calibration.unlink()
+    with pytest.raises(ImageError, match="cannot be read"):
+        load_middlebury(scene)
+    Image.fromarray(np.zeros((16, 30, 3), np.uint8)).save(scene / "right.png")
+    with pytest.raises(ImageError, match="differ in size"):
+        load_middlebury(scene)

@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from deepdetect import DeepDetect, OptionError
+from deepdetect.bundled import BUNDLED, bundled_weights, find_weights
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize("suffix", [".onnx", ".safetensors"])
+def test_every_name_has_its_files(name: str, suffix: str) -> None:
+    path = bundled_weights(name, suffix)
+    assert path.is_file()
+    assert path.suffix == suffix
+    assert 1e6 < path.stat().st_size < 2e6
+
+
+def test_the_names_stand_for_different_weights() -> None:
+    assert len({bundled_weights(name).read_bytes() for name in BUNDLED}) == len(BUNDLED)
+    assert DeepDetect().weights == DeepDetect("matching").weights == bundled_weights()
+    assert DeepDetect("geometry").weights == bundled_weights("geometry")
+
+
+def test_a_path_is_left_as_it_is(tmp_path: Path) -> None:
+    for path in ("best.safetensors", "run/deepdetect.onnx", tmp_path / "weights"):
+        assert find_weights(path) == Path(path)
+
+
+def test_an_unknown_name_says_the_nearest() -> None:
+    with pytest.raises(OptionError, match="did you mean 'geometry'"):
+        DeepDetect("geometri")
