@@ -25,7 +25,7 @@ PRESETS: dict[str, TrainingOptions] = {
     # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser
     # labels. Meant to go on from trained weights, as --start matching.
     "geometry": TrainingOptions(
-        stages=(Stage(480, 8, 6, (480,)), Stage(480, 8, 2, (720,)), Stage(240, 32, 4, (240,))),
+        stages=(Stage(480, 8, 5, (480,)), Stage(480, 8, 1, (720,)), Stage(240, 32, 3, (240,))),
         interleave=True,
         short_sides=(480, 240, 720),
         dark_fraction=0.0,
