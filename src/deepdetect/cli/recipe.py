@@ -27,6 +27,12 @@ short_sides_option = click.option(
     "the first.  "
     "[default: 480 360 240]",
 )
+variations_option = click.option(
+    "--variations",
+    type=int,
+    help="Varied views of each photograph at the first size, in normal and in dark light: turned, "
+    "relit, blurred, noisy or compressed.  [default: 0]",
+)
 detectors_option = click.option(
     "--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]"
 )

@@ -7,7 +7,13 @@ from typing import Any
 
 import click
 
-from .recipe import chosen_recipe, detectors_option, preset_option, short_sides_option
+from .recipe import (
+    chosen_recipe,
+    detectors_option,
+    preset_option,
+    short_sides_option,
+    variations_option,
+)
 from .shared import (
     PATH,
     json_option,
@@ -23,6 +29,7 @@ from .shared import (
 @click.option("-o", "--output", type=PATH, required=True, help="Folder for the shards.")
 @preset_option
 @short_sides_option
+@variations_option
 @detectors_option
 @label_settings_option
 @click.option(

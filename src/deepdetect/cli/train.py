@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .cluster import ending_all_processes
-from .recipe import chosen_recipe, detectors_option, preset_option, short_sides_option
+from .recipe import (
+    chosen_recipe,
+    detectors_option,
+    preset_option,
+    short_sides_option,
+    variations_option,
+)
 from .shared import (
     PATH,
     json_option,
@@ -55,6 +61,22 @@ if TYPE_CHECKING:
 )
 @short_sides_option
 @click.option("--dark-fraction", type=float, help="Share of darkened images.  [default: 0.25]")
+@variations_option
+@click.option(
+    "--flips/--no-flips",
+    default=None,
+    help="Mirror crops left to right and upside down, too, where labels fit less.  [default: no]",
+)
+@click.option(
+    "--transpositions/--no-transpositions",
+    default=None,
+    help="Mirror crops along their diagonal, where labels are the same.  [default: yes]",
+)
+@click.option(
+    "--color-changes",
+    type=float,
+    help="Share of crops with other colours of the same luma.  [default: 0.5]",
+)
 @click.option("--optimizer", help="adam or soap.  [default: adam]")
 @click.option("--learning-rate", type=float, help="At the start.  [default: 0.001]")
 @click.option("--warm-up", type=int, help="Steps to that rate.  [default: 0]")

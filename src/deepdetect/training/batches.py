@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
+from .augmentation import flip, transpose, turn_hue, without_color
 from .cluster import Place
 from .feed import Example, Feed
 from .photos import Photo
@@ -98,19 +98,27 @@ class Batches:
     def _crop(
         self, example: Example, epoch: int, place: int, stage: Stage
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Cut the crop of one sample, flipped by chance."""
+        """Cut the crop of one sample, mirrored and with other colours by chance."""
         generator = np.random.default_rng([self.schedule.options.seed, 2, epoch, place])
-        image, mask = example.load(self._choose_view(example.photo, stage, generator))
+        view = self._choose_view(example.photo, stage, generator)
+        image, mask = example.load(view)
         side = stage.crop
         top = int(generator.integers(image.shape[0] - side + 1))
         left = int(generator.integers(image.shape[1] - side + 1))
         image = image[top : top + side, left : left + side]
         mask = mask[top : top + side, left : left + side]
-        for axis in (1, 0):  # left-right, then upside down
+        options = self.schedule.options
+        for axis in (1, 0) if options.flips else ():  # left-right, then upside down
             if generator.random() < 0.5:
-                # Copies a hundred times faster than a negative stride.
-                image = cv2.flip(image, axis)
-                mask = cv2.flip(mask.view(np.uint8), axis).view(bool)
+                image, mask = flip(image, mask, axis)
+        if options.transpositions and generator.random() < 0.5:
+            image, mask = transpose(image, mask)
+        if generator.random() < options.color_changes:
+            # In the dark, where one level more or less makes a keypoint, only what is exact.
+            if view.darkening is not None or generator.random() < 0.5:
+                image = without_color(image)
+            else:
+                image = turn_hue(image, generator.uniform(0, 2 * np.pi), generator.uniform(0, 1.2))
         return image, mask
 
     def _choose_view(self, photo: Photo, stage: Stage, generator: np.random.Generator) -> View:

@@ -64,6 +64,7 @@ def list_photos(
                 options.darkening,
                 options.dark_variants,
                 options.square,
+                options.variations,
             ),
         )
         for path in paths

@@ -78,6 +78,13 @@ class TrainingOptions:
         dark_fraction: share of darkened images (paper: a quarter).
         dark_variants: darkened versions of each photograph at each size.
         darkening: ranges of the darkening.
+        variations: varied views of each photograph at the first size, in normal and in dark
+            light: turned, relit, blurred, noisy or compressed (`variation.vary`).
+        flips: mirror crops left to right and upside down. The label of a mirrored photograph
+            is another one, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
+        transpositions: mirror crops along their diagonal, which changes no label.
+        color_changes: share of crops whose colours are taken away or turned around the luma,
+            on which alone labels depend.
         optimizer: "adam", or "soap", which learns more from an image (measured in the model
             card of the bundled weights).
         learning_rate, final_learning_rate: ends of its cosine annealing.
@@ -104,6 +111,10 @@ class TrainingOptions:
     dark_fraction: float = 0.25
     dark_variants: int = 1
     darkening: DarkeningRange = field(default_factory=DarkeningRange)
+    variations: int = 0
+    flips: bool = False
+    transpositions: bool = True
+    color_changes: float = 0.5
     optimizer: str = "adam"
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-6
@@ -139,6 +150,12 @@ class TrainingOptions:
             raise OptionError(f"the share held out must lie in (0, 1), not {self.held_out}")
         if not 0 <= self.dark_fraction <= 1:
             raise OptionError(f"the dark fraction must lie in [0, 1], not {self.dark_fraction}")
+        if not 0 <= self.color_changes <= 1:
+            raise OptionError(
+                f"the share of colour changes must lie in [0, 1], not {self.color_changes}"
+            )
+        if self.variations < 0:
+            raise OptionError(f"the variations must not be negative, not {self.variations}")
         if self.dark_variants < 1 or self.validations < 1:
             raise OptionError("dark variants and validations must be at least 1")
         if self.warm_up < 0:

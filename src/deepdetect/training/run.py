@@ -254,12 +254,12 @@ class Run:
 def _difference(stored: str, options: TrainingOptions) -> list[str]:
     """Name the options that differ between a checkpoint and this run.
 
-    What a run of an older version lacks had the value of today's default.
+    What a run of an older version lacks was not there, or had the value of today's default.
     """
     now = json.loads(options.to_json())
-    before = {
-        **json.loads(TrainingOptions(frozen_batch_norm=False).to_json()),
-        **json.loads(stored),
-    }
+    older = TrainingOptions(
+        frozen_batch_norm=False, flips=True, transpositions=False, color_changes=0.0
+    )
+    before = {**json.loads(older.to_json()), **json.loads(stored)}
     before["stages"] = [{"sides": [], **stage} for stage in before["stages"]]
     return [name for name in {**before, **now} if before.get(name) != now.get(name)]

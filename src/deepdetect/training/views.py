@@ -10,6 +10,7 @@ import numpy as np
 
 from ..image import load_image, scale_short_side
 from .darkening import Darkening, DarkeningRange, darken
+from .variation import VERSION, vary
 
 
 @dataclass(frozen=True)
@@ -20,11 +21,13 @@ class View:
         short_side: length in pixels that the shorter side is scaled to.
         darkening: the darkening, or None for the photograph as it is.
         square: squashed to a square instead of scaled evenly.
+        variation: seed of a varied square (`vary`), or None for the whole photograph.
     """
 
     short_side: int
     darkening: Darkening | None = None
     square: bool = False
+    variation: int | None = None
 
     @property
     def name(self) -> str:
@@ -32,7 +35,10 @@ class View:
         light = "normal"
         if self.darkening is not None:
             light = f"b{self.darkening.brightness:.3f}c{self.darkening.contrast:.3f}"
-        return f"{self.short_side}{'x' * self.square}_{light}"
+        shape = "x" * self.square
+        if self.variation is not None:
+            shape = f"v{VERSION}-{self.variation:08x}"
+        return f"{self.short_side}{shape}_{light}"
 
 
 def views_of(
@@ -41,6 +47,7 @@ def views_of(
     darkening: DarkeningRange,
     variants: int,
     square: bool = False,
+    variations: int = 0,
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """List the normal and the dark views of a photograph, the same on every call.
 
@@ -50,9 +57,10 @@ def views_of(
         darkening: ranges of the factors.
         variants: dark views of each size.
         square: squash the photograph to squares.
+        variations: varied views of the first size, each in normal and in dark light.
 
     Returns:
-        The normal views and the dark ones, of each size in turn.
+        The normal views and the dark ones, of each size in turn, the varied ones last.
     """
     generator = np.random.default_rng(zlib.crc32(name.encode()))
     normal = tuple(View(side, None, square) for side in short_sides)
@@ -61,6 +69,11 @@ def views_of(
         for side in short_sides
         for _ in range(variants)
     )
+    drawn = np.random.default_rng([zlib.crc32(name.encode()), 1])
+    for _ in range(variations):
+        seed = int(drawn.integers(2**32))
+        normal += (View(short_sides[0], None, False, seed),)
+        dark += (View(short_sides[0], darkening.draw(drawn), False, seed),)
     return normal, dark
 
 
@@ -81,6 +94,9 @@ def render(photo: object, view: View) -> np.ndarray:
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    scale = squash if view.square else scale_short_side
-    rgb = scale(load_image(photo), view.short_side)
+    if view.variation is not None:
+        rgb = vary(load_image(photo), view.short_side, view.variation)
+    else:
+        scale = squash if view.square else scale_short_side
+        rgb = scale(load_image(photo), view.short_side)
     return rgb if view.darkening is None else darken(rgb, view.darkening)

@@ -110,6 +110,7 @@ def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
         "max_photos": options.max_photos,
         "held_out": options.held_out,
         "dark_variants": options.dark_variants,
+        "variations": options.variations,
         "darkening": dataclasses.asdict(options.darkening),
         "labels": settings_digest(options.label_options),
     }

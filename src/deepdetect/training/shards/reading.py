@@ -150,7 +150,12 @@ def _example(shard: Path, sample: dict[str, Any], options: TrainingOptions) -> S
         if ending.startswith("label.")
     }
     views = views_of(
-        name, options.short_sides, options.darkening, options.dark_variants, options.square
+        name,
+        options.short_sides,
+        options.darkening,
+        options.dark_variants,
+        options.square,
+        options.variations,
     )
     photo = Photo(Path(name), sample["__key__"].rpartition("_")[2], *views)
     return ShardExample(shard, photo, content, labels)
