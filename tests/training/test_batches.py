@@ -20,6 +20,9 @@ from deepdetect.training.views import render
 OPTIONS = TrainingOptions(
     stages=(Stage(64, 4, 6), Stage(96, 2, 1)),
     short_sides=(96, 64),
+    flips=True,
+    color_changes=0.0,
+    variations=1,
     detectors=("fast", "harris", "sobel"),
 )
 
@@ -29,7 +32,7 @@ def batches(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Batc
     cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.label_options)
     photos = list_photos(photographs, OPTIONS)
     wanted = [(photo, photo.normal + photo.dark) for photo in photos]
-    assert cache.make(wanted, 1, quiet=True) == 12 * 4
+    assert cache.make(wanted, 1, quiet=True) == 12 * 6
     assert cache.make(wanted, 1, quiet=True) == 0, "labels are made once"
     feed = FileFeed(photos, ViewStore(cache), OPTIONS.seed)
     return Batches(feed, Schedule(OPTIONS, len(photos)))
@@ -92,7 +95,10 @@ def test_crops_and_labels_belong_together(batches: Batches) -> None:
 def _found(image: np.ndarray, mask: np.ndarray, view: np.ndarray, label: np.ndarray) -> bool:
     side = len(image)
     for flipped, flipped_mask in (
-        (image[::a, ::b], mask[::a, ::b]) for a in (1, -1) for b in (1, -1)
+        (turned[::a, ::b], turned_mask[::a, ::b])
+        for turned, turned_mask in ((image, mask), (image.transpose(1, 0, 2), mask.T))
+        for a in (1, -1)
+        for b in (1, -1)
     ):
         corner = (view[: len(view) - side + 1, : view.shape[1] - side + 1] == flipped[0, 0]).all(2)
         for top, left in np.argwhere(corner):
@@ -100,6 +106,37 @@ def _found(image: np.ndarray, mask: np.ndarray, view: np.ndarray, label: np.ndar
             if np.array_equal(view[place], flipped) and np.array_equal(label[place], flipped_mask):
                 return True
     return False
+
+
+def test_mirrors_come_only_when_asked_for(batches: Batches) -> None:
+    """Without flips and transpositions each crop is a part of a view as it is."""
+    options = changed(OPTIONS, flips=False, transpositions=False)
+    plain = Batches(batches.feed, Schedule(options, len(batches.feed)))
+    views = [
+        render(photo.path, view)
+        for photo in batches.feed.photos
+        for view in photo.normal + photo.dark
+    ]
+    for image in plain.batch(1)[0]:
+        assert any(
+            (view[top : top + 64, left : left + 64] == image).all()
+            for view in views
+            for top, left in np.argwhere((view[:-63, :-63] == image[0, 0]).all(2))
+        )
+
+
+def test_colors_change_and_labels_do_not(batches: Batches) -> None:
+    options = changed(OPTIONS, color_changes=1.0)
+    colored = Batches(batches.feed, Schedule(options, len(batches.feed)))
+    gray = 0
+    for step in range(4):
+        images, masks = batches.batch(step)
+        others, same = colored.batch(step)
+        np.testing.assert_array_equal(masks, same)
+        for image, other in zip(images, others, strict=True):
+            assert np.abs(luma(other).astype(int) - luma(image)).max() <= 1
+            gray += (other == other[..., :1]).all()
+    assert 4 < gray < 16
 
 
 def test_dark_labels_use_the_low_visibility_settings(batches: Batches) -> None:
@@ -143,9 +180,10 @@ def test_a_stage_can_take_some_views_only(batches: Batches) -> None:
 
 
 def _inside(image: np.ndarray, view: np.ndarray) -> bool:
-    """Whether a flipped crop is part of a view."""
+    """Whether a mirrored crop is part of a view."""
     side = len(image)
-    flipped = [image[::a, ::b] for a in (1, -1) for b in (1, -1)]
+    turned = (image, image.transpose(1, 0, 2))
+    flipped = [each[::a, ::b] for each in turned for a in (1, -1) for b in (1, -1)]
     return any(
         np.array_equal(view[:side, left : left + side], crop)
         for crop in flipped

@@ -29,6 +29,8 @@ def test_bad_stages_are_refused(text: str) -> None:
         {"stages": (Stage(64, 8, 1, (96,)),), "short_sides": (240, 64)},
         {"dark_fraction": 1.5},
         {"dark_variants": 0},
+        {"variations": -1},
+        {"color_changes": 1.5},
         {"validations": 0},
         {"learning_rate": -1.0},
         {"warm_up": -1},

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect.training.darkening import Darkening, DarkeningRange, darken
+from deepdetect.training.variation import vary
 from deepdetect.training.views import View, render, scale_short_side, views_of
 
 RANGE = DarkeningRange()
@@ -19,6 +20,8 @@ RANGE = DarkeningRange()
         (View(480), "480_normal"),
         (View(240, Darkening(0.3, 0.4)), "240_b0.300c0.400"),
         (View(240, Darkening(0.2345, 1)), "240_b0.234c1.000"),
+        (View(240, None, True), "240x_normal"),
+        (View(240, Darkening(0.3, 0.4), False, 255), "240v1-000000ff_b0.300c0.400"),
     ],
 )
 def test_names(view: View, name: str) -> None:
@@ -43,6 +46,25 @@ def test_views_of_a_photograph(name: str, short_sides: tuple[int, ...], variants
         light = view.name.partition("_b")[2].partition("c")
         assert Darkening(float(light[0]), float(light[2])) == view.darkening
     assert views_of(name, short_sides, RANGE, variants) == (normal, dark)
+
+
+def test_varied_views_come_last_and_leave_the_others_alone() -> None:
+    plain = views_of("a.jpg", (96, 64), RANGE, 2)
+    normal, dark = views_of("a.jpg", (96, 64), RANGE, 2, variations=3)
+    assert (normal[:2], dark[:4]) == plain
+    assert [view.short_side for view in normal[2:] + dark[4:]] == [96] * 6
+    assert [view.variation for view in normal[2:]] == [view.variation for view in dark[4:]]
+    assert len({view.variation for view in normal}) == 4
+    other, _ = views_of("b.jpg", (96, 64), RANGE, 2, variations=3)
+    assert {view.variation for view in other[2:]}.isdisjoint(v.variation for v in normal[2:])
+    assert len({view.name for view in normal + dark}) == 5 + 7
+
+
+def test_a_varied_view_is_darkened_after_it_is_varied(photo: np.ndarray) -> None:
+    bright = render(photo, View(80, None, False, 7))
+    np.testing.assert_array_equal(bright, vary(photo, 80, 7))
+    dark = render(photo, View(80, Darkening(0.3, 0.4), False, 7))
+    np.testing.assert_array_equal(dark, darken(bright, Darkening(0.3, 0.4)))
 
 
 def test_photographs_differ_in_their_dark_views() -> None:
