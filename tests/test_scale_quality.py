@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from deepdetect import ImageError, OptionError
+from deepdetect import DeepDetect, ImageError, OptionError
 from deepdetect.heatmap import HeatmapOptions
 from deepdetect.image import luma
 from deepdetect.labels import fuse
 from deepdetect.scale_quality import scale_quality
+from deepdetect.training.darkening import Darkening
+from deepdetect.training.views import View, render
 
 
 class Labels:
@@ -53,6 +57,28 @@ def test_nonsense_is_refused(photo: np.ndarray, scale: float) -> None:
 def test_an_image_must_not_vanish(photo: np.ndarray, scale: float) -> None:
     with pytest.raises(ImageError, match="at least 16"):
         scale_quality([Labels()], [photo], (scale,))
+
+
+@pytest.mark.parametrize("darkening", [None, Darkening(0.3, 0.4)])
+def test_the_bundled_weights_hold_from_half_to_twice_the_size(
+    shared: Path, darkening: Darkening | None
+) -> None:
+    """Photographs held out, scaled and then darkened, against labels of their own.
+
+    The scales are those of the training, 240 to 960 pixels, around the 480 of the photographs.
+    """
+    photos = sorted((shared / "data" / "photos" / "val").glob("*.jpg"))[::32]
+    rows = {}
+    for side in (240, 480, 960):
+        views = [render(path, View(side, darkening)) for path in photos]
+        (rows[side],) = scale_quality([DeepDetect()], views, (1,))
+    for side in (240, 960):
+        (row,), (middle,) = rows[side], rows[480]
+        assert row.visibility == middle.visibility == ("normal" if darkening is None else "low")
+        dark = 0 if darkening is None else 1
+        assert row.score.iou > middle.score.iou - (0.03, 0.12)[dark]
+        assert row.score.loss < 1.25 * middle.score.loss
+        assert row.density == pytest.approx(row.label_density, rel=(0.1, 0.3)[dark])
 
 
 def test_the_command_prints_a_row_for_each_scale(run_evaluate) -> None:

@@ -9,6 +9,7 @@ from PIL import Image
 
 from deepdetect import DeepDetect
 from deepdetect.datasets.oxford import SCENES, load_oxford
+from deepdetect.heatmap import HeatmapOptions
 from deepdetect.weights_quality import PAIRS, THRESHOLDS, oxford_quality, oxford_steps
 
 SIZE = 160
@@ -46,6 +47,24 @@ def test_shifted_images_repeat_and_match(folder: Path) -> None:
     assert set(found.correct) == {f"{scene} 1-{number}" for scene, number in PAIRS}
     for pair, correct in found.correct.items():
         assert 0.5 * found.matches[pair] < correct <= found.matches[pair]
+
+
+def test_the_bundled_weights_are_as_dense_as_the_paper_s(shared: Path) -> None:
+    """All 48 images of Oxford: within 0.04 at each threshold."""
+    pytest.importorskip("torch", reason="needs torch to read the published weights")
+    published = shared / "reference" / "published_matching.safetensors"
+    squashing = [
+        detector.configured(HeatmapOptions(480))
+        for detector in (DeepDetect(), DeepDetect(published))
+    ]
+    images = [path for scene in load_oxford(shared / "data" / "oxford") for path in scene.images]
+    maps = [[detector.heatmap(path) for path in images] for detector in squashing]
+    ours, theirs = (
+        [np.mean([(heatmap > threshold).mean() for heatmap in own]) for threshold in THRESHOLDS]
+        for own in maps
+    )
+    assert ours == sorted(ours, reverse=True)
+    np.testing.assert_allclose(ours, theirs, atol=0.04)
 
 
 def test_the_command_prints_weights_side_by_side(run_evaluate, folder: Path) -> None:

@@ -52,17 +52,17 @@ def turn_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
     Returns:
         (H, W, 3) uint8 RGB, whose luma differs by at most one level.
     """
-    values = rgb.astype(np.float32)
-    gray = values @ np.array([RED, GREEN, BLUE], np.float32)
+    red, green, blue = cv2.split(rgb.astype(np.float32))
+    gray = RED * red + GREEN * green + BLUE * blue
     # The two differences have these ranges, so that the turn is one of Cb and Cr.
     wide_blue, wide_red = 1 - BLUE, 1 - RED
-    blue, red = (values[..., 2] - gray) / wide_blue, (values[..., 0] - gray) / wide_red
+    blue, red = (blue - gray) / wide_blue, (red - gray) / wide_red
     cosine, sine = saturation * math.cos(angle), saturation * math.sin(angle)
-    turned = np.empty_like(values)
-    turned[..., 2] = (cosine * blue - sine * red) * wide_blue
-    turned[..., 0] = (sine * blue + cosine * red) * wide_red
-    turned[..., 1] = -(RED * turned[..., 0] + BLUE * turned[..., 2]) / GREEN
-    room = np.where(turned > 0, 255 - gray[..., None], gray[..., None])
-    share = (room / np.maximum(np.abs(turned), 1e-6)).min(2, keepdims=True)
-    turned = gray[..., None] + turned * np.minimum(share, 1)
-    return np.clip(np.rint(turned), 0, 255).astype(np.uint8)
+    blue, red = wide_blue * (cosine * blue - sine * red), wide_red * (sine * blue + cosine * red)
+    green = -(RED * red + BLUE * blue) / GREEN
+    # How far each pixel goes beyond white or black, as a multiple of the room that it has.
+    above = np.maximum(np.maximum(red, green), blue) / np.maximum(255 - gray, 1e-6)
+    below = np.minimum(np.minimum(red, green), blue) / np.minimum(-gray, -1e-6)
+    share = 1 / np.maximum(np.maximum(above, below), 1)
+    turned = cv2.merge([gray + share * plane for plane in (red, green, blue)])
+    return cv2.convertScaleAbs(turned)
