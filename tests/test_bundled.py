@@ -31,3 +31,17 @@ def test_a_path_is_left_as_it_is(tmp_path: Path) -> None:
 def test_an_unknown_name_says_the_nearest() -> None:
     with pytest.raises(OptionError, match="did you mean 'geometry'"):
         DeepDetect("geometri")
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_weights_tell_where_they_come_from(name: str) -> None:
+    pytest.importorskip("safetensors", reason="needs safetensors, which is for training only")
+    pytest.importorskip("torch", reason="needs torch, which is for training only")
+    from deepdetect.network.weights import read_notes
+
+    notes = read_notes(bundled_weights(name, ".safetensors"))
+    assert notes["command"].startswith("deepdetect train photos/train ")
+    assert " /" not in notes["command"], "no folder of one machine"
+    assert len(notes["commit"]) == 40
+    for word in ("options", "photographs_digest", "versions", "machine", "start", "point"):
+        assert notes[word]
