@@ -181,9 +181,11 @@ def test_the_wheel_installs_and_detects(folder: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     weights = target / "deepdetect" / "weights"
-    for name in ("deepdetect.onnx", "geometry.onnx", "geometry.safetensors"):
-        assert 0 < (weights / name).stat().st_size < 2_000_000
-    assert (weights / "MODEL_CARD.md").exists()
+    for name in ("deepdetect", "geometry"):
+        assert 0 < (weights / f"{name}.onnx").stat().st_size < 2_000_000
+        assert 0 < (weights / f"{name}.safetensors").stat().st_size < 2_000_000
+    for name in ("MODEL_CARD.md", "GEOMETRY_CARD.md"):
+        assert (weights / name).exists()
     code = (
         f"import sys; sys.path.insert(0, {str(target)!r}); import deepdetect;"
         f"assert deepdetect.__file__.startswith({str(target)!r}), deepdetect.__file__;"

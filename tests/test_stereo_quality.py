@@ -57,7 +57,14 @@ def test_the_command_prints_a_row_for_each(pair: StereoPair, tmp_path: Path) -> 
     Image.fromarray(np.full(pair.disparity.shape, 24, np.uint8)).save(tmp_path / "disparity.png")
     truth = {"file": "disparity.png", "value_per_pixel": 4, "unknown": 0}
     (tmp_path / "calib.json").write_text(json.dumps({"ground_truth": truth}))
-    arguments = ["evaluate-stereo", str(tmp_path), "--labels", "geometry", "--weights", "matching"]
+    arguments = [
+        "evaluate-stereo",
+        str(tmp_path),
+        "--label-settings",
+        "geometry",
+        "--weights",
+        "matching",
+    ]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
     for source in ("labels geometry", "weights matching", "random, as weights", "every pixel"):

@@ -6,6 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from .errors import look_up
+from .options import is_path, look_up_word
 
 BUNDLED: dict[str, str] = {
     "matching": "deepdetect",  # photographs in any light
@@ -38,7 +39,7 @@ def find_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
     """Return the path of weights that are named, or are a file.
 
     Args:
-        weights: a name of `BUNDLED`, or a path; a file's name has an ending.
+        weights: a name of `BUNDLED`, or a path (`is_path`).
         suffix: as of `bundled_weights`.
 
     Raises:
@@ -48,7 +49,7 @@ def find_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
         >>> find_weights("run/best.safetensors").name
         'best.safetensors'
     """
-    path = Path(weights)
-    if path.suffix or len(path.parts) > 1:
-        return path
-    return bundled_weights(path.name, suffix)
+    if is_path(weights):
+        return Path(weights)
+    look_up_word("weights", weights, BUNDLED)
+    return bundled_weights(str(weights), suffix)

@@ -3,11 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from .errors import unknown_name
 
 Options = TypeVar("Options")
+Entry = TypeVar("Entry")
+
+
+def is_path(value: str | Path) -> bool:
+    """Tell a file's path from a name: it has an ending, or a folder before it.
+
+    Example:
+        >>> [is_path(text) for text in ("geometry", "geometry.onnx", "./geometry")]
+        [False, True, True]
+    """
+    text = str(value)
+    return bool(Path(text).suffix) or any(mark in text for mark in (os.sep, os.altsep) if mark)
+
+
+def look_up_word(kind: str, word: str | Path, registry: Mapping[str, Entry]) -> Entry:
+    """Find an entry of a registry by a word that is no path.
+
+    Raises:
+        OptionError: there is none (the nearest right one is named, and that a file would do).
+    """
+    if str(word) not in registry:
+        raise unknown_name(kind, str(word), (*registry, "or a file with its ending"))
+    return registry[str(word)]
 
 
 def changed(options: Options, **changes: Any) -> Options:

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from .controls import RandomPoints
 from .datasets import StereoPair
 from .detector import DeepDetect
 from .geometry import disparity_errors
@@ -22,6 +21,7 @@ from .pictures import (
     save_picture,
     with_caption,
 )
+from .stereo_quality import match_random_points
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,8 @@ def run_demo(pair: StereoPair, detector: DeepDetect, folder: Path) -> DemoResult
     """
     matches = match_images(pair.left, pair.right, detector)
     errors = disparity_errors(matches.points0, matches.points1, pair.disparity)
-    random = _match_random_points(pair, matches)
+    density = (matches.keypoints0.density + matches.keypoints1.density) / 2
+    random = match_random_points(pair, density)
     random_errors = disparity_errors(random.points0, random.points1, pair.disparity)
     return DemoResult(
         keypoints=(len(matches.keypoints0), len(matches.keypoints1)),
@@ -91,13 +92,6 @@ def run_demo(pair: StereoPair, detector: DeepDetect, folder: Path) -> DemoResult
         random=score_errors(random_errors),
         seconds=matches.seconds,
         pictures=_draw(pair, detector, matches, errors, folder),
-    )
-
-
-def _match_random_points(pair: StereoPair, matches: Matches) -> Matches:
-    density = (matches.keypoints0.density + matches.keypoints1.density) / 2
-    return match_images(
-        pair.left, pair.right, RandomPoints(), density=max(density, 1e-6), model="none"
     )
 
 

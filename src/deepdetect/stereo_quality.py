@@ -12,7 +12,7 @@ from .controls import EveryPixel, RandomPoints
 from .datasets.stereo import StereoPair
 from .image import load_image, luma
 from .labels import LabelOptions, fuse
-from .matching import HeatmapDetector, match_images
+from .matching import HeatmapDetector, Matches, match_images
 from .metrics.stereo_matches import StereoScore, stereo_score
 
 
@@ -23,7 +23,7 @@ class StereoQuality:
     Attributes:
         source: its name.
         pair: the pair's name.
-        density: keypoints a pixel of the left view.
+        density: keypoints a pixel, mean of both views.
         score: its matches, and how many of them are right.
     """
 
@@ -74,27 +74,31 @@ def stereo_quality(
     Returns:
         For each source its rows and then the control's, pair by pair.
     """
+
+    def judged(source: str, pair: StereoPair, found: Matches) -> StereoQuality:
+        done(1)
+        density = (found.keypoints0.density + found.keypoints1.density) / 2
+        score = stereo_score(found.points0, found.points1, pair.disparity)
+        return StereoQuality(source, pair.name, density, score)
+
     rows: list[StereoQuality] = []
-    for name, source in sources.items():
-        own = [_measure(name, source, pair, None, done) for pair in pairs]
+    for name, detector in sources.items():
+        own = [judged(name, pair, match_stereo(pair, detector)) for pair in pairs]
         control = f"random, as {name}"
         rows += own
         rows += [
-            _measure(control, RandomPoints(), pair, row.density, done)
+            judged(control, pair, match_random_points(pair, row.density))
             for pair, row in zip(pairs, own, strict=True)
         ]
-    return rows + [_measure("every pixel", EveryPixel(), pair, None, done) for pair in pairs]
+    every = EveryPixel()
+    return rows + [judged("every pixel", pair, match_stereo(pair, every)) for pair in pairs]
 
 
-def _measure(
-    name: str,
-    source: HeatmapDetector,
-    pair: StereoPair,
-    density: float | None,
-    done: Callable[[int], object],
-) -> StereoQuality:
-    wanted = {} if density is None else {"density": max(density, 1e-6)}
-    found = match_images(pair.left, pair.right, source, model="none", **wanted)
-    score = stereo_score(found.points0, found.points1, pair.disparity)
-    done(1)
-    return StereoQuality(name, pair.name, found.keypoints0.density, score)
+def match_stereo(pair: StereoPair, detector: HeatmapDetector, **changes: Any) -> Matches:
+    """Match both views, without looking for their geometry."""
+    return match_images(pair.left, pair.right, detector, model="none", **changes)
+
+
+def match_random_points(pair: StereoPair, density: float) -> Matches:
+    """Match random points of a density, in keypoints a pixel: the control."""
+    return match_stereo(pair, RandomPoints(), density=max(density, 1e-6))

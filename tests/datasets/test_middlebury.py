@@ -13,7 +13,7 @@ from deepdetect.datasets.middlebury import load_middlebury
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """Views of 6x4 pixels, and a map of half their size."""
+    """Views of 32x16 pixels, and a map of half their size."""
     for name in ("left", "right"):
         Image.fromarray(np.zeros((16, 32, 3), np.uint8)).save(tmp_path / f"{name}.png")
     stored = np.arange(8 * 16, dtype=np.uint8).reshape(8, 16)
@@ -64,13 +64,27 @@ def test_what_is_missing_or_wrong_is_named(scene: Path, one_line) -> None:
         ("{", "does not say"),
         (
             '{"ground_truth": {"file": "no.png", "value_per_pixel": 4, "unknown": 0}}',
-            "no grey image",
+            "no.png is missing",
+        ),
+        (
+            '{"ground_truth": {"file": "disparity.png", "value_per_pixel": 0, "unknown": 0}}',
+            "scale above 0",
+        ),
+        *(
+            (
+                '{"ground_truth": {"file": "disparity.png", "value_per_pixel": 4, '
+                f'"unknown": {unknown}}}}}',
+                "does not say",
+            )
+            for unknown in ("[1, 2]", "null", "{}")
         ),
     ):
         calibration.write_text(text)
         with pytest.raises(ImageError, match=message) as error:
             load_middlebury(scene)
         one_line(error.value)
+    with pytest.raises(ImageError, match="no folder"):
+        load_middlebury(scene / "left.png")
     calibration.unlink()
     with pytest.raises(ImageError, match="cannot be read"):
         load_middlebury(scene)

@@ -125,6 +125,47 @@ def test_mirrors_come_only_when_asked_for(batches: Batches) -> None:
         )
 
 
+def test_all_mirrors_come_when_asked_for(batches: Batches) -> None:
+    """Crops of an image that every mirror changes: each of the eight is seen."""
+    options = changed(OPTIONS, stages=(Stage(64, 4, 60),), dark_fraction=0.0)
+
+    class Corners:
+        """One image for all views, with another value at each corner."""
+
+        photo = batches.feed.photos[0]
+
+        def load(self, view):
+            image = np.zeros((64, 64, 3), np.uint8)
+            image[0, 0], image[0, -1], image[-1, 0] = 1, 2, 3
+            return image, image[..., 0] > 0
+
+    class OneFeed:
+        def __len__(self) -> int:
+            return 12
+
+        def epoch(self, number, first=0):
+            return iter([Corners()] * (12 - first))
+
+    for flips, transpositions, count in ((True, True, 8), (True, False, 4), (False, True, 2)):
+        recipe = changed(options, flips=flips, transpositions=transpositions)
+        seen = set()
+        for images, masks in Batches(OneFeed(), Schedule(recipe, 12)).stream(0, 40):
+            np.testing.assert_array_equal(masks, images[..., 0] > 0)
+            seen |= {tuple(i[[0, 0, -1, -1], [0, -1, 0, -1], 0].tolist()) for i in images}
+        assert len(seen) == count
+
+
+def test_dark_crops_keep_their_luma_to_the_level(batches: Batches) -> None:
+    dark = changed(OPTIONS, dark_fraction=1.0)
+    plain, gray = (
+        Batches(batches.feed, Schedule(changed(dark, color_changes=share), len(batches.feed)))
+        for share in (0.0, 1.0)
+    )
+    for image, other in zip(plain.batch(0)[0], gray.batch(0)[0], strict=True):
+        np.testing.assert_array_equal(luma(image), luma(other))
+        assert (other == other[..., :1]).all()
+
+
 def test_colors_change_and_labels_do_not(batches: Batches) -> None:
     options = changed(OPTIONS, color_changes=1.0)
     colored = Batches(batches.feed, Schedule(options, len(batches.feed)))

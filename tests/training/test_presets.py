@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from deepdetect import OptionError
+from deepdetect.cli.recipe import chosen_recipe
+from deepdetect.labels import find_label_settings
 from deepdetect.training.presets import training_preset
 from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.schedule import Schedule
@@ -19,6 +23,26 @@ def test_the_papers_recipe() -> None:
     assert schedule.steps == 51_562
     assert schedule.learning_rate(0) == pytest.approx(1e-3)
     assert schedule.learning_rate(schedule.steps) == pytest.approx(1e-6)
+
+
+def test_the_recipe_for_geometry() -> None:
+    """Normal light only, and the labels of the name."""
+    geometry = training_preset("geometry")
+    assert geometry.dark_fraction == 0
+    assert geometry.label_changes == find_label_settings("geometry").changes
+    assert Schedule(geometry, 2_705).steps > 1_000
+
+
+def test_a_preset_keeps_its_label_settings_unless_others_are_given(tmp_path: Path) -> None:
+    changes = training_preset("geometry").label_changes
+    assert chosen_recipe("geometry", None, None, {}).label_changes == changes
+    assert chosen_recipe("geometry", "sobel,fast", None, {}).label_changes == changes
+    assert chosen_recipe("geometry", "fast", None, {}).label_changes == ()
+    assert chosen_recipe("geometry", None, "paper", {}).label_changes == ()
+    assert chosen_recipe("paper", None, "geometry", {}).label_changes == changes
+    (tmp_path / "mine.toml").write_text("[fast]\nnormal = { threshold = 20 }\n")
+    (change,) = chosen_recipe("geometry", None, str(tmp_path / "mine.toml"), {}).label_changes
+    assert change.detector == "fast"
 
 
 def test_the_default_is_that_of_the_options() -> None:

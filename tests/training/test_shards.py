@@ -31,6 +31,7 @@ from deepdetect.training.views import render
 OPTIONS = TrainingOptions(
     stages=(Stage(64, 2, 3), Stage(96, 2, 2)),
     short_sides=(96, 64),
+    variations=1,
     detectors=("fast", "harris", "sobel"),
     held_out=0.2,
 )
@@ -125,9 +126,23 @@ def test_a_broken_off_call_goes_on(photographs: Path, tmp_path: Path) -> None:
     assert kept.stat().st_mtime_ns == written
 
 
+def test_shards_of_an_older_version_are_those_without_variations(
+    photographs: Path, tmp_path: Path
+) -> None:
+    options = dataclasses.replace(OPTIONS, variations=0, detectors=("fast",))
+    write_shards(photographs, tmp_path, options, photos_a_shard=6, workers=1)
+    path = tmp_path / "shards.json"
+    index = json.loads(path.read_text())
+    del index["options"]["variations"]
+    path.write_text(json.dumps(index))
+    assert Shards.open(tmp_path, options).training
+    with pytest.raises(OptionError, match="variations"):
+        Shards.open(tmp_path, dataclasses.replace(options, variations=1))
+
+
 def test_other_options_are_refused(photographs: Path, shards: Shards) -> None:
     other = TrainingOptions(stages=OPTIONS.stages, short_sides=(96,), detectors=("fast",))
-    with pytest.raises(OptionError, match="short_sides, held_out, labels"):
+    with pytest.raises(OptionError, match="short_sides, held_out, variations, labels"):
         Shards.open(shards.folder, other)
     with pytest.raises(OptionError, match="another folder"):
         write_shards(photographs, shards.folder, other)

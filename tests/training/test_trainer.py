@@ -19,12 +19,13 @@ torch = pytest.importorskip("torch", reason="needs torch, which is for training 
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from deepdetect import DeepDetect, ImageError, OptionError, WeightsError  # noqa: E402
+from deepdetect.bundled import bundled_weights  # noqa: E402
 from deepdetect.network.espnet import ESPNet  # noqa: E402
 from deepdetect.network.weights import load_network, weights_digest  # noqa: E402
 from deepdetect.training.checkpoint import read_checkpoint, restore, save_checkpoint  # noqa: E402
 from deepdetect.training.device import DeviceOptions, Engine  # noqa: E402
 from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
-from deepdetect.training.trainer import BUNDLED, train  # noqa: E402
+from deepdetect.training.trainer import train  # noqa: E402
 
 PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
 RECIPE = ["--stage", "64x4x8", "--stage", "96x2x2", "--short-side", "96", "--short-side", "64"]
@@ -198,7 +199,7 @@ def test_frozen_batch_norm_keeps_the_statistics_and_trains_the_rest(
     arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels")]
     arguments += ["--start", "matching"]
     subprocess.run(arguments, check=True, capture_output=True)
-    before = load_network(BUNDLED).state_dict()
+    before = load_network(bundled_weights("matching", ".safetensors")).state_dict()
     after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
     kept = {name for name in before if torch.equal(before[name], after[name])}
     statistics = {name for name in before if name.rpartition(".")[2].startswith(("running", "num"))}
@@ -219,18 +220,23 @@ def test_frozen_batch_norm_needs_trained_weights(photographs: Path, tmp_path: Pa
 def test_a_run_of_an_older_version_goes_on(
     photographs: Path, unbroken: Path, tmp_path: Path
 ) -> None:
-    """Its options lack what came later, which then had the value of today's default."""
+    """Its options lack what came later: crops were flipped and nothing else was done to them."""
     shutil.copytree(unbroken, tmp_path / "run")
     path = tmp_path / "run" / "checkpoint.safetensors"
     found = read_checkpoint(path)
     options = json.loads(found.state["options"])
-    for name in ("interleave", "optimizer", "frozen_batch_norm"):
+    later = ("interleave", "optimizer", "frozen_batch_norm", "flips", "transpositions")
+    for name in (*later, "color_changes", "variations"):
         del options[name]
     for stage in options["stages"]:
         del stage["sides"]
     state = {**found.state, "options": json.dumps(options)}
     save_file(found.tensors, path, metadata={"state": json.dumps(state)})
     arguments = command(photographs, tmp_path / "run", unbroken.parent / "labels")
+    done = subprocess.run(arguments, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "color_changes, flips, transpositions" in done.stderr
+    arguments += ["--flips", "--no-transpositions", "--color-changes", "0"]
     subprocess.run(arguments, check=True, capture_output=True)
 
 

@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import io
+
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
 
+from deepdetect.training import variation
 from deepdetect.training.variation import vary
 
 
@@ -28,10 +32,8 @@ def test_seeds_give_other_views(photo: np.ndarray) -> None:
     assert len(views) == 20
 
 
-def test_all_of_it_comes_from_inside(photo: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The places that a view is sampled from, seen in two ramps; the rest is switched off."""
-    from deepdetect.training import variation
-
+def test_all_of_it_comes_from_inside() -> None:
+    """The places that a view is sampled from, seen in two ramps."""
     rows, columns = np.mgrid[0:200, 0:240].astype(np.uint8)
     ramps = np.dstack([columns, rows, np.zeros_like(rows)])
     edges = []
@@ -53,10 +55,41 @@ def test_all_of_it_comes_from_inside(photo: np.ndarray, monkeypatch: pytest.Monk
     assert max(edges) > 1.6
 
 
-def test_light_blur_noise_and_compression_all_occur(photo: np.ndarray) -> None:
-    gray = cv2.resize(photo, (200, 200), interpolation=cv2.INTER_AREA)
-    views = [cv2.cvtColor(vary(gray, 128, seed), cv2.COLOR_RGB2GRAY) for seed in range(60)]
-    sharpness = [cv2.Laplacian(view, cv2.CV_64F).std() for view in views]
-    assert max(sharpness) > 8 * min(sharpness)
-    means = [view.mean() for view in views]
-    assert np.std(means) > 10
+def sharpness(view: np.ndarray) -> float:
+    return float(cv2.Laplacian(cv2.cvtColor(view, cv2.COLOR_RGB2GRAY), cv2.CV_64F).std())
+
+
+def test_some_views_are_blurred_and_some_relit(photo: np.ndarray) -> None:
+    small = cv2.resize(photo, (200, 200), interpolation=cv2.INTER_AREA)
+    views = [vary(small, 128, seed) for seed in range(60)]
+    sharp = [sharpness(view) for view in views]
+    assert max(sharp) > 8 * min(sharp)
+    assert np.std([view.mean() for view in views]) > 10
+
+
+def test_some_views_have_noise() -> None:
+    flat = np.full((80, 80, 3), 128, np.uint8)
+    noise = [vary(flat, 64, seed).std() for seed in range(60)]
+    assert 5 < sum(deviation > 0.5 for deviation in noise) < 30
+    assert 3 < max(noise) < 12
+
+
+def test_relighting_is_one_rising_curve_for_all_channels() -> None:
+    levels = np.arange(256, dtype=np.uint8)[None, :, None].repeat(3, 2)
+    curves = [variation._relit(levels, np.random.default_rng(seed))[0] for seed in range(30)]
+    for curve in curves:
+        assert (curve == curve[:, :1]).all()
+        assert (np.diff(curve[:, 0].astype(int)) >= 0).all()
+    middles = [int(curve[128, 0]) for curve in curves]
+    assert min(middles) < 110
+    assert max(middles) > 145
+
+
+def test_compression_is_that_of_pillow(photo: np.ndarray) -> None:
+    """Channels in their order: with red and blue swapped the luma would lose more."""
+    file = io.BytesIO()
+    Image.fromarray(photo).save(file, "JPEG", quality=30)
+    expected = np.asarray(Image.open(file)).astype(int)
+    found = variation._compressed(photo, 30).astype(int)
+    assert np.abs(found - expected).mean() < 2
+    assert np.abs(found - photo).mean() > 2

@@ -26,9 +26,8 @@ WIDTH = 12
 @detector_options
 @click.option(
     "--against",
-    type=PATH,
     multiple=True,
-    metavar="WEIGHTS",
+    metavar="NAME|FILE",
     help="Measure these weights too, beside the first; may be repeated.",
 )
 @click.option(
@@ -48,7 +47,7 @@ WIDTH = 12
 @json_option
 def evaluate(
     samples: Path,
-    against: tuple[Path, ...],
+    against: tuple[str, ...],
     oxford: Path | None,
     scales: tuple[float, ...],
     as_json: bool,

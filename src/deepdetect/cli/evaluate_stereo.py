@@ -21,7 +21,8 @@ from .shared import PATH, json_option, print_json
     help="matching or geometry, the bundled weights, or a file; may be repeated.",
 )
 @click.option(
-    "--labels",
+    "--label-settings",
+    "labels",
     multiple=True,
     metavar="NAME|FILE.toml",
     help="Label settings whose labels are the keypoints, without a network: paper or geometry, "
@@ -39,7 +40,7 @@ def evaluate_stereo(
 
     \b
     deepdetect evaluate-stereo cones/ teddy/ --weights matching --weights geometry
-    deepdetect evaluate-stereo cones/ teddy/ --labels paper --labels mine.toml
+    deepdetect evaluate-stereo cones/ teddy/ --label-settings paper --label-settings mine.toml
     """
     from ..bundled import BUNDLED
     from ..datasets.middlebury import load_middlebury

@@ -31,7 +31,7 @@ variations_option = click.option(
     "--variations",
     type=int,
     help="Varied views of each photograph at the first size, in normal and in dark light: turned, "
-    "relit, blurred, noisy or compressed.  [default: 0]",
+    "relit, blurred, noisy or compressed; each is taken as often as the plain one.  [default: 0]",
 )
 detectors_option = click.option(
     "--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]"
@@ -52,7 +52,11 @@ def chosen_recipe(
     from ..training.presets import training_preset
 
     given = {name: value for name, value in values.items() if value not in (None, ())}
+    recipe = training_preset(preset)
     if detectors is not None or label_settings is not None:
         settings = chosen_label_settings(detectors, label_settings)
         given["detectors"], given["label_changes"] = settings.detectors, settings.changes
-    return changed(training_preset(preset), **given)
+    if label_settings is None:  # the preset's, as far as its detectors are taken
+        chosen = given.get("detectors", recipe.detectors)
+        given["label_changes"] = tuple(c for c in recipe.label_changes if c.detector in chosen)
+    return changed(recipe, **given)

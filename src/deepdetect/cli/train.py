@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 @click.option("--labels", type=PATH, help="Folder for the label cache.  [default: in the run's]")
 @click.option(
     "--start",
-    type=PATH,
+    metavar="NAME|FILE",
     help="Weights to start from: matching or geometry, the bundled ones, or a .safetensors "
     "file.  [default: random ones]",
 )
@@ -118,7 +118,7 @@ def train(
     output: Path,
     validation: Path | None,
     labels: Path | None,
-    start: Path | None,
+    start: str | None,
     device: str,
     precision: str,
     compile_network: bool | None,

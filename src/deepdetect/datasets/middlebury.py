@@ -32,7 +32,9 @@ def load_middlebury(folder: str | Path) -> StereoPair:
     Raises:
         ImageError: a file is missing or damaged, or the scene has no ground truth.
     """
-    root = Path(folder)
+    root = Path(folder).resolve()
+    if not root.is_dir():
+        raise ImageError(f"there is no folder {folder}: name the folder of a stereo scene")
     left, right = load_image(root / "left.png"), load_image(root / "right.png")
     if left.shape != right.shape:
         raise ImageError(f"left.png and right.png in {root} differ in size: take a rectified pair")
@@ -41,14 +43,17 @@ def load_middlebury(folder: str | Path) -> StereoPair:
         truth = json.loads(path.read_text(encoding="utf-8")).get("ground_truth")
         if truth is None:
             raise ImageError(f"{root} has no ground truth: take a scene that has one")
-        value, unknown = float(truth["value_per_pixel"]), truth["unknown"]
-        stored = cv2.imread(str(root / truth["file"]), cv2.IMREAD_UNCHANGED)
+        value, unknown = float(truth["value_per_pixel"]), float(truth["unknown"])
+        file = root / truth["file"]
     except OSError as error:
         raise ImageError(f"{path} cannot be read ({error.strerror}): check the path") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ImageError(f"{path} does not say how its ground truth is stored ({error})") from None
+    stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if file.is_file() else None
     if stored is None or stored.ndim != 2 or not value > 0:
-        raise ImageError(f"the ground truth of {root} is no grey image with values of disparity")
+        raise ImageError(
+            f"the ground truth {file} is missing, or no grey image with a scale above 0"
+        )
     disparity = np.where(stored == unknown, np.nan, stored / value).astype(np.float32)
     return StereoPair(root.name, left, right, _enlarged(disparity, left.shape[:2]))
 

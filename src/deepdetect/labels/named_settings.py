@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import look_up
+from ..options import is_path, look_up_word
 from .settings import LabelSettings, SettingChange, read_label_settings
 
 LABEL_SETTINGS: dict[str, LabelSettings] = {
     "paper": LabelSettings(),
-    # Denser, for geometry: most true stereo matches of the settings tried (docs/labels.md).
+    # Denser, for geometry: chosen by true stereo matches (docs/labels.md).
     "geometry": LabelSettings(
         changes=(SettingChange("sobel", "normal", "relative_threshold", 0.02),)
     ),
@@ -29,7 +29,6 @@ def find_label_settings(settings: str | Path) -> LabelSettings:
         >>> find_label_settings("paper").changes
         ()
     """
-    path = Path(settings)
-    if path.suffix or len(path.parts) > 1:
-        return read_label_settings(path)
-    return look_up("label settings", path.name, LABEL_SETTINGS)
+    if is_path(settings):
+        return read_label_settings(settings)
+    return look_up_word("label settings", settings, LABEL_SETTINGS)

@@ -1,4 +1,4 @@
-"""Changes of a crop that leave its label as it is: a symmetry, and colours of the same luma."""
+"""Changes of a crop and its label: mirrors, and colours of the same luma."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
 def flip(image: np.ndarray, mask: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Mirror a crop left to right (axis 1) or upside down (axis 0).
 
-    The label of a mirrored photograph is another one in 3 % of its pixels: some detectors have
-    filters of even width, or look for corners at even pixels of a smaller image.
+    The label of a mirrored photograph is another one: some detectors have filters of even width, or
+    look for corners at even pixels of a smaller image (docs/training.md).
     """
     # Copies a hundred times faster than a negative stride.
     return cv2.flip(image, axis), cv2.flip(mask.view(np.uint8), axis).view(bool)

@@ -79,7 +79,8 @@ class TrainingOptions:
         dark_variants: darkened versions of each photograph at each size.
         darkening: ranges of the darkening.
         variations: varied views of each photograph at the first size, in normal and in dark
-            light: turned, relit, blurred, noisy or compressed (`variation.vary`).
+            light: turned, relit, blurred, noisy or compressed (`variation.vary`). Each is taken
+            as often as the plain view of a size.
         flips: mirror crops left to right and upside down. The label of a mirrored photograph
             is another one, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
         transpositions: mirror crops along their diagonal, which changes no label.
@@ -96,7 +97,7 @@ class TrainingOptions:
         detectors: label detectors to fuse.
         label_changes: settings of label detectors that differ from the paper's.
         validations: how often the validation loss is taken.
-        seed: decides the start weights, the order, the crops and the flips.
+        seed: decides the start weights, the order, the crops and what is done to them.
 
     Raises:
         OptionError: a value is out of its range.

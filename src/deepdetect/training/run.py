@@ -262,4 +262,4 @@ def _difference(stored: str, options: TrainingOptions) -> list[str]:
     )
     before = {**json.loads(older.to_json()), **json.loads(stored)}
     before["stages"] = [{"sides": [], **stage} for stage in before["stages"]]
-    return [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    return sorted(name for name in {**before, **now} if before.get(name) != now.get(name))

@@ -1,8 +1,9 @@
 """Varied views: a part of a photograph, turned, relit, blurred, noisy, compressed.
 
-A few thousand photographs are learnt by heart; detectors that look at single pixels mark a
-turned or blurred one quite differently, so each varied view is as good as a new photograph. Its
-label is made from the varied view itself.
+Detectors that look at single pixels mark a turned or blurred photograph quite differently, so each
+varied view has something new to learn from. Its label is made from the varied view itself. Noise,
+interpolation and compression are numpy's and OpenCV's: other versions of them may give slightly
+other views of the same seed.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 import cv2
 import numpy as np
 
-VERSION = 1
+VERSION = 2
 """Part of the names of varied views: another drawing must not get the labels of this one."""
 
 
@@ -85,5 +86,6 @@ def _relit(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 def _compressed(rgb: np.ndarray, quality: int) -> np.ndarray:
     """Store as JPEG and read again."""
-    _, stored = cv2.imencode(".jpg", rgb, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return cv2.imdecode(stored, cv2.IMREAD_COLOR)
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)  # OpenCV's order, so that luma is luma
+    _, stored = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)

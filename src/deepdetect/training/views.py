@@ -10,7 +10,8 @@ import numpy as np
 
 from ..image import load_image, scale_short_side
 from .darkening import Darkening, DarkeningRange, darken
-from .variation import VERSION, vary
+from .variation import VERSION as VARIATION_VERSION
+from .variation import vary
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class View:
             light = f"b{self.darkening.brightness:.3f}c{self.darkening.contrast:.3f}"
         shape = "x" * self.square
         if self.variation is not None:
-            shape = f"v{VERSION}-{self.variation:08x}"
+            shape = f"v{VARIATION_VERSION}-{self.variation:08x}"
         return f"{self.short_side}{shape}_{light}"
 
 

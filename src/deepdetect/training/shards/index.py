@@ -119,6 +119,7 @@ def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
 
 def _compare(folder: Path, made: dict[str, Any], options: TrainingOptions) -> None:
     fixed = _fixed_options(options)
+    made = {"variations": 0, **made}  # shards of an older version have none
     other = [name for name in fixed if made.get(name) != fixed[name]]
     if other:
         raise OptionError(
