@@ -30,6 +30,8 @@ def test_bad_stages_are_refused(text: str) -> None:
         {"dark_fraction": 1.5},
         {"dark_variants": 0},
         {"variations": -1},
+        {"marked_weight": 0.0},
+        {"marked_weight": float("nan")},
         {"color_changes": 1.5},
         {"validations": 0},
         {"learning_rate": -1.0},

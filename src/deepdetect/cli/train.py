@@ -85,6 +85,11 @@ if TYPE_CHECKING:
     default=None,
     help="Keep the start weights' batch statistics.  [default: with --start]",
 )
+@click.option(
+    "--marked-weight",
+    type=float,
+    help="Weight of marked pixels in the loss: above 1 gives more keypoints.  [default: 1]",
+)
 @detectors_option
 @label_settings_option
 @click.option("--validations", type=int, help="How often the loss is validated.  [default: 12]")

@@ -23,6 +23,7 @@ class Learner:
         device: how it is run.
         optimizer: name of the optimiser.
         frozen_batch_norm: keep the statistics of the batch normalisation as they are.
+        marked_weight: weight of a marked pixel in the loss; others have 1.
     """
 
     def __init__(
@@ -31,11 +32,14 @@ class Learner:
         device: DeviceOptions,
         optimizer: str = "adam",
         frozen_batch_norm: bool = False,
+        marked_weight: float = 1.0,
     ) -> None:
         self.frozen_batch_norm = frozen_batch_norm
         self.engine = Engine(network, device)
         self.network = self.engine.network
         self.optimizers = make_optimizers(optimizer, self.network, self.engine.share)
+        weight = np.full(1, marked_weight, np.float32)
+        self.weight = None if marked_weight == 1 else self.engine.place_tensor(weight)
 
     def learn(self, rgb: np.ndarray, masks: np.ndarray, rate: float, step: int) -> float:
         """Make one optimiser step.
@@ -61,7 +65,8 @@ class Learner:
                 group["lr"] = rate
         images = self.engine.images(rgb)
         truth = self.engine.place_tensor(masks)[:, None].float()
-        loss = binary_cross_entropy_with_logits(self.engine.logits(images), truth)
+        logits = self.engine.logits(images)
+        loss = binary_cross_entropy_with_logits(logits, truth, pos_weight=self.weight)
         self.engine.backward(loss)
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         value = self.engine.mean_over_processes(loss.detach()).item()

@@ -86,7 +86,13 @@ class Run:
         self.photographs, self.folder, self.options = photographs, folder, options
         self.start = weights_digest(network)
         self.schedule = Schedule(options, len(photographs.training))
-        self.learner = Learner(network, device, options.optimizer, bool(options.frozen_batch_norm))
+        self.learner = Learner(
+            network,
+            device,
+            options.optimizer,
+            bool(options.frozen_batch_norm),
+            options.marked_weight,
+        )
         self.engine, self.network = self.learner.engine, self.learner.network
         self.place = self.engine.place
         self.say = say if self.place.is_first else None

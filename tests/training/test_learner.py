@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
+
+from deepdetect.training.device import DeviceOptions  # noqa: E402
+from deepdetect.training.learner import Learner  # noqa: E402
+
+PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
+
+
+class Constant(torch.nn.Module):
+    """A network that knows nothing but how much is marked."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.logit = torch.nn.Parameter(torch.zeros(()))
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return self.logit.expand(len(image), 1, *image.shape[2:])
+
+
+@pytest.mark.parametrize("weight", [1.0, 1.3, 0.5])
+def test_a_marked_pixel_counts_by_its_weight(weight: float) -> None:
+    """The least loss of a constant is at the odds of the marked pixels times the weight."""
+    learner = Learner(Constant(), PLAIN, marked_weight=weight)
+    rgb = np.zeros((2, 16, 16, 3), np.uint8)
+    masks = np.zeros((2, 16, 16), bool)
+    masks[:, :4] = True
+    first = learner.learn(rgb, masks, 0.05, 0)
+    assert first == pytest.approx(math.log(2) * (0.75 + 0.25 * weight), rel=1e-5)
+    for step in range(1, 300):
+        learner.learn(rgb, masks, 0.05 * (1 - step / 300), step)
+    assert learner.network.logit.item() == pytest.approx(math.log(weight / 3), abs=0.01)
