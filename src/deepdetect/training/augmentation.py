@@ -23,7 +23,7 @@ def flip(image: np.ndarray, mask: np.ndarray, axis: int) -> tuple[np.ndarray, np
 
 
 def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror a crop along its diagonal: the detectors mark the same pixels there."""
+    """Mirror a crop along its diagonal: all detectors but BRISK mark the same pixels."""
     return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
 
 

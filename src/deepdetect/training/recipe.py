@@ -83,7 +83,7 @@ class TrainingOptions:
             as often as the plain view of a size.
         flips: mirror crops left to right and upside down. The label of a mirrored photograph
             is another one, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
-        transpositions: mirror crops along their diagonal, which changes no label.
+        transpositions: mirror crops along their diagonal, which changes labels of BRISK only.
         color_changes: share of crops whose colours are taken away or turned around the luma,
             on which alone labels depend.
         optimizer: "adam", or "soap", which learns more from an image (measured in the model
