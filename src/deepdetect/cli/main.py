@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from ..errors import DeepDetectError
+from .benchmark import benchmark
 from .datasets import datasets
 from .demo import demo
 from .detect import detect
@@ -61,5 +62,16 @@ def main() -> None:
     """
 
 
-for command in (detect, match, label, shards, train, datasets, evaluate, evaluate_stereo, demo):
+for command in (
+    detect,
+    match,
+    label,
+    shards,
+    train,
+    datasets,
+    evaluate,
+    evaluate_stereo,
+    benchmark,
+    demo,
+):
     main.add_command(command)

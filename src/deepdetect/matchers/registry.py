@@ -13,12 +13,14 @@ import numpy as np
 from ..errors import look_up
 from .exact import exact_neighbours
 from .flann import flann_neighbours
+from .hamming import hamming_neighbours
 
 Matcher = Callable[[np.ndarray, np.ndarray, int, int], tuple[np.ndarray, np.ndarray]]
 
 MATCHERS: dict[str, Matcher] = {
     "flann": flann_neighbours,
     "exact": exact_neighbours,
+    "hamming": hamming_neighbours,
 }
 
 

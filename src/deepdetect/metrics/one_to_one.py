@@ -16,7 +16,9 @@ import numpy as np
 from .overlap import map_into
 
 CHANCE_POINTS = 20_000
-"""Random points that the chance level is taken from, at least; few at a time are drawn often."""
+"""Random points that the chance level is taken from; few at a time are drawn often."""
+
+MOST_DRAWS = 100
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def _chance(
         return [0.0] * len(radii)
     grids = _in_overlap(_grid(sizes[0]), _grid(sizes[1]), homography, sizes)
     generator = np.random.default_rng(seed)
-    draws = -(-CHANCE_POINTS // fewest)
+    draws = min(-(-CHANCE_POINTS // fewest), MOST_DRAWS)
     repeated = np.zeros(len(radii))
     for _ in range(draws):
         # Classical detectors may mark a pixel more than once; random points then do so too.

@@ -16,6 +16,7 @@ from ..network.espnet import ESPNet
 from ..network.onnx_export import export_onnx
 from ..network.weights import load_network, read_notes, save_weights, weights_digest
 from ..progress import progress
+from ..provenance import provenance
 from .batches import Batches
 from .checkpoint import Checkpoint, read_checkpoint, restore, save_checkpoint
 from .curves import CurvePoint, save_curves
@@ -25,7 +26,6 @@ from .model_card import write_model_card
 from .photos import Photo
 from .prefetch import prefetched
 from .preparation import Photographs
-from .provenance import provenance
 from .recipe import TrainingOptions
 from .schedule import Schedule
 from .validation import score_network

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from ..processes import processor_count
+from .processes import processor_count
 
 PACKAGES = ("numpy", "opencv-contrib-python-headless", "pillow", "torch", "lightning-fabric")
 """The packages that pixels, labels and weights go through."""
@@ -61,7 +61,7 @@ def _commit() -> str:
             [*run, "ls-files", "--error-unmatch", __file__], capture_output=True, check=True
         )
         changed = subprocess.run(
-            [*run, "status", "--porcelain", "--", str(sources.parent)],
+            [*run, "status", "--porcelain", "--", str(sources)],
             capture_output=True,
             text=True,
             check=True,

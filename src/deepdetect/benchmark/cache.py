@@ -1,0 +1,79 @@
+"""Results of stages on disk, so that a second run does only the new work."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..atomic import atomic_path
+
+Arrays = Mapping[str, np.ndarray]
+
+
+class StageCache:
+    """Arrays by what they were made of.
+
+    A result is kept under the digest of its stage and of all that it depends on; when one of
+    these changes it is made anew. A damaged file is made anew too. Old files are never removed:
+    delete the folder to free its room.
+
+    Args:
+        folder: where the files are; None keeps nothing.
+
+    Attributes:
+        made: number of results that were made, not found.
+
+    Example:
+        >>> cache = StageCache(None)
+        >>> cache.get("sum", {"of": [1, 2]}, lambda: {"value": np.array(3)})["value"].item()
+        3
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+        self.made = 0
+
+    def get(self, stage: str, key: Mapping[str, Any], make: Callable[[], Arrays]) -> Arrays:
+        """Find a result, or make and keep it.
+
+        Args:
+            stage: name of the stage, as "keypoints".
+            key: all that the result depends on, as plain values.
+            make: makes the arrays.
+        """
+        if self.folder is None:
+            self.made += 1
+            return make()
+        text = json.dumps(key, sort_keys=True)
+        digest = hashlib.sha256(text.encode()).hexdigest()[:32]
+        path = self.folder / stage / f"{digest}.npz"
+        found = _read(path)
+        if found is not None:
+            return found
+        self.made += 1
+        arrays = dict(make())
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+        return arrays
+
+
+def _read(path: Path) -> Arrays | None:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+@lru_cache(maxsize=4096)
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file; it is read once in a process."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

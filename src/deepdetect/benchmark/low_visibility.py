@@ -1,0 +1,58 @@
+"""The dusty and the smoky pair (Figure 6): keypoints and matches where little can be seen."""
+
+from __future__ import annotations
+
+from ..datasets.low_visibility import load_low_visibility
+from . import planar_paper
+from .options import BenchmarkOptions
+from .paper_figures import keypoint_figure, match_figure
+from .planar_sections import standard_sections, standard_steps
+from .report import Section
+from .workspace import Workspace
+
+
+def low_visibility_steps(workspace: Workspace, options: BenchmarkOptions) -> int:
+    """Return the number of steps that `low_visibility_sections` reports."""
+    scenes = load_low_visibility(workspace.folder("low-visibility"))
+    steps = 0
+    if "paper" in options.protocols:
+        steps += planar_paper.steps(options.density_methods(), scenes, ())
+        steps += len(options.matching_methods()) * len(scenes)
+    if "standard" in options.protocols:
+        steps += standard_steps(options, scenes)
+    return steps
+
+
+def low_visibility_sections(workspace: Workspace, options: BenchmarkOptions) -> list[Section]:
+    """Measure the methods on both pairs."""
+    scenes = load_low_visibility(workspace.folder("low-visibility"))
+    pairs = [pair for scene in scenes for pair in scene.pairs()]
+    sections = []
+    if "paper" in options.protocols:
+        methods = options.density_methods()
+        tables = (
+            planar_paper.density_table(workspace, methods, scenes, "low_visibility_density"),
+            planar_paper.repeatability_table(
+                workspace, methods, scenes, "low_visibility_repeatability"
+            ),
+            planar_paper.matches_table(
+                workspace, options.matching_methods(), pairs, "low_visibility_matches"
+            ),
+        )
+        figures = (
+            *(keypoint_figure(workspace, options, scene) for scene in scenes),
+            *(match_figure(workspace, options.own(), pair, "Figure 6") for pair in pairs),
+        )
+        text = "Nothing moves between the two images of a scene."
+        title = "Low visibility, the paper's protocol"
+        sections.append(Section(title, (text,), tables, figures))
+    if "standard" in options.protocols:
+        sections += standard_sections(
+            workspace,
+            options,
+            scenes,
+            "low_visibility",
+            "Low visibility",
+            "Nothing moves between the two images of a scene.",
+        )
+    return sections

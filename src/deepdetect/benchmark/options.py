@@ -1,0 +1,130 @@
+"""What a benchmark is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from ..detector import DeepDetect
+from ..errors import OptionError, unknown_name
+from ..heatmap import HeatmapOptions
+from ..keypoints import SelectionOptions
+from ..methods import (
+    CLASSICAL,
+    Method,
+    PointDescriptor,
+    deepdetect_method,
+    every_pixel_method,
+    random_method,
+)
+
+PROTOCOLS = ("paper", "standard")
+THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
+COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
+LOW = ("sift-low", "orb-low", "brisk-low", "fast-low", "agast-low", "harris-low", "shi-tomasi-low")
+DEFAULT = ("sift", "orb", "brisk", "fast", "agast", "harris", "shi-tomasi")
+
+
+@dataclass(frozen=True, eq=False)
+class BenchmarkOptions:
+    """What is compared, and how.
+
+    Attributes:
+        detector: DeepDetect, with the weights that are judged.
+        protocols: "paper", "standard" or both.
+        classical: names of the classical methods.
+        others: further methods.
+        channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
+            feeds its own weights.
+
+    Raises:
+        OptionError: a name is unknown, or nothing is left to do.
+    """
+
+    detector: DeepDetect
+    protocols: tuple[str, ...] = PROTOCOLS
+    classical: tuple[str, ...] = (*DEFAULT, *LOW)
+    others: tuple[Method, ...] = ()
+    channels: str = "rgb"
+
+    def __post_init__(self) -> None:
+        for protocol in self.protocols:
+            if protocol not in PROTOCOLS:
+                raise unknown_name("protocol", protocol, PROTOCOLS)
+        if not self.protocols:
+            raise OptionError(f"choose a protocol: {' or '.join(PROTOCOLS)}")
+        for name in self.classical:
+            if name not in CLASSICAL:
+                raise unknown_name("classical method", name, CLASSICAL)
+
+    def own(self, threshold: float = 0.5) -> Method:
+        """Return DeepDetect as the paper runs it: images squashed to 480x480, SIFT of size 3."""
+        squashing = self.detector.configured(HeatmapOptions(480, self.channels))
+        return deepdetect_method(
+            squashing,
+            SelectionOptions(threshold),
+            name=f"deepdetect-{threshold:g}",
+            title=f"DeepDetect, threshold {threshold:g}",
+        )
+
+    def controls(self) -> tuple[Method, Method]:
+        """Return as many random points as DeepDetect finds, and every pixel."""
+        return random_method(self.own()), every_pixel_method()
+
+    def density_methods(self) -> tuple[Method, ...]:
+        """Return the rows of Table I and of the repeatability, controls last."""
+        classical = [CLASSICAL[name] for name in self.classical]
+        own = [self.own(threshold) for threshold in THRESHOLDS]
+        return (*classical, *self.others, *own, *self.controls())
+
+    def matching_methods(self) -> tuple[Method, ...]:
+        """Return the rows of Table II: the low settings, DeepDetect, controls."""
+        low = [CLASSICAL[name] for name in self.classical if name in LOW]
+        return (*low, *self.others, self.own(), *self.controls())
+
+    def standard_methods(self) -> tuple[Method, ...]:
+        """Return the rows of the standard protocol: default settings, ours sparse, controls."""
+        classical = [common(CLASSICAL[name]) for name in self.classical if name in DEFAULT]
+        systems = [CLASSICAL[name] for name in self.classical if name in ("sift", "orb")]
+        systems = [
+            replace(method, name=f"{method.name}-own", title=f"{method.title}, own descriptors")
+            for method in systems
+        ]
+        own = deepdetect_method(
+            self._native(),
+            SelectionOptions(nms_radius=1),
+            name="deepdetect-sparse",
+            title="DeepDetect, native resolution, suppression 3x3",
+            descriptor=COMMON_DESCRIPTOR,
+        )
+        dense = common(self.native())
+        controls = (common(method) for method in self.native_controls())
+        return (*classical, *systems, *self.others, own, dense, *controls)
+
+    def native(self) -> Method:
+        """Return DeepDetect at the image's own size, all pixels over 0.5."""
+        title = "DeepDetect, native resolution, all pixels over 0.5"
+        return deepdetect_method(self._native(), name="deepdetect-native", title=title)
+
+    def native_controls(self) -> tuple[Method, Method]:
+        """Return as many random points as `native` finds, and every pixel."""
+        return random_method(self.native(), name="random-native"), every_pixel_method()
+
+    def _native(self) -> DeepDetect:
+        return self.detector.configured(HeatmapOptions("native", self.channels))
+
+
+def common(method: Method) -> Method:
+    """Return a method with the descriptor that all detectors get in the standard protocol."""
+    return replace(
+        method,
+        name=f"{method.name}-common",
+        describe=COMMON_DESCRIPTOR.describe,
+        binary=False,
+        version=f"{method.version} {COMMON_DESCRIPTOR}",
+    )
+
+
+def without_repeats(methods: Sequence[Method]) -> tuple[Method, ...]:
+    """Return the methods, each name once."""
+    return tuple({method.name: method for method in methods}.values())

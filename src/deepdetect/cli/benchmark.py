@@ -1,0 +1,107 @@
+"""`deepdetect benchmark`: the tables and figures of the paper, and what they are worth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .shared import PATH, detector_options, json_option, make_detector, print_json
+
+NAMES = ("oxford", "hpatches", "middlebury", "foreground", "low-visibility", "speed", "all")
+
+
+@click.command(short_help="The tables and figures of the paper, and their controls.")
+@click.argument("name", metavar="|".join(NAMES))
+@click.option("--data", type=PATH, required=True, help="Folder of the data sets.")
+@click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    default=Path("benchmark"),
+    show_default=True,
+    help="For the report.",
+)
+@click.option(
+    "--protocol",
+    "protocols",
+    multiple=True,
+    help="paper or standard; may be repeated.  [default: both]",
+)
+@click.option(
+    "--method",
+    "words",
+    multiple=True,
+    metavar="NAME|FILE.onnx|MODULE:FUNCTION",
+    help="A further method as one more row; may be repeated.",
+)
+@click.option(
+    "--only",
+    metavar="NAMES",
+    help="Classical methods, with commas between; none for none.  [default: all 14]",
+)
+@click.option(
+    "--preset",
+    default="default",
+    show_default=True,
+    help="published: show the network the channels as the paper's code does (BGR).",
+)
+@click.option(
+    "--cache", type=PATH, help="Folder of the stages' results.  [default: cache in the output]"
+)
+@detector_options
+@json_option
+def benchmark(
+    name: str,
+    data: Path,
+    output: Path,
+    protocols: tuple[str, ...],
+    words: tuple[str, ...],
+    only: str | None,
+    preset: str,
+    cache: Path | None,
+    as_json: bool,
+    **values: Any,
+) -> None:
+    """Write a report on the detectors: index.html, report.md, tables/*.csv, report.json.
+
+    NAME is one of the data sets or all. A second run does only what is new.
+
+    \b
+    deepdetect benchmark oxford --data data -o report
+    deepdetect benchmark oxford --data data -o report --method xfeat.onnx
+    deepdetect benchmark foreground --data data --only sift,fast-low -o report
+    """
+    from ..benchmark import BENCHMARKS, PROTOCOLS, BenchmarkOptions, run_benchmarks
+    from ..benchmark.formats import report_values, save_report, table_text
+    from ..errors import look_up
+    from ..methods import CLASSICAL, find_method
+    from ..presets import get_preset
+
+    names = list(BENCHMARKS) if name == "all" else [name]
+    for each in names:
+        look_up("benchmark", each, {**BENCHMARKS, "all": None})
+    heatmap = get_preset(preset).heatmap
+    classical = tuple(CLASSICAL)
+    if only is not None:
+        classical = tuple(
+            word.strip() for word in only.split(",") if word.strip() not in ("", "none")
+        )
+    options = BenchmarkOptions(
+        make_detector(values),
+        protocols or PROTOCOLS,
+        classical,
+        tuple(find_method(word) for word in words),
+        "rgb" if heatmap is None else heatmap.channels,
+    )
+    report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)
+    paths = save_report(report, output)
+    if as_json:
+        print_json({**report_values(report), "files": paths})
+        return
+    for table in report.tables():
+        click.echo(f"{table.title}\n\n{table_text(table)}\n")
+    for reason in report.left_out:
+        click.echo(f"left out: {reason}")
+    click.echo(f"report: {paths[0]}")

@@ -1,0 +1,55 @@
+"""Photographs with a mask of their foreground, as of ECSSD (Yan et al., 2013).
+
+NAME.jpg (or .png) and NAME_mask.png lie side by side; the mask is white on the foreground.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..errors import ImageError
+
+ENDINGS = (".jpg", ".png")
+
+
+@dataclass(frozen=True)
+class MaskedPhotograph:
+    """A photograph's file and that of its foreground."""
+
+    image: Path
+    mask: Path
+
+    def foreground(self) -> np.ndarray:
+        """Read the mask, (H, W) bool.
+
+        Raises:
+            ImageError: it cannot be read.
+        """
+        stored = cv2.imread(str(self.mask), cv2.IMREAD_GRAYSCALE)
+        if stored is None:
+            raise ImageError(f"{self.mask} is no picture that can be read: check the file")
+        return stored > 127
+
+
+def load_foreground(folder: str | Path) -> list[MaskedPhotograph]:
+    """List the photographs that have a mask.
+
+    Raises:
+        ImageError: there is none.
+    """
+    found = []
+    for mask in sorted(Path(folder).glob("*_mask.png")):
+        stem = mask.name.removesuffix("_mask.png")
+        images = [p for e in ENDINGS if (p := mask.with_name(stem + e)).exists()]
+        if images:
+            found.append(MaskedPhotograph(images[0], mask))
+    if not found:
+        raise ImageError(
+            f"there are no photographs with masks in {folder}: it must hold NAME.jpg with "
+            "NAME_mask.png"
+        )
+    return found

@@ -1,0 +1,68 @@
+"""HPatches sequences (Balntas et al., 2017): i_NAME change the light, v_NAME the viewpoint.
+
+The layout is the public one: SCENE/1.ppm (or .png) to 6, SCENE/H_1_2 to H_1_6.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..errors import ImageError
+from .planar import PlanarScene, read_homography
+
+ENDINGS = (".ppm", ".png")
+LARGE = frozenset(
+    (
+        "i_contruction",
+        "i_crownnight",
+        "i_dc",
+        "i_pencils",
+        "i_whitebuilding",
+        "v_artisans",
+        "v_astronautis",
+        "v_talent",
+    )
+)
+"""The eight scenes with images beyond 1600x1200, which most papers leave out (D2-Net's list)."""
+
+
+def load_hpatches(folder: str | Path) -> list[PlanarScene]:
+    """List the scenes that are there: 116 in the whole set.
+
+    Args:
+        folder: the data set, whose folders i_* and v_* are its scenes.
+
+    Raises:
+        ImageError: there is no scene, or a file of one is missing.
+    """
+    root = Path(folder)
+    scenes = [*sorted(root.glob("i_*")), *sorted(root.glob("v_*"))]
+    if not scenes:
+        raise ImageError(
+            f"there are no HPatches scenes in {folder}: it must hold folders i_NAME and v_NAME"
+        )
+    return [_load_scene(scene) for scene in scenes]
+
+
+def is_illumination(scene: PlanarScene) -> bool:
+    """Tell scenes that change the light from those that change the viewpoint."""
+    return scene.name.startswith("i_")
+
+
+def is_usual(scene: PlanarScene) -> bool:
+    """Tell whether a scene is one of the 108 that papers usually measure."""
+    return scene.name not in LARGE
+
+
+def _load_scene(folder: Path) -> PlanarScene:
+    images = tuple(_image(folder, number) for number in range(1, 7))
+    homographies = tuple(read_homography(folder / f"H_1_{number}") for number in range(2, 7))
+    return PlanarScene(folder.name, images, homographies)
+
+
+def _image(folder: Path, number: int) -> Path:
+    for ending in ENDINGS:
+        path = folder / f"{number}{ending}"
+        if path.exists():
+            return path
+    raise ImageError(f"there is no image {number} in {folder}: a scene has images 1 to 6")

@@ -1,0 +1,26 @@
+"""Methods: the detectors with their descriptors that the benchmarks compare."""
+
+from .features import Features
+from .heatmaps import (
+    PointDescriptor,
+    deepdetect_method,
+    every_pixel_method,
+    random_method,
+)
+from .importable import importable_method
+from .method import Method
+from .onnx_file import onnx_method
+from .registry import CLASSICAL, find_method
+
+__all__ = [
+    "CLASSICAL",
+    "Features",
+    "Method",
+    "PointDescriptor",
+    "deepdetect_method",
+    "every_pixel_method",
+    "find_method",
+    "importable_method",
+    "onnx_method",
+    "random_method",
+]
