@@ -1,0 +1,84 @@
+"""How alike two images look under a homography: local correlation, blind to light."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+WINDOW = 15
+FLAT = 1.0
+"""Grey levels; where both windows vary less than that there is nothing to compare."""
+
+
+def warp_back(
+    gray1: np.ndarray, homography: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Show the second image in the frame of the first.
+
+    Args:
+        gray1: (H1, W1) uint8, the second image.
+        homography: (3, 3) from the first image to the second.
+        size: (width, height) of the first image.
+
+    Returns:
+        (H, W) uint8 warped image, and (H, W) bool where it has content.
+    """
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpPerspective(gray1, homography, size, flags=flags)
+    whole = np.full(gray1.shape, 255, np.uint8)
+    nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    return warped, cv2.warpPerspective(whole, homography, size, flags=nearest) > 0
+
+
+def local_correlation(
+    first: np.ndarray, second: np.ndarray, valid: np.ndarray, window: int = WINDOW
+) -> np.ndarray:
+    """Compute the zero-mean correlation of the windows around each pixel.
+
+    Args:
+        first, second: (H, W) uint8 images in the same frame.
+        valid: (H, W) bool; windows that reach beyond it do not count.
+        window: side of the square windows in pixels, odd.
+
+    Returns:
+        (H, W) float32 in [-1, 1], NaN where a window does not count or is flat.
+
+    Example:
+        >>> image = np.random.default_rng(0).integers(0, 256, (32, 32)).astype(np.uint8)
+        >>> seen = np.ones((32, 32), bool)
+        >>> float(np.nanmedian(local_correlation(image, 255 - image, seen)).round(3))
+        -1.0
+    """
+    a, b = first.astype(np.float64), second.astype(np.float64)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return cv2.boxFilter(values, cv2.CV_64F, (window, window))
+
+    mean_a, mean_b = mean(a), mean(b)
+    variance_a = mean(a * a) - mean_a**2
+    variance_b = mean(b * b) - mean_b**2
+    kernel = np.ones((window, window), np.uint8)
+    inside = cv2.erode(valid.astype(np.uint8), kernel, borderValue=0) > 0
+    known = inside & (variance_a > FLAT) & (variance_b > FLAT)
+    covariance = mean(a * b) - mean_a * mean_b
+    result = np.full(first.shape, np.nan, np.float32)
+    spread = np.sqrt(variance_a[known] * variance_b[known])
+    result[known] = np.clip(covariance[known] / spread, -1, 1)
+    return result
+
+
+def agreement(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> float:
+    """Return the median correlation of two images over their overlap, in [-1, 1].
+
+    Args:
+        gray0, gray1: (H, W) uint8 images.
+        homography: (3, 3) from the first to the second.
+
+    Returns:
+        The median over the windows that count; -1 when there are none.
+    """
+    size = (gray0.shape[1], gray0.shape[0])
+    warped, seen = warp_back(gray1, homography, size)
+    values = local_correlation(gray0, warped, seen)
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else -1.0

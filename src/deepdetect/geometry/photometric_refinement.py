@@ -1,0 +1,146 @@
+"""Sharpening a homography by the images themselves: Lucas-Kanade on the warped image.
+
+Each step warps the second image back by what is known, tracks thousands of corners over the few
+pixels that are left, there and back, and fits a homography to the tracks. A step is kept only
+when the images then correlate better, so it cannot make things worse by that measure. Blur and
+foliage want larger windows than sharp walls, so several are tried in turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..errors import OptionError
+from .correlation import agreement, warp_back
+
+FEWEST = 30
+"""Tracks that a homography is fitted to, at least."""
+
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """How a homography is refined.
+
+    Attributes:
+        rounds: at the most; each takes one step with every window.
+        corners: tracked in each step.
+        windows: sides of the tracked windows in pixels.
+        levels: of the pyramid above the image; each doubles what a track can move.
+        round_trip: a track counts when there and back it ends so near, in pixels.
+        inlier_threshold: of MAGSAC, in pixels.
+        seed: of its random samples.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    rounds: int = 4
+    corners: int = 4000
+    windows: tuple[int, ...] = (21, 31, 41)
+    levels: int = 3
+    round_trip: float = 0.3
+    inlier_threshold: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1 or self.corners < FEWEST or self.levels < 0:
+            raise OptionError(f"a refinement needs a round and {FEWEST} corners at least")
+        if not self.windows or min(self.windows) < 5:
+            raise OptionError("a refinement needs windows of 5 pixels at least")
+        if not (self.round_trip > 0 and self.inlier_threshold > 0):
+            raise OptionError("the distances of a refinement must be above 0 pixels")
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """A refined homography.
+
+    Attributes:
+        homography: (3, 3) from the first image to the second, its last element 1.
+        agreement: median local correlation of the images under it.
+        before: the same under the homography that it began with.
+        steps: number of steps that were kept.
+    """
+
+    homography: np.ndarray
+    agreement: float
+    before: float
+    steps: int
+
+
+def refine_homography(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    homography: np.ndarray,
+    options: RefinementOptions = RefinementOptions(),
+) -> Refinement:
+    """Refine a homography by the two images.
+
+    Args:
+        gray0, gray1: (H, W) uint8 luma.
+        homography: (3, 3) from the first to the second, right within some ten pixels.
+        options: how.
+
+    Returns:
+        The best homography found; the one given when no step made it better.
+    """
+    current = np.asarray(homography, np.float64)
+    before = best = agreement(gray0, gray1, current)
+    kept = 0
+    for _ in range(options.rounds):
+        kept_before = kept
+        for window in options.windows:
+            correction = _track(gray0, gray1, current, window, options)
+            if correction is None:
+                continue
+            candidate = current @ correction
+            reached = agreement(gray0, gray1, candidate)
+            if reached > best:
+                current, best, kept = candidate, reached, kept + 1
+        if kept == kept_before:
+            break
+    return Refinement(current / current[2, 2], best, before, kept)
+
+
+def _track(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    homography: np.ndarray,
+    window: int,
+    options: RefinementOptions,
+) -> np.ndarray | None:
+    """Return the homography from the first image to the warped second one, near identity."""
+    size = (gray0.shape[1], gray0.shape[0])
+    warped, seen = warp_back(gray1, homography, size)
+    # Equalised, so that light and shade do not pass for motion.
+    equalise = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply
+    first, second = equalise(gray0), equalise(warped)
+    margin = np.ones((window, window), np.uint8)
+    inside = cv2.erode(seen.astype(np.uint8), margin, borderValue=0)
+    corners = cv2.goodFeaturesToTrack(first, options.corners, 0.001, 5, mask=inside)
+    if corners is None or len(corners) < FEWEST:
+        return None
+    parameters = {
+        "winSize": (window, window),
+        "maxLevel": options.levels,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 0.005),
+    }
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, **parameters)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, **parameters)
+    gap = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
+    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (gap < options.round_trip)
+    if good.sum() < FEWEST:
+        return None
+    cv2.setRNGSeed(options.seed)
+    correction, _ = cv2.findHomography(
+        corners.reshape(-1, 2)[good],
+        there.reshape(-1, 2)[good],
+        cv2.USAC_MAGSAC,
+        options.inlier_threshold,
+        maxIters=5000,
+        confidence=0.9999,
+    )
+    return correction
