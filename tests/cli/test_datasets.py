@@ -15,8 +15,10 @@ def test_list_names_size_and_licence(run) -> None:
     assert "coco" in result.output
     assert "19.3 GB" in result.output
     assert "licence" in result.output
-    (entry,) = json.loads(run("datasets", "list", "--json").output)
-    assert entry["images"] == 118_287
+    entries = {e["name"]: e for e in json.loads(run("datasets", "list", "--json").output)}
+    assert set(entries) == {"coco", "oxford", "hpatches", "middlebury"}
+    assert entries["coco"]["images"] == 118_287
+    assert entries["coco"]["bytes"] == 19_336_861_798
 
 
 def test_get_reports_what_it_has_written(run, tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:

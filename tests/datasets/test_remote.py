@@ -4,7 +4,10 @@ import functools
 import hashlib
 import http.server
 import io
+import json
+import tarfile
 import threading
+import time
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
@@ -14,13 +17,18 @@ import pytest
 
 pytest.importorskip("pooch", reason="needs pooch (pip install '.[data]')")
 
+from PIL import Image
+
+import deepdetect.datasets.download as download
 from deepdetect import DeepDetectError, OptionError
 from deepdetect.datasets import (
     REMOTE_DATASETS,
     RemoteDataset,
+    RemoteFile,
     find_remote_dataset,
     get_dataset,
 )
+from deepdetect.datasets.contents import content_digest
 
 NAMES = [f"train/{k:04d}.jpg" for k in range(5)]
 
@@ -37,6 +45,8 @@ class Server(http.server.ThreadingHTTPServer):
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
         self.ranges: list[str | None] = []
+        self.contents: dict[str, bytes] = {}
+        self.slow_after: dict[str, int] = {}
 
     @property
     def url(self) -> str:
@@ -53,15 +63,22 @@ class Handler(http.server.BaseHTTPRequestHandler):
             self.send_error(self.server.status)
             return
         first = 0
+        content = self.server.contents.get(self.path, self.server.content)
         if asked and self.server.knows_ranges:
             first = int(asked.removeprefix("bytes=").removesuffix("-"))
-            if first >= len(self.server.content):
+            if first >= len(content):
                 self.send_error(416)
                 return
         self.send_response(206 if asked and self.server.knows_ranges else 200)
-        self.send_header("Content-Length", str(len(self.server.content) - first))
+        self.send_header("Content-Length", str(len(content) - first))
         self.end_headers()
-        part = self.server.content[first:]
+        part = content[first:]
+        slow = self.server.slow_after.get(self.path)
+        if slow is not None:
+            self.wfile.write(part[:slow])
+            self.wfile.flush()
+            time.sleep(1)
+            return
         self.wfile.write(part[: self.server.break_after])
 
     def log_message(self, *arguments: object) -> None:
@@ -93,7 +110,13 @@ def server() -> Iterator[Server]:
 @pytest.fixture
 def dataset(server: Server) -> RemoteDataset:
     checksum = "md5:" + hashlib.md5(server.content).hexdigest()
-    return RemoteDataset("tiny", "a test", server.url, checksum, len(server.content), 5, "none")
+    file = RemoteFile((server.url,), len(server.content), checksum)
+    return RemoteDataset("tiny", "a test", (file,), 5, "none")
+
+
+def with_file(dataset: RemoteDataset, **changes: object) -> RemoteDataset:
+    """The data set, with its only file changed."""
+    return replace(dataset, files=(replace(dataset.files[0], **changes),))
 
 
 def unpacked(folder: Path) -> list[str]:
@@ -142,7 +165,8 @@ def test_a_server_without_ranges_sends_all_again(
 def test_a_run_stopped_between_download_and_check_goes_on(
     dataset: RemoteDataset, server: Server, tmp_path: Path
 ) -> None:
-    (tmp_path / "tiny.zip.part").write_bytes(server.content)
+    (tmp_path / "tiny.download").mkdir()
+    (tmp_path / "tiny.download" / "00-train.zip.part").write_bytes(server.content)
     assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
 
 
@@ -167,7 +191,8 @@ def test_a_stop_while_the_checksum_is_taken_loses_nothing(
         patch.setattr(pooch.core, "hash_matches", stopped)
         with pytest.raises(KeyboardInterrupt):
             get_dataset(dataset, tmp_path / "tiny")
-    assert [path.name for path in tmp_path.iterdir()] == ["tiny.zip.part"]
+    left = [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")]
+    assert left == ["tiny.download", "tiny.download/00-train.zip.part"]
     assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
     assert server.ranges == [None, f"bytes={len(server.content)}-"], "no byte came twice"
 
@@ -202,7 +227,7 @@ def test_the_servers_answer_is_told(dataset: RemoteDataset, server: Server, tmp_
 def test_a_server_that_says_no_is_told_in_one_sentence(
     dataset: RemoteDataset, tmp_path: Path
 ) -> None:
-    gone = replace(dataset, url="http://127.0.0.1:9/train.zip")
+    gone = with_file(dataset, urls=("http://127.0.0.1:9/train.zip",))
     with pytest.raises(DeepDetectError, match="cannot be downloaded"):
         get_dataset(gone, tmp_path / "tiny")
 
@@ -211,8 +236,113 @@ def test_too_little_room_is_told_before_the_download(
     dataset: RemoteDataset, server: Server, tmp_path: Path
 ) -> None:
     with pytest.raises(DeepDetectError, match="GB free"):
-        get_dataset(replace(dataset, size=10**18), tmp_path / "tiny")
+        get_dataset(with_file(dataset, size=10**18), tmp_path / "tiny")
     assert server.ranges == []
+
+
+def other_file(server: Server) -> str:
+    """Another address of the same server."""
+    return server.url.replace("train", "mirror")
+
+
+def test_a_mirror_is_asked_when_a_host_fails(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    two = with_file(dataset, urls=("http://127.0.0.1:9/train.zip", other_file(server)))
+    assert unpacked(get_dataset(two, tmp_path / "tiny")) == NAMES
+    assert len(server.ranges) == 1
+
+
+def test_a_mirror_is_asked_when_a_host_sends_wrong_bytes(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    good = server.content
+    bad = good[:-1] + b"?"
+    server.contents = {"/train.zip": bad, "/mirror.zip": good}
+    two = with_file(dataset, urls=(server.url, other_file(server)))
+    assert unpacked(get_dataset(two, tmp_path / "tiny")) == NAMES
+    assert server.ranges == [None, None], "nothing of the wrong bytes is kept"
+
+
+def test_a_mirror_goes_on_where_a_slow_host_stopped(
+    dataset: RemoteDataset, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(download, "TIMEOUT", 0.3)
+    server.slow_after = {"/train.zip": 400_000}
+    two = with_file(dataset, urls=(server.url, other_file(server)))
+    assert unpacked(get_dataset(two, tmp_path / "tiny")) == NAMES
+    first, second = server.ranges
+    assert first is None
+    assert second is not None
+    assert int(second.removeprefix("bytes=").removesuffix("-")) > 0
+
+
+def tar_of(names: list[str]) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as file:
+        for k, name in enumerate(names):
+            picture = io.BytesIO()
+            Image.new("RGB", (8, 8), (k, 0, 0)).save(picture, "PPM")
+            entry = tarfile.TarInfo(name)
+            entry.size = len(picture.getvalue())
+            file.addfile(entry, io.BytesIO(picture.getvalue()))
+    return buffer.getvalue()
+
+
+def test_archives_and_single_files_are_put_together(server: Server, tmp_path: Path) -> None:
+    picture = io.BytesIO()
+    Image.new("RGB", (8, 8), (1, 0, 0)).save(picture, "PNG")
+    server.contents = {
+        "/a.tar.gz": tar_of(["top/img1.ppm", "top/img2.ppm"]),
+        "/b.png": picture.getvalue(),
+    }
+    root = server.url.removesuffix("/train.zip")
+    made = RemoteDataset(
+        "mixed",
+        "a test",
+        (
+            RemoteFile((f"{root}/a.tar.gz",), 100, into="scene", inside="top"),
+            RemoteFile((f"{root}/b.png",), 100, into="other/left.png"),
+        ),
+        3,
+        "none",
+        texts={"other/calib.json": "{}\n"},
+    )
+    folder = get_dataset(made, tmp_path / "mixed")
+    found = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    assert found == ["other/calib.json", "other/left.png", "scene/img1.ppm", "scene/img2.ppm"]
+    # The second picture of the archive is the same one in another format.
+    same = content_digest(folder, "other/left")
+    assert same == content_digest(folder, "scene/img2") != content_digest(folder, "scene/img1")
+    checked = replace(made, contents={"scene/img2": same})
+    assert get_dataset(checked, tmp_path / "again").is_dir()
+    for name, word in (("scene/img1", "not the one"), ("scene/img9", "missing")):
+        with pytest.raises(DeepDetectError, match=word):
+            get_dataset(replace(made, contents={name: same}), tmp_path / "wrong")
+        assert not (tmp_path / "wrong").exists()
+        assert not (tmp_path / "wrong.download").exists()
+
+
+def test_what_is_no_archive_is_refused(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    server.content = b"<html>not found</html>"
+    with pytest.raises(DeepDetectError, match="no archive"):
+        get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["oxford", "middlebury", "hpatches"])
+def test_the_known_contents_are_those_of_the_reference_data(shared: Path, name: str) -> None:
+    dataset = find_remote_dataset(name)
+    assert dataset.contents
+    for path, digest in list(dataset.contents.items())[:12]:
+        assert content_digest(shared / "data" / name, path) == digest
+    for path, text in dataset.texts.items():
+        ours, theirs = json.loads(text), json.loads((shared / "data" / name / path).read_text())
+        truth, reference = (values.pop("ground_truth", {}) for values in (ours, theirs))
+        assert ours == pytest.approx({key: theirs[key] for key in ours})
+        assert truth == pytest.approx({key: reference[key] for key in truth})
 
 
 def test_names_are_looked_up() -> None:
@@ -221,4 +351,7 @@ def test_names_are_looked_up() -> None:
         find_remote_dataset("cocoo")
     for name, entry in REMOTE_DATASETS.items():
         assert name == entry.name
-        assert entry.checksum.startswith(("md5:", "sha256:"))
+        for file in entry.files:
+            assert file.checksum is not None or entry.contents
+            assert file.checksum is None or file.checksum.startswith(("md5:", "sha256:"))
+            assert all(url.startswith("http") for url in file.urls)

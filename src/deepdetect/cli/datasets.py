@@ -11,19 +11,29 @@ from .shared import PATH, json_option, print_json, print_table
 
 @click.group(short_help="Download data sets.")
 def datasets() -> None:
-    """Download data sets for training."""
+    """Download data sets for training and for the benchmarks."""
 
 
 @datasets.command("list", short_help="Show the data sets that can be had.")
 @json_option
 def list_datasets(as_json: bool) -> None:
     """Show the data sets that can be downloaded."""
-    from dataclasses import asdict
-
     from ..datasets import REMOTE_DATASETS
 
     if as_json:
-        print_json([asdict(dataset) for dataset in REMOTE_DATASETS.values()])
+        print_json(
+            [
+                {
+                    "name": dataset.name,
+                    "title": dataset.title,
+                    "images": dataset.images,
+                    "bytes": dataset.size,
+                    "licence": dataset.licence,
+                    "urls": [url for file in dataset.files for url in file.urls],
+                }
+                for dataset in REMOTE_DATASETS.values()
+            ]
+        )
         return
     for dataset in REMOTE_DATASETS.values():
         rows = [
@@ -46,6 +56,8 @@ def get(name: str, output: Path | None, as_json: bool) -> None:
     \b
     deepdetect datasets get coco
     deepdetect train --preset paper data/coco -o run
+    deepdetect datasets get oxford
+    deepdetect benchmark oxford --data data -o report
     """
     from ..datasets import find_remote_dataset, get_dataset
     from ..image import find_images

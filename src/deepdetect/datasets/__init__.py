@@ -4,15 +4,20 @@ from collections.abc import Callable
 
 from ..errors import look_up
 from .coco import COCO
+from .download import RemoteFile
 from .motorcycle import load_motorcycle
 from .remote import RemoteDataset, get_dataset
+from .remote_middlebury import MIDDLEBURY
+from .remote_planar import HPATCHES, OXFORD
 from .stereo import StereoPair
 
 STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {
     "motorcycle": load_motorcycle,
 }
 
-REMOTE_DATASETS: dict[str, RemoteDataset] = {dataset.name: dataset for dataset in (COCO,)}
+REMOTE_DATASETS: dict[str, RemoteDataset] = {
+    dataset.name: dataset for dataset in (COCO, OXFORD, HPATCHES, MIDDLEBURY)
+}
 
 
 def find_remote_dataset(name: str) -> RemoteDataset:
@@ -37,6 +42,7 @@ __all__ = [
     "REMOTE_DATASETS",
     "STEREO_PAIRS",
     "RemoteDataset",
+    "RemoteFile",
     "StereoPair",
     "find_remote_dataset",
     "get_dataset",

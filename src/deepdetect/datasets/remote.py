@@ -1,51 +1,56 @@
-"""Data sets on the web: downloaded with their checksum by pooch, and unpacked whole."""
+"""Data sets on the web: what they are made of, and how they are put together."""
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
+import tarfile
 import zipfile
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ..errors import DeepDetectError, MissingExtraError
 from ..image import find_images
 from ..progress import progress
-
-CHUNK = 1 << 16  # bytes; so many are lost when a download is broken off
-TIMEOUT = 60  # seconds without a byte
+from .contents import content_digest
+from .download import RemoteFile, download, have_pooch, partial_size
 
 
 @dataclass(frozen=True)
 class RemoteDataset:
-    """A zip archive of images on the web.
+    """A data set of images on the web.
 
     Attributes:
         name: the name users choose it by.
         title: what it is.
-        url: the archive.
-        checksum: "md5:..." or "sha256:...", as its makers or many users give it.
-        size: bytes of the archive.
+        files: archives, which are unpacked, and single files.
         images: number of images.
         licence: what they may be used for.
+        contents: by path in the data set, the digest of what is in a file (`content_digest`):
+            it holds whichever archive and image format the file came in.
+        texts: files that are written, not downloaded, by path in the data set.
     """
 
     name: str
     title: str
-    url: str
-    checksum: str
-    size: int
+    files: tuple[RemoteFile, ...]
     images: int
     licence: str
+    contents: Mapping[str, str] = field(default_factory=dict, repr=False)
+    texts: Mapping[str, str] = field(default_factory=dict, repr=False)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the download."""
+        return sum(file.size for file in self.files)
 
 
 def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = True) -> Path:
     """Download and unpack a data set; what is there already is not done again.
 
     A download that was broken off goes on where it stopped. The folder appears when all
-    images are in it; then the archive is removed.
+    images are in it and are the right ones; then the archives are removed.
 
     Args:
         dataset: the data set.
@@ -57,28 +62,38 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
 
     Raises:
         MissingExtraError: pooch is not installed.
-        DeepDetectError: the download fails, its checksum is wrong, there is no room, or
+        DeepDetectError: the download fails, a checksum is wrong, there is no room, or
             the folder holds something else.
     """
-    if importlib.util.find_spec("pooch") is None:
+    if not have_pooch():
         raise MissingExtraError(
             "downloading data sets needs the package pooch, which is not installed: "
             "run pip install pooch"
         )
     final = Path(folder)
     if final.is_dir() and any(final.iterdir()):
-        _check_count(dataset, final, f"{final} is there and")
+        _check(dataset, final, f"{final} is there and")
         return final
-    archive = final.with_name(f"{final.name}.zip")
+    store = final.with_name(f"{final.name}.download")
     try:
-        final.parent.mkdir(parents=True, exist_ok=True)
-        if not archive.exists():
-            # As much again, for what is unpacked.
-            _need_room(final.parent, 2 * dataset.size - _size(_part(archive)))
-            _download(dataset, archive, quiet)
-        _need_room(final.parent, dataset.size)
-        _unpack(dataset, archive, final, quiet)
-        archive.unlink()
+        store.mkdir(parents=True, exist_ok=True)
+        paths = [store / f"{k:02d}-{file.name}" for k, file in enumerate(dataset.files)]
+        missing = [
+            (file, path)
+            for file, path in zip(dataset.files, paths, strict=True)
+            if not path.exists()
+        ]
+        # As much again, for what is unpacked.
+        there = sum(partial_size(path) for _, path in missing)
+        _need_room(store, dataset.size + sum(file.size for file, _ in missing) - there)
+        for file, path in missing:
+            download(file, path, quiet=quiet)
+        _put_together(dataset, paths, final, quiet)
+        shutil.rmtree(store)
+    except DeepDetectError:
+        if store.is_dir() and not any(store.iterdir()):
+            store.rmdir()
+        raise
     except OSError as error:
         raise DeepDetectError(
             f"cannot write {final} ({error.strerror or error}): make room or choose another place"
@@ -90,115 +105,82 @@ def _need_room(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise DeepDetectError(
-            f"{folder} has {free / 1e9:.0f} GB free, {needed / 1e9:.0f} GB are needed: "
+            f"{folder.parent} has {free / 1e9:.1f} GB free, {needed / 1e9:.1f} GB are needed: "
             "make room or choose another place with -o"
         )
 
 
-def _part(archive: Path) -> Path:
-    return archive.with_name(f"{archive.name}.part")
-
-
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
-
-
-def _download(dataset: RemoteDataset, archive: Path, quiet: bool) -> None:
-    import pooch
-    from requests import HTTPError, RequestException
-
-    part = _part(archive)
-    pooch.get_logger().setLevel("WARNING")  # the progress bar says enough
-    try:
-        pooch.retrieve(
-            dataset.url,
-            dataset.checksum,
-            fname=archive.name,
-            path=archive.parent,
-            downloader=_resuming(part, dataset, quiet),
-        )
-    except HTTPError as error:
-        raise DeepDetectError(
-            f"{dataset.url} cannot be downloaded (the server answers "
-            f"{error.response.status_code}): try again later"
-        ) from None
-    except RequestException as error:
-        raise DeepDetectError(
-            f"{dataset.url} cannot be downloaded ({error.__class__.__name__}): "
-            "give the same command again to go on where it stopped"
-        ) from None
-    except ValueError:  # pooch's word for a wrong checksum
-        part.unlink(missing_ok=True)
-        raise DeepDetectError(
-            f"{dataset.url} has another checksum than {dataset.checksum}: "
-            "it has changed or was damaged on the way; try again later"
-        ) from None
-    part.unlink(missing_ok=True)
-
-
-def _resuming(part: Path, dataset: RemoteDataset, quiet: bool) -> Callable[..., None]:
-    """Make a downloader for pooch that keeps what it has got when it is broken off."""
-
-    def download(url: str, output: str, _: Any) -> None:
-        import requests
-
-        have = _size(part)
-        headers = {"Range": f"bytes={have}-"} if have else {}
-        with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as response:
-            if response.status_code == 416:  # nothing is missing
-                _second_name(part, Path(output))
-                return
-            response.raise_for_status()
-            if response.status_code != 206:  # the server sends all of it again
-                have = 0
-            total = have + int(response.headers.get("Content-Length", dataset.size - have))
-            with (
-                part.open("ab" if have else "wb") as file,
-                progress(total, dataset.name, "B", quiet, have) as bar,
-            ):
-                bar.unit_scale = True
-                for chunk in response.iter_content(CHUNK):
-                    file.write(chunk)
-                    bar.update(len(chunk))
-        if part.stat().st_size < total:
-            raise requests.ConnectionError("the connection broke off")
-        _second_name(part, Path(output))
-
-    return download
-
-
-def _second_name(part: Path, output: Path) -> None:
-    """Give the file to pooch, which deletes it when it is stopped, and keep it."""
-    output.unlink(missing_ok=True)
-    try:
-        output.hardlink_to(part)
-    except OSError:  # a file system without links
-        shutil.copyfile(part, output)
-
-
-def _check_count(dataset: RemoteDataset, folder: Path, subject: str) -> None:
+def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:
+    """Make sure that the folder holds the data set."""
     count = len(find_images(folder))
     if count != dataset.images:
         raise DeepDetectError(
             f"{subject} holds {count:,} images, not the {dataset.images:,} of {dataset.name}: "
             "choose another folder with -o"
         )
+    for name, digest in dataset.contents.items():
+        found = content_digest(folder, name)
+        if found != digest:
+            state = "is missing" if found is None else "is not the one of the data set"
+            raise DeepDetectError(
+                f"{subject} holds another {dataset.name}: {name} {state}; "
+                "it has changed or was damaged on the way"
+            )
 
 
-def _unpack(dataset: RemoteDataset, archive: Path, final: Path, quiet: bool) -> None:
-    """Unpack into a folder beside the final one, and rename it when all is there."""
+def _put_together(dataset: RemoteDataset, paths: list[Path], final: Path, quiet: bool) -> None:
+    """Unpack into a folder beside the final one, and rename it when all is there and right."""
     unfinished = final.with_name(f".{final.name}.part")
     shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
     try:
-        with zipfile.ZipFile(archive) as file:
-            members = file.infolist()
-            with progress(len(members), "unpacking", "file", quiet) as bar:
-                for member in members:
-                    file.extract(member, unfinished)
-                    bar.update(1)
-    except zipfile.BadZipFile:
-        raise DeepDetectError(f"{archive} is no zip archive: delete it and try again") from None
-    _check_count(dataset, unfinished, str(archive))
+        for file, path in zip(dataset.files, paths, strict=True):
+            _place(file, path, unfinished / file.into, quiet)
+        for name, text in dataset.texts.items():
+            (unfinished / name).parent.mkdir(parents=True, exist_ok=True)
+            (unfinished / name).write_text(text, encoding="utf-8")
+        _check(dataset, unfinished, "the download")
+    except DeepDetectError:
+        shutil.rmtree(unfinished)
+        for path in paths:  # else the same wrong files would be taken again
+            path.unlink()
+        raise
     if final.exists():
         final.rmdir()
     unfinished.rename(final)
+
+
+def _place(file: RemoteFile, path: Path, target: Path, quiet: bool) -> None:
+    """Put a downloaded file to its place, or what is in it."""
+    if not file.is_archive:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, target)
+        return
+    target.mkdir(parents=True, exist_ok=True)
+    try:
+        _unpack(path, target, file.inside, quiet)
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError):
+        raise DeepDetectError(
+            f"{file.urls[0]} is no archive that can be unpacked: try again"
+        ) from None
+
+
+def _unpack(archive: Path, target: Path, inside: str, quiet: bool) -> None:
+    """Unpack a zip or tar archive; what lies below its folder `inside` is moved up."""
+    if zipfile.is_zipfile(archive):
+        with zipfile.ZipFile(archive) as file:
+            _each(file.infolist(), lambda member: file.extract(member, target), quiet)
+    else:
+        with tarfile.open(archive) as tar:
+            _each(tar.getmembers(), lambda one: tar.extract(one, target, filter="data"), quiet)
+    if inside and (target / inside).is_dir():
+        for entry in sorted((target / inside).iterdir()):
+            entry.rename(target / entry.name)
+        (target / inside).rmdir()
+
+
+def _each(members: list[Any], extract: Callable[[Any], object], quiet: bool) -> None:
+    with progress(len(members), "unpacking", "file", quiet) as bar:
+        for member in members:
+            extract(member)
+            bar.update(1)
