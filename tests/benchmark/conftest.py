@@ -83,7 +83,7 @@ def oxford_folder(tmp_path_factory: pytest.TempPathFactory, write_scene) -> Path
     """Eight scenes of small images: only boat's are large enough for ORB; ubc 6 equals 1."""
     root = tmp_path_factory.mktemp("data")
     for index, scene in enumerate(SCENES):
-        size = (128, 112) if scene == "boat" else (64, 48 + index)
+        size = (100, 92) if scene == "boat" else (48, 36 + index)
         move = np.array(MOVES.get(scene, np.eye(3)), float)
         corner = (100 + 17 * index, 30 + 11 * index)
         write_scene(root / "oxford" / scene, size, move, corner=corner)
@@ -98,7 +98,7 @@ def low_visibility_folder(tmp_path_factory: pytest.TempPathFactory, write_scene)
     root = tmp_path_factory.mktemp("low") / "low-visibility"
     for scene, fading in (("dusty", 0.0), ("smoky", 0.4)):
         write_scene(
-            *(root / scene, (96, 80), np.eye(3), ("img{}.png", "H1to{}p"), 2),
+            *(root / scene, (80, 64), np.eye(3), ("img{}.png", "H1to{}p"), 2),
             corner=(180, 90),
             fading=fading,
         )

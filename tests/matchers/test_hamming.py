@@ -48,7 +48,7 @@ def test_neighbours_are_right_among_ties(data: st.DataObject, count: int) -> Non
 
 @pytest.mark.parametrize("block", [1, 7, 59, 60, 61])
 def test_blocks_do_not_change_the_result(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hamming, "BLOCK", block)
+    monkeypatch.setattr(hamming, "QUERIES", block)
     assert_nearest(random_bytes(0, 60, 32), random_bytes(1, 80, 32), 2)
 
 

@@ -56,7 +56,7 @@ def test_the_ratio_is_strict(best: float, second: float, ratio: float, kept: boo
         np.testing.assert_allclose(matches.ratios, [best / second if second else 1], rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", MATCHERS)
+@pytest.mark.parametrize("name", ["flann", "exact"])
 def test_known_answer(name: str) -> None:
     first = points((0, 0), (10, 0), (0, 10), (5, 5))
     second = points((10, 1), (0, 0), (0, 12), (100, 100))
@@ -73,7 +73,7 @@ def test_known_answer(name: str) -> None:
     assert pairs(both) == {(0, 1), (1, 0), (2, 2)}
 
 
-@pytest.mark.parametrize("name", MATCHERS)
+@pytest.mark.parametrize("name", ["flann", "exact"])
 def test_two_copies_of_the_nearest_are_no_match(name: str) -> None:
     first = points((1, 2), (8, 8))
     second = points((1, 2), (1, 2), (8, 8))
@@ -81,7 +81,7 @@ def test_two_copies_of_the_nearest_are_no_match(name: str) -> None:
     assert pairs(matches) == {(1, 2)}
 
 
-@pytest.mark.parametrize("name", MATCHERS)
+@pytest.mark.parametrize("name", ["flann", "exact"])
 @pytest.mark.parametrize("mutual", [False, True])
 @pytest.mark.parametrize(("count0", "count1"), [(0, 0), (0, 5), (5, 0), (5, 1), (1, 1), (0, 1)])
 def test_without_a_second_best_nothing_matches(
@@ -101,7 +101,7 @@ def test_without_a_second_best_nothing_matches(
     assert matches.ratios.dtype == np.float32
 
 
-@pytest.mark.parametrize("name", MATCHERS)
+@pytest.mark.parametrize("name", ["flann", "exact"])
 @pytest.mark.parametrize("mutual", [False, True])
 def test_one_descriptor_matches_into_a_larger_set(name: str, mutual: bool) -> None:
     """There is a second-best in the second set, whatever the size of the first."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -13,8 +12,17 @@ from typing import Any
 import numpy as np
 
 from ..atomic import atomic_path
+from ..errors import DeepDetectError
 
 Arrays = Mapping[str, np.ndarray]
+
+
+NAMES = "names of the arrays"
+"""Key of the list of all others, by which a file that lost some is known."""
+
+
+class CacheError(DeepDetectError):
+    """A result cannot be kept: the folder cannot be written."""
 
 
 class StageCache:
@@ -47,33 +55,47 @@ class StageCache:
             stage: name of the stage, as "keypoints".
             key: all that the result depends on, as plain values.
             make: makes the arrays.
+
+        Raises:
+            CacheError: the result cannot be written.
         """
         if self.folder is None:
+            made = make()
             self.made += 1
-            return make()
+            return made
         text = json.dumps(key, sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:32]
         path = self.folder / stage / f"{digest}.npz"
         found = _read(path)
         if found is not None:
             return found
-        self.made += 1
         arrays = dict(make())
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+        self.made += 1
+        try:
+            with atomic_path(path) as temporary, temporary.open("wb") as file:
+                np.savez_compressed(file, **arrays, **{NAMES: np.array(sorted(arrays))})
+        except DeepDetectError as error:
+            raise CacheError(str(error)) from None
         return arrays
 
 
 def _read(path: Path) -> Arrays | None:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return dict(file)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            arrays = dict(file)
+        names = arrays.pop(NAMES).tolist()
+    except Exception:  # damage shows as any of a dozen errors of zip, zlib and numpy
         return None
+    return arrays if sorted(arrays) == names else None
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file; it is read once in a process, and when it has changed."""
+    state = path.stat()
+    return _digest(path.resolve(), state.st_mtime_ns, state.st_size)
 
 
 @lru_cache(maxsize=4096)
-def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file; it is read once in a process."""
+def _digest(path: Path, changed: int, size: int) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..datasets.foreground import MaskedPhotograph
+from ..errors import ImageError
 from ..methods import Method
 from ..metrics.spread import foreground_share
 from .report import Cell, Column, Table
@@ -65,7 +66,10 @@ def _measure(
 ) -> tuple[float, float]:
     def make() -> dict[str, np.ndarray]:
         features = workspace.keypoints(method, photograph.image).features
-        share = foreground_share(features.xy, photograph.foreground())
+        foreground = photograph.foreground()
+        if foreground.shape[::-1] != features.image_size:
+            raise ImageError(f"{photograph.mask.name} is not of the photograph's size")
+        share = foreground_share(features.xy, foreground)
         return {"values": np.array([share, features.density])}
 
     images = (photograph.image, photograph.mask)

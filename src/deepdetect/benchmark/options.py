@@ -75,20 +75,22 @@ class BenchmarkOptions:
         """Return the rows of Table I and of the repeatability, controls last."""
         classical = [CLASSICAL[name] for name in self.classical]
         own = [self.own(threshold) for threshold in THRESHOLDS]
-        return (*classical, *self.others, *own, *self.controls())
+        return without_repeats((*classical, *self.others, *own, *self.controls()))
 
     def matching_methods(self) -> tuple[Method, ...]:
         """Return the rows of Table II: the low settings, DeepDetect, controls."""
         low = [CLASSICAL[name] for name in self.classical if name in LOW]
-        return (*low, *self.others, self.own(), *self.controls())
+        return without_repeats((*low, *self.others, self.own(), *self.controls()))
 
     def standard_methods(self) -> tuple[Method, ...]:
         """Return the rows of the standard protocol: default settings, ours sparse, controls."""
         classical = [common(CLASSICAL[name]) for name in self.classical if name in DEFAULT]
-        systems = [CLASSICAL[name] for name in self.classical if name in ("sift", "orb")]
+        others = [method for method in self.others if method.name not in CLASSICAL]
+        own_names = {"sift", "orb"} & set(self.classical) | {m.name for m in self.others}
         systems = [
             replace(method, name=f"{method.name}-own", title=f"{method.title}, own descriptors")
-            for method in systems
+            for method in CLASSICAL.values()
+            if method.name in own_names
         ]
         own = deepdetect_method(
             self._native(),
@@ -99,7 +101,7 @@ class BenchmarkOptions:
         )
         dense = common(self.native())
         controls = (common(method) for method in self.native_controls())
-        return (*classical, *systems, *self.others, own, dense, *controls)
+        return without_repeats((*classical, *systems, *others, own, dense, *controls))
 
     def native(self) -> Method:
         """Return DeepDetect at the image's own size, all pixels over 0.5."""
@@ -126,5 +128,15 @@ def common(method: Method) -> Method:
 
 
 def without_repeats(methods: Sequence[Method]) -> tuple[Method, ...]:
-    """Return the methods, each name once."""
-    return tuple({method.name: method for method in methods}.values())
+    """Return the methods, each once.
+
+    Raises:
+        OptionError: two that are not the same have one name.
+    """
+    by_name: dict[str, Method] = {}
+    for method in methods:
+        if by_name.setdefault(method.name, method).version != method.version:
+            raise OptionError(
+                f"two methods are named {method.name}: rename one of the files they come from"
+            )
+    return tuple(by_name.values())

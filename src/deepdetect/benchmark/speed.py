@@ -19,6 +19,7 @@ REPEATS = 3
 
 def speed_steps(workspace: Workspace, options: BenchmarkOptions) -> int:
     """Return the number of steps that `speed_sections` reports."""
+    load_oxford(workspace.folder("oxford"))
     return (REPEATS + 1) * len(options.matching_methods())
 
 

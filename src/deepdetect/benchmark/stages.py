@@ -84,7 +84,7 @@ def find_keypoints(cache: StageCache, method: Method, image: Path) -> FoundFeatu
             features = method.detect(rgb)
         return {**_packed(features), **_meter_arrays("detect", meter)}
 
-    key = {"detection": method.detection, "image": file_digest(image), **_versions()}
+    key = {"detection": method.detection, "image": file_digest(image), **versions()}
     found = cache.get("keypoints", key, make)
     return FoundFeatures(*_meter(found, "detect"), _unpacked(found))
 
@@ -98,10 +98,11 @@ def find_matches(
         both = [features.best(settings.budget) for features in both]
 
     def make() -> dict[str, np.ndarray]:
+        rgb = [load_image(image) for image in images]
         with metered() as describing:
             descriptors = [
-                method.describe(load_image(image), features)
-                for image, features in zip(images, both, strict=True)
+                method.describe(pixels, features)
+                for pixels, features in zip(rgb, both, strict=True)
             ]
         for name, features, rows in zip(images, both, descriptors, strict=True):
             if len(rows) != len(features):
@@ -130,7 +131,7 @@ def find_matches(
         "version": method.version,
         "images": [file_digest(image) for image in images],
         "settings": vars(settings),
-        **_versions(),
+        **versions(),
     }
     found = cache.get("matches", key, make)
     return FoundMatches(
@@ -143,13 +144,15 @@ def find_matches(
     )
 
 
-def _versions() -> dict[str, Any]:
+def versions() -> dict[str, Any]:
+    """Return what all results depend on, for the keys of the cache."""
     return {"stages": VERSION, "opencv": cv2.__version__}
 
 
 def _packed(features: Features) -> dict[str, np.ndarray]:
     """Store positions on whole pixels as such: they are most of a cache."""
-    whole = features.xy.astype(np.int16)
+    small = bool((np.abs(features.xy) < 2**15).all())
+    whole = features.xy.astype(np.int16) if small else features.xy
     exact = (whole == features.xy).all()
     arrays = {
         "xy": whole if exact else features.xy,

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from ..datasets.planar import PlanarPair
-from ..errors import DeepDetectError
 from ..image import load_image
 from ..methods import Method
-from .cache import Arrays, StageCache, file_digest
+from .cache import Arrays, CacheError, StageCache, file_digest
 from .stages import (
     FoundFeatures,
     FoundMatches,
     MatchSettings,
     find_keypoints,
     find_matches,
+    versions,
 )
 
 
@@ -76,6 +76,7 @@ class Workspace:
             "version": method.version,
             "images": [file_digest(image) for image in images],
             **depends,
+            **versions(),
         }
         return self.cache.get("metrics", key, make)
 
@@ -83,7 +84,9 @@ class Workspace:
         """Do a piece of work; when it fails, note what is left out and why, and return None."""
         try:
             return work(*arguments)
-        except (DeepDetectError, ArithmeticError, ValueError, RuntimeError) as error:
+        except CacheError:
+            raise
+        except Exception as error:  # whatever a detector from outside may raise
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             self.left_out.append(f"{what}: {reason}")
             return None

@@ -36,7 +36,8 @@ def load_hpatches(folder: str | Path) -> list[PlanarScene]:
         ImageError: there is no scene, or a file of one is missing.
     """
     root = Path(folder)
-    scenes = [*sorted(root.glob("i_*")), *sorted(root.glob("v_*"))]
+    found = [*sorted(root.glob("i_*")), *sorted(root.glob("v_*"))]
+    scenes = [path for path in found if path.is_dir()]
     if not scenes:
         raise ImageError(
             f"there are no HPatches scenes in {folder}: it must hold folders i_NAME and v_NAME"

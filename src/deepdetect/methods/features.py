@@ -41,6 +41,15 @@ class Features:
         scores = np.asarray(self.scores, np.float32)
         object.__setattr__(self, "xy", xy)
         object.__setattr__(self, "scores", scores)
+        for name, dtype in (("sizes", np.float32), ("angles", np.float32), ("octaves", np.int32)):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, np.asarray(getattr(self, name), dtype))
+        if self.descriptors is not None:
+            rows_found = np.asarray(self.descriptors)
+            kept = rows_found.dtype == np.uint8
+            object.__setattr__(
+                self, "descriptors", rows_found if kept else rows_found.astype(np.float32)
+            )
         rows = [
             len(part)
             for part in (scores, self.sizes, self.angles, self.octaves, self.descriptors)

@@ -63,7 +63,7 @@ def deepdetect_method(
         return Features(points.xy, points.scores, points.image_size)
 
     digest = hashlib.sha256(detector.weights.read_bytes()).hexdigest()[:16]
-    version = f"{digest} {detector.heatmap_options} {selection} {descriptor}"
+    version = f"{digest} {detector.backend} {detector.heatmap_options} {selection} {descriptor}"
     return Method(name, title, detect, descriptor.describe, version=version)
 
 
@@ -98,15 +98,18 @@ def every_pixel_method() -> Method:
     def detect(rgb: np.ndarray) -> Features:
         height, width = rgb.shape[:2]
         row, column = (part.ravel() for part in np.indices((height, width)))
-        scores = 1 - _even_order(column, row)
+        scores = 1 - _even_order(column, row, min(12, (max(height, width) - 1).bit_length()))
         return Features(np.column_stack([column, row]), scores, (width, height))
 
     title = "control: every pixel (a grid, where there is a budget)"
     return Method("every-pixel", title, detect, PAPER_DESCRIPTOR.describe)
 
 
-def _even_order(column: np.ndarray, row: np.ndarray, bits: int = 7) -> np.ndarray:
-    """Order pixels so that the first ones are spread evenly (Bayer's dither matrix), in [0, 1)."""
+def _even_order(column: np.ndarray, row: np.ndarray, bits: int) -> np.ndarray:
+    """Order pixels so that the first ones are spread evenly (Bayer's dither matrix), in [0, 1).
+
+    The matrix of 2^bits columns and rows; float32 holds its values exactly up to 12 bits.
+    """
     order = np.zeros(len(row), np.int64)
     for _ in range(bits):  # the lowest bits of the position decide most
         order = 4 * order + 2 * ((column ^ row) & 1) + (row & 1)

@@ -44,7 +44,7 @@ def importable_method(target: str) -> Method:
             return COMMON.describe(rgb, features)
         return features.descriptors
 
-    source = getattr(sys.modules[function.__module__], "__file__", None)
+    source = getattr(sys.modules.get(target.partition(":")[0]), "__file__", None)
     version = str(Path(source).stat().st_mtime_ns) if source else "1"
     return Method(target, target, detect, describe, version=version)
 
@@ -57,9 +57,10 @@ def _find(target: str) -> Callable[[np.ndarray], Mapping[str, np.ndarray]]:
         sys.path.insert(0, here)
     try:
         function = getattr(importlib.import_module(module_name), name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except Exception as error:  # the module's own code runs here
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise OptionError(
-            f"{target} cannot be imported ({error}): name it as package.module:function"
+            f"{target} cannot be imported ({reason}): name it as package.module:function"
         ) from None
     finally:
         if added:

@@ -40,10 +40,11 @@ def onnx_method(path: str | Path, name: str | None = None) -> Method:
         raise WeightsError(f"{file} cannot be read ({error.strerror}): check the path") from None
     session = _open(data, file)
     outputs = [output.name for output in session.get_outputs()]
-    if len(session.get_inputs()) != 1 or not {"keypoints", "scores"} <= set(outputs):
-        raise WeightsError(
-            f"{file} must have one input and the outputs keypoints and scores, not {outputs}"
-        )
+    shapes = [entry.shape for entry in session.get_inputs()]
+    if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
+        raise WeightsError(f"{file} must have one input 1x3xHxW, RGB, not {shapes}")
+    if not {"keypoints", "scores"} <= set(outputs):
+        raise WeightsError(f"{file} must have the outputs keypoints and scores, not {outputs}")
 
     def detect(rgb: np.ndarray) -> Features:
         return _detect(session, outputs, rgb)

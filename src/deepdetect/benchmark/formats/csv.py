@@ -24,5 +24,8 @@ def save_csv(report: Report, folder: Path) -> list[Path]:
         ):
             writer = csv.writer(file)
             writer.writerow(column.title for column in table.columns)
-            writer.writerows(["" if cell is None else cell for cell in row] for row in table.rows)
+            # What is not a number is the only value that differs from itself.
+            writer.writerows(
+                ["" if cell is None or cell != cell else cell for cell in row] for row in table.rows
+            )
     return paths

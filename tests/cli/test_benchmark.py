@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+from skimage import data
+
+from deepdetect.benchmark import BENCHMARKS
+from deepdetect.cli import main
+from deepdetect.cli.benchmark import NAMES
+
+FILES = {"index.html", "report.md", "report.json", "tables/foreground.csv"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One small photograph with a mask."""
+    root = tmp_path_factory.mktemp("data") / "foreground"
+    root.mkdir()
+    Image.fromarray(data.chelsea()[60:124, 90:170]).save(root / "cat.png")
+    mask = np.zeros((64, 80), np.uint8)
+    mask[:, :40] = 255
+    Image.fromarray(mask).save(root / "cat_mask.png")
+    return root.parent
+
+
+@pytest.fixture(scope="module")
+def made(folder: Path, tmp_path_factory: pytest.TempPathFactory):
+    """The first run, whose results the others find."""
+    output = tmp_path_factory.mktemp("output")
+    arguments = ["benchmark", "foreground", "--data", str(folder), "-o", str(output)]
+    result = CliRunner().invoke(main, [*arguments, "--only", "fast, harris"])
+    assert result.exit_code == 0, result.output
+    return result, output
+
+
+def test_the_names_are_those_of_the_benchmarks_and_two_more() -> None:
+    assert set(NAMES) == {*BENCHMARKS, "all", "refine-oxford"}
+
+
+def test_the_report_is_written_and_printed(made, folder: Path) -> None:
+    result, output = made
+    written = {path.relative_to(output).as_posix() for path in output.rglob("*") if path.is_file()}
+    assert {path for path in written if not path.startswith("cache/")} == FILES
+    assert any(path.startswith("cache/keypoints/") for path in written)
+    assert f"report: {output / 'index.html'}" in result.stdout
+    assert "| FAST |" in result.stdout
+    assert "Traceback" not in result.output
+    gray = cv2.cvtColor(cv2.imread(str(folder / "foreground" / "cat.png")), cv2.COLOR_BGR2GRAY)
+    points = cv2.FastFeatureDetector_create().detect(gray, None)
+    share = np.mean([p.pt[0] < 40 for p in points])
+    rows = (output / "tables" / "foreground.csv").read_text().splitlines()
+    (fast,) = [row.split(",") for row in rows if row.startswith("FAST,")]
+    assert float(fast[1]) == pytest.approx(share)
+    assert float(fast[3]) == pytest.approx(len(points) / gray.size)
+    assert [row.split(",")[0] for row in rows[:3]] == ["method", "FAST", "Harris"]
+
+
+def test_json_can_be_parsed_and_names_the_files(made, folder: Path, run) -> None:
+    _, output = made
+    result = run(
+        *("benchmark", "foreground", "--data", folder, "-o", "out", "--only", "fast,harris"),
+        *("--cache", output / "cache", "--json"),
+    )
+    assert result.exit_code == 0, result.output
+    values = json.loads(result.stdout)
+    assert {Path(path).relative_to("out").as_posix() for path in values["files"]} == FILES
+    assert all(Path(path).is_file() for path in values["files"])
+    assert [row["method"] for row in values["tables"]["foreground"]["rows"]][:2] == [
+        *("FAST", "Harris"),
+    ]
+    assert values["origin"]["results made, not found in the cache"] == "0"
+    assert values["left_out"] == []
+
+
+def test_a_further_method_is_one_more_row_and_the_rest_is_found(made, folder: Path, run) -> None:
+    _, output = made
+    Path("own_corner_finder.py").write_text(
+        "def find(rgb):\n    return {'keypoints': [[1, 1], [70, 1]], 'scores': [1, 1]}\n"
+    )
+    result = run(
+        *("benchmark", "foreground", "--data", folder / "foreground", "-o", "out"),
+        *("--only", "fast", "--method", "own_corner_finder:find", "--method", "agast"),
+        *("--cache", output / "cache", "--json"),
+    )
+    assert result.exit_code == 0, result.output
+    values = json.loads(result.stdout)
+    rows = {row["method"]: row for row in values["tables"]["foreground"]["rows"]}
+    assert list(rows)[:3] == ["FAST", "own_corner_finder:find", "AGAST"]
+    assert rows["own_corner_finder:find"]["share on the foreground"] == 0.5
+    # Keypoints and shares of the two new methods.
+    assert values["origin"]["results made, not found in the cache"] == "4"
+
+
+def test_no_classical_method_may_be_wanted(made, folder: Path, run) -> None:
+    _, output = made
+    result = run(
+        *("benchmark", "foreground", "--data", folder, "-o", "out", "--only", "none"),
+        *("--cache", output / "cache"),
+    )
+    assert result.exit_code == 0, result.output
+    assert "FAST" not in result.stdout
+    assert "DeepDetect" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        ("oxfort", "'oxford'"),
+        ("forground", "'foreground'"),
+        ("low_visibility", "'low-visibility'"),
+        ("foreground --protocol papers", "'paper'"),
+        ("foreground --protocol paper --protocol standart", "'standard'"),
+        ("foreground --only siift", "'sift'"),
+        ("foreground --only fast,fast-lo", "'fast-low'"),
+        ("foreground --method shi-tomas", "'shi-tomasi'"),
+        ("foreground --method none.onnx", "none.onnx"),
+        ("foreground --method no_such_module:find", "no_such_module"),
+        ("foreground --preset publishd", "'published'"),
+        ("foreground --weights geometri", "'geometry'"),
+        ("oxford", "img1"),
+        ("hpatches", "HPatches"),
+        ("middlebury", "stereo"),
+        ("low-visibility", "dusty"),
+        ("speed", "img1"),
+    ],
+)
+def test_a_wrong_name_ends_with_one_line_and_exit_code_2(
+    run, folder: Path, arguments: str, hint: str
+) -> None:
+    result = run("benchmark", *arguments.split(), "--data", folder, "-o", "out")
+    assert result.exit_code == 2, result.output
+    message = result.stderr.strip()
+    assert message.startswith("deepdetect: ")
+    assert len(message.splitlines()) == 1, message
+    assert hint in message
+    assert not Path("out").exists()
+
+
+def test_missing_data_are_asked_for(run) -> None:
+    result = run("benchmark", "foreground")
+    assert result.exit_code == 2
+    assert "--data" in result.stderr
+
+
+def test_an_output_that_is_a_file_ends_with_one_line(run, folder: Path, made) -> None:
+    _, output = made
+    Path("taken").write_text("")
+    result = run(
+        *("benchmark", "foreground", "--data", folder, "-o", "taken", "--only", "none"),
+        *("--cache", output / "cache"),
+    )
+    assert result.exit_code == 2
+    (message,) = [line for line in result.stderr.splitlines() if line.startswith("deepdetect: ")]
+    assert "cannot write" in message
+    assert "Traceback" not in result.output
+
+
+def test_help_has_words_for_every_option(run) -> None:
+    result = run("benchmark", "--help")
+    assert result.exit_code == 0
+    unwrapped = "".join(result.stdout.split())
+    for name in NAMES:
+        assert name in unwrapped
+    for parameter in main.commands["benchmark"].params:
+        if parameter.param_type_name == "option":
+            assert parameter.help, parameter.name
