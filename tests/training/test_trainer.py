@@ -21,7 +21,13 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 from deepdetect import DeepDetect, ImageError, OptionError, WeightsError  # noqa: E402
 from deepdetect.bundled import bundled_weights  # noqa: E402
 from deepdetect.network.espnet import ESPNet  # noqa: E402
-from deepdetect.network.weights import load_network, weights_digest  # noqa: E402
+from deepdetect.network.weights import (  # noqa: E402
+    load_mean_network,
+    load_network,
+    read_notes,
+    save_weights,
+    weights_digest,
+)
 from deepdetect.training.checkpoint import read_checkpoint, restore, save_checkpoint  # noqa: E402
 from deepdetect.training.device import DeviceOptions, Engine  # noqa: E402
 from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
@@ -269,6 +275,27 @@ def test_a_run_can_start_from_trained_weights(
         assert file.metadata()["start"] == weights_digest(load_network(start))
     with pytest.raises(OptionError, match="started from other weights"):
         train(photographs, tmp_path / "moved", options, device=PLAIN, workers=1)
+
+
+def test_a_run_can_start_from_the_mean_of_several_weights(
+    unbroken: Path, photographs: Path, tmp_path: Path
+) -> None:
+    first = unbroken / "best.safetensors"
+    other = tmp_path / "other.safetensors"
+    changed = load_network(first)
+    with torch.no_grad():
+        changed.classifier.weight += 2
+    save_weights(changed, other, {})
+    mean = load_mean_network([first, other]).state_dict()
+    for name, value in load_network(first).state_dict().items():
+        expected = value + 1 if name == "classifier.weight" else value
+        torch.testing.assert_close(mean[name], expected)
+    recipe = TrainingOptions(
+        stages=(Stage(64, 4, 1),), short_sides=(64,), detectors=("fast",), validations=1
+    )
+    train(photographs, tmp_path / "run", recipe, start=[first, other], device=PLAIN, workers=1)
+    notes = read_notes(tmp_path / "run" / "best.safetensors")
+    assert notes["start"] == weights_digest(load_mean_network([first, other]))
 
 
 def test_missing_weights_to_start_from_are_refused_before_any_work(

@@ -42,9 +42,10 @@ if TYPE_CHECKING:
 @click.option("--labels", type=PATH, help="Folder for the label cache.  [default: in the run's]")
 @click.option(
     "--start",
+    multiple=True,
     metavar="NAME|FILE",
     help="Weights to start from: matching or geometry, the bundled ones, or a .safetensors "
-    "file.  [default: random ones]",
+    "file; repeated, the mean of all.  [default: random ones]",
 )
 @click.option(
     "--stage",
@@ -123,7 +124,7 @@ def train(
     output: Path,
     validation: Path | None,
     labels: Path | None,
-    start: str | None,
+    start: tuple[str, ...],
     device: str,
     precision: str,
     compile_network: bool | None,
@@ -164,7 +165,7 @@ def train(
     arguments = {
         "validation": validation,
         "labels": labels,
-        "start": start,
+        "start": start or None,
         "device": DeviceOptions(device, precision, compile_network, threads, loaders),
         "workers": workers,
         "say": None if as_json else click.echo,

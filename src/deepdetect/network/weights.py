@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -51,6 +52,27 @@ def load_network(path: str | Path) -> ESPNet:
             "use weights that deepdetect has trained, or the published ones"
         ) from None
     return network.eval()
+
+
+def load_mean_network(paths: Sequence[str | Path]) -> ESPNet:
+    """Make the network from the mean of several weights files.
+
+    The mean of runs that went on from one another is often better than each of them
+    (Wortsman et al., "Model soups", 2022). Counts, which have no mean, are the first file's.
+
+    Raises:
+        WeightsError: a file is missing, damaged or does not fit the network.
+    """
+    networks = [load_network(path) for path in paths]
+    states = [network.state_dict() for network in networks]
+    mean = {
+        name: sum(state[name] for state in states) / len(states)
+        if value.is_floating_point()
+        else value
+        for name, value in states[0].items()
+    }
+    networks[0].load_state_dict(mean)
+    return networks[0]
 
 
 def read_notes(path: str | Path) -> dict[str, str]:

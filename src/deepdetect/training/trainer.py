@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -11,7 +11,7 @@ import torch
 from ..bundled import find_weights
 from ..errors import OptionError
 from ..network.espnet import ESPNet
-from ..network.weights import load_network
+from ..network.weights import load_mean_network
 from ..progress import progress
 from .device import DeviceOptions
 from .preparation import Sources, prepare
@@ -27,7 +27,7 @@ def train(
     *,
     validation: str | Path | None = None,
     labels: str | Path | None = None,
-    start: str | Path | None = None,
+    start: str | Path | Sequence[str | Path] | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
     say: Callable[[str], None] | None = None,
@@ -46,7 +46,7 @@ def train(
         validation: folder of other photographs; default: some are held out.
         labels: folder for the label cache; default: in `output`.
         start: weights (.safetensors) to start from, or "matching" or "geometry" for those
-            inside the package; default: random ones, by the seed.
+            inside the package; of several, their mean; default: random ones, by the seed.
         device: how the network is run.
         workers: processes that make labels; default one for each processor.
         say: takes the one line that says how the network is run; without it there is
@@ -81,7 +81,7 @@ def profile(
     steps: int = 30,
     validation: str | Path | None = None,
     labels: str | Path | None = None,
-    start: str | Path | None = None,
+    start: str | Path | Sequence[str | Path] | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
     say: Callable[[str], None] | None = None,
@@ -116,12 +116,15 @@ def profile(
     return profiles
 
 
-def _start(options: TrainingOptions, start: str | Path | None) -> tuple[TrainingOptions, ESPNet]:
+def _start(
+    options: TrainingOptions, start: str | Path | Sequence[str | Path] | None
+) -> tuple[TrainingOptions, ESPNet]:
     """Make the network with the weights that the run starts from, and settle what hangs on them."""
     if start is not None:
         if options.frozen_batch_norm is None:
             options = dataclasses.replace(options, frozen_batch_norm=True)
-        return options, load_network(find_weights(start, ".safetensors"))
+        chosen = [start] if isinstance(start, (str, Path)) else list(start)
+        return options, load_mean_network([find_weights(name, ".safetensors") for name in chosen])
     if options.frozen_batch_norm:
         raise OptionError(
             "random weights have no batch statistics to keep: name trained ones with --start, "
