@@ -17,7 +17,7 @@ test: $(VENV)/.test test-opencv4
 
 # The label detectors live in other modules of OpenCV 4 than of OpenCV 5.
 test-opencv4: $(VENV_OPENCV4)/.test
-	$(VENV_OPENCV4)/bin/python -m pytest -q -p no:cacheprovider tests/labels tests/descriptors tests/matchers tests/geometry
+	$(VENV_OPENCV4)/bin/python -m pytest -q -p no:cacheprovider tests/labels tests/descriptors tests/matchers tests/geometry tests/methods
 
 lint: $(VENV)/.test
 	$(VENV)/bin/ruff check .
@@ -41,7 +41,7 @@ $(VENV)/.demo: $(VENV)/bin/hatchling pyproject.toml
 
 $(VENV)/.test: $(VENV)/bin/hatchling pyproject.toml
 	$(VENV)/bin/python -m pip install $(PIP_FLAGS) -c $(LOCK) --no-build-isolation \
-		-e '.[data,demo,openvino,test,train]'
+		-e '.[benchmark,data,demo,openvino,test,train]'
 	touch $@
 
 $(VENV_OPENCV4)/.test: $(LOCK) pyproject.toml
@@ -49,5 +49,5 @@ $(VENV_OPENCV4)/.test: $(LOCK) pyproject.toml
 	grep -v opencv $(LOCK) > $(VENV_OPENCV4)/lock.txt
 	$(VENV_OPENCV4)/bin/python -m pip install $(PIP_FLAGS) -c $(VENV_OPENCV4)/lock.txt hatchling editables
 	$(VENV_OPENCV4)/bin/python -m pip install $(PIP_FLAGS) -c $(VENV_OPENCV4)/lock.txt --no-build-isolation \
-		-e '.[demo,test]' $(OPENCV4)
+		-e '.[benchmark,demo,test]' $(OPENCV4)
 	touch $@

@@ -105,6 +105,11 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
         Image.fromarray(np.full((160, 200), 120, np.uint8)).save("scene/disparity.png")
         truth = {"file": "disparity.png", "value_per_pixel": 4, "unknown": 0}
         Path("scene/calib.json").write_text(json.dumps({"ground_truth": truth}))
+    if "benchmark" in words:
+        (folder / "masked").mkdir()
+        shutil.copy("left.png", "masked/left.png")
+        mask = np.asarray(Image.open("left.png").convert("L")) > 100
+        Image.fromarray(mask).save("masked/left_mask.png")
     (folder / "photos").mkdir()
     shutil.copy("left.png", "photos")
     shutil.copy("right.png", "photos/another.png")
@@ -116,6 +121,8 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
         "PHOTOS": "photos",
         "SAMPLES": "samples",
         "SCENES": "scene",
+        "NAME": "foreground",
+        "DATA": "masked",
     }
     command = [sys.executable, "-m", *(places.get(word, word) for word in words)]
     done = subprocess.run(command, capture_output=True, text=True)
