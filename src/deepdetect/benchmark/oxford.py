@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ..datasets.oxford import find_scene, load_oxford
 from ..datasets.planar import PlanarPair, PlanarScene
+from ..weights_quality import PAIRS
 from . import paper_figures, planar_paper
 from .charts import bar_chart
 from .options import BenchmarkOptions
@@ -14,12 +15,6 @@ from .paper_numbers import DENSITY, MATCHES, REPEATABILITY
 from .planar_sections import standard_sections, standard_steps
 from .report import Cell, Figure, Section, Table
 from .workspace import Workspace
-
-PAIRS = (
-    *(("graf", 6), ("wall", 6), ("bikes", 6), ("leuven", 6), ("trees", 6), ("ubc", 6)),
-    ("boat", 2),
-)
-"""The pairs of Table II: scene, and number of the second image."""
 
 PAPER = "DeepDetect, in the paper"
 

@@ -11,11 +11,11 @@ from ..datasets.planar import PlanarPair, PlanarScene
 from ..geometry.residuals import transfer_errors
 from ..methods import Method
 from ..metrics import published_repeatability
+from ..weights_quality import CORRECT
 from .report import Cell, Column, Table
 from .stages import MatchSettings
 from .workspace import Workspace, matrix_key
 
-CORRECT = 1.0  # pixels, strictly under
 PAPER_MATCHING = MatchSettings(matcher="flann", ratio=0.99)
 
 
