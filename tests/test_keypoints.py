@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from deepdetect import DeepDetect
 from deepdetect.errors import OptionError
 from deepdetect.keypoints import Keypoints, SelectionOptions, select_keypoints
 
@@ -96,8 +97,20 @@ def test_shapes_that_do_not_fit(xy: list, scores: list) -> None:
 # The selection.
 
 
-def ranked(scores: list[tuple[float, int, int]]) -> list[tuple[float, int, int]]:
-    return sorted(scores, key=lambda one: (-one[0], one[1], one[2]))
+def bayer(bits: int) -> np.ndarray:
+    """The dither matrix of 2^bits rows, from its definition by smaller ones."""
+    if bits == 0:
+        return np.zeros((1, 1), int)
+    smaller = 4 ** (bits - 1) * np.array([[0, 2], [3, 1]])
+    tiles = 2 ** (bits - 1)
+    return np.tile(smaller, (tiles, tiles)) + np.repeat(np.repeat(bayer(bits - 1), 2, 0), 2, 1)
+
+
+def ranked(
+    scores: list[tuple[float, int, int]], shape: tuple[int, ...]
+) -> list[tuple[float, int, int]]:
+    order = bayer(max(1, (max(shape) - 1).bit_length()))
+    return sorted(scores, key=lambda one: (-one[0], order[one[1], one[2]]))
 
 
 def reference(heatmap: np.ndarray, options: SelectionOptions) -> list[tuple[int, int]]:
@@ -111,7 +124,8 @@ def reference(heatmap: np.ndarray, options: SelectionOptions) -> list[tuple[int,
             for column in range(width)
             if heatmap[row, column] > limit
             and not (options.ignore is not None and options.ignore[row, column])
-        ]
+        ],
+        heatmap.shape,
     )
     radius = options.nms_radius
     kept: list[tuple[float, int, int]] = []
@@ -211,13 +225,32 @@ def test_the_most_probable_are_kept(count: int) -> None:
 @pytest.mark.parametrize(
     "options", [SelectionOptions(max_keypoints=3), SelectionOptions(density=3 / 400)]
 )
-def test_ties_go_by_row_then_column(options: SelectionOptions) -> None:
+def test_ties_do_not_go_before_better_ones(options: SelectionOptions) -> None:
     heatmap = np.zeros((20, 20), np.float32)
     for row, column in [(2, 9), (2, 15), (4, 0), (11, 3)]:
         heatmap[row, column] = 0.75
-    assert select_keypoints(heatmap, options).xy.tolist() == [[9, 2], [15, 2], [0, 4]]
     heatmap[19, 19] = 0.9
-    assert select_keypoints(heatmap, options).xy.tolist() == [[9, 2], [15, 2], [19, 19]]
+    found = select_keypoints(heatmap, options).xy.tolist()
+    assert len(found) == 3
+    assert [19, 19] in found
+
+
+@pytest.mark.parametrize("radius", [0, 1])
+@pytest.mark.parametrize("count", [16, 64, 500])
+def test_ties_are_spread_over_the_image(radius: int, count: int) -> None:
+    """The network's probabilities are 1 to the last bit on a tenth of an image."""
+    heatmap = np.ones((120, 200), np.float32)
+    options = SelectionOptions(max_keypoints=count, nms_radius=radius)
+    xy = select_keypoints(heatmap, options).xy
+    cells = (xy // (50, 60)).astype(int)
+    share = np.bincount(cells[:, 1] * 4 + cells[:, 0], minlength=8) / count
+    np.testing.assert_allclose(share, 1 / 8, atol=1.1 / count + 0.03)
+
+
+def test_the_network_s_best_keypoints_span_a_photograph(photo: np.ndarray) -> None:
+    keypoints = DeepDetect().detect(photo, max_keypoints=300)
+    cells = (keypoints.xy // 64).astype(int)
+    assert len(np.unique(cells[:, 1] * 4 + cells[:, 0])) >= 14
 
 
 def test_a_plateau_leaves_its_first_pixel() -> None:

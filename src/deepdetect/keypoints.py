@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from .errors import OptionError
+from .even_order import even_order
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,8 @@ def select_keypoints(
     Args:
         heatmap: (H, W) float32 probability.
         options: what to choose. The order is: ignore mask, threshold, suppression,
-            density or maximum number. Equal probabilities go by row, then column.
+            density or maximum number. Where probabilities are equal, as the many that float32
+            rounds to 1, those come first that spread the keypoints evenly (`even_order`).
 
     Returns:
         Keypoints on pixel centres, in the order of rows and columns.
@@ -149,11 +151,17 @@ def select_keypoints(
         pixels, scores = pixels[kept], scores[kept]
     count = _wanted_count(options, heatmap.size)
     if count is not None and len(pixels) > count:
-        # A stable sort keeps the earlier of equal pixels.
-        kept = np.sort(np.argsort(-scores, kind="stable")[:count])
+        kept = np.sort(_ranked(pixels, scores, heatmap.shape)[:count])
         pixels, scores = pixels[kept], scores[kept]
     row, column = np.divmod(pixels, width)
     return Keypoints(np.stack([column, row], 1).astype(np.float32), scores, (width, height))
+
+
+def _ranked(pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the rows from the best to the worst; equals are spread evenly over the image."""
+    row, column = np.divmod(pixels, shape[1])
+    spread = even_order(np.column_stack([column, row]), (shape[1], shape[0]))
+    return np.lexsort((spread, -scores))
 
 
 def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
@@ -175,7 +183,7 @@ def _suppress(
     and so on with what is left, until nothing is: the same as going through the list.
     """
     left = np.zeros(shape, np.float64)
-    left.ravel()[pixels[np.argsort(-scores, kind="stable")]] = np.arange(len(pixels), 0, -1)
+    left.ravel()[pixels[_ranked(pixels, scores, shape)]] = np.arange(len(pixels), 0, -1)
     kept = np.zeros(shape, np.uint8)
     window = np.ones((2 * int(radius) + 1,) * 2, np.uint8)  # a box is dilated in linear time
     while left.any():

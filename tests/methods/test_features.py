@@ -64,16 +64,26 @@ def test_the_best_are_those_with_the_highest_scores_in_their_own_order() -> None
     assert some([0.1, 0.9, 0.5, 0.7]).best(2).xy[:, 0].tolist() == [1, 3]
 
 
-def test_ties_for_the_best_go_to_the_earlier() -> None:
-    assert some([0.5, 0.9, 0.5, 0.5, 0.9]).best(3).xy[:, 0].tolist() == [0, 1, 4]
-    assert some([0.5] * 6).best(4).xy[:, 0].tolist() == [0, 1, 2, 3]
+def test_ties_for_the_best_are_spread_over_the_image() -> None:
+    xy = np.stack(np.meshgrid(np.arange(64), np.arange(48)), -1).reshape(-1, 2)
+    best = Features(xy, np.ones(len(xy)), (64, 48)).best(12)
+    assert len(np.unique(best.xy // 16, axis=0)) == 12
+    assert some([0.5, 0.9, 0.5, 0.5, 0.9]).best(2).xy[:, 0].tolist() == [1, 4]
+
+
+def test_each_position_is_once_among_the_distinct_with_its_best_score() -> None:
+    xy = np.array([[1, 1], [2, 2], [1, 1], [3.5, 1], [2, 2]])
+    found = Features(xy, np.array([0.2, 0.9, 0.7, 0.1, 0.3]), (8, 8)).distinct()
+    assert found.xy.tolist() == [[2, 2], [1, 1], [3.5, 1]]
+    np.testing.assert_allclose(found.scores, [0.9, 0.7, 0.1])
+    assert len(found.distinct()) == 3
 
 
 @given(scores=st.lists(st.integers(0, 4).map(float), max_size=30), count=st.integers(0, 35))
-def test_the_best_equal_a_sort_by_score_and_row(scores: list[float], count: int) -> None:
-    chosen = sorted(range(len(scores)), key=lambda row: (-scores[row], row))[:count]
+def test_the_best_have_the_highest_scores(scores: list[float], count: int) -> None:
     best = some(scores).best(count)
-    assert best.xy[:, 0].tolist() == sorted(chosen)
+    chosen = best.xy[:, 0].astype(int).tolist()
+    assert sorted(scores[row] for row in chosen) == sorted(sorted(scores, reverse=True)[:count])
     # All columns stay together.
     for column in (best.sizes, best.angles, best.octaves, best.descriptors[:, 3]):
         assert column.tolist() == sorted(chosen)

@@ -28,6 +28,7 @@ def exact_neighbours(
     rows = np.empty((len(queries), count), np.int32)
     distances = np.empty((len(queries), count), np.float32)
     # Double precision: the expansion below loses digits where distances are small.
+    queries, base = (np.asarray(part, np.float32) for part in (queries, base))
     wide = base.astype(np.float64)
     lengths = np.einsum("ij,ij->i", wide, wide)
     step = max(1, BLOCK // (2 * max(len(base), 2 * count * base.shape[1])))

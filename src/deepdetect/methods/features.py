@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from ..errors import OptionError
+from ..even_order import even_order
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +87,21 @@ class Features:
         return len(self) / (self.image_size[0] * self.image_size[1])
 
     def best(self, count: int) -> Features:
-        """Return the keypoints with the highest scores, in their order; ties go to the earlier."""
+        """Return the keypoints with the highest scores, in their order.
+
+        Of equal scores those come first that are spread evenly over the image: scores that are
+        rounded, or equal for all, must not favour its top.
+        """
         if len(self) <= count:
             return self
-        return self[np.sort(np.argsort(-self.scores, kind="stable")[:count])]
+        spread = even_order(self.xy, self.image_size)
+        return self[np.sort(np.lexsort((spread, -self.scores))[:count])]
+
+    def distinct(self) -> Features:
+        """Return each position once, with its highest score: SIFT doubles some for directions."""
+        order = np.argsort(-self.scores, kind="stable")
+        _, first = np.unique(self.xy[order], axis=0, return_index=True)
+        return self if len(first) == len(self) else self[np.sort(order[first])]
 
     @classmethod
     def from_opencv(

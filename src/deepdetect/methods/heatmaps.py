@@ -13,6 +13,7 @@ import numpy as np
 from ..controls import RandomPoints
 from ..descriptors import get_descriptor
 from ..detector import DeepDetect
+from ..even_order import even_order
 from ..image import luma
 from ..keypoints import SelectionOptions, select_keypoints
 from .features import Features
@@ -98,20 +99,8 @@ def every_pixel_method() -> Method:
     def detect(rgb: np.ndarray) -> Features:
         height, width = rgb.shape[:2]
         row, column = (part.ravel() for part in np.indices((height, width)))
-        scores = 1 - _even_order(column, row, min(12, (max(height, width) - 1).bit_length()))
-        return Features(np.column_stack([column, row]), scores, (width, height))
+        xy = np.column_stack([column, row])
+        return Features(xy, 1 - even_order(xy, (width, height)), (width, height))
 
     title = "control: every pixel (a grid, where there is a budget)"
     return Method("every-pixel", title, detect, PAPER_DESCRIPTOR.describe)
-
-
-def _even_order(column: np.ndarray, row: np.ndarray, bits: int) -> np.ndarray:
-    """Order pixels so that the first ones are spread evenly (Bayer's dither matrix), in [0, 1).
-
-    The matrix of 2^bits columns and rows; float32 holds its values exactly up to 12 bits.
-    """
-    order = np.zeros(len(row), np.int64)
-    for _ in range(bits):  # the lowest bits of the position decide most
-        order = 4 * order + 2 * ((column ^ row) & 1) + (row & 1)
-        column, row = column >> 1, row >> 1
-    return (order / 4**bits).astype(np.float32)
