@@ -108,7 +108,7 @@ def match_images(
         heatmaps = [detector.heatmap(image) for image in rgb]
     with _timed(seconds, "keypoints"):
         keypoints = [select_keypoints(heatmap, chosen.selection) for heatmap in heatmaps]
-    _check_memory(keypoints)
+    check_memory([len(points) for points in keypoints])
     with _timed(seconds, "descriptors"):
         describe = get_descriptor(chosen.descriptor)
         descriptors = [
@@ -155,16 +155,19 @@ def _configured(
     return detector.configured(heatmap)
 
 
-def _check_memory(keypoints: Sequence[Keypoints]) -> None:
+def check_memory(keypoints: Sequence[int]) -> None:
     """Stop before the descriptors and their search trees fill the memory.
 
+    Args:
+        keypoints: how many there are in each image.
+
     Raises:
-        OptionError: there are too many keypoints.
+        OptionError: there are too many.
     """
-    needed = sum(len(points) for points in keypoints) * BYTES_A_KEYPOINT
+    needed = sum(keypoints) * BYTES_A_KEYPOINT
     if needed > free_memory():
         raise OptionError(
-            f"{len(keypoints[0]):,} and {len(keypoints[1]):,} keypoints need about "
+            f"{' and '.join(f'{count:,}' for count in keypoints)} keypoints need about "
             f"{needed / 1e9:.0f} GB of memory to be matched: make them fewer with "
             "max_keypoints, density, or a smaller resolution"
         )

@@ -323,6 +323,30 @@ def test_archives_and_single_files_are_put_together(server: Server, tmp_path: Pa
         assert not (tmp_path / "wrong.download").exists()
 
 
+def test_a_mirror_begins_anew_where_no_checksum_tells_the_bytes(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    """As a mirror that has the same data in another kind of archive."""
+    other = tar_of(NAMES)
+    server.contents = {"/mirror.zip": other}
+    server.break_after = 400_000  # more than the mirror's whole file
+    assert len(other) < 400_000
+    two = with_file(dataset, urls=(server.url, other_file(server)), checksum=None)
+    assert unpacked(get_dataset(two, tmp_path / "tiny")) == NAMES
+    assert server.ranges == [None, None]
+
+
+def test_a_damaged_tar_is_refused_without_a_checksum(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    content = bytearray(tar_of(NAMES))
+    content[-6] ^= 255  # in the checksum that gzip has at its end
+    server.content = bytes(content)
+    with pytest.raises(DeepDetectError, match="no archive"):
+        get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")
+    assert not (tmp_path / "tiny").exists()
+
+
 def test_what_is_no_archive_is_refused(
     dataset: RemoteDataset, server: Server, tmp_path: Path
 ) -> None:

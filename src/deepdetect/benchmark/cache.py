@@ -17,6 +17,9 @@ from ..errors import DeepDetectError
 Arrays = Mapping[str, np.ndarray]
 
 
+UNRELATED = frozenset({"cli", "training"})
+"""Packages that no result of a benchmark goes through."""
+
 NAMES = "names of the arrays"
 """Key of the list of all others, by which a file that lost some is known."""
 
@@ -93,6 +96,20 @@ def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file; it is read once in a process, and when it has changed."""
     state = path.stat()
     return _digest(path.resolve(), state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=1)
+def source_digest() -> str:
+    """Return a digest of the package's own sources but for the command line's.
+
+    A result that was made by other code is not used: no number that is raised by hand is forgotten.
+    """
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        if path.relative_to(root).parts[0] not in UNRELATED:
+            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 @lru_cache(maxsize=4096)

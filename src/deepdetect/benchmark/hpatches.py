@@ -8,13 +8,13 @@ from ..datasets.hpatches import is_illumination, is_usual, load_hpatches
 from ..datasets.planar import PlanarScene
 from . import planar_paper
 from .options import BenchmarkOptions
-from .paper_figures import match_figure
+from .paper_figures import drawn_figures, match_figure
 from .paper_numbers import MOST_MATCHES
 from .planar_sections import standard_sections, standard_steps
 from .report import Cell, Column, Section, Table
 from .workspace import Workspace
 
-DRAWN = 4  # scenes of Figure 7
+DRAWN = 4  # scenes of Figure 7, half of each kind
 
 
 def hpatches_steps(workspace: Workspace, options: BenchmarkOptions) -> int:
@@ -89,8 +89,15 @@ def _paper_section(
     matches = planar_paper.matches_table(
         workspace, options.matching_methods(), last, "hpatches_matches"
     )
-    figures = tuple(
-        match_figure(workspace, options.own(), pair, "Figure 7") for pair in last[:DRAWN]
+    drawn = [
+        pair
+        for kind in (True, False)
+        for pair in [p for p, s in zip(last, scenes, strict=True) if is_illumination(s) is kind][
+            : DRAWN // 2
+        ]
+    ]
+    figures = drawn_figures(
+        workspace, [(match_figure, options.own(), pair, "Figure 7") for pair in drawn]
     )
     return Section(
         "HPatches, the paper's protocol",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ..datasets.low_visibility import load_low_visibility
 from . import planar_paper
 from .options import BenchmarkOptions
-from .paper_figures import keypoint_figure, match_figure
+from .paper_figures import drawn_figures, keypoint_figure, match_figure
 from .planar_sections import standard_sections, standard_steps
 from .report import Section
 from .workspace import Workspace
@@ -39,9 +39,12 @@ def low_visibility_sections(workspace: Workspace, options: BenchmarkOptions) -> 
                 workspace, options.matching_methods(), pairs, "low_visibility_matches"
             ),
         )
-        figures = (
-            *(keypoint_figure(workspace, options, scene) for scene in scenes),
-            *(match_figure(workspace, options.own(), pair, "Figure 6") for pair in pairs),
+        figures = drawn_figures(
+            workspace,
+            [
+                *((keypoint_figure, options, scene) for scene in scenes),
+                *((match_figure, options.own(), pair, "Figure 6") for pair in pairs),
+            ],
         )
         text = "Nothing moves between the two images of a scene."
         title = "Low visibility, the paper's protocol"

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
+import platform
 import resource
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-INTERVAL = 0.005  # seconds between two looks at the memory
-STATUS = Path("/proc/self/statm")
+STATUS = Path("/proc/self/status")
+RESET = Path("/proc/self/clear_refs")
 
 
 @dataclass
@@ -32,8 +33,9 @@ class Meter:
 def metered() -> Iterator[Meter]:
     """Measure the time and the growth of memory of the block.
 
-    The memory is looked at every 5 ms; where the system does not tell it (not Linux), the
-    growth of the process's peak is taken instead, which is 0 when it was higher before.
+    Before it, freed memory goes back to the system as far as that can be done, and on Linux the
+    process's peak is reset, so that each block is told by itself. Elsewhere it is the growth of
+    the peak, which is 0 when something before the block took more.
 
     Example:
         >>> with metered() as meter:
@@ -42,28 +44,36 @@ def metered() -> Iterator[Meter]:
         True
     """
     meter = Meter()
-    before = _resident()
-    stop = threading.Event()
-
-    def watch() -> None:
-        while not stop.wait(INTERVAL):
-            meter.memory = max(meter.memory, _resident() - before)
-
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
+    before = _start()
     started = time.perf_counter()
     try:
         yield meter
     finally:
         meter.seconds = time.perf_counter() - started
-        stop.set()
-        watcher.join()
-        meter.memory = max(meter.memory, _resident() - before)
+        meter.memory = max(_peak() - before, 0)
 
 
-def _resident() -> int:
-    """Return the memory of this process in bytes."""
+def _start() -> int:
+    """Give freed memory back and reset the peak; return the memory in use, in bytes."""
+    if platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).malloc_trim(0)
+    try:
+        RESET.write_text("5")  # resets VmHWM; see proc(5)
+    except OSError:
+        return _peak()
+    return _status("VmRSS")
+
+
+def _peak() -> int:
     if STATUS.exists():
-        return int(STATUS.read_text().split()[1]) * resource.getpagesize()
+        return _status("VmHWM")
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def _status(name: str) -> int:
+    """Read a line of the process's status, in bytes."""
+    for line in STATUS.read_text().splitlines():
+        if line.startswith(f"{name}:"):
+            return int(line.split()[1]) * 1024
+    return 0

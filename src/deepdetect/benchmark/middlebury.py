@@ -55,7 +55,8 @@ def _scenes(workspace: Workspace) -> list[Path]:
 
 def _methods(options: BenchmarkOptions) -> list[Method]:
     known = [m for m in options.density_methods() if m.name in CLASSICAL_ROWS]
-    return [*known, *options.others, options.native(), *options.native_controls()]
+    own = [options.native(), options.geometry()]
+    return [*known, *options.others, *own, *options.native_controls()]
 
 
 def _scene_table(workspace: Workspace, options: BenchmarkOptions, scene: Path) -> Table:

@@ -11,8 +11,9 @@ from ..heatmap import HeatmapOptions
 from ..keypoints import SelectionOptions
 from ..methods import (
     CLASSICAL,
+    COMMON_DESCRIPTOR,
+    STANDARD,
     Method,
-    PointDescriptor,
     deepdetect_method,
     every_pixel_method,
     random_method,
@@ -20,7 +21,6 @@ from ..methods import (
 
 PROTOCOLS = ("paper", "standard")
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
-COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
 LOW = ("sift-low", "orb-low", "brisk-low", "fast-low", "agast-low", "harris-low", "shi-tomasi-low")
 DEFAULT = ("sift", "orb", "brisk", "fast", "agast", "harris", "shi-tomasi")
 
@@ -84,13 +84,14 @@ class BenchmarkOptions:
 
     def standard_methods(self) -> tuple[Method, ...]:
         """Return the rows of the standard protocol: default settings, ours sparse, controls."""
-        classical = [common(CLASSICAL[name]) for name in self.classical if name in DEFAULT]
+        chosen = [name for name in STANDARD if name in self.classical]
+        classical = [common(STANDARD[name]) for name in chosen]
         others = [method for method in self.others if method.name not in CLASSICAL]
-        own_names = {"sift", "orb"} & set(self.classical) | {m.name for m in self.others}
+        named = {method.name: method for method in self.others if method.name in CLASSICAL}
+        named |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
         systems = [
-            replace(method, name=f"{method.name}-own", title=f"{method.title}, own descriptors")
-            for method in CLASSICAL.values()
-            if method.name in own_names
+            replace(method, name=f"{method.name}-own", title=f"{method.title}, as it is")
+            for method in named.values()
         ]
         own = deepdetect_method(
             self._native(),
@@ -108,6 +109,12 @@ class BenchmarkOptions:
         title = "DeepDetect, native resolution, all pixels over 0.5"
         return deepdetect_method(self._native(), name="deepdetect-native", title=title)
 
+    def geometry(self) -> Method:
+        """Return the bundled weights for geometry, at the image's own size."""
+        detector = DeepDetect("geometry", backend=self.detector.backend)
+        title = 'DeepDetect("geometry"), native resolution, all pixels over 0.5'
+        return deepdetect_method(detector, name="deepdetect-geometry", title=title)
+
     def native_controls(self) -> tuple[Method, Method]:
         """Return as many random points as `native` finds, and every pixel."""
         return random_method(self.native(), name="random-native"), every_pixel_method()
@@ -117,13 +124,18 @@ class BenchmarkOptions:
 
 
 def common(method: Method) -> Method:
-    """Return a method with the descriptor that all detectors get in the standard protocol."""
+    """Return a method with the descriptor that all detectors get in the standard protocol.
+
+    That knows positions only, so each is taken once: SIFT doubles some for their directions.
+    """
     return replace(
         method,
         name=f"{method.name}-common",
+        detect=lambda rgb: method.detect(rgb).distinct(),
         describe=COMMON_DESCRIPTOR.describe,
         binary=False,
         version=f"{method.version} {COMMON_DESCRIPTOR}",
+        detection=f"{method.detection}, distinct",
     )
 
 

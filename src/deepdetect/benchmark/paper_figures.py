@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from importlib import resources
+from typing import Any
 
 import numpy as np
 
+from ..bundled import bundled_weights
 from ..datasets.planar import PlanarPair, PlanarScene
 from ..geometry.residuals import transfer_errors
 from ..image import load_image, luma
@@ -31,23 +33,36 @@ def oxford_figures(
     pairs: Sequence[PlanarPair],
 ) -> list[Figure]:
     """Draw Figures 2, 4, 5 and 6."""
-    figures = []
-    for scene in scenes:
-        if scene.name in KEYPOINT_SCENES:
-            figures.append(keypoint_figure(workspace, options, scene))
-    first = scenes[0].images[0]
-    rgb = load_image(first)
-    label = draw_label(rgb, fuse(luma(rgb)))
-    figures.append(
-        Figure(
-            "masks",
-            f"Figure 4: keypoint and edge masks, and both combined ({scenes[0].name})",
-            picture(label),
+    shown = [scene for scene in scenes if scene.name in KEYPOINT_SCENES]
+    tasks: list[tuple[Any, ...]] = [(keypoint_figure, options, scene) for scene in shown]
+    tasks.append((mask_figure, scenes[0]))
+    if options.detector.weights == bundled_weights("matching"):
+        tasks.append((loss_figure,))
+    else:
+        workspace.left_out.append(
+            "Figure 5, the losses: the package knows those of its own weights only"
         )
-    )
-    figures.append(loss_figure())
-    figures += [match_figure(workspace, options.own(), pair, "Figure 6") for pair in pairs]
-    return figures
+    tasks += [(match_figure, options.own(), pair, "Figure 6") for pair in pairs]
+    return list(drawn_figures(workspace, tasks))
+
+
+def drawn_figures(workspace: Workspace, tasks: Sequence[tuple[Any, ...]]) -> tuple[Figure, ...]:
+    """Draw figures: functions of the workspace, with their other arguments.
+
+    One that fails is left out and noted.
+    """
+    found = [
+        workspace.attempt(f"a picture by {draw.__name__}", draw, workspace, *arguments)
+        for draw, *arguments in tasks
+    ]
+    return tuple(figure for figure in found if figure is not None)
+
+
+def mask_figure(workspace: Workspace, scene: PlanarScene) -> Figure:
+    """Draw Figure 4: the keypoint and the edge mask of an image, and both combined."""
+    rgb = load_image(scene.images[0])
+    title = f"Figure 4: keypoint and edge masks, and both combined ({scene.name})"
+    return Figure("masks", title, picture(draw_label(rgb, fuse(luma(rgb)))))
 
 
 def keypoint_figure(workspace: Workspace, options: BenchmarkOptions, scene: PlanarScene) -> Figure:
@@ -65,7 +80,7 @@ def keypoint_figure(workspace: Workspace, options: BenchmarkOptions, scene: Plan
     return Figure(f"keypoints_{scene.name}", title, picture(side_by_side(panels)))
 
 
-def loss_figure() -> Figure:
+def loss_figure(workspace: Workspace) -> Figure:
     """Draw Figure 5: the losses of the bundled weights' last training run."""
     text = resources.files("deepdetect").joinpath("weights/curves.csv").read_text("utf-8")
     rows = list(csv.DictReader(text.splitlines()))

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..datasets.planar import PlanarScene
-from . import planar_standard
+from . import standard_tables
 from .options import BenchmarkOptions
 from .report import Section
+from .standard_measures import measure
 from .workspace import Workspace
 
 
@@ -35,15 +36,14 @@ def standard_sections(
         text: what the truth is.
     """
     pairs = [pair for scene in scenes for pair in scene.pairs()]
-    results = [
-        planar_standard.measure(workspace, method, pairs) for method in options.standard_methods()
-    ]
+    results = [measure(workspace, method, pairs) for method in options.standard_methods()]
     what = f"{title} ({len(pairs)} pairs)"
     tables = (
-        *planar_standard.repeatability_tables(results, key, what),
-        planar_standard.matching_table(results, key, what),
-        planar_standard.accuracy_table(results, key, what),
-        planar_standard.cost_table(results, key),
+        *standard_tables.repeatability_tables(results, key, what),
+        standard_tables.matching_table(results, key, what),
+        standard_tables.homography_table(results, key, what),
+        standard_tables.accuracy_table(results, key, what),
+        standard_tables.cost_table(results, key),
     )
-    figures = (planar_standard.accuracy_figure(results, key, what),)
+    figures = (standard_tables.accuracy_figure(results, key, what),)
     return [Section(f"{title}, the standard protocol", (text,), tables, figures)]

@@ -47,7 +47,7 @@ class Table:
         note: what a reader must know to read it.
 
     Raises:
-        OptionError: a row has another length.
+        OptionError: a row has another length, or two columns have one title.
     """
 
     key: str
@@ -57,6 +57,9 @@ class Table:
     note: str = ""
 
     def __post_init__(self) -> None:
+        titles = [column.title for column in self.columns]
+        if len(set(titles)) < len(titles):
+            raise OptionError(f"columns of the table {self.key} share a title: {titles}")
         for row in self.rows:
             if len(row) != len(self.columns):
                 raise OptionError(

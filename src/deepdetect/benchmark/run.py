@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..errors import look_up
+from ..errors import ImageError, look_up
 from ..progress import progress
 from ..provenance import provenance
-from .cache import StageCache
+from .cache import StageCache, file_digest
 from .options import BenchmarkOptions
-from .registry import BENCHMARKS
+from .registry import BENCHMARKS, Benchmark
 from .report import Report
 from .workspace import Workspace
 
@@ -36,9 +37,12 @@ def run_benchmarks(
         OptionError: a name is unknown.
         ImageError: data are missing.
     """
+    started = time.monotonic()
     chosen = [look_up("benchmark", name, BENCHMARKS) for name in names]
     store = StageCache(None if cache is None else Path(cache))
     workspace = Workspace(Path(data), store)
+    if len(chosen) > 1:
+        chosen = [one for one in chosen if _has_data(one, workspace, options)]
     total = sum(benchmark.steps(workspace, options) for benchmark in chosen)
     sections = []
     with progress(total, "benchmark", "step", quiet) as bar:
@@ -55,6 +59,18 @@ def run_benchmarks(
         "weights": options.detector.weights.name,
         "results made, not found in the cache": str(store.made),
     }
+    origin["weights' SHA-256"] = file_digest(options.detector.weights)[:16]
+    origin["minutes"] = f"{(time.monotonic() - started) / 60:.1f}"
     title = f"DeepDetect benchmark: {', '.join(names)}"
     left_out = tuple(dict.fromkeys(workspace.left_out))
     return Report(title, origin, tuple(sections), left_out)
+
+
+def _has_data(benchmark: Benchmark, workspace: Workspace, options: BenchmarkOptions) -> bool:
+    """Tell whether a benchmark's data are there; if not, note that it is left out."""
+    try:
+        benchmark.steps(workspace, options)
+    except ImageError as error:
+        workspace.left_out.append(f"the benchmark {benchmark.name}: {error}")
+        return False
+    return True

@@ -13,12 +13,10 @@ import numpy as np
 from ..errors import OptionError
 from ..image import load_image
 from ..matchers import get_matcher, match_descriptors
+from ..matching import check_memory
 from ..methods import Features, Method
-from .cache import StageCache, file_digest
+from .cache import StageCache, file_digest, source_digest
 from .metering import Meter, metered
-
-VERSION = 1
-"""Raised when what the stages compute changes, so that older results are not used."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +96,7 @@ def find_matches(
         both = [features.best(settings.budget) for features in both]
 
     def make() -> dict[str, np.ndarray]:
+        check_memory([len(features) for features in both])
         rgb = [load_image(image) for image in images]
         with metered() as describing:
             descriptors = [
@@ -146,7 +145,7 @@ def find_matches(
 
 def versions() -> dict[str, Any]:
     """Return what all results depend on, for the keys of the cache."""
-    return {"stages": VERSION, "opencv": cv2.__version__}
+    return {"sources": source_digest(), "opencv": cv2.__version__, "numpy": np.__version__}
 
 
 def _packed(features: Features) -> dict[str, np.ndarray]:

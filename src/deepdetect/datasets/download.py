@@ -71,7 +71,9 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
         DeepDetectError: no host gives it; the last one's trouble is told.
     """
     failed: DeepDetectError | None = None
-    for url in file.urls:
+    for k, url in enumerate(file.urls):
+        if k and file.checksum is None:
+            _part(path).unlink(missing_ok=True)  # nothing tells that the hosts' bytes are the same
         try:
             _download_from(url, file, path, quiet)
             return
@@ -127,7 +129,10 @@ def _resuming(part: Path, file: RemoteFile, quiet: bool) -> Callable[..., None]:
         have = part.stat().st_size if part.exists() else 0
         headers = {"Range": f"bytes={have}-"} if have else {}
         with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as response:
-            if response.status_code == 416:  # nothing is missing
+            if response.status_code == 416:  # nothing is missing, as the checksum will tell
+                if file.checksum is None:
+                    part.unlink()
+                    raise requests.ConnectionError("what is there is of another file")
                 _second_name(part, Path(output))
                 return
             response.raise_for_status()

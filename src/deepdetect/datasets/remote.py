@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import shutil
 import tarfile
 import zipfile
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +17,8 @@ from ..image import find_images
 from ..progress import progress
 from .contents import content_digest
 from .download import RemoteFile, download, have_pooch, partial_size
+
+GZIP = b"\x1f\x8b"
 
 
 @dataclass(frozen=True)
@@ -159,7 +163,7 @@ def _place(file: RemoteFile, path: Path, target: Path, quiet: bool) -> None:
     target.mkdir(parents=True, exist_ok=True)
     try:
         _unpack(path, target, file.inside, quiet)
-    except (zipfile.BadZipFile, tarfile.TarError, EOFError):
+    except (zipfile.BadZipFile, tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError):
         raise DeepDetectError(
             f"{file.urls[0]} is no archive that can be unpacked: try again"
         ) from None
@@ -171,12 +175,23 @@ def _unpack(archive: Path, target: Path, inside: str, quiet: bool) -> None:
         with zipfile.ZipFile(archive) as file:
             _each(file.infolist(), lambda member: file.extract(member, target), quiet)
     else:
+        _check_gzip(archive)
         with tarfile.open(archive) as tar:
             _each(tar.getmembers(), lambda one: tar.extract(one, target, filter="data"), quiet)
     if inside and (target / inside).is_dir():
         for entry in sorted((target / inside).iterdir()):
             entry.rename(target / entry.name)
         (target / inside).rmdir()
+
+
+def _check_gzip(archive: Path) -> None:
+    """Read a gzip file to its end, where its checksum is: unpacking a tar stops before it."""
+    with archive.open("rb") as start:
+        if start.read(2) != GZIP:
+            return
+    with gzip.open(archive) as file:
+        while file.read(1 << 20):
+            pass
 
 
 def _each(members: list[Any], extract: Callable[[Any], object], quiet: bool) -> None:

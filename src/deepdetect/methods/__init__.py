@@ -2,6 +2,7 @@
 
 from .features import Features
 from .heatmaps import (
+    COMMON_DESCRIPTOR,
     PointDescriptor,
     deepdetect_method,
     every_pixel_method,
@@ -10,10 +11,12 @@ from .heatmaps import (
 from .importable import importable_method
 from .method import Method
 from .onnx_file import onnx_method
-from .registry import CLASSICAL, find_method
+from .registry import CLASSICAL, STANDARD, find_method
 
 __all__ = [
     "CLASSICAL",
+    "COMMON_DESCRIPTOR",
+    "STANDARD",
     "Features",
     "Method",
     "PointDescriptor",

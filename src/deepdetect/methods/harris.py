@@ -23,11 +23,23 @@ def _method(
         xy = np.column_stack([column, row])
         return Features(xy, response[row, column], (rgb.shape[1], rgb.shape[0]))
 
-    def describe(rgb: np.ndarray, features: Features) -> np.ndarray:
-        return describe_with(cv2.SIFT_create, rgb, features)
+    return Method(name, title, detect, _describe)
 
-    return Method(name, title, detect, describe)
 
+def _maxima(rgb: np.ndarray) -> Features:
+    response = cv2.cornerHarris(luma(rgb), 3, 3, 0.04)
+    peaks = (response == cv2.dilate(response, None)) & (response > 0)
+    row, column = np.nonzero(peaks)
+    xy = np.column_stack([column, row])
+    return Features(xy, response[row, column], (rgb.shape[1], rgb.shape[0]))
+
+
+def _describe(rgb: np.ndarray, features: Features) -> np.ndarray:
+    return describe_with(cv2.SIFT_create, rgb, features)
+
+
+HARRIS_MAXIMA = Method("harris-maxima", "Harris, local maxima", _maxima, _describe)
+"""As the field takes them: one keypoint a corner, ranked by its response."""
 
 HARRIS_DEFAULT = _method("harris", "Harris", 2, 3, 0.04, 0.04)
 HARRIS_LOW = _method("harris-low", "Harris, low settings", 3, 5, 0.001, 0.001)

@@ -41,6 +41,9 @@ class PointDescriptor:
 
 PAPER_DESCRIPTOR = PointDescriptor()
 
+COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
+"""What all detectors get that have no descriptors of their own, where they are compared."""
+
 
 def deepdetect_method(
     detector: DeepDetect,
@@ -90,7 +93,7 @@ def random_method(like: Method, seed: int = 0, *, name: str = "random") -> Metho
 
     title = f"control: as many random points as {like.title}"
     version = f"{like.name} {like.version} {seed}"
-    return Method(name, title, detect, PAPER_DESCRIPTOR.describe, version=version)
+    return Method(name, title, detect, PAPER_DESCRIPTOR.describe, control=True, version=version)
 
 
 def every_pixel_method() -> Method:
@@ -103,4 +106,4 @@ def every_pixel_method() -> Method:
         return Features(xy, 1 - even_order(xy, (width, height)), (width, height))
 
     title = "control: every pixel (a grid, where there is a budget)"
-    return Method("every-pixel", title, detect, PAPER_DESCRIPTOR.describe)
+    return Method("every-pixel", title, detect, PAPER_DESCRIPTOR.describe, control=True)

@@ -1,7 +1,10 @@
 """Any detector that Python can import joins the benchmark as one more row.
 
 It is named as "package.module:function"; the function takes a (H, W, 3) uint8 RGB image and
-returns a dict with `keypoints` (N, 2), `scores` (N,) and maybe `descriptors` (N, D).
+returns a dict with `keypoints` (N, 2), `scores` (N,) and maybe `descriptors` (N, D). Attributes of
+the function tell more: `learned` (descriptors that need no ratio test), `binary` (compared by
+Hamming's distance), and `version`, to be changed when its results change: of its sources only the
+module's own file is watched.
 """
 
 from __future__ import annotations
@@ -15,8 +18,8 @@ import numpy as np
 
 from ..errors import OptionError
 from .features import Features
+from .heatmaps import COMMON_DESCRIPTOR
 from .method import Method
-from .onnx_file import COMMON
 
 
 def importable_method(target: str) -> Method:
@@ -41,12 +44,20 @@ def importable_method(target: str) -> Method:
 
     def describe(rgb: np.ndarray, features: Features) -> np.ndarray:
         if features.descriptors is None:
-            return COMMON.describe(rgb, features)
+            return COMMON_DESCRIPTOR.describe(rgb, features)
         return features.descriptors
 
     source = getattr(sys.modules.get(target.partition(":")[0]), "__file__", None)
     version = str(Path(source).stat().st_mtime_ns) if source else "1"
-    return Method(target, target, detect, describe, version=version)
+    return Method(
+        target,
+        target,
+        detect,
+        describe,
+        binary=bool(getattr(function, "binary", False)),
+        learned=bool(getattr(function, "learned", False)),
+        version=f"{getattr(function, 'version', '')} {version}",
+    )
 
 
 def _find(target: str) -> Callable[[np.ndarray], Mapping[str, np.ndarray]]:

@@ -24,6 +24,7 @@ class Method:
         describe: function from the image and its features to (N, D) descriptors.
         binary: the descriptors are compared by Hamming's distance, else by Euclid's.
         learned: the descriptors were learned for their detector and need no ratio test.
+        control: the points know nothing of the image; the time they take tells nothing.
         version: what results depend on besides the name: cached ones of another are not used.
         detection: what the keypoints depend on, where several methods share them.
     """
@@ -34,6 +35,7 @@ class Method:
     describe: Callable[[np.ndarray, Features], np.ndarray]
     binary: bool = False
     learned: bool = False
+    control: bool = False
     version: str = "1"
     detection: str = ""
 

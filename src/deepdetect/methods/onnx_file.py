@@ -16,11 +16,8 @@ import numpy as np
 
 from ..errors import WeightsError
 from .features import Features
-from .heatmaps import PointDescriptor
+from .heatmaps import COMMON_DESCRIPTOR
 from .method import Method
-
-COMMON = PointDescriptor("rootsift", 4.0, 0.0)
-"""For networks that make no descriptors."""
 
 
 def onnx_method(path: str | Path, name: str | None = None) -> Method:
@@ -51,7 +48,7 @@ def onnx_method(path: str | Path, name: str | None = None) -> Method:
 
     def describe(rgb: np.ndarray, features: Features) -> np.ndarray:
         if features.descriptors is None:
-            return COMMON.describe(rgb, features)
+            return COMMON_DESCRIPTOR.describe(rgb, features)
         return features.descriptors
 
     name = name or file.stem
@@ -82,7 +79,10 @@ def _detect(session: Any, outputs: list[str], rgb: np.ndarray) -> Features:
         fixed if isinstance(fixed, int) else own
         for fixed, own in zip(entry.shape[2:], (height, width), strict=True)
     ]
-    shown = cv2.resize(rgb, (wanted[1], wanted[0]), interpolation=cv2.INTER_AREA)
+    # Averages where pixels fall together; where the image grows, that would repeat pixels.
+    shrinks = wanted[0] <= height and wanted[1] <= width
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    shown = cv2.resize(rgb, (wanted[1], wanted[0]), interpolation=method)
     planes = np.ascontiguousarray(shown.transpose(2, 0, 1)[None], np.float32) / 255
     found = dict(zip(outputs, session.run(None, {entry.name: planes}), strict=True))
     parts = {

@@ -11,12 +11,12 @@ from ..errors import OptionError, look_up
 from .agast import AGAST_DEFAULT, AGAST_LOW
 from .brisk import BRISK_DEFAULT, BRISK_LOW
 from .fast import FAST_DEFAULT, FAST_LOW
-from .harris import HARRIS_DEFAULT, HARRIS_LOW
+from .harris import HARRIS_DEFAULT, HARRIS_LOW, HARRIS_MAXIMA
 from .importable import importable_method
 from .method import Method
 from .onnx_file import onnx_method
-from .orb import ORB_DEFAULT, ORB_LOW
-from .shi_tomasi import SHI_TOMASI_DEFAULT, SHI_TOMASI_LOW
+from .orb import ORB_DEFAULT, ORB_LOW, ORB_MANY
+from .shi_tomasi import SHI_TOMASI_DEFAULT, SHI_TOMASI_EIGENVALUE, SHI_TOMASI_LOW
 from .sift import SIFT_DEFAULT, SIFT_LOW
 
 CLASSICAL: dict[str, Method] = {
@@ -38,6 +38,19 @@ CLASSICAL: dict[str, Method] = {
         SHI_TOMASI_LOW,
     )
 }
+
+
+STANDARD: dict[str, Method] = {
+    "sift": SIFT_DEFAULT,
+    "orb": ORB_MANY,
+    "brisk": BRISK_DEFAULT,
+    "fast": FAST_DEFAULT,
+    "agast": AGAST_DEFAULT,
+    "harris": HARRIS_MAXIMA,
+    "shi-tomasi": SHI_TOMASI_EIGENVALUE,
+}
+"""By the names of the default settings, what takes their place where methods are compared by their
+best so many keypoints: settings that give enough of them, in an order of worth."""
 
 
 def find_method(word: str) -> Method:

@@ -22,11 +22,13 @@ class MatchAccuracy:
         matches: their number.
         correct: how many are at most 1, 2, ..., 10 px off, in the second image.
         seen: keypoints that the other image shows too, of the image that has fewer such.
+        correct_seen: as `correct`, of the matches whose two points both images show.
     """
 
     matches: int
     correct: tuple[int, ...]
     seen: int
+    correct_seen: tuple[int, ...]
 
     @property
     def accuracy(self) -> tuple[float, ...]:
@@ -42,7 +44,7 @@ class MatchAccuracy:
 
     def matching_score(self, threshold: int = 3) -> float:
         """Right matches over the keypoints that could have one."""
-        return self.correct[threshold - 1] / self.seen if self.seen else 0.0
+        return self.correct_seen[threshold - 1] / self.seen if self.seen else 0.0
 
 
 def match_accuracy(
@@ -69,10 +71,18 @@ def match_accuracy(
         (0.75, 1.0)
     """
     errors = transfer_errors(points0, points1, homography)
-    seen0 = np.isfinite(map_into(keypoints0, homography, sizes[1])[:, 0]).sum()
-    seen1 = np.isfinite(map_into(keypoints1, np.linalg.inv(homography), sizes[0])[:, 0]).sum()
+    back = np.linalg.inv(homography)
+
+    def shown(points: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        return np.isfinite(map_into(points, matrix, size)[:, 0])
+
+    seen = min(
+        shown(keypoints0, homography, sizes[1]).sum(), shown(keypoints1, back, sizes[0]).sum()
+    )
+    both = shown(points0, homography, sizes[1]) & shown(points1, back, sizes[0])
     correct = tuple(int((errors <= threshold).sum()) for threshold in THRESHOLDS)
-    return MatchAccuracy(len(errors), correct, int(min(seen0, seen1)))
+    correct_seen = tuple(int((errors[both] <= threshold).sum()) for threshold in THRESHOLDS)
+    return MatchAccuracy(len(errors), correct, int(seen), correct_seen)
 
 
 def mean_matching_accuracy(pairs: Sequence[MatchAccuracy]) -> tuple[float, ...]:

@@ -11,7 +11,8 @@ from deepdetect import DeepDetect
 from deepdetect.benchmark import BenchmarkOptions, Report, run_benchmarks
 from deepdetect.benchmark.cache import StageCache
 from deepdetect.benchmark.options import common
-from deepdetect.benchmark.planar_standard import BUDGETS, matching_table, measure
+from deepdetect.benchmark.standard_measures import BUDGETS, measure
+from deepdetect.benchmark.standard_tables import homography_table, matching_table
 from deepdetect.benchmark.workspace import Workspace
 from deepdetect.datasets.low_visibility import load_low_visibility
 from deepdetect.datasets.planar import PlanarPair
@@ -43,35 +44,36 @@ def test_budgets_repeatability_and_coverage_are_those_of_the_best_points(
             points = []
             for path in (pair.first, pair.second):
                 features = workspace.keypoints(method, path).features
-                order = np.argsort(-features.scores, kind="stable")[: budget or len(features)]
-                points.append(features.xy[order])
+                assert len(np.unique(features.xy, axis=0)) == len(features)
+                points.append(features.best(budget or len(features)).xy)
             expected = one_to_one_repeatability(*points, np.eye(3), ((80, 64), (80, 64)))
-            found = result.repeatability[budget][index]
+            found = result.pairs[index].repeatability[budget]
             assert [e.radius for e in found] == [1, 2, 3]
             for one, other in zip(found, expected, strict=True):
                 assert (one.repeated, one.fewest) == (other.repeated, other.fewest)
                 assert one.localisation == pytest.approx(other.localisation, nan_ok=True)
                 assert one.chance == pytest.approx(other.chance, abs=1e-12)
             cells = {(int(x + 0.5) // 32, int(y + 0.5) // 32) for x, y in points[0]}
-            assert result.coverage[budget][index] == pytest.approx(len(cells) / 6)
-    assert result.repeatability[64][0][0].fewest == 64
+            assert result.pairs[index].coverage[budget] == pytest.approx(len(cells) / 6)
+    assert result.pairs[0].repeatability[64][0].fewest == 64
 
 
 def test_of_equal_images_all_is_repeated_and_the_homography_exact(
     pairs: list[PlanarPair], tmp_path: Path
 ) -> None:
     result = measure(Workspace(tmp_path), common(CLASSICAL["fast"]), pairs[:1], (512,))
-    (entries,) = result.repeatability[512]
-    assert [(e.value, e.localisation) for e in entries] == [(1, 0)] * 3
-    (judged,) = result.accuracy
-    assert judged.matches == judged.correct[0] > 10
-    assert len(result.corner_errors) == 5
-    assert max(error for seed in result.corner_errors for error in seed) < 1e-3
-    table = matching_table([result], "key", "what")
-    row = dict(zip([c.title for c in table.columns], table.rows[0], strict=True))
-    assert row["precision at 1 px"] == row["corners within 1 px"] == 1
+    (found,) = result.pairs
+    assert [(e.value, e.localisation) for e in found.repeatability[512]] == [(1, 0)] * 3
+    assert found.matches.matches == found.matches.correct[0] > 10
+    assert found.all_matches.matches >= found.matches.matches
+    assert len(found.corner_errors) == 5
+    assert max(found.corner_errors) < 1e-3
+    row = {}
+    for table in (matching_table([result], "a", ""), homography_table([result], "b", "")):
+        row |= dict(zip([c.title for c in table.columns], table.rows[0], strict=True))
+    assert row["precision at 1 px"] == row["within 1 px"] == 1
     assert row["AUC at 3 px"] == pytest.approx(1, abs=1e-3)
-    assert row["spread of AUC at 3 px"] == pytest.approx(0, abs=1e-3)
+    assert row["± of AUC 3"] == pytest.approx(0, abs=1e-3)
 
 
 def test_learned_descriptors_are_matched_without_a_ratio_test(
@@ -82,7 +84,8 @@ def test_learned_descriptors_are_matched_without_a_ratio_test(
         measure(Workspace(tmp_path), dataclasses.replace(method, learned=learned), pairs, (512,))
         for learned in (False, True)
     )
-    assert untested.accuracy[1].matches > tested.accuracy[1].matches
+    assert untested.pairs[1].matches.matches > tested.pairs[1].matches.matches
+    assert untested.pairs[1].all_matches == tested.pairs[1].all_matches
 
 
 def fails_on(pair: PlanarPair) -> Method:
@@ -104,8 +107,9 @@ def test_a_pair_that_fails_is_left_out_and_the_others_count(
     done: list[int] = []
     workspace = Workspace(tmp_path, done=lambda steps, text: done.append(steps))
     result = measure(workspace, fails_on(pairs[1]), pairs, (64, None))
-    assert len(result.accuracy) == len(result.repeatability[64]) == 1
-    assert [len(seed) for seed in result.corner_errors] == [1] * 5
+    assert len(result.pairs) == 1
+    assert result.asked == 2
+    assert matching_table([result], "key", "").rows[0][1] == 1
     assert sum(done) == 2
     (note,) = workspace.left_out
     assert "smoky 1-2" in note
@@ -122,12 +126,11 @@ def test_a_pair_without_keypoints_counts_as_wrong_and_is_no_error(
     workspace = Workspace(tmp_path)
     result = measure(workspace, method, pairs, (64, None))
     assert workspace.left_out == []
-    assert [judged.matches for judged in result.accuracy] == [0, 0]
-    assert {error for seed in result.corner_errors for error in seed} == {math.inf}
-    row = matching_table([result], "key", "what").rows[0]
-    assert row[1] == 0
-    assert row[7:13] == (0,) * 6
-    assert math.isnan(result.repeatability[64][0][0].localisation)
+    assert [pair.matches.matches for pair in result.pairs] == [0, 0]
+    assert {error for pair in result.pairs for error in pair.corner_errors} == {math.inf}
+    assert matching_table([result], "key", "what").rows[0][2:] == (0,) * 8
+    assert homography_table([result], "key", "what").rows[0][2:] == (0,) * 12
+    assert math.isnan(result.pairs[0].repeatability[64][0].localisation)
 
 
 @pytest.fixture(scope="module")
@@ -148,16 +151,15 @@ def test_all_tables_of_the_section_have_all_methods(report: Report) -> None:
     tables = {table.key: table for table in report.tables()}
     assert list(tables) == [
         *(f"low_visibility_repeatability_{r}px" for r in (1, 2, 3)),
-        *("low_visibility_matching", "low_visibility_accuracy", "low_visibility_cost"),
+        *("low_visibility_matching", "low_visibility_homography", "low_visibility_accuracy"),
+        "low_visibility_cost",
     ]
-    for key, table in tables.items():
+    for table in tables.values():
         rows = [row[0] for row in table.rows]
-        assert len(rows) == (5 if key == "low_visibility_accuracy" else 6)
-        assert [t for t in titles if t in rows] == [
-            t for t in titles if t != "Never works" or key != "low_visibility_accuracy"
-        ]
+        assert len(rows) == 6
+        assert [title for title in titles if title in rows] == titles
     heads = [c.title for c in tables["low_visibility_repeatability_1px"].columns]
-    assert len(heads) == len(set(heads)) == 1 + 2 * len(BUDGETS) + 2
+    assert len(heads) == len(set(heads)) == 2 + 3 * len(BUDGETS) + 2
     assert any("Never works" in note for note in report.left_out)
 
 
@@ -174,8 +176,10 @@ def test_controls_are_worth_what_chance_is(report: Report) -> None:
     rows = {row[0]: dict(zip(heads, row, strict=True)) for row in table.rows}
     every = rows["control: every pixel (a grid, where there is a budget)"]
     assert every["all"] == 1
-    assert every["all: above chance"] == 0
-    assert every["all: points"] == 80 * 64
+    assert every["all: chance"] == 1
+    assert every["all: above chance"] is None, "nothing can be told from chance"
+    assert every["keypoints of all"] == 80 * 64
     # Of smoky's two images the random points differ; dusty's are one image twice.
     own = rows["DeepDetect, native resolution, suppression 3x3"]
-    assert own["512: above chance"] > 0.3
+    assert own["512: above chance"] is None or own["512: above chance"] > 0.3
+    assert own["all"] > own["all: chance"]
