@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +10,8 @@ from deepdetect import DeepDetect, OptionError
 from deepdetect.benchmark import BenchmarkOptions
 from deepdetect.benchmark.options import COMMON_DESCRIPTOR, DEFAULT, LOW, common
 from deepdetect.descriptors.sift import root_sift_descriptors
-from deepdetect.image import luma
-from deepdetect.methods import CLASSICAL
+from deepdetect.image import load_image, luma
+from deepdetect.methods import CLASSICAL, STANDARD
 
 
 @pytest.fixture
@@ -59,8 +60,9 @@ def test_the_rows_of_table_2(options: BenchmarkOptions) -> None:
 def test_the_rows_of_the_standard_protocol(options: BenchmarkOptions) -> None:
     found = names(options.standard_methods())
     assert found == [
-        *(f"{name}-common" for name in DEFAULT),
-        *("sift-own", "orb-own", "deepdetect-sparse", "deepdetect-native-common"),
+        *("sift-common", "orb-many-common", "brisk-common", "fast-common", "agast-common"),
+        *("harris-maxima-common", "shi-tomasi-eigenvalue-common", "sift-own", "orb-many-own"),
+        *("deepdetect-sparse", "deepdetect-native-common"),
         *("random-native-common", "every-pixel-common"),
     ]
 
@@ -98,14 +100,26 @@ def test_the_papers_way_squashes_and_the_standard_one_does_not(options: Benchmar
     assert bgr.native().version != options.native().version
 
 
-def test_the_common_descriptor_takes_the_place_of_any_and_shares_the_keypoints(
+def test_methods_of_the_standard_protocol_fill_a_budget_in_an_order_of_worth(
+    shared: Path,
+) -> None:
+    """OpenCV's ORB stops at 500; the paper's Harris marks blocks around each corner."""
+    rgb = load_image(shared / "data" / "oxford" / "graf" / "img1.png")
+    for method in STANDARD.values():
+        found = common(method).detect(rgb)
+        assert len(found) >= 1000, method.name
+        assert len(np.unique(found.xy, axis=0)) == len(found)
+        rows = found.best(512).xy[:, 1] / rgb.shape[0]
+        assert np.ptp(rows) > 0.5, method.name
+
+
+def test_the_common_descriptor_takes_the_place_of_any(
     photo: np.ndarray,
 ) -> None:
     crop = np.ascontiguousarray(photo[60:160, 60:160])
     for name in ("orb", "sift", "fast"):
         method = common(CLASSICAL[name])
         assert not method.binary
-        assert method.detection == CLASSICAL[name].detection
         assert method.version != CLASSICAL[name].version
         found = method.detect(crop)[:40]
         expected = root_sift_descriptors(luma(crop), found.xy, 4.0, 0.0)

@@ -111,7 +111,7 @@ class BenchmarkOptions:
 
     def geometry(self) -> Method:
         """Return the bundled weights for geometry, at the image's own size."""
-        detector = DeepDetect("geometry", backend=self.detector.backend)
+        detector = DeepDetect("geometry")
         title = 'DeepDetect("geometry"), native resolution, all pixels over 0.5'
         return deepdetect_method(detector, name="deepdetect-geometry", title=title)
 

@@ -35,7 +35,7 @@ class PairResult:
     Attributes:
         repeatability: by budget, the result at each of `RADII`.
         coverage: by budget, of the first image.
-        counts: by budget, the keypoints used in the image that has fewer.
+        counts: by budget, and for the matching, the keypoints used in the image that has fewer.
         matches: judged, with the ratio test.
         all_matches: judged, mutual nearest neighbours without a ratio test.
         corner_errors: of the homography by each seed, in pixels.
@@ -105,7 +105,7 @@ def measure_pair(
     return PairResult(
         repeatability={b: _repeatability(workspace, method, pair, sizes, b) for b in budgets},
         coverage={b: _coverage(workspace, method, pair.first, sizes[0], b) for b in budgets},
-        counts={b: fewest if b is None else min(fewest, b) for b in budgets},
+        counts={b: fewest if b is None else min(fewest, b) for b in (*budgets, MATCHING_BUDGET)},
         matches=_judge(matches, pair, sizes),
         all_matches=_judge(everything, pair, sizes),
         corner_errors=_corner_errors(workspace, method, pair, matches, settings, sizes),
