@@ -57,8 +57,8 @@ def evaluate(
 
     Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), apart
     for normal and for low-visibility images; with --oxford also what the paper's protocol
-    gives: images squashed to 480x480, FLANN (mean of three seeds), ratio 0.99, correct under 1 px. With --scale,
-    whether the quality holds on larger and smaller images.
+    gives: images squashed to 480x480, FLANN (mean of three seeds), ratio 0.99, correct under
+    1 px. With --scale, whether the quality holds on larger and smaller images.
 
     \b
     deepdetect evaluate samples/
