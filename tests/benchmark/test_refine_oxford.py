@@ -83,5 +83,5 @@ def test_the_command_writes_the_files_and_a_report(folder: Path, tmp_path: Path)
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     assert len(found["tables"]["oxford_refined"]["rows"]) == 40
-    assert (tmp_path / "index.html").exists()
+    assert (tmp_path / "refinement" / "index.html").exists()
     assert str(tmp_path / "graf" / "H1to2p.refined") in found["files"]

@@ -3,8 +3,8 @@ from __future__ import annotations
 import pytest
 
 from deepdetect import OptionError
-from deepdetect.benchmark import Report, Section, Table
-from deepdetect.benchmark.report import Column, Figure, joined
+from deepdetect.benchmark import Table
+from deepdetect.benchmark.report import Column
 
 
 @pytest.mark.parametrize(
@@ -34,25 +34,8 @@ def test_a_row_of_another_length_is_an_error(one_line) -> None:
     one_line(caught.value)
 
 
-def test_reports_are_joined_in_order() -> None:
-    reports = [
-        Report(
-            f"R{k}",
-            {"machine": "m", f"only {k}": str(k)},
-            (
-                Section(
-                    f"S{k}",
-                    (),
-                    (Table(f"t{k}", "T", (Column("a"),), ((k,),)),),
-                    (Figure(f"f{k}", "F", b"png"),),
-                ),
-            ),
-            (f"left {k}",),
-        )
-        for k in range(2)
-    ]
-    whole = joined("Both", reports)
-    assert [table.key for table in whole.tables()] == ["t0", "t1"]
-    assert [figure.key for figure in whole.figures()] == ["f0", "f1"]
-    assert whole.left_out == ("left 0", "left 1")
-    assert whole.origin == {"machine": "m", "only 0": "0", "only 1": "1"}
+def test_two_columns_of_one_title_are_refused(one_line) -> None:
+    """Rows become dicts by title in the JSON."""
+    with pytest.raises(OptionError, match="share a title") as caught:
+        Table("t", "T", (Column("a"), Column("a")), ())
+    one_line(caught.value)

@@ -15,14 +15,17 @@ WIDEST = 1600
 
 
 def bar_chart(
-    values: Mapping[str, float], label: str, best: Sequence[str] = (), limit: float | None = None
+    values: Mapping[str, float],
+    label: str,
+    highlighted: Sequence[str] = (),
+    limit: float | None = None,
 ) -> bytes:
     """Draw horizontal bars, with the value beside each.
 
     Args:
         values: by name, from top to bottom.
         label: of the axis.
-        best: names that are drawn in another colour.
+        highlighted: names that are drawn in another colour.
         limit: end of the axis.
 
     Returns:
@@ -31,7 +34,7 @@ def bar_chart(
     figure = _figure(8, 0.32 * len(values) + 1)
     axes = figure.subplots()
     names = list(values)
-    colors = ["C1" if name in best else "C0" for name in names]
+    colors = ["C1" if name in highlighted else "C0" for name in names]
     bars = axes.barh(names, list(values.values()), color=colors)
     axes.bar_label(bars, fmt="{:.3f}", padding=3)
     axes.invert_yaxis()

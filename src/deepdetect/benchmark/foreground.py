@@ -18,10 +18,10 @@ def foreground_table(
     workspace: Workspace, methods: Sequence[Method], photographs: Sequence[MaskedPhotograph]
 ) -> Table:
     """Tabulate the share on the foreground, mean over the photographs, and the density."""
-    covered = float(np.mean([photograph.foreground().mean() for photograph in photographs]))
+    covered = {each.image: float(each.foreground().mean()) for each in photographs}
     rows: list[tuple[Cell, ...]] = []
     for method in methods:
-        shares, densities = [], []
+        shares, by_chance, densities = [], [], []
         for photograph in photographs:
             found = workspace.attempt(
                 f"foreground of {method.title} on {photograph.image.name}",
@@ -33,8 +33,11 @@ def foreground_table(
             workspace.done(1, f"{method.name}, {photograph.image.name}")
             if found is not None:
                 shares.append(found[0])
+                by_chance.append(covered[photograph.image])
                 densities.append(found[1])
         known = [share for share in shares if share == share]
+        # Random points, on the same photographs.
+        chance = [c for c, share in zip(by_chance, shares, strict=True) if share == share]
         if len(known) < len(shares):
             workspace.left_out.append(
                 f"foreground of {method.title}: {len(shares) - len(known)} photographs without "
@@ -44,7 +47,7 @@ def foreground_table(
             (
                 method.title,
                 float(np.mean(known)) if known else None,
-                float(np.mean(known)) / covered if known else None,
+                float(np.mean(known) / np.mean(chance)) if known else None,
                 float(np.mean(densities)) if densities else None,
             )
         )
@@ -55,8 +58,8 @@ def foreground_table(
         Column("keypoints a pixel", ".4f"),
     )
     note = (
-        f"{len(photographs)} photographs; their foreground is {covered:.1%} of the pixels, which "
-        "is what random points reach."
+        f"{len(photographs)} photographs; their foreground is {np.mean(list(covered.values())):.1%} "
+        "of the pixels, which is what random points reach."
     )
     return Table("foreground", "Keypoints on the foreground", columns, tuple(rows), note)
 

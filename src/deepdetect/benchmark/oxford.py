@@ -133,6 +133,6 @@ def _with_row(table: Table, row: tuple[Cell, ...]) -> Table:
 
 def _repeatability_figure(table: Table) -> Figure:
     values = {str(row[0]): float(row[1]) for row in table.rows if isinstance(row[1], float)}
-    best = [name for name in values if name.startswith("DeepDetect")]
-    png = bar_chart(values, "repeatability as published, mean of the scenes", best)
+    ours = [name for name in values if name.startswith("DeepDetect")]
+    png = bar_chart(values, "repeatability as published, mean of the scenes", ours)
     return Figure("oxford_repeatability", "Figure 1: average repeatability, with controls", png)

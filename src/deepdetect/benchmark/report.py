@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from ..errors import OptionError
@@ -129,11 +128,3 @@ class Report:
     def figures(self) -> list[Figure]:
         """Return the figures of all sections."""
         return [figure for section in self.sections for figure in section.figures]
-
-
-def joined(title: str, reports: Sequence[Report]) -> Report:
-    """Make one report of several."""
-    sections = tuple(section for report in reports for section in report.sections)
-    left_out = tuple(reason for report in reports for reason in report.left_out)
-    origin = {name: text for report in reports for name, text in report.origin.items()}
-    return Report(title, origin, sections, left_out)

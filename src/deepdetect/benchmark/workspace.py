@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..datasets.planar import PlanarPair
+from ..errors import DeepDetectError
 from ..image import load_image
 from ..methods import Method
 from .cache import Arrays, CacheError, StageCache, file_digest
@@ -87,7 +88,9 @@ class Workspace:
         except CacheError:
             raise
         except Exception as error:  # whatever a detector from outside may raise
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            reason = str(error).splitlines()[0] if str(error) else "it failed"
+            if not isinstance(error, DeepDetectError):
+                reason = f"{reason} ({type(error).__name__})"
             self.left_out.append(f"{what}: {reason}")
             return None
 

@@ -83,10 +83,14 @@ def benchmark(
         return
     from ..benchmark import BENCHMARKS, PROTOCOLS, BenchmarkOptions, run_benchmarks
     from ..benchmark.formats import report_values, save_report, table_text
-    from ..errors import look_up
+    from ..errors import OptionError, look_up
     from ..methods import CLASSICAL, find_method
     from ..presets import get_preset
 
+    if values["resolution"] != "native":
+        raise OptionError(
+            "the protocols fix the resolution (480x480 and native): leave out --resolution"
+        )
     names = list(BENCHMARKS) if name == "all" else [name]
     for each in names:
         look_up("benchmark", each, dict.fromkeys(NAMES))
@@ -128,7 +132,7 @@ def _refine_oxford(data: Path, output: Path, as_json: bool) -> None:
     table = refinement_table(results)
     section = Section("Oxford's homographies, refined", (), (table,))
     report = Report("DeepDetect: refined homographies of Oxford", provenance(), (section,))
-    paths = save_report(report, output)
+    paths = save_report(report, output / "refinement")
     written = [result.written for result in results if result.written]
     if as_json:
         print_json({**report_values(report), "files": [*paths, *written]})
