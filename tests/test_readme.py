@@ -92,6 +92,9 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
             "1",
         ]
         words += ["--no-compile", "--workers", "1", "--validation", "PHOTOS"]
+    if "average" in words:
+        pytest.importorskip("torch", reason="needs torch to read weights")
+        words[words.index("WEIGHTS") : words.index("WEIGHTS") + 1] = ["matching", "geometry"]
     if "shards" in words:
         pytest.importorskip("webdataset", reason="needs webdataset, of the extra data")
         words += ["--detectors", "fast", "--short-side", "32", "--workers", "1"]

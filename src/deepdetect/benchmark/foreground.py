@@ -57,9 +57,10 @@ def foreground_table(
         Column("over that of random points", ".2f"),
         Column("keypoints a pixel", ".4f"),
     )
+    mean = np.mean(list(covered.values()))
     note = (
-        f"{len(photographs)} photographs; their foreground is {np.mean(list(covered.values())):.1%} "
-        "of the pixels, which is what random points reach."
+        f"{len(photographs)} photographs; their foreground is {mean:.1%} of the pixels, "
+        "which is what random points reach."
     )
     return Table("foreground", "Keypoints on the foreground", columns, tuple(rows), note)
 

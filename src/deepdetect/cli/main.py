@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from ..errors import DeepDetectError
+from .average import average
 from .benchmark import benchmark
 from .datasets import datasets
 from .demo import demo
@@ -68,6 +69,7 @@ for command in (
     label,
     shards,
     train,
+    average,
     datasets,
     evaluate,
     evaluate_stereo,

@@ -1,0 +1,51 @@
+"""`deepdetect average`: the mean of several weights."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import click
+
+from .shared import PATH, json_option, print_json, print_table
+
+
+@click.command(short_help="The mean of several weights.")
+@click.argument("weights", nargs=-1, required=True, metavar="WEIGHTS...")
+@click.option("-o", "--output", type=PATH, required=True, help="Folder for both files.")
+@json_option
+def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
+    """Write the mean of WEIGHTS: best.safetensors and deepdetect.onnx.
+
+    The mean of runs that went on from one another is often better than each of them; name one
+    twice to give it twice the weight. WEIGHTS are .safetensors files, or matching or geometry.
+
+    \b
+    deepdetect average first/best.safetensors second/best.safetensors -o mean
+    deepdetect evaluate samples/ --weights mean/deepdetect.onnx
+    """
+    from ..errors import MissingExtraError, OptionError
+
+    for package in ("torch", "safetensors", "onnx"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtraError(
+                f"averaging weights needs the package {package}, which is not installed: "
+                "run pip install torch safetensors onnx"
+            )
+    from ..bundled import find_weights
+    from ..network.onnx_export import export_onnx
+    from ..network.weights import load_mean_network, load_network, save_weights, weights_digest
+    from ..provenance import provenance
+
+    if len(weights) < 2:
+        raise OptionError("name two weights at least: the mean of one is itself")
+    paths = [find_weights(name, ".safetensors") for name in weights]
+    network = load_mean_network(paths)
+    parts = ", ".join(weights_digest(load_network(path))[:16] for path in paths)
+    files = {"weights": output / "best.safetensors", "onnx": output / "deepdetect.onnx"}
+    save_weights(network, files["weights"], {"mean_of": parts, **provenance()})
+    export_onnx(network, files["onnx"])
+    if as_json:
+        print_json(files)
+        return
+    print_table([("mean of", f"{len(paths)} weights"), *((k, str(v)) for k, v in files.items())])

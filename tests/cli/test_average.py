@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs torch, which is for training only")
+
+from deepdetect import DeepDetect
+from deepdetect.bundled import bundled_weights
+from deepdetect.network.weights import load_mean_network, load_network, read_notes, weights_digest
+
+
+def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo) -> None:
+    result = run("average", "matching", "matching", "geometry", "-o", tmp_path, "--json")
+    assert result.exit_code == 0, result.output
+    files = json.loads(result.output)
+    parts = [bundled_weights(name, ".safetensors") for name in ("matching", "geometry")]
+    expected = load_mean_network([parts[0], parts[0], parts[1]])
+    assert weights_digest(load_network(files["weights"])) == weights_digest(expected)
+    assert len(read_notes(files["weights"])["mean_of"].split(", ")) == 3
+    maps = [
+        DeepDetect(files[name], backend=backend).heatmap(photo)
+        for name, backend in (("weights", "torch"), ("onnx", "onnxruntime"))
+    ]
+    np.testing.assert_allclose(*maps, atol=1e-3)
+
+
+def test_the_mean_of_equals_is_the_same(run, tmp_path: Path) -> None:
+    assert run("average", "matching", "matching", "-o", tmp_path).exit_code == 0
+    own = load_network(bundled_weights("matching", ".safetensors"))
+    assert weights_digest(load_network(tmp_path / "best.safetensors")) == weights_digest(own)
+
+
+@pytest.mark.parametrize("words", [["matching"], ["matching", "matchin"], ["matching", "no.onnx"]])
+def test_a_mistake_ends_with_exit_code_2_and_leaves_nothing(run, tmp_path: Path, words) -> None:
+    result = run("average", *words, "-o", tmp_path / "out")
+    assert result.exit_code == 2
+    assert not (tmp_path / "out").exists()
