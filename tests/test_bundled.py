@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -40,8 +41,14 @@ def test_weights_tell_where_they_come_from(name: str) -> None:
     from deepdetect.network.weights import read_notes
 
     notes = read_notes(bundled_weights(name, ".safetensors"))
-    assert notes["command"].startswith("deepdetect train photos/train ")
-    assert " /" not in notes["command"], "no folder of one machine"
-    assert len(notes["commit"]) == 40
-    for word in ("options", "photographs_digest", "versions", "machine", "start", "point"):
-        assert notes[word]
+    runs = [notes]
+    if "parts" in notes:
+        assert notes["command"].startswith("deepdetect average ")
+        runs = json.loads(notes["parts"])
+    for run in runs:
+        assert run["command"].startswith("deepdetect train photos/train ")
+        for word in ("options", "photographs_digest", "versions", "machine", "start", "point"):
+            assert run[word]
+    for one in (notes, *runs):
+        assert " /" not in one["command"], "no folder of one machine"
+        assert len(one["commit"]) == 40

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from pathlib import Path
 
 import click
@@ -34,16 +35,22 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
             )
     from ..bundled import find_weights
     from ..network.onnx_export import export_onnx
-    from ..network.weights import load_mean_network, load_network, save_weights, weights_digest
+    from ..network.weights import (
+        load_mean_network,
+        load_network,
+        read_notes,
+        save_weights,
+        weights_digest,
+    )
     from ..provenance import provenance
 
     if len(weights) < 2:
         raise OptionError("name two weights at least: the mean of one is itself")
     paths = [find_weights(name, ".safetensors") for name in weights]
     network = load_mean_network(paths)
-    parts = ", ".join(weights_digest(load_network(path))[:16] for path in paths)
+    parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]
     files = {"weights": output / "best.safetensors", "onnx": output / "deepdetect.onnx"}
-    save_weights(network, files["weights"], {"mean_of": parts, **provenance()})
+    save_weights(network, files["weights"], {"parts": json.dumps(parts), **provenance()})
     export_onnx(network, files["onnx"])
     if as_json:
         print_json(files)
