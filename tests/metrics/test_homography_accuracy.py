@@ -53,3 +53,28 @@ def test_the_area_is_the_mean_of_the_shares_up_to_the_threshold(
     steps = (np.arange(4000) + 0.5) / 4000 * threshold
     mean = np.mean([share_within(errors, step) for step in steps])
     assert area_under_curve(errors, threshold) == pytest.approx(mean, abs=1e-3)
+
+
+HOMOGRAPHIES = st.builds(
+    lambda angle, scale, shift, tilt: np.array(
+        [
+            [scale * math.cos(angle), -scale * math.sin(angle), shift[0]],
+            [scale * math.sin(angle), scale * math.cos(angle), shift[1]],
+            [tilt[0], tilt[1], 1],
+        ]
+    ),
+    st.floats(-3, 3),
+    st.floats(0.5, 2),
+    st.tuples(st.floats(-50, 50), st.floats(-50, 50)),
+    st.tuples(st.floats(-5e-4, 5e-4), st.floats(-5e-4, 5e-4)),
+)
+
+
+@given(homography=HOMOGRAPHIES, factor=st.floats(0.1, 10), sign=st.sampled_from([-1, 1]))
+def test_the_scale_and_sign_of_a_homography_do_not_matter(
+    homography: np.ndarray, factor: float, sign: int
+) -> None:
+    other = sign * factor * homography
+    assert corner_error(other, homography, (200, 150)) == pytest.approx(0, abs=1e-6)
+    shift = np.array([[1.0, 0, 3], [0, 1, -4], [0, 0, 1]])
+    assert corner_error(shift @ other, homography, (200, 150)) == pytest.approx(5)

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect.metrics.match_accuracy import match_accuracy, mean_matching_accuracy
 
@@ -44,3 +46,20 @@ def test_no_matches_count_as_nothing_right() -> None:
     assert none.accuracy == (0.0,) * 10
     assert none.matching_score() == 0
     assert mean_matching_accuracy([none, judged(POINTS)]) == pytest.approx([0.5] * 10)
+
+
+@given(
+    shift=st.tuples(st.floats(-12, 12), st.floats(-12, 12)),
+    noise=st.lists(st.floats(0, 15), min_size=4, max_size=4),
+)
+def test_matches_off_by_known_distances_count_as_such(
+    shift: tuple[float, float], noise: list[float]
+) -> None:
+    homography = np.array([[1.0, 0, shift[0]], [0, 1, shift[1]], [0, 0, 1]])
+    moved = POINTS + shift + np.column_stack([noise, np.zeros(4)])
+    found = judged(moved, homography=homography)
+    errors = np.linalg.norm(moved - (POINTS + shift), axis=1)
+    assert found.correct == tuple(int((errors <= t).sum()) for t in range(1, 11))
+    assert list(found.accuracy) == sorted(found.accuracy)
+    for threshold in (1, 3, 10):
+        assert 0 <= found.matching_score(threshold) <= 1

@@ -39,7 +39,7 @@ def speed_sections(workspace: Workspace, options: BenchmarkOptions) -> list[Sect
             workspace.done(1, f"{method.name}, round {turn}")
             if turn and found is not None:
                 runs[method.name].append(found)
-    rows = tuple((method.title, *_row(runs[method.name])) for method in methods)
+    rows = tuple((method.title, *_row(method, runs[method.name])) for method in methods)
     stages = ("detect", "describe", "match")
     columns = (
         Column("method"),
@@ -64,17 +64,20 @@ def _run(method: Method, images: tuple) -> tuple[FoundFeatures, FoundMatches]:  
     return keypoints, find_matches(nothing_kept, method, images, PAPER_MATCHING)
 
 
-def _row(runs: list[tuple[FoundFeatures, FoundMatches]]) -> tuple[Cell, ...]:
+def _row(method: Method, runs: list[tuple[FoundFeatures, FoundMatches]]) -> tuple[Cell, ...]:
     if not runs:
         return (None,) * 9
     times = np.array([(k.seconds, m.describing.seconds, m.seconds) for k, m in runs])
     memory = np.array([(k.memory, m.describing.memory, m.memory) for k, m in runs])
     total = times.sum(1)
+    medians: list[Cell] = [float(value) for value in np.median(times, axis=0)]
+    if method.control:  # random points are counted by running the detector that they follow
+        medians[0] = None
     keypoints, matches = runs[0]
     return (
         len(keypoints.features),
         len(matches),
-        *(float(value) for value in np.median(times, axis=0)),
+        *medians,
         float(total.max() / total.min()),
         *(float(value) / 1e6 for value in memory.max(axis=0)),
     )
