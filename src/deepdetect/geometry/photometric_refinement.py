@@ -20,6 +20,10 @@ FEWEST = 30
 """Tracks that a homography is fitted to, at least."""
 
 
+LEAST_GAIN = 0.001
+"""Of correlation, by a step that is kept: less than that is noise, and moves the borders about."""
+
+
 @dataclass(frozen=True)
 class RefinementOptions:
     """How a homography is refined.
@@ -98,7 +102,7 @@ def refine_homography(
                 continue
             candidate = current @ correction
             reached = agreement(gray0, gray1, candidate)
-            if reached > best:
+            if reached > best + LEAST_GAIN:
                 current, best, kept = candidate, reached, kept + 1
         if kept == kept_before:
             break
