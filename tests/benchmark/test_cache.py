@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetectError
+from deepdetect.benchmark import cache as cache_module
 from deepdetect.benchmark.cache import StageCache, file_digest
 
 ARRAYS = {
@@ -167,3 +168,10 @@ def test_the_same_relative_path_in_another_folder_is_another_file(
         monkeypatch.chdir(tmp_path / name)
         digests.add(file_digest(Path("relative-image")))
     assert len(digests) == 2
+
+
+def test_what_only_draws_and_writes_does_not_make_results_old() -> None:
+    root = Path(cache_module.__file__).parents[1]
+    for name in cache_module.UNRELATED:
+        assert (root / name).exists(), name
+    assert "benchmark/stages.py" not in cache_module.UNRELATED

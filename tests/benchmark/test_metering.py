@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect.benchmark import metering
-from deepdetect.benchmark.metering import metered
+from deepdetect.benchmark.metering import metered, peak_memory
 
 
 def test_the_time_is_that_of_the_block() -> None:
@@ -65,3 +65,14 @@ def test_the_peak_of_the_process_is_taken_where_the_system_tells_no_more(
         pass
     assert meter.memory >= 0
     assert metering._peak() >= 0.5 * now
+
+
+@pytest.mark.skipif(not metering.STATUS.exists(), reason="the system does not tell its memory")
+def test_the_peak_of_all_outlives_the_reset() -> None:
+    block = np.ones(30_000_000)
+    before = peak_memory()
+    del block
+    with metered():
+        pass
+    assert before > 240e6
+    assert peak_memory() == pytest.approx(before, rel=0.02)  # the kernel counts in lumps

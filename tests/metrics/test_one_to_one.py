@@ -105,3 +105,11 @@ def test_points_moved_by_the_homography_are_repeated(
         assert entry.repeated == entry.fewest
         assert entry.repeated == 0 or entry.localisation == pytest.approx(0, abs=1e-6)
         assert 0 <= entry.chance <= 1
+
+
+def test_chance_of_points_between_pixels_is_that_of_such_points() -> None:
+    generator = np.random.default_rng(5)
+    size = (64, 48)
+    points = [generator.uniform(-0.5, np.array(size) - 0.5, (20, 2)) for _ in range(2)]
+    entry = one_to_one_repeatability(*points, np.eye(3), (size, size), (1.0,))[0]
+    assert entry.chance == pytest.approx(20 * np.pi / 3072, rel=0.2)

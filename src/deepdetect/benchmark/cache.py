@@ -17,8 +17,15 @@ from ..errors import DeepDetectError
 Arrays = Mapping[str, np.ndarray]
 
 
-UNRELATED = frozenset({"cli", "training"})
-"""Packages that no result of a benchmark goes through."""
+UNRELATED = frozenset(
+    {
+        *("cli", "training", "pictures.py", "progress.py", "provenance.py", "benchmark/formats"),
+        *("benchmark/charts.py", "benchmark/paper_figures.py", "benchmark/paper_numbers.py"),
+        *("benchmark/registry.py", "benchmark/report.py", "benchmark/run.py"),
+        *("benchmark/planar_sections.py", "benchmark/standard_tables.py"),
+    }
+)
+"""Packages and modules that no cached result goes through: command line, drawing, writing."""
 
 NAMES = "names of the arrays"
 """Key of the list of all others, by which a file that lost some is known."""
@@ -100,15 +107,16 @@ def file_digest(path: Path) -> str:
 
 @lru_cache(maxsize=1)
 def source_digest() -> str:
-    """Return a digest of the package's own sources but for the command line's.
+    """Return a digest of the package's own sources but for `UNRELATED`.
 
     A result that was made by other code is not used: no number that is raised by hand is forgotten.
     """
     root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for path in sorted(root.rglob("*.py")):
-        if path.relative_to(root).parts[0] not in UNRELATED:
-            digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+        inside = path.relative_to(root)
+        if UNRELATED.isdisjoint(part.as_posix() for part in (inside, *inside.parents)):
+            digest.update(inside.as_posix().encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 

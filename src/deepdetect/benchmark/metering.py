@@ -14,6 +14,7 @@ from pathlib import Path
 
 STATUS = Path("/proc/self/status")
 RESET = Path("/proc/self/clear_refs")
+_highest = 0
 
 
 @dataclass
@@ -53,8 +54,22 @@ def metered() -> Iterator[Meter]:
         meter.memory = max(_peak() - before, 0)
 
 
+def peak_memory() -> int:
+    """Return the most memory that the process has held so far, in bytes.
+
+    The system's own number is gone after a `metered` block, which resets it.
+
+    Example:
+        >>> peak_memory() > 1_000_000
+        True
+    """
+    return max(_highest, _peak())
+
+
 def _start() -> int:
     """Give freed memory back and reset the peak; return the memory in use, in bytes."""
+    global _highest
+    _highest = peak_memory()
     if platform.libc_ver()[0] == "glibc":
         ctypes.CDLL(None).malloc_trim(0)
     try:

@@ -10,6 +10,7 @@ from ..errors import ImageError, look_up
 from ..progress import progress
 from ..provenance import provenance
 from .cache import StageCache, file_digest
+from .metering import peak_memory
 from .options import BenchmarkOptions
 from .registry import BENCHMARKS, Benchmark
 from .report import Report
@@ -61,6 +62,7 @@ def run_benchmarks(
     }
     origin["weights' SHA-256"] = file_digest(options.detector.weights)[:16]
     origin["minutes"] = f"{(time.monotonic() - started) / 60:.1f}"
+    origin["peak memory"] = f"{peak_memory() / 1e9:.2f} GB"
     title = f"DeepDetect benchmark: {', '.join(names)}"
     left_out = tuple(dict.fromkeys(workspace.left_out))
     return Report(title, origin, tuple(sections), left_out)
