@@ -19,10 +19,16 @@ Arrays = Mapping[str, np.ndarray]
 
 UNRELATED = frozenset(
     {
-        *("cli", "training", "pictures.py", "progress.py", "provenance.py", "benchmark/formats"),
-        *("benchmark/charts.py", "benchmark/paper_figures.py", "benchmark/paper_numbers.py"),
-        *("benchmark/registry.py", "benchmark/report.py", "benchmark/run.py"),
-        *("benchmark/planar_sections.py", "benchmark/standard_tables.py"),
+        *("cli", "training", "pictures.py", "progress.py", "provenance.py", "stereo_demo.py"),
+        *("geometry/photometric_refinement.py", "geometry/correlation.py"),
+        *(
+            f"benchmark/{name}"
+            for name in (
+                *("formats", "cache.py", "charts.py", "paper_figures.py", "paper_numbers.py"),
+                *("registry.py", "report.py", "run.py", "refine_oxford.py", "planar_sections.py"),
+                *("standard_tables.py", "oxford.py", "hpatches.py", "low_visibility.py"),
+            )
+        ),
     }
 )
 """Packages and modules that no cached result goes through: command line, drawing, writing."""
