@@ -1,0 +1,67 @@
+"""The paper's protocol with the published weights, beside what is known of the published system."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from deepdetect import DeepDetect
+from deepdetect.benchmark import BenchmarkOptions
+from deepdetect.benchmark.oxford import paper_pairs
+from deepdetect.benchmark.planar_paper import density_table, matches_table, repeatability_table
+from deepdetect.benchmark.workspace import Workspace
+from deepdetect.datasets.oxford import load_oxford
+from deepdetect.datasets.planar import PlanarScene
+
+DENSITY = {0.5: 0.525, 0.7: 0.486, 0.8: 0.462, 0.9: 0.431}
+REPEATABILITY = {
+    **{"graf": 0.898, "wall": 0.988, "bikes": 0.945},
+    **{"leuven": 1.0, "trees": 0.950, "ubc": 0.899},
+}
+MATCHES = {"bikes 1-6": 16_447, "leuven 1-6": 58_946, "ubc 1-6": 39_891}
+"""The scenes whose matching takes seconds; wall and trees take a minute each."""
+
+
+@pytest.fixture(scope="module")
+def weights(shared: Path) -> DeepDetect:
+    return DeepDetect(shared / "reference" / "published_matching.safetensors")
+
+
+@pytest.fixture(scope="module")
+def scenes(shared: Path) -> list[PlanarScene]:
+    every = load_oxford(shared / "data" / "oxford")
+    return [scene for scene in every if scene.name in REPEATABILITY]
+
+
+@pytest.fixture(scope="module")
+def workspace(shared: Path) -> Workspace:
+    return Workspace(shared / "data")
+
+
+def test_densities(workspace: Workspace, weights: DeepDetect, scenes: list[PlanarScene]) -> None:
+    options = BenchmarkOptions(weights, channels="rgb")
+    methods = [options.own(threshold) for threshold in DENSITY]
+    table = density_table(workspace, methods, scenes, "density")
+    for row, expected in zip(table.rows, DENSITY.values(), strict=True):
+        assert row[1] == pytest.approx(expected, abs=0.005)
+
+
+def test_repeatability(
+    workspace: Workspace, weights: DeepDetect, scenes: list[PlanarScene]
+) -> None:
+    options = BenchmarkOptions(weights, channels="bgr")
+    table = repeatability_table(workspace, [options.own()], scenes, "repeatability")
+    found = dict(zip([scene.name for scene in scenes], table.rows[0][2:], strict=True))
+    assert found == pytest.approx(REPEATABILITY, abs=0.01)
+
+
+def test_matches(
+    workspace: Workspace, weights: DeepDetect, scenes: list[PlanarScene], shared: Path
+) -> None:
+    options = BenchmarkOptions(weights, channels="bgr")
+    every = paper_pairs(load_oxford(shared / "data" / "oxford"))
+    pairs = [pair for pair in every if pair.name in MATCHES]
+    table = matches_table(workspace, [options.own()], pairs, "matches")
+    found = dict(zip([pair.name for pair in pairs], table.rows[0][1::2], strict=True))
+    assert found == pytest.approx(MATCHES, rel=0.05)
