@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import shift as shifted
 
-from deepdetect.geometry.correlation import agreement, local_correlation, warp_back
+from deepdetect.geometry.correlation import (
+    agreement,
+    away_from_border,
+    local_correlation,
+    locally_normalised,
+    smoothed,
+    warp_back,
+)
 
 
 def noise(seed: int = 0, size: tuple[int, int] = (64, 80)) -> np.ndarray:
@@ -51,3 +58,23 @@ def test_warping_back_undoes_a_shift_of_whole_pixels() -> None:
 def test_without_an_overlap_nothing_agrees() -> None:
     far = np.array([[1.0, 0, 500], [0, 1, 0], [0, 0, 1]])
     assert agreement(noise(), noise(), far) == -1
+
+
+def test_what_lies_beyond_the_border_does_not_bleed_in() -> None:
+    first, second = noise(), noise()
+    second[:, 60:] = 255
+    seen = np.ones(first.shape, bool)
+    seen[:, 60:] = False
+    inside = away_from_border(seen, 1.25)
+    difference = np.abs(smoothed(first, 1.25) - smoothed(second, 1.25))
+    assert inside[8:-8, 8:55].all()
+    assert difference[inside].max() < 0.5
+    assert difference[:, 57:60].max() > 5
+
+
+def test_normalised_images_correlate_as_their_windows_do() -> None:
+    first, second = noise(0), noise(1) // 2 + noise(0) // 2
+    a, b = (locally_normalised(image)[10:-10, 10:-10] for image in (first, second))
+    windows = local_correlation(first, second, np.ones(first.shape, bool))
+    assert (a * b).mean() == pytest.approx(np.nanmean(windows), abs=0.03)
+    assert np.abs(locally_normalised(np.full((40, 40), 9, np.uint8))).max() < 1e-3

@@ -60,16 +60,21 @@ def test_is_the_same_on_repetition(pair: tuple[np.ndarray, np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"rounds": 0}, {"corners": 5}, {"windows": ()}, {"windows": (3,)}, {"round_trip": 0}]
+    "wrong", [{"rounds": 0}, {"corners": 5}, {"windows": ()}, {"windows": (3,)}, {"blurs": (0,)}]
 )
 def test_options_out_of_range_are_refused(wrong: dict) -> None:
     with pytest.raises(OptionError):
         RefinementOptions(**wrong)
 
 
-@pytest.mark.parametrize("name", ["wall-2", "bark-3"])
-def test_agrees_with_the_refined_homographies_of_oxford(shared: Path, name: str) -> None:
-    """From the published one, whose points are up to 3 px off."""
+@pytest.mark.parametrize(
+    ("name", "median", "largest"),
+    [("wall-2", 0.1, 0.3), ("bark-3", 0.1, 0.3), ("bikes-6", 0.3, 1.0), ("graf-6", 0.3, 1.6)],
+)
+def test_agrees_with_the_refined_homographies_of_oxford(
+    shared: Path, name: str, median: float, largest: float
+) -> None:
+    """From the published one, whose points are up to 5 px off."""
     from deepdetect.benchmark.refine_oxford import displacement
 
     scene, number = name.split("-")
@@ -79,7 +84,16 @@ def test_agrees_with_the_refined_homographies_of_oxford(shared: Path, name: str)
     expected = read_homography(folder / f"H1to{number}p.refined")
     found = refine_homography(*map(luma, images), published)
     sizes = [(image.shape[1], image.shape[0]) for image in images]
-    assert displacement(expected, published, *sizes)[0] > 1
-    median, largest = displacement(expected, found.homography, *sizes)
-    assert median < 0.1
-    assert largest < 0.3
+    assert displacement(expected, published, *sizes)[0] > median
+    found_median, found_largest = displacement(expected, found.homography, *sizes)
+    assert found_median < median
+    assert found_largest < largest
+
+
+def test_moving_parts_have_no_say(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    first, second = pair
+    moved = second.copy()
+    moved[60:160, 70:150] = np.roll(second[60:160, 70:150], 2, axis=1)
+    start = TRUE @ np.array([[1.0, 0, 0.6], [0, 1, -0.5], [0, 0, 1]])
+    found = refine_homography(first, moved, start, RefinementOptions(windows=(21,)))
+    assert corner_error(found.homography, TRUE, (256, 256)) < 0.3

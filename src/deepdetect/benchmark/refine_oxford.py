@@ -24,10 +24,11 @@ from ..matchers import get_matcher, match_descriptors
 from ..metrics.overlap import map_into
 from .report import Column, Table
 
-LEAST_GAIN = 0.005
+LEAST_GAIN = 0.002
 """Correlation that a refined homography must gain over the published one to be written."""
 
 START_RATIO = 0.85
+START_KEYPOINTS = 8000
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +92,7 @@ def _refine(pair: PlanarPair, path: Path) -> RefinedPair:
 
 def sift_homography(gray0: np.ndarray, gray1: np.ndarray) -> np.ndarray | None:
     """Estimate a homography by SIFT, ratio test and MAGSAC; None where that fails."""
-    sift = cv2.SIFT_create()
+    sift = cv2.SIFT_create(nfeatures=START_KEYPOINTS)
     found = [sift.detectAndCompute(gray, None) for gray in (gray0, gray1)]
     if any(descriptors is None for _, descriptors in found):
         return None

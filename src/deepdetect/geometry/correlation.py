@@ -6,6 +6,12 @@ import cv2
 import numpy as np
 
 WINDOW = 15
+SMOOTHING = 1.25
+"""Pixels (sigma) of blur before images are compared: noise and resampling are not what counts."""
+
+NOISE = 2.0
+"""Grey levels that are added to the spread of a window, so that noise is not blown up."""
+
 FLAT = 1.0
 """Grey levels; where both windows vary less than that there is nothing to compare."""
 
@@ -36,7 +42,7 @@ def local_correlation(
     """Compute the zero-mean correlation of the windows around each pixel.
 
     Args:
-        first, second: (H, W) uint8 images in the same frame.
+        first, second: (H, W) images in the same frame, any dtype.
         valid: (H, W) bool; windows that reach beyond it do not count.
         window: side of the square windows in pixels, odd.
 
@@ -67,18 +73,52 @@ def local_correlation(
     return result
 
 
-def agreement(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> float:
+def agreement(
+    gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray, smoothing: float = SMOOTHING
+) -> float:
     """Return the median correlation of two images over their overlap, in [-1, 1].
 
     Args:
         gray0, gray1: (H, W) uint8 images.
         homography: (3, 3) from the first to the second.
+        smoothing: sigma of a blur before, in pixels of the first image.
 
     Returns:
         The median over the windows that count; -1 when there are none.
     """
     size = (gray0.shape[1], gray0.shape[0])
     warped, seen = warp_back(gray1, homography, size)
-    values = local_correlation(gray0, warped, seen)
+    first, second = (smoothed(gray, smoothing) for gray in (gray0, warped))
+    values = local_correlation(first, second, away_from_border(seen, smoothing))
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else -1.0
+
+
+def smoothed(gray: np.ndarray, sigma: float) -> np.ndarray:
+    """Blur an image; returns (H, W) float32."""
+    return cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma)
+
+
+def away_from_border(valid: np.ndarray, sigma: float) -> np.ndarray:
+    """Leave out the pixels that a blur of this sigma mixes with what is not valid; (H, W) bool."""
+    reach = 2 * int(np.ceil(3 * sigma)) + 1
+    kernel = np.ones((reach, reach), np.uint8)
+    return cv2.erode(valid.astype(np.uint8), kernel, borderValue=0) > 0
+
+
+def locally_normalised(gray: np.ndarray, window: int = WINDOW) -> np.ndarray:
+    """Take away the mean of the window around each pixel and divide by its spread.
+
+    The correlation of two images made so is that of all their windows at once.
+
+    Args:
+        gray: (H, W), any dtype.
+        window: side of the square windows in pixels, odd.
+
+    Returns:
+        (H, W) float32; near 0 where a window is flat.
+    """
+    values = gray.astype(np.float32)
+    mean = cv2.boxFilter(values, cv2.CV_32F, (window, window))
+    variance = cv2.boxFilter(values * values, cv2.CV_32F, (window, window)) - mean * mean
+    return (values - mean) / np.sqrt(np.maximum(variance, 0) + NOISE**2)

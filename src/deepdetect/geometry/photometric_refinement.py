@@ -1,24 +1,39 @@
-"""Sharpening a homography by the images themselves: Lucas-Kanade on the warped image.
+"""Sharpening a homography by the images themselves: Lucas-Kanade on the warped image, then ECC.
 
-Each step warps the second image back by what is known, tracks thousands of corners over the few
-pixels that are left, there and back, and fits a homography to the tracks. A step is kept only
-when the images then correlate better, so it cannot make things worse by that measure. Blur and
-foliage want larger windows than sharp walls, so several are tried in turn.
+Each step warps the second image back by what is known. Some track thousands of corners over the
+few pixels that are left, there and back, and fit a homography to the tracks: blur and foliage want
+larger windows than sharp walls, so several are tried in turn. The others take all pixels at once:
+they raise the correlation of the locally normalised images (Evangelidis and Psarakis, "Parametric
+image alignment using enhanced correlation coefficient maximization", 2008; OpenCV's). A step is
+kept only when the images then correlate better, so it cannot make things worse by that measure.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 
 from ..errors import OptionError
-from .correlation import agreement, warp_back
+from .correlation import (
+    WINDOW,
+    agreement,
+    away_from_border,
+    local_correlation,
+    locally_normalised,
+    smoothed,
+    warp_back,
+)
 
 FEWEST = 30
 """Tracks that a homography is fitted to, at least."""
 
+
+LEFT_OUT = 0.2
+"""Share of the pixels, those that are least alike, that has no say: what moved or is not plane."""
 
 LEAST_GAIN = 0.001
 """Of correlation, by a step that is kept: less than that is noise, and moves the borders about."""
@@ -32,6 +47,7 @@ class RefinementOptions:
         rounds: at the most; each takes one step with every window.
         corners: tracked in each step.
         windows: sides of the tracked windows in pixels.
+        blurs: sigmas of the blur in pixels before the steps that take all pixels.
         levels: of the pyramid above the image; each doubles what a track can move.
         round_trip: a track counts when there and back it ends so near, in pixels.
         inlier_threshold: of MAGSAC, in pixels.
@@ -44,6 +60,7 @@ class RefinementOptions:
     rounds: int = 4
     corners: int = 4000
     windows: tuple[int, ...] = (21, 31, 41)
+    blurs: tuple[float, ...] = (2.0, 1.0)
     levels: int = 3
     round_trip: float = 0.3
     inlier_threshold: float = 1.0
@@ -54,6 +71,8 @@ class RefinementOptions:
             raise OptionError(f"a refinement needs a round and {FEWEST} corners at least")
         if not self.windows or min(self.windows) < 5:
             raise OptionError("a refinement needs windows of 5 pixels at least")
+        if self.blurs and min(self.blurs) <= 0:
+            raise OptionError("the blurs of a refinement must be above 0 pixels")
         if not (self.round_trip > 0 and self.inlier_threshold > 0):
             raise OptionError("the distances of a refinement must be above 0 pixels")
 
@@ -93,11 +112,15 @@ def refine_homography(
     """
     current = np.asarray(homography, np.float64)
     before = best = agreement(gray0, gray1, current)
+    steps: list[Callable[[np.ndarray, np.ndarray], np.ndarray | None]] = [
+        *(partial(_track, gray0, window=window, options=options) for window in options.windows),
+        *(partial(_align, gray0, blur=blur) for blur in options.blurs),
+    ]
     kept = 0
     for _ in range(options.rounds):
         kept_before = kept
-        for window in options.windows:
-            correction = _track(gray0, gray1, current, window, options)
+        for step in steps:
+            correction = step(*warp_back(gray1, current, (gray0.shape[1], gray0.shape[0])))
             if correction is None:
                 continue
             candidate = current @ correction
@@ -109,16 +132,42 @@ def refine_homography(
     return Refinement(current / current[2, 2], best, before, kept)
 
 
+def _align(
+    gray0: np.ndarray, warped: np.ndarray, seen: np.ndarray, *, blur: float
+) -> np.ndarray | None:
+    """Return the homography from the first image to the warped second one, by all pixels."""
+    # Blur first, then windows reach over the border.
+    inside = away_from_border(away_from_border(seen, blur), WINDOW / 6)
+    images = [smoothed(gray, blur) for gray in (gray0, warped)]
+    alike = local_correlation(*images, inside)
+    if not np.isfinite(alike).any():
+        return None
+    inside = alike > np.nanquantile(alike, LEFT_OUT)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-6)
+    start = np.eye(3, dtype=np.float32)
+    try:
+        _, correction = cv2.findTransformECC(
+            *map(locally_normalised, images),
+            start,
+            cv2.MOTION_HOMOGRAPHY,
+            criteria,
+            inside.astype(np.uint8),
+            1,
+        )
+    except cv2.error:  # it does not converge, or there is nothing to correlate
+        return None
+    return correction.astype(np.float64)
+
+
 def _track(
     gray0: np.ndarray,
-    gray1: np.ndarray,
-    homography: np.ndarray,
+    warped: np.ndarray,
+    seen: np.ndarray,
+    *,
     window: int,
     options: RefinementOptions,
 ) -> np.ndarray | None:
-    """Return the homography from the first image to the warped second one, near identity."""
-    size = (gray0.shape[1], gray0.shape[0])
-    warped, seen = warp_back(gray1, homography, size)
+    """Return the homography from the first image to the warped second one, by corners."""
     # Equalised, so that light and shade do not pass for motion.
     equalise = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply
     first, second = equalise(gray0), equalise(warped)
