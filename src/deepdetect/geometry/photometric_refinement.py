@@ -10,7 +10,6 @@ kept only when the images then correlate better, so it cannot make things worse 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -36,7 +35,10 @@ LEFT_OUT = 0.2
 """Share of the pixels, those that are least alike, that has no say: what moved or is not plane."""
 
 LEAST_GAIN = 0.001
-"""Of correlation, by a step that is kept: less than that is noise, and moves the borders about."""
+"""Of correlation, by a step by corners that is kept: less is noise, and moves the borders about."""
+
+LEAST_GAIN_OF_ALL = 0.0001
+"""The same by a step that takes all pixels, which has less noise."""
 
 
 @dataclass(frozen=True)
@@ -112,20 +114,22 @@ def refine_homography(
     """
     current = np.asarray(homography, np.float64)
     before = best = agreement(gray0, gray1, current)
-    steps: list[Callable[[np.ndarray, np.ndarray], np.ndarray | None]] = [
-        *(partial(_track, gray0, window=window, options=options) for window in options.windows),
-        *(partial(_align, gray0, blur=blur) for blur in options.blurs),
+    track = [partial(_track, gray0, window=side, options=options) for side in options.windows]
+    align = [partial(_align, gray0, blur=blur) for blur in options.blurs]
+    steps = [
+        *((step, LEAST_GAIN) for step in track),
+        *((step, LEAST_GAIN_OF_ALL) for step in align),
     ]
     kept = 0
     for _ in range(options.rounds):
         kept_before = kept
-        for step in steps:
+        for step, least_gain in steps:
             correction = step(*warp_back(gray1, current, (gray0.shape[1], gray0.shape[0])))
             if correction is None:
                 continue
             candidate = current @ correction
             reached = agreement(gray0, gray1, candidate)
-            if reached > best + LEAST_GAIN:
+            if reached > best + least_gain:
                 current, best, kept = candidate, reached, kept + 1
         if kept == kept_before:
             break
