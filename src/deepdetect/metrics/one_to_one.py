@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -19,6 +20,9 @@ CHANCE_POINTS = 20_000
 """Random points that the chance level is taken from; few at a time are drawn often."""
 
 MOST_DRAWS = 100
+
+WORTH_THREADS = 20_000
+"""Points from which a search is worth starting threads for."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +117,9 @@ def _mutual_distances(points0: np.ndarray, points1: np.ndarray, radius: float) -
         return np.empty(0)
     # The bound is exclusive in the tree, and keeps it from searching far.
     bound = np.nextafter(radius, np.inf)
-    distance, nearest = KDTree(points1).query(points0, distance_upper_bound=bound, workers=-1)
-    _, back = KDTree(points0).query(points1, distance_upper_bound=bound, workers=-1)
+    workers = -1 if min(len(points0), len(points1)) > WORTH_THREADS else 1
+    distance, nearest = KDTree(points1).query(points0, distance_upper_bound=bound, workers=workers)
+    _, back = KDTree(points0).query(points1, distance_upper_bound=bound, workers=workers)
     rows = np.flatnonzero(np.isfinite(distance))
     return distance[rows[back[nearest[rows]] == rows]]
 
@@ -139,7 +144,7 @@ def _chance(
     fewest = min(counts)
     if not fewest:
         return [0.0] * len(radii)
-    grids = _in_overlap(_grid(sizes[0]), _grid(sizes[1]), homography, sizes)
+    grids = _overlapping_grids(np.asarray(homography, np.float64).tobytes(), sizes)
     generator = np.random.default_rng(seed)
     draws = min(-(-CHANCE_POINTS // fewest), MOST_DRAWS)
     repeated = np.zeros(len(radii))
@@ -154,6 +159,15 @@ def _chance(
         distances = _mutual_distances(drawn[0], drawn[1], max(radii))
         repeated += [(distances <= radius).sum() for radius in radii]
     return [float(value) for value in repeated / (draws * fewest)]
+
+
+@lru_cache(maxsize=2)  # all budgets and methods of a pair draw from the same
+def _overlapping_grids(
+    homography: bytes, sizes: tuple[tuple[int, int], tuple[int, int]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels of both images that the other one shows, in the second image."""
+    matrix = np.frombuffer(homography).reshape(3, 3)
+    return _in_overlap(_grid(sizes[0]), _grid(sizes[1]), matrix, sizes)
 
 
 def _grid(size: tuple[int, int]) -> np.ndarray:
