@@ -200,7 +200,7 @@ def opencv_pipeline(
 @pytest.mark.parametrize(
     "options",
     [
-        MatchingOptions(selection=SelectionOptions(density=0.02)),
+        MatchingOptions(selection=SelectionOptions(density=0.02), descriptor="sift-opencv"),
         MatchingOptions(selection=SelectionOptions(threshold=0.8), ratio=0.9, angle=-1.0),
         MatchingOptions(
             selection=SelectionOptions(max_keypoints=300), matcher="exact", keypoint_size=5.0
@@ -244,7 +244,7 @@ def test_ratios_belong_to_their_rows(photo: np.ndarray) -> None:
     second = warped(photo, WARP)
     matches = match_images(photo, second, Corners(), max_keypoints=400, matcher="exact")
     gray0, gray1 = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (photo, second))
-    base = sift_descriptors(gray1, matches.keypoints1.xy)
+    base = sift_descriptors(gray1, matches.keypoints1.xy).astype(float)
     for index in range(0, len(matches), 10):
         query = sift_descriptors(gray0, matches.points0[index : index + 1])
         distances = np.linalg.norm(base - query, axis=1)

@@ -19,7 +19,7 @@ class MatchingOptions:
     Attributes:
         heatmap: how the network sees the images; None leaves the detector's own way.
         selection: which pixels become keypoints.
-        descriptor: "sift" or "rootsift".
+        descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case.
         keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3).
         angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
         matcher: "flann" or "exact" ("hamming" is for binary descriptors).
@@ -44,6 +44,10 @@ class MatchingOptions:
     def __post_init__(self) -> None:
         get_descriptor(self.descriptor)
         get_matcher(self.matcher)
+        if self.matcher == "hamming":
+            raise OptionError(
+                "the matcher hamming compares binary descriptors, as ORB's: take exact or flann"
+            )
         if not 0 < self.keypoint_size <= 100:
             raise OptionError(
                 f"the keypoint size must be above 0 and at most 100 pixels, "

@@ -5,12 +5,17 @@ import pytest
 
 from deepdetect import OptionError
 from deepdetect.descriptors import DESCRIPTORS, get_descriptor
-from deepdetect.descriptors.sift import root_sift_descriptors, sift_descriptors
+from deepdetect.descriptors.sift import (
+    opencv_sift_descriptors,
+    root_sift_descriptors,
+    sift_descriptors,
+)
 
 
 def test_the_documented_names_exist() -> None:
     assert get_descriptor("sift") is sift_descriptors
     assert get_descriptor("rootsift") is root_sift_descriptors
+    assert get_descriptor("sift-opencv") is opencv_sift_descriptors
 
 
 @pytest.mark.parametrize(
@@ -44,7 +49,7 @@ def test_every_descriptor_keeps_the_contract(name: str, count: int) -> None:
     xy = rng.integers(0, 40, (count, 2)).astype(np.float32)
     before = gray.copy(), xy.copy()
     descriptors = DESCRIPTORS[name](gray, xy, 3.0, 0.0)
-    assert descriptors.dtype == np.float32
+    assert descriptors.dtype == np.uint8
     assert descriptors.ndim == 2
     assert len(descriptors) == count
     np.testing.assert_array_equal(gray, before[0])

@@ -4,7 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.descriptors.sift import root_sift_descriptors, sift_descriptors
+from deepdetect.descriptors.dense_sift import dense_sift
+from deepdetect.descriptors.sift import (
+    opencv_sift_descriptors,
+    root_sift_descriptors,
+    sift_descriptors,
+)
 
 
 def make_gray(seed: int = 0, width: int = 90, height: int = 70) -> np.ndarray:
@@ -65,12 +70,9 @@ def test_every_point_of_the_image_gets_a_row(describe) -> None:
 
 def test_sift_holds_whole_numbers_of_a_byte() -> None:
     descriptors = sift_descriptors(make_gray(), make_points())
-    assert descriptors.dtype == np.float32
-    assert descriptors.min() >= 0
-    assert descriptors.max() <= 255
-    np.testing.assert_array_equal(descriptors, descriptors.astype(np.uint8))
+    assert descriptors.dtype == np.uint8
     # Not a trivial 0: OpenCV scales the length to about 512.
-    assert (np.linalg.norm(descriptors, axis=1) > 400).all()
+    assert (np.linalg.norm(descriptors.astype(int), axis=1) > 400).all()
 
 
 @pytest.mark.parametrize("describe", [sift_descriptors, root_sift_descriptors])
@@ -78,7 +80,7 @@ def test_sift_holds_whole_numbers_of_a_byte() -> None:
 def test_no_points_give_an_empty_array(describe, xy) -> None:
     descriptors = describe(make_gray(), xy)
     assert descriptors.shape == (0, 128)
-    assert descriptors.dtype == np.float32
+    assert descriptors.dtype == np.uint8
 
 
 @pytest.mark.parametrize("kind", [int, np.int32, np.float32, np.float64])
@@ -91,8 +93,8 @@ def test_positions_may_have_any_number_type(kind: type) -> None:
 
 def test_the_unset_angle_is_a_turn_of_one_degree() -> None:
     gray, xy = make_gray(), make_points()
-    unset = sift_descriptors(gray, xy, angle=-1)
-    upright = sift_descriptors(gray, xy, angle=0)
+    unset = sift_descriptors(gray, xy, angle=-1).astype(int)
+    upright = sift_descriptors(gray, xy, angle=0).astype(int)
     assert not np.array_equal(unset, upright)
     # -1 and 359 are the same direction, up to the rounding of cosine and sine.
     turned = sift_descriptors(gray, xy, angle=359)
@@ -123,18 +125,18 @@ def test_pixel_centres_are_whole_numbers() -> None:
     height, width = gray.shape
     xy = make_points(margin=20)
     turned = np.ascontiguousarray(gray[::-1, ::-1])
-    upright = sift_descriptors(gray, xy)
+    upright = sift_descriptors(gray, xy).astype(int)
     right = sift_descriptors(turned, np.float32([width - 1, height - 1]) - xy, angle=180)
     wrong = sift_descriptors(turned, np.float32([width, height]) - xy, angle=180)
     assert np.abs(upright - right).max() <= 2
     assert np.linalg.norm(upright - wrong, axis=1).mean() > 20
 
 
-def test_root_sift_has_unit_length() -> None:
+def test_root_sift_has_a_length_of_512() -> None:
     descriptors = root_sift_descriptors(make_gray(), make_points())
-    assert descriptors.dtype == np.float32
-    assert descriptors.min() >= 0
-    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, atol=1e-6)
+    assert descriptors.dtype == np.uint8
+    lengths = np.linalg.norm(descriptors.astype(int), axis=1)
+    np.testing.assert_allclose(lengths, 512, rtol=0.005)
 
 
 def test_root_sift_is_zero_where_sift_is() -> None:
@@ -150,13 +152,29 @@ def test_root_sift_distances_are_hellinger_distances_of_sift() -> None:
     sift = sift_descriptors(gray, xy).astype(np.float64)
     distribution = sift / sift.sum(1, keepdims=True)
     affinity = np.sqrt(distribution[:, None] * distribution[None]).sum(2)
-    root = root_sift_descriptors(gray, xy).astype(np.float64)
+    root = root_sift_descriptors(gray, xy) / 512
     squared = ((root[:, None] - root[None]) ** 2).sum(2)
-    np.testing.assert_allclose(squared, 2 - 2 * affinity, atol=1e-6)
+    np.testing.assert_allclose(squared, 2 - 2 * affinity, atol=0.01)
 
 
 def test_root_sift_follows_size_and_angle() -> None:
     gray, xy = make_gray(), make_points()
-    sift = sift_descriptors(gray, xy, 5.0, 30.0)
+    sift = sift_descriptors(gray, xy, 5.0, 30.0).astype(float)
     root = root_sift_descriptors(gray, xy, 5.0, 30.0)
-    np.testing.assert_allclose(root**2 * sift.sum(1, keepdims=True), sift, atol=1e-3)
+    expected = 512 * np.sqrt(sift / sift.sum(1, keepdims=True))
+    np.testing.assert_allclose(root, np.minimum(expected, 255), atol=0.51)
+
+
+def test_many_keypoints_are_done_at_once_and_few_by_opencv() -> None:
+    gray = make_gray()
+    everywhere = np.stack(np.meshgrid(np.arange(90), np.arange(70)), -1).reshape(-1, 2)
+    np.testing.assert_array_equal(sift_descriptors(gray, everywhere), dense_sift(gray, everywhere))
+    expected = opencv_sift_descriptors(gray, everywhere).astype(int)
+    assert np.abs(sift_descriptors(gray, everywhere) - expected).max() <= 1
+    for xy, angle in ((everywhere, 30.0), (everywhere + 0.25, 0.0), (everywhere[:9], 0.0)):
+        np.testing.assert_array_equal(
+            sift_descriptors(gray, xy, 3.0, angle), opencv_sift_descriptors(gray, xy, 3.0, angle)
+        )
+    np.testing.assert_array_equal(
+        sift_descriptors(gray, everywhere, 9.0), opencv_sift_descriptors(gray, everywhere, 9.0)
+    )

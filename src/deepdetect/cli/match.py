@@ -33,7 +33,7 @@ from .shared import (
     help="Options to start from: default, or published (exactly the paper's code).",
 )
 @selection_options
-@click.option("--descriptor", help="sift or rootsift.  [default: sift]")
+@click.option("--descriptor", help="sift, rootsift or sift-opencv.  [default: sift]")
 @click.option("--keypoint-size", type=float, help="Size for the descriptor, pixels.  [default: 3]")
 @click.option("--matcher", help="flann or exact.  [default: flann]")
 @click.option("--ratio", type=float, help="Ratio test: keep matches under it.  [default: 0.99]")

@@ -1,7 +1,7 @@
 """The descriptors: one line each.
 
 To add a descriptor, write its module beside this one, with a function
-`(gray, xy, size, angle) -> (N, D) float32`, and add its line.
+`(gray, xy, size, angle) -> (N, D) uint8 or float32`, and add its line.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ from collections.abc import Callable
 import numpy as np
 
 from ..errors import look_up
-from .sift import root_sift_descriptors, sift_descriptors
+from .sift import opencv_sift_descriptors, root_sift_descriptors, sift_descriptors
 
 Descriptor = Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]
 
 DESCRIPTORS: dict[str, Descriptor] = {
     "sift": sift_descriptors,
     "rootsift": root_sift_descriptors,
+    "sift-opencv": opencv_sift_descriptors,
 }
 
 

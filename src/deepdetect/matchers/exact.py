@@ -16,8 +16,8 @@ def exact_neighbours(
     The time grows with the product of the numbers: meant for tens of thousands.
 
     Args:
-        queries: (N, D) float32 descriptors.
-        base: (M, D) float32 descriptors, M >= count.
+        queries: (N, D) descriptors, uint8 or float32.
+        base: (M, D) descriptors, M >= count.
         count: neighbours of each query.
         seed: not used; all matchers take the same arguments.
 

@@ -16,8 +16,8 @@ def flann_neighbours(
     """Find the nearest neighbours with 5 kd-trees and 50 checks.
 
     Args:
-        queries: (N, D) float32 descriptors.
-        base: (M, D) float32 descriptors, M >= count.
+        queries: (N, D) descriptors, uint8 or float32.
+        base: (M, D) descriptors, M >= count.
         count: neighbours of each query.
         seed: of the random trees; the result is the same for the same seed.
 
@@ -25,6 +25,7 @@ def flann_neighbours(
         (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances,
         the nearest first. The search is approximate: it misses some neighbours.
     """
+    queries, base = (np.asarray(part, np.float32) for part in (queries, base))
     cv2.setRNGSeed(seed)
     index = cv2.flann_Index(base, {"algorithm": KD_TREE, "trees": TREES})
     rows, squared = index.knnSearch(queries, count, params={"checks": CHECKS})

@@ -25,7 +25,7 @@ class PointDescriptor:
     """How points that have no size and direction of their own are described.
 
     Attributes:
-        name: "sift" or "rootsift".
+        name: "sift", "rootsift" or "sift-opencv".
         size: diameter in pixels (paper: 3).
         angle: direction in degrees; -1 is OpenCV's "unset", as the paper's code leaves it.
     """
