@@ -122,6 +122,7 @@ def match_images(
             ratio=chosen.ratio,
             mutual=chosen.mutual,
             seed=chosen.geometry.seed,
+            positions=(keypoints[0].xy, keypoints[1].xy),
         )
     points0 = keypoints[0].xy[found.rows0]
     points1 = keypoints[1].xy[found.rows1]

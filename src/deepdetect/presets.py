@@ -22,7 +22,8 @@ class MatchingOptions:
         descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case.
         keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3).
         angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
-        matcher: "flann" or "exact" ("hamming" is for binary descriptors).
+        matcher: "flann", "exact", "faiss" or "patchmatch" ("hamming" is for binary
+            descriptors).
         ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
         mutual: keep only pairs that are each other's nearest.
         geometry: which geometry is estimated, and how.

@@ -15,7 +15,9 @@ def told(
 ) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
     """A matcher that answers what it was told."""
 
-    def matcher(queries, base, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def matcher(
+        queries, base, count: int, seed: int, positions=None
+    ) -> tuple[np.ndarray, np.ndarray]:
         return np.array(rows, np.int32)[:, :count], np.array(distances, np.float32)[:, :count]
 
     return matcher
@@ -113,7 +115,7 @@ def test_one_descriptor_matches_into_a_larger_set(name: str, mutual: bool) -> No
 def test_mutual_asks_the_matcher_the_other_way_with_the_same_seed() -> None:
     calls: list[tuple[int, int, int, int]] = []
 
-    def spy(queries, base, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    def spy(queries, base, count: int, seed: int, positions=None) -> tuple[np.ndarray, np.ndarray]:
         calls.append((len(queries), len(base), count, seed))
         return MATCHERS["exact"](queries, base, count, seed)
 

@@ -39,13 +39,19 @@ def test_a_name_like_no_other_brings_the_whole_list(name: object) -> None:
 @pytest.mark.parametrize("name", MATCHERS)
 @pytest.mark.parametrize("count", [1, 2])
 def test_every_matcher_keeps_the_contract(name: str, count: int) -> None:
+    if name == "faiss":
+        pytest.importorskip("faiss", reason="needs faiss-cpu")
     rng = np.random.default_rng(0)
     queries = rng.random((20, 32), np.float32)
     base = rng.random((30, 32), np.float32)
-    if name == "hamming":
+    if name in ("hamming", "patchmatch"):
         queries, base = (np.rint(part * 255).astype(np.uint8) for part in (queries, base))
+    positions = tuple(
+        np.column_stack([np.arange(count), np.zeros(count)]).astype(np.float32)
+        for count in (20, 30)
+    )
     before = queries.copy(), base.copy()
-    rows, distances = MATCHERS[name](queries, base, count, 0)
+    rows, distances = MATCHERS[name](queries, base, count, 0, positions)
     assert rows.shape == distances.shape == (20, count)
     assert rows.dtype == np.int32
     assert distances.dtype == np.float32

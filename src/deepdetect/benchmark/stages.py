@@ -117,6 +117,7 @@ def find_matches(
                 ratio=settings.ratio,
                 mutual=settings.mutual,
                 seed=settings.seed,
+                positions=(both[0].xy, both[1].xy),
             )
         return {
             "rows0": found.rows0,

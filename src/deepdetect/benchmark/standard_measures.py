@@ -10,7 +10,7 @@ import numpy as np
 
 from ..datasets.planar import PlanarPair
 from ..geometry import GeometryOptions, estimate_geometry
-from ..methods import Method
+from ..methods import Features, Method
 from ..metrics.homography_accuracy import corner_error
 from ..metrics.match_accuracy import MatchAccuracy, match_accuracy
 from ..metrics.one_to_one import Repeatability, one_to_one_repeatability
@@ -95,7 +95,9 @@ def measure_pair(
     images = (pair.first, pair.second)
     sizes = (image_size(pair.first), image_size(pair.second))
     found = [workspace.keypoints(method, image) for image in images]
-    fewest = min(len(one.features.distinct()) for one in found)
+    # Positions, each once: an orientation of SIFT's is no further place.
+    places = [one.features.distinct() for one in found]
+    fewest = min(len(features) for features in places)
     ratio = 1.0 if method.learned else RATIO
     settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
     matches = workspace.matches(method, pair, settings)
@@ -103,8 +105,12 @@ def measure_pair(
     everything = workspace.matches(method, pair, unfiltered)
     stages = {"detect": found[0], "describe": matches.describing, "match": matches}
     return PairResult(
-        repeatability={b: _repeatability(workspace, method, pair, sizes, b) for b in budgets},
-        coverage={b: _coverage(workspace, method, pair.first, sizes[0], b) for b in budgets},
+        repeatability={
+            b: _repeatability(workspace, method, pair, sizes, places, b) for b in budgets
+        },
+        coverage={
+            b: _coverage(workspace, method, pair.first, sizes[0], places[0], b) for b in budgets
+        },
         counts={b: fewest if b is None else min(fewest, b) for b in (*budgets, MATCHING_BUDGET)},
         matches=_judge(matches, pair, sizes),
         all_matches=_judge(everything, pair, sizes),
@@ -151,12 +157,17 @@ def _corner_errors(
 
 
 def _repeatability(
-    workspace: Workspace, method: Method, pair: PlanarPair, sizes: Sizes, budget: int | None
+    workspace: Workspace,
+    method: Method,
+    pair: PlanarPair,
+    sizes: Sizes,
+    places: Sequence[Features],
+    budget: int | None,
 ) -> list[Repeatability]:
     images = (pair.first, pair.second)
 
     def make() -> dict[str, np.ndarray]:
-        points = [_best(workspace, method, image, budget) for image in images]
+        points = [_best(features, budget) for features in places]
         found = one_to_one_repeatability(*points, pair.homography, sizes, RADII)
         rows = [(e.radius, e.repeated, e.fewest, e.localisation, e.chance) for e in found]
         return {"rows": np.array(rows, np.float64)}
@@ -171,16 +182,19 @@ def _repeatability(
 
 
 def _coverage(
-    workspace: Workspace, method: Method, image: Path, size: tuple[int, int], budget: int | None
+    workspace: Workspace,
+    method: Method,
+    image: Path,
+    size: tuple[int, int],
+    places: Features,
+    budget: int | None,
 ) -> float:
     def make() -> dict[str, np.ndarray]:
-        return {"value": np.array(coverage(_best(workspace, method, image, budget), size))}
+        return {"value": np.array(coverage(_best(places, budget), size))}
 
     found = workspace.metric("coverage", method, (image,), {"budget": budget}, make)
     return float(found["value"])
 
 
-def _best(workspace: Workspace, method: Method, image: Path, budget: int | None) -> np.ndarray:
-    """Return positions, each once: an orientation of SIFT's is no further place."""
-    features = workspace.keypoints(method, image).features.distinct()
+def _best(features: Features, budget: int | None) -> np.ndarray:
     return (features if budget is None else features.best(budget)).xy

@@ -35,7 +35,7 @@ from .shared import (
 @selection_options
 @click.option("--descriptor", help="sift, rootsift or sift-opencv.  [default: sift]")
 @click.option("--keypoint-size", type=float, help="Size for the descriptor, pixels.  [default: 3]")
-@click.option("--matcher", help="flann or exact.  [default: flann]")
+@click.option("--matcher", help="flann, exact, faiss or patchmatch.  [default: flann]")
 @click.option("--ratio", type=float, help="Ratio test: keep matches under it.  [default: 0.99]")
 @click.option("--mutual/--no-mutual", default=None, help="Keep mutual nearest neighbours only.")
 @click.option(

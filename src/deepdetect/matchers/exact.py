@@ -9,7 +9,7 @@ BLOCK = 32_000_000
 
 
 def exact_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the true nearest neighbours.
 
@@ -19,7 +19,7 @@ def exact_neighbours(
         queries: (N, D) descriptors, uint8 or float32.
         base: (M, D) descriptors, M >= count.
         count: neighbours of each query.
-        seed: not used; all matchers take the same arguments.
+        seed, positions: not used; all matchers take the same arguments.
 
     Returns:
         (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances,

@@ -11,7 +11,7 @@ CHECKS = 50
 
 
 def flann_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the nearest neighbours with 5 kd-trees and 50 checks.
 
@@ -20,6 +20,7 @@ def flann_neighbours(
         base: (M, D) descriptors, M >= count.
         count: neighbours of each query.
         seed: of the random trees; the result is the same for the same seed.
+        positions: not used; all matchers take the same arguments.
 
     Returns:
         (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances,

@@ -15,7 +15,7 @@ BASE = 200_000
 
 
 def hamming_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the nearest neighbours by the number of differing bits.
 
@@ -23,7 +23,7 @@ def hamming_neighbours(
         queries: (N, D) uint8 descriptors.
         base: (M, D) uint8 descriptors, M >= count.
         count: neighbours of each query.
-        seed: not used; all matchers take the same arguments.
+        seed, positions: not used; all matchers take the same arguments.
 
     Returns:
         (N, count) int32 rows of `base` and (N, count) float32 distances, the nearest first.

@@ -34,15 +34,17 @@ def match_descriptors(
     ratio: float = 0.99,
     mutual: bool = False,
     seed: int = 0,
+    positions: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> DescriptorMatches:
     """Match by nearest neighbour and ratio test.
 
     Args:
-        descriptors0, descriptors1: (N, D) and (M, D) float32.
+        descriptors0, descriptors1: (N, D) and (M, D), uint8 or float32.
         matcher: finds the neighbours.
         ratio: a match needs a ratio strictly under it (paper's code: 0.99).
         mutual: keep only pairs that are each other's nearest.
         seed: of a matcher that is random.
+        positions: (N, 2) and (M, 2) of the keypoints, for a matcher that goes by them.
 
     Returns:
         The matches, by ascending row of the first set. None are found when the second
@@ -57,24 +59,15 @@ def match_descriptors(
     if len(descriptors0) == 0 or len(descriptors1) < 2:
         none = np.empty(0, np.int32)
         return DescriptorMatches(none, none, np.empty(0, np.float32))
-    rows, distances = matcher(descriptors0, descriptors1, 2, seed)
+    rows, distances = matcher(descriptors0, descriptors1, 2, seed, positions)
     best, second = distances[:, 0], distances[:, 1]
     # Two neighbours at distance 0 are equally good: their ratio is 1.
     ratios = np.divide(best, second, out=np.ones_like(best), where=second > 0)
+    ratios[~np.isfinite(second)] = 1  # a second one that the search did not find tells nothing
     kept = ratios < ratio
     if mutual:
-        kept &= _mutual(descriptors0, descriptors1, rows[:, 0], matcher, seed)
+        back = None if positions is None else positions[::-1]
+        nearest = matcher(descriptors1, descriptors0, 1, seed, back)[0][:, 0]
+        kept &= nearest[rows[:, 0]] == np.arange(len(rows))
     rows0 = np.flatnonzero(kept).astype(np.int32)
     return DescriptorMatches(rows0, rows[rows0, 0].astype(np.int32), ratios[rows0])
-
-
-def _mutual(
-    descriptors0: np.ndarray,
-    descriptors1: np.ndarray,
-    nearest: np.ndarray,
-    matcher: Matcher,
-    seed: int,
-) -> np.ndarray:
-    """Tell which rows of the first set are the nearest of their own nearest."""
-    back = matcher(descriptors1, descriptors0, 1, seed)[0][:, 0]
-    return back[nearest] == np.arange(len(nearest))
