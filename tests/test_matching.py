@@ -63,6 +63,11 @@ def assert_well_formed(matches: Matches) -> None:
         assert (matches.model.shape, matches.model.dtype) == ((3, 3), np.float64)
 
 
+def unguided(*images: Any, **changes: Any) -> Matches:
+    """Match by descriptors alone, whatever the options are otherwise."""
+    return match_images(*images, **{**changes, "guidance": "none"})
+
+
 def assert_same(one: Matches, other: Matches) -> None:
     for name in ("points0", "points1", "ratios", "inliers"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
@@ -92,7 +97,7 @@ def test_a_shifted_photo_matches_itself(photo: np.ndarray, detector: Any, shift)
     height, width = photo.shape[:2]
     first = photo[: height - dy, : width - dx]
     second = photo[dy:, dx:]
-    matches = match_images(
+    matches = unguided(
         first, second, detector, density=0.1, ratio=0.8, mutual=True, model="homography"
     )
     truth = np.array([[1, 0, -dx], [0, 1, -dy], [0, 0, 1]])
@@ -140,7 +145,7 @@ def warp_points(points: np.ndarray) -> np.ndarray:
 
 def test_a_given_homography_judges_the_matches(photo: np.ndarray) -> None:
     second = warped(photo, WARP)
-    matches = match_images(
+    matches = unguided(
         photo, second, Corners(), density=0.05, homography=WARP, inlier_threshold=1.5
     )
     assert matches.kind == "homography"
@@ -151,9 +156,7 @@ def test_a_given_homography_judges_the_matches(photo: np.ndarray) -> None:
 
 
 def test_images_of_two_sizes(photo: np.ndarray, detector: Any) -> None:
-    matches = match_images(
-        photo, photo[20:200, 30:150], detector, density=0.1, ratio=0.8, mutual=True
-    )
+    matches = unguided(photo, photo[20:200, 30:150], detector, density=0.1, ratio=0.8, mutual=True)
     assert_well_formed(matches)
     assert matches.keypoints0.image_size == (photo.shape[1], photo.shape[0])
     assert matches.keypoints1.image_size == (120, 180)
@@ -213,7 +216,7 @@ def opencv_pipeline(
 def test_equals_a_pipeline_of_opencv(photo: np.ndarray, options: MatchingOptions) -> None:
     images = [photo, warped(photo, WARP)]
     corners = Corners()
-    matches = match_images(*images, corners, options=options)
+    matches = unguided(*images, corners, options=options)
     maps = [corners.heatmap(image) for image in images]
     points0, points1, ratios = opencv_pipeline(maps, images, options.selection, options)
     assert len(matches) > 20
@@ -242,7 +245,7 @@ def test_the_published_preset_equals_the_published_pipeline(
 
 def test_ratios_belong_to_their_rows(photo: np.ndarray) -> None:
     second = warped(photo, WARP)
-    matches = match_images(photo, second, Corners(), max_keypoints=400, matcher="exact")
+    matches = unguided(photo, second, Corners(), max_keypoints=400, matcher="exact")
     gray0, gray1 = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (photo, second))
     base = sift_descriptors(gray1, matches.keypoints1.xy).astype(float)
     for index in range(0, len(matches), 10):
@@ -260,7 +263,7 @@ def test_ratios_belong_to_their_rows(photo: np.ndarray) -> None:
 
 @pytest.mark.parametrize("ratio", [0.5, 0.8, 0.99])
 def test_all_ratios_are_under_the_wanted(photo: np.ndarray, ratio: float) -> None:
-    matches = match_images(photo, warped(photo, WARP), Corners(), density=0.02, ratio=ratio)
+    matches = unguided(photo, warped(photo, WARP), Corners(), density=0.02, ratio=ratio)
     assert len(matches) > 0
     assert (matches.ratios < ratio).all()
 
@@ -276,8 +279,8 @@ def test_selection_options_reach_both_images(photo: np.ndarray) -> None:
 
 def test_mutual_leaves_one_to_one(photo: np.ndarray) -> None:
     second = warped(photo, WARP)
-    every = match_images(photo, second, Corners(), density=0.02, matcher="exact")
-    mutual = match_images(photo, second, Corners(), density=0.02, matcher="exact", mutual=True)
+    every = unguided(photo, second, Corners(), density=0.02, matcher="exact")
+    mutual = unguided(photo, second, Corners(), density=0.02, matcher="exact", mutual=True)
     assert 0 < len(mutual) < len(every)
     assert len(np.unique(mutual.points1, axis=0)) == len(mutual)
     assert len(np.unique(every.points1, axis=0)) < len(every)
@@ -304,8 +307,7 @@ def test_the_model_is_the_wanted_one(photo: np.ndarray, model: str, estimator: s
 def test_the_seed_reaches_the_matcher(photo: np.ndarray) -> None:
     second = warped(photo, WARP)
     found = [
-        match_images(photo, second, Corners(), density=0.1, model="none", seed=seed)
-        for seed in (0, 1)
+        unguided(photo, second, Corners(), density=0.1, model="none", seed=seed) for seed in (0, 1)
     ]
     assert found[0].points1.shape != found[1].points1.shape or not np.array_equal(
         found[0].points1, found[1].points1
@@ -456,9 +458,7 @@ def test_a_constant_image_has_no_matches(
 @pytest.mark.parametrize("matcher", ["flann", "exact"])
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_very_few_keypoints(photo: np.ndarray, matcher: str, mutual: bool, count: int) -> None:
-    matches = match_images(
-        photo, photo, Corners(), max_keypoints=count, matcher=matcher, mutual=mutual
-    )
+    matches = unguided(photo, photo, Corners(), max_keypoints=count, matcher=matcher, mutual=mutual)
     assert_well_formed(matches)
     assert len(matches) == (0 if count == 1 else count)
     np.testing.assert_array_equal(matches.points0, matches.points1)
@@ -492,7 +492,7 @@ def test_the_result_is_the_same_every_time(photo: np.ndarray, detector: Any) -> 
 
 
 def test_every_stage_has_its_time(photo: np.ndarray) -> None:
-    matches = match_images(photo, photo, Corners(), max_keypoints=50)
+    matches = unguided(photo, photo, Corners(), max_keypoints=50)
     assert list(matches.seconds) == [
         "heat map",
         "keypoints",

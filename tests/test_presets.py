@@ -89,6 +89,7 @@ def test_a_preset_like_no_other_brings_the_whole_list() -> None:
         ("matcher", "exact", "matcher"),
         ("ratio", 0.8, "ratio"),
         ("mutual", True, "mutual"),
+        ("guidance", "homography", "guidance"),
         ("threshold", 0.7, "selection.threshold"),
         ("density", 0.1, "selection.density"),
         ("max_keypoints", 50, "selection.max_keypoints"),

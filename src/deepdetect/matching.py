@@ -13,11 +13,13 @@ import numpy as np
 from .descriptors import get_descriptor
 from .detector import DeepDetect
 from .errors import OptionError
-from .geometry import estimate_geometry
+from .geometry import Geometry, GeometryOptions, estimate_geometry
+from .geometry.residuals import transfer_errors
+from .guidance import Guidance, guided_matches
 from .heatmap import HeatmapOptions
 from .image import load_image, luma
 from .keypoints import Keypoints, select_keypoints
-from .matchers import get_matcher, match_descriptors
+from .matchers import DescriptorMatches, get_matcher, match_descriptors
 from .memory import free_memory
 from .options import changed
 from .presets import MatchingOptions, get_preset
@@ -41,13 +43,15 @@ class Matches:
     Attributes:
         points0, points1: (M, 2) float32 positions in the first and in the second
             image, matched row by row; centre of the first pixel (0, 0).
-        ratios: (M,) float32, distance to the best over that to the second-best
-            descriptor: small is distinctive.
+        ratios: (M,) float32: small is sure. Unguided, the distance to the best over that to the
+            second-best descriptor; guided, the distance over that of strangers.
         model: (3, 3) float64 geometry between the images, or None.
         inliers: (M,) bool, the matches that agree with the model.
         kind: what `model` is: "homography", "fundamental", "essential" or "none".
         keypoints0, keypoints1: all keypoints of the two images.
         seconds: time of each stage, both images together.
+        guidance: what guided the matching; None when no guidance was asked for. With the kind
+            "none" no geometry could be trusted, and the matches are unguided.
     """
 
     points0: np.ndarray
@@ -59,6 +63,12 @@ class Matches:
     keypoints0: Keypoints
     keypoints1: Keypoints
     seconds: dict[str, float] = field(default_factory=dict)
+    guidance: Guidance | None = None
+
+    @property
+    def guided(self) -> bool:
+        """Whether a geometry proposed these matches."""
+        return self.guidance is not None and self.guidance.kind != "none"
 
     def __len__(self) -> int:
         return len(self.points0)
@@ -108,26 +118,22 @@ def match_images(
         heatmaps = [detector.heatmap(image) for image in rgb]
     with _timed(seconds, "keypoints"):
         keypoints = [select_keypoints(heatmap, chosen.selection) for heatmap in heatmaps]
-    check_memory([len(points) for points in keypoints])
-    with _timed(seconds, "descriptors"):
-        describe = get_descriptor(chosen.descriptor)
-        descriptors = [
-            describe(luma(image), points.xy, chosen.keypoint_size, chosen.angle)
-            for image, points in zip(rgb, keypoints, strict=True)
-        ]
-    with _timed(seconds, "matching"):
-        found = match_descriptors(
-            *descriptors,
-            get_matcher(chosen.matcher),
-            ratio=chosen.ratio,
-            mutual=chosen.mutual,
-            seed=chosen.geometry.seed,
-            positions=(keypoints[0].xy, keypoints[1].xy),
-        )
+    grays = luma(rgb[0]), luma(rgb[1])
+    guidance, found = None, None
+    if chosen.guidance != "none":
+        with _timed(seconds, "guided matching"):
+            guidance, found = guided_matches(
+                *grays,
+                *(points.xy for points in keypoints),
+                _guiding_model(chosen),
+                chosen.geometry.seed,
+            )
+    if found is None:
+        found = _unguided(grays, keypoints, chosen, seconds)
     points0 = keypoints[0].xy[found.rows0]
     points1 = keypoints[1].xy[found.rows1]
     with _timed(seconds, "geometry"):
-        geometry = estimate_geometry(points0, points1, chosen.geometry)
+        geometry = _geometry(points0, points1, chosen.geometry, guidance)
     return Matches(
         points0,
         points1,
@@ -137,7 +143,52 @@ def match_images(
         geometry.kind,
         *keypoints,
         seconds,
+        guidance,
     )
+
+
+def _unguided(
+    grays: Sequence[np.ndarray],
+    keypoints: Sequence[Keypoints],
+    chosen: MatchingOptions,
+    seconds: dict[str, float],
+) -> DescriptorMatches:
+    """Match all descriptors with all others."""
+    check_memory([len(points) for points in keypoints])
+    with _timed(seconds, "descriptors"):
+        describe = get_descriptor(chosen.descriptor)
+        descriptors = [
+            describe(gray, points.xy, chosen.keypoint_size, chosen.angle)
+            for gray, points in zip(grays, keypoints, strict=True)
+        ]
+    with _timed(seconds, "matching"):
+        return match_descriptors(
+            *descriptors,
+            get_matcher(chosen.matcher),
+            ratio=chosen.ratio,
+            mutual=chosen.mutual,
+            seed=chosen.geometry.seed,
+            positions=(keypoints[0].xy, keypoints[1].xy),
+        )
+
+
+def _guiding_model(chosen: MatchingOptions) -> str:
+    """A plane that is asked for guides; any other geometry leaves the choice open."""
+    asked = chosen.geometry.model
+    return asked if chosen.guidance == "auto" and asked == "homography" else chosen.guidance
+
+
+def _geometry(
+    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, guidance: Guidance | None
+) -> Geometry:
+    """Take the geometry that guided where that is what is asked for, else estimate it."""
+    known = guidance is not None and guidance.kind == "homography"
+    if known and options.model in ("auto", "homography") and options.homography is None:
+        assert guidance is not None
+        assert guidance.matrix is not None
+        errors = transfer_errors(points0, points1, guidance.matrix)
+        return Geometry("homography", guidance.matrix, errors < options.inlier_threshold)
+    return estimate_geometry(points0, points1, options)
 
 
 def _configured(

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from .descriptors import get_descriptor
-from .errors import OptionError, look_up
+from .errors import OptionError, look_up, unknown_name
 from .geometry import GeometryOptions
+from .guidance import GUIDANCES
 from .heatmap import HeatmapOptions
 from .keypoints import SelectionOptions
 from .matchers import get_matcher
@@ -26,6 +27,9 @@ class MatchingOptions:
             descriptors).
         ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
         mutual: keep only pairs that are each other's nearest.
+        guidance: "auto", "homography" or "fundamental": a geometry from few points proposes the
+            matches ("auto" chooses which; `guidance.guided`), and the matcher and its ratio only
+            serve where none can be trusted; "none": the matcher alone.
         geometry: which geometry is estimated, and how.
 
     Raises:
@@ -40,7 +44,8 @@ class MatchingOptions:
     matcher: str = "flann"
     ratio: float = 0.99
     mutual: bool = False
-    geometry: GeometryOptions = field(default_factory=GeometryOptions)
+    guidance: str = "auto"
+    geometry: GeometryOptions = field(default_factory=lambda: GeometryOptions(model="auto"))
 
     def __post_init__(self) -> None:
         get_descriptor(self.descriptor)
@@ -49,6 +54,8 @@ class MatchingOptions:
             raise OptionError(
                 "the matcher hamming compares binary descriptors, as ORB's: take exact or flann"
             )
+        if self.guidance not in GUIDANCES:
+            raise unknown_name("guidance", self.guidance, GUIDANCES)
         if not 0 < self.keypoint_size <= 100:
             raise OptionError(
                 f"the keypoint size must be above 0 and at most 100 pixels, "
@@ -72,6 +79,7 @@ PRESETS: dict[str, MatchingOptions] = {
         angle=-1.0,
         matcher="flann",
         ratio=0.99,
+        guidance="none",
         geometry=GeometryOptions(model="none"),
     ),
 }

@@ -61,10 +61,9 @@ def stereo_quality(
 ) -> list[StereoQuality]:
     """Match rectified pairs with several sources of keypoints, and judge the matches.
 
-    Matching is the default one of `match_images` (SIFT descriptors, FLANN, ratio 0.99) over the
-    whole image: neither the rows nor the true disparity are used. Beside each source stand
-    random points at its density, since more keypoints always find more; every pixel is the
-    last row.
+    Matching is unguided (SIFT descriptors, FLANN, ratio 0.99) over the whole image: neither the
+    rows nor the true disparity are used. Beside each source stand random points at its density,
+    since more keypoints always find more; every pixel is the last row.
 
     Args:
         sources: detectors by name.
@@ -95,8 +94,8 @@ def stereo_quality(
 
 
 def match_stereo(pair: StereoPair, detector: HeatmapDetector, **changes: Any) -> Matches:
-    """Match both views, without looking for their geometry."""
-    return match_images(pair.left, pair.right, detector, model="none", **changes)
+    """Match both views, unguided and without looking for their geometry."""
+    return match_images(pair.left, pair.right, detector, guidance="none", model="none", **changes)
 
 
 def match_random_points(pair: StereoPair, density: float) -> Matches:

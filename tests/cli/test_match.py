@@ -18,7 +18,7 @@ def test_writes_matches_and_a_picture(run, photos: Path) -> None:
         np.testing.assert_array_equal(file["points1"], expected.points1)
         np.testing.assert_array_equal(file["inliers"], expected.inliers)
         np.testing.assert_allclose(file["model"], expected.model)
-        assert str(file["kind"]) == "fundamental"
+        assert str(file["kind"]) == expected.kind
     assert np.asarray(Image.open("out/left_right_matches.png")).shape[1] == 400
     assert f"{len(expected):,}" in result.stdout
 
@@ -27,7 +27,7 @@ def test_options_reach_the_matcher(run, photos: Path) -> None:
     result = run(
         *("match", photos / "left.png", photos / "right.png", "--json", "--no-pictures"),
         *("--ratio", 0.8, "--mutual", "--model", "none", "--matcher", "exact"),
-        *("--max-keypoints", 500, "--descriptor", "rootsift"),
+        *("--max-keypoints", 500, "--descriptor", "rootsift", "--guidance", "none"),
     )
     report = json.loads(result.stdout)
     expected = match_images(
@@ -39,6 +39,7 @@ def test_options_reach_the_matcher(run, photos: Path) -> None:
         matcher="exact",
         max_keypoints=500,
         descriptor="rootsift",
+        guidance="none",
     )
     assert report["keypoints0"] == 500
     assert report["matches"] == len(expected)

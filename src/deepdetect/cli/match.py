@@ -39,10 +39,14 @@ from .shared import (
 @click.option("--ratio", type=float, help="Ratio test: keep matches under it.  [default: 0.99]")
 @click.option("--mutual/--no-mutual", default=None, help="Keep mutual nearest neighbours only.")
 @click.option(
+    "--guidance",
+    help="A geometry from few points proposes the matches: auto, homography (planes, pure "
+    "rotation), fundamental, or none: match everything with everything.  [default: auto]",
+)
+@click.option(
     "--model",
     help="fundamental (any static scene), essential (the same with known cameras), homography "
-    "(planes, pure rotation) or none.  "
-    "[default: fundamental]",
+    "(planes, pure rotation), none, or auto: homography or fundamental.  [default: auto]",
 )
 @click.option("--estimator", help="magsac or ransac.  [default: magsac]")
 @click.option("--inlier-threshold", type=float, help="Pixels.  [default: 1]")
@@ -117,6 +121,8 @@ def match(
         "matches": len(matches),
         "inliers": int(matches.inliers.sum()),
         "kind": matches.kind,
+        "guided": matches.guided,
+        "guidance": _guidance(matches),
         "model": None if matches.model is None else matches.model.tolist(),
         "backend": detector.backend,
         "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
@@ -132,13 +138,29 @@ def match(
             ("density", f"{numbers['density0']:.3f} and {numbers['density1']:.3f}"),
             ("matches", f"{len(matches):,}"),
             (f"inliers ({matches.kind})", f"{numbers['inliers']:,}"),
+            ("guided by", matches.guidance.kind if matches.guided else "nothing"),
             *seconds_rows(matches.seconds),
             ("written", ", ".join(str(path) for path in (file, picture) if path)),
         ],
         f"{image0} and {image1}",
     )
+    if matches.guidance is not None and not matches.guided:
+        click.echo("no geometry could be trusted: these matches are unguided", err=True)
     if matches.model is None and matches.kind != "none":
         click.echo(f"no {matches.kind} could be estimated from these matches", err=True)
+
+
+def _guidance(matches: Any) -> dict[str, Any] | None:
+    if matches.guidance is None:
+        return None
+    found = matches.guidance
+    return {
+        "kind": found.kind,
+        "sparse_matches": found.sparse_matches,
+        "sparse_inliers": found.sparse_inliers,
+        "log_false_alarms": found.log_false_alarms if abs(found.log_false_alarms) < 1e9 else None,
+        "simulated_views": found.simulated_views,
+    }
 
 
 def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:

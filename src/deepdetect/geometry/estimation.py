@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
 from ..errors import OptionError, unknown_name
+from .model_choice import has_depth
 from .residuals import epipolar_errors, transfer_errors
 
 ESTIMATORS = ("magsac", "ransac")
-MODEL_NAMES = ("homography", "fundamental", "essential", "none")
+MODEL_NAMES = ("auto", "homography", "fundamental", "essential", "none")
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +22,8 @@ class GeometryOptions:
     """Which geometry is estimated, and how.
 
     Attributes:
-        model: "homography" (planes, pure rotation), "fundamental" (any static scene),
+        model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto"
+            (one of these two: the homography, but for scenes with depth; `model_choice`),
             "essential" (known cameras), or "none".
         estimator: "magsac" or "ransac".
         inlier_threshold: a match is an inlier when it is nearer to the model than this, in
@@ -140,6 +142,13 @@ def estimate_geometry(
         return Geometry("homography", options.homography, errors < options.inlier_threshold)
     if options.model == "none":
         return Geometry("none", None, np.ones(len(points0), bool))
+    if options.model == "auto":
+        plane, space = (
+            estimate_geometry(points0, points1, replace(options, model=model))
+            for model in ("homography", "fundamental")
+        )
+        depth = plane.matrix is None or has_depth(plane.inliers, space.inliers)
+        return space if depth else plane
     model = MODELS[options.model]
     nothing = Geometry(options.model, None, np.zeros(len(points0), bool))
     if len(points0) < model.fewest:

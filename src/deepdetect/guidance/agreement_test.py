@@ -35,7 +35,14 @@ BLOCKS = 24
 def alike(
     gray0: np.ndarray, warped: np.ndarray, seen: np.ndarray, pixels: np.ndarray, seed: int = 0
 ) -> np.ndarray:
-    """Tell which points agree.
+    """Tell which points agree, (N,) bool; arguments as of `unlikeness`."""
+    return unlikeness(gray0, warped, seen, pixels, seed) < 1
+
+
+def unlikeness(
+    gray0: np.ndarray, warped: np.ndarray, seen: np.ndarray, pixels: np.ndarray, seed: int = 0
+) -> np.ndarray:
+    """Compare the surroundings of points.
 
     Args:
         gray0: (H, W) uint8, the first image.
@@ -45,10 +52,11 @@ def alike(
         seed: of the choice of strangers.
 
     Returns:
-        (N,) bool; false where the second image is not seen.
+        (N,) float32: the distance of the descriptors, with those around, over that which a share
+        of `STRANGERS` stays under; infinite where the second image is not seen.
     """
     pixels = np.asarray(pixels).astype(np.int64)
-    result = np.zeros(len(pixels), bool)
+    result = np.full(len(pixels), np.inf, np.float32)
     known = np.flatnonzero(seen[pixels[:, 1], pixels[:, 0]])
     if not len(known):
         return result
@@ -58,7 +66,7 @@ def alike(
     strangers = _strangers(gray0.shape, warped, seen, pixels[known], described, seed)
     if not len(strangers):
         return result
-    result[known] = nearness < np.quantile(strangers, STRANGERS)
+    result[known] = nearness / max(np.quantile(strangers, STRANGERS), 1e-6)
     return result
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..geometry.correlation import warp_back
 from ..geometry.residuals import transform_points
-from .agreement_test import alike
+from .agreement_test import unlikeness
 
 REACH = 1.0
 """A keypoint matches when it is nearer than this to where the homography takes the other."""
@@ -19,7 +19,7 @@ def matches_by_homography(
     xy1: np.ndarray,
     homography: np.ndarray,
     seed: int = 0,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Match keypoints by a homography, and keep those that look alike.
 
     Args:
@@ -29,17 +29,18 @@ def matches_by_homography(
         seed: of the test of likeness.
 
     Returns:
-        (K,) rows of the first and of the second keypoints. A keypoint of the second image may
-        have several partners: each of the first counts once.
+        (K,) rows of the first and of the second keypoints, and their `unlikeness`, under 1. A
+        keypoint of the second image may have several partners: each of the first counts once.
     """
     places = transform_points(xy0, homography)
     rows1, distances = nearest_pixel(places, xy1, (gray1.shape[1], gray1.shape[0]))
     rows0 = np.flatnonzero(distances < REACH)
     if not len(rows0):
-        return rows0, rows0
+        return rows0, rows0, np.empty(0, np.float32)
     warped, seen = warp_back(gray1, homography, (gray0.shape[1], gray0.shape[0]))
-    kept = rows0[alike(gray0, warped, seen, xy0[rows0], seed)]
-    return kept, rows1[kept]
+    scores = unlikeness(gray0, warped, seen, xy0[rows0], seed)
+    kept = rows0[scores < 1]
+    return kept, rows1[kept], scores[scores < 1]
 
 
 def nearest_pixel(

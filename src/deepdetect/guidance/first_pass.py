@@ -7,14 +7,15 @@ takes part, and nothing of the truth.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from ..geometry import GeometryOptions, estimate_geometry
+from ..geometry.model_choice import has_depth
 from ..geometry.residuals import epipolar_errors, transfer_errors
 from ..matchers import get_matcher, match_descriptors
+from .scaling import scaled_fundamental, scaled_homography, scaled_points, shrunk
 from .sparse import MOST, SparseFeatures, sparse_features
 from .trust import LARGEST, false_alarms
 from .views import TILTS, tilted_views
@@ -25,12 +26,6 @@ LONGEST = 1200
 RATIO = 0.85
 THRESHOLDS = {"homography": 3.0, "fundamental": 1.5}
 """Pixels (of the shrunk images) within which matches agree with a model."""
-
-DEPTH_OF_REST = 0.5
-DEPTH_OF_ALL = 0.1
-"""A scene has depth when the fundamental matrix explains at least half of the matches that the
-homography leaves, and these are at least a tenth of all that it explains. (On planes it explains
-some too, as a band is easily hit, but few of the rest.)"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +64,7 @@ def first_pass(
     Returns:
         The geometry, or the kind "none".
     """
-    small = [_shrunk(gray) for gray in (gray0, gray1)]
-    (view0, scale0), (view1, scale1) = small
+    (view0, scale0), (view1, scale1) = (shrunk(gray, LONGEST) for gray in (gray0, gray1))
     best = FirstPass("none", None, *np.empty((2, 0, 2)), 0, float("inf"), 0)
     simulated = 0
     for pairs, views in _looks(view0, view1):
@@ -157,49 +151,13 @@ def _estimate(
     return min((trusted or found).values(), key=lambda one: one.log_false_alarms, default=nothing)
 
 
-def has_depth(by_homography: np.ndarray, by_fundamental: np.ndarray) -> bool:
-    """Tell whether a scene is more than a plane, from which matches the two models explain.
-
-    Args:
-        by_homography, by_fundamental: (M,) bool.
-
-    Example:
-        >>> plane = np.arange(100) < 60
-        >>> has_depth(plane, plane), has_depth(plane, np.arange(100) < 95)
-        (False, True)
-    """
-    rest = by_fundamental & ~by_homography
-    left, all_of_it = np.count_nonzero(~by_homography), np.count_nonzero(by_fundamental)
-    return bool(rest.sum() >= max(DEPTH_OF_REST * left, DEPTH_OF_ALL * all_of_it, 1))
-
-
-def _shrunk(gray: np.ndarray) -> tuple[np.ndarray, float]:
-    scale = min(1.0, LONGEST / max(gray.shape))
-    if scale == 1:
-        return gray, 1.0
-    size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
-    return cv2.resize(gray, size, interpolation=cv2.INTER_AREA), scale
-
-
 def _enlarged(found: FirstPass, scale0: float, scale1: float) -> FirstPass:
     """Return a geometry of shrunk images as one of the images themselves."""
-    to_small, back = (_scaling(scale0), np.linalg.inv(_scaling(scale1)))
     assert found.matrix is not None
-    if found.kind == "homography":
-        matrix = back @ found.matrix @ to_small
-        matrix /= matrix[2, 2]
-    else:
-        matrix = _scaling(scale1).T @ found.matrix @ to_small
-    points = [
-        (points + 0.5) / scale - 0.5
-        for points, scale in ((found.points0, scale0), (found.points1, scale1))
-    ]
-    return FirstPass(
-        found.kind, matrix, *points, found.matches, found.log_false_alarms, found.simulated
+    convert = scaled_homography if found.kind == "homography" else scaled_fundamental
+    return replace(
+        found,
+        matrix=convert(found.matrix, 1 / scale0, 1 / scale1),
+        points0=scaled_points(found.points0, 1 / scale0),
+        points1=scaled_points(found.points1, 1 / scale1),
     )
-
-
-def _scaling(scale: float) -> np.ndarray:
-    """Return the (3, 3) map of an image to a shrunk one; pixel centres are whole numbers."""
-    shift = 0.5 * scale - 0.5
-    return np.array([[scale, 0, shift], [0, scale, shift], [0, 0, 1]])

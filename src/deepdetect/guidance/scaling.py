@@ -1,0 +1,46 @@
+"""Images made smaller, and geometries that go with them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+
+def shrunk(gray: np.ndarray, longest: int) -> tuple[np.ndarray, float]:
+    """Shrink an image so that its longer side has at most so many pixels.
+
+    Returns:
+        The image, and its scale: at most 1.
+    """
+    scale = min(1.0, longest / max(gray.shape))
+    if scale == 1:
+        return gray, 1.0
+    size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
+    return cv2.resize(gray, size, interpolation=cv2.INTER_AREA), scale
+
+
+def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:
+    """Return where points are in an image of another scale; pixel centres are whole numbers.
+
+    Example:
+        >>> scaled_points(np.array([[0.0, 1.0]]), 2).tolist()
+        [[0.5, 2.5]]
+    """
+    return (np.asarray(points, np.float64) + 0.5) * scale - 0.5
+
+
+def scaled_homography(homography: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
+    """Return the homography between both images at other scales, its last element 1."""
+    matrix = _scaling(scale1) @ homography @ _scaling(1 / scale0)
+    return matrix / matrix[2, 2]
+
+
+def scaled_fundamental(fundamental: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
+    """Return the fundamental matrix between both images at other scales."""
+    return _scaling(1 / scale1).T @ fundamental @ _scaling(1 / scale0)
+
+
+def _scaling(scale: float) -> np.ndarray:
+    """Return the (3, 3) map of an image to the same at another scale."""
+    shift = 0.5 * scale - 0.5
+    return np.array([[scale, 0, shift], [0, scale, shift], [0, 0, 1]])
