@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import unknown_name
+from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.photometric_refinement import RefinementOptions, refine_homography
 from ..matchers import DescriptorMatches
+from .by_epipolar_line import matches_by_epipolar_line
 from .by_homography import matches_by_homography
 from .first_pass import FirstPass, first_pass
 from .scaling import scaled_homography, shrunk
@@ -23,6 +25,11 @@ LONGEST = 1600
 """Longer sides are shrunk to so many pixels where the geometry is sharpened."""
 
 SHARPENING = RefinementOptions(rounds=2, windows=(15, 31), blurs=(), inlier_threshold=0.5)
+
+ROUNDS = 2
+LEAST_MORE = 0.01
+"""New fundamental matrices from the dense matches, at the most, and the share of further matches
+that one must give."""
 
 FEWEST = 0.02
 """With fewer matches than this share of the keypoints, the geometry is not trusted after all."""
@@ -75,13 +82,39 @@ def guided_matches(
     if model not in GUIDANCES[:3]:
         raise unknown_name("guidance", model, GUIDANCES)
     first = first_pass(gray0, gray1, model, seed)
-    if first.kind != "homography" or first.matrix is None:
-        return _guidance(first, first.matrix), None
-    homography = sharpened(gray0, gray1, first.matrix)
-    rows0, rows1, ratios = matches_by_homography(gray0, gray1, xy0, xy1, homography, seed)
+    if first.kind == "none" or first.matrix is None:
+        return _guidance(first, None), None
+    if first.kind == "homography":
+        matrix = sharpened(gray0, gray1, first.matrix)
+        rows0, rows1, ratios = matches_by_homography(gray0, gray1, xy0, xy1, matrix, seed)
+    else:
+        matrix, (rows0, rows1, ratios) = _by_lines(gray0, gray1, xy0, xy1, first.matrix, seed)
     if len(rows0) < FEWEST * min(len(xy0), len(xy1)):
         return _guidance(replace(first, kind="none", points0=first.points0[:0]), None), None
-    return _guidance(first, homography), DescriptorMatches(rows0, rows1, ratios)
+    return _guidance(first, matrix), DescriptorMatches(rows0, rows1, ratios)
+
+
+def _by_lines(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    xy0: np.ndarray,
+    xy1: np.ndarray,
+    fundamental: np.ndarray,
+    seed: int,
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Match by a fundamental matrix; take a new one from the matches while that gives more."""
+    best = fundamental, matches_by_epipolar_line(gray0, gray1, xy0, xy1, fundamental, seed)
+    for _ in range(ROUNDS):
+        rows0, rows1, _ = best[1]
+        options = GeometryOptions(model="fundamental", inlier_threshold=1.0, seed=seed)
+        matrix = estimate_geometry(xy0[rows0], xy1[rows1], options).matrix
+        if matrix is None:
+            break
+        found = matches_by_epipolar_line(gray0, gray1, xy0, xy1, matrix, seed)
+        if len(found[0]) <= len(rows0) * (1 + LEAST_MORE):
+            break
+        best = matrix, found
+    return best
 
 
 def sharpened(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:

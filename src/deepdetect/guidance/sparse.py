@@ -12,6 +12,10 @@ from ..descriptors.dense_sift import root
 MOST = 4000
 """Keypoints of an image."""
 
+ENOUGH = 1000
+CONTRASTS = (0.04, 0.01, 0.0025)
+"""SIFT's threshold of contrast (Lowe: 0.04); the next is tried where there are not enough."""
+
 CELLS = 24
 """Cells along the longer side; each gives its strongest keypoints, so that all parts have some."""
 
@@ -44,8 +48,11 @@ def sparse_features(gray: np.ndarray, most: int = MOST) -> SparseFeatures:
         >>> len(sparse_features(gray, 50))
         50
     """
-    sift = cv2.SIFT_create()
-    keypoints = sift.detect(gray, None)
+    for contrast in CONTRASTS:
+        sift = cv2.SIFT_create(contrastThreshold=contrast)
+        keypoints = sift.detect(gray, None)
+        if len(keypoints) >= min(ENOUGH, most):
+            break
     xy = cv2.KeyPoint_convert(keypoints)
     if not len(xy):
         return SparseFeatures(np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8))

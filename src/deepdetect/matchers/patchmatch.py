@@ -20,6 +20,9 @@ OFFSETS = (1, 4, 12)
 BAND = 96
 """Height in pixels of a part that is done by one thread; the result depends on it."""
 
+TRIES = 16
+"""Random places on its epipolar line that a query begins with."""
+
 SHRINK = 3
 """Random tries begin with the whole image around the best, each then so many times nearer."""
 
@@ -55,6 +58,40 @@ def patchmatch_neighbours(
         )
     if count > 2 or len(base) < 2:
         raise OptionError("the matcher patchmatch finds one or two neighbours, of two or more")
+    return _search(queries, base, count, seed, positions, None, np.inf)
+
+
+def epipolar_neighbours(
+    queries: np.ndarray,
+    base: np.ndarray,
+    seed: int,
+    positions: tuple[np.ndarray, np.ndarray],
+    fundamental: np.ndarray,
+    band: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the nearest neighbour of each query near its epipolar line.
+
+    Args:
+        queries, base, seed, positions: as of `patchmatch_neighbours`.
+        fundamental: (3, 3) with x1^T F x0 = 0.
+        band: a neighbour is at most so far from the line, in pixels.
+
+    Returns:
+        (N,) int32 rows of `base` and (N,) float32 distances, infinite where none was found.
+    """
+    rows, distances = _search(queries, base, 1, seed, positions, fundamental, band)
+    return rows[:, 0], distances[:, 0]
+
+
+def _search(
+    queries: np.ndarray,
+    base: np.ndarray,
+    count: int,
+    seed: int,
+    positions: tuple[np.ndarray, np.ndarray],
+    fundamental: np.ndarray | None,
+    band: float,
+) -> tuple[np.ndarray, np.ndarray]:
     from . import patchmatch_kernel as kernel
 
     pixels = [_pixels(xy) for xy in positions]
@@ -66,20 +103,30 @@ def patchmatch_neighbours(
     bands = np.searchsorted(pixels[0][:, 1], edges)
     rows = np.empty((len(queries), 2), np.int32)
     distances = np.empty((len(queries), 2), np.int32)
-    in_threads(
-        len(queries),
-        lambda first, last: kernel.start(first, last, queries, base, seed, rows, distances),
-    )
-    for turn in range(SWEEPS):
-        shared = (queries, base, *pixels, at0, at1, np.array(OFFSETS), turn, seed)
-        last_of = (_radii(at1.shape), rows.copy(), rows, distances)
+    matrix = np.zeros((3, 3)) if fundamental is None else np.asarray(fundamental, np.float64)
 
-        def work(first: int, last: int, shared: tuple = shared, last_of: tuple = last_of) -> None:  # type: ignore[type-arg]
-            kernel.sweep(first, last, bands, *shared, *last_of)
+    def begin(first: int, last: int) -> None:
+        if fundamental is None:
+            kernel.start(first, last, queries, base, seed, rows, distances)
+        else:
+            kernel.start_on_lines(
+                first, last, queries, base, pixels[0], at1, matrix, TRIES, seed, rows, distances
+            )
+
+    in_threads(len(queries), begin)
+    for turn in range(SWEEPS):
+        before = rows.copy()
+
+        def work(first: int, last: int, turn: int = turn, before: np.ndarray = before) -> None:
+            kernel.sweep(
+                *(first, last, bands, queries, base, *pixels, at0, at1, np.array(OFFSETS), turn),
+                *(seed, _radii(at1.shape), before, rows, distances, matrix, float(band)),
+            )
 
         in_threads(len(bands) - 1, work)
     found = np.empty_like(rows), np.empty(rows.shape, np.float32)
-    found[0][order], found[1][order] = rows, np.sqrt(distances.astype(np.float32))
+    gaps = np.sqrt(distances.astype(np.float32))
+    found[0][order], found[1][order] = rows, np.where(distances == kernel.FAR, np.inf, gaps)
     return found[0][:, :count], found[1][:, :count]
 
 
