@@ -152,7 +152,7 @@ def test_make_demo_runs(tmp_path: Path) -> None:
         ["make", "demo", f"DEMO_OUTPUT={tmp_path}"], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    for word in ("keypoints", "density", "matches", "truth", "seconds: matching"):
+    for word in ("keypoints", "density", "matches", "truth", "seconds: guided matching"):
         assert word in done.stdout
     pictures = {path.name.removeprefix("motorcycle_") for path in tmp_path.glob("*.png")}
     assert pictures == {

@@ -1,9 +1,12 @@
 """Which points look alike in both images once the geometry is taken out.
 
-The second image is warped into the frame of the first; descriptors are taken from both at the same
-pixels. What two places that have nothing to do with each other look like is measured on the pair
-itself, by comparing with the warped image moved by a third of its size: a point agrees when its
-descriptors, with those around it, are nearer than all but a fiftieth of such strangers.
+The second image is warped into the frame of the first, and descriptors are taken from both at the
+same pixels, small and large ones. They are compared by their correlation, with the mean descriptor
+taken away: all descriptors have much in common, those of noise-like texture nearly everything.
+What two places that have nothing to do with each other look like is measured on the pair itself,
+by comparing with the warped image moved by a third of its size. A point agrees when its
+descriptors, with those right around it, are more alike than all but a hundredth of such strangers,
+and when most points about it agree too.
 """
 
 from __future__ import annotations
@@ -15,14 +18,18 @@ import numpy as np
 
 from ..descriptors.dense_sift import dense_sift, root
 
-SIZE = 6.0
-"""Diameter of the keypoints for these descriptors, in pixels."""
+SIZES = (3.0, 8.0)
+"""Diameters of the keypoints for these descriptors, in pixels."""
 
-STRANGERS = 0.02
-"""Share of strangers that would pass."""
+STRANGERS = 0.01
+"""Share of strangers that would pass by themselves."""
 
 TOGETHER = 2.5
-"""Sigma in pixels of the mean over the points around: neighbours agree together."""
+"""Sigma in pixels of the mean over the points right around: neighbours agree together."""
+
+CROWD = 41
+MAJORITY = 0.6
+"""Side in pixels of the window about a point, and the share of its points that must agree."""
 
 MOVES = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 """Shares of width and height that the strangers are apart."""
@@ -30,6 +37,12 @@ MOVES = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 BLOCK = 64
 BLOCKS = 24
 """Side in pixels and number of the blocks of the image that strangers are taken from."""
+
+STEP = 20_000
+"""Descriptors that are compared at a time, to bound the memory."""
+
+FEW = 100
+"""With fewer points no mean is taken away: theirs would be near to themselves."""
 
 
 def alike(
@@ -52,73 +65,98 @@ def unlikeness(
         seed: of the choice of strangers.
 
     Returns:
-        (N,) float32: the distance of the descriptors, with those around, over that which a share
-        of `STRANGERS` stays under; infinite where the second image is not seen.
+        (N,) float32: how unlike they are (1 - correlation, with those around) over the bound that
+        a share of `STRANGERS` stays under. Infinite where the second image is not seen, where
+        most points about do not agree, and everywhere when strangers all look the same.
     """
     pixels = np.asarray(pixels).astype(np.int64)
     result = np.full(len(pixels), np.inf, np.float32)
     known = np.flatnonzero(seen[pixels[:, 1], pixels[:, 0]])
     if not len(known):
         return result
-    described = _described(gray0, pixels[known])
-    distances = _distances(described, _described(warped, pixels[known]))
-    nearness = _together(pixels[known], distances, gray0.shape)
-    strangers = _strangers(gray0.shape, warped, seen, pixels[known], described, seed)
-    if not len(strangers):
+    here = pixels[known]
+    in_blocks = _some_blocks(here, seed)
+    unlike = np.zeros(len(known), np.float32)
+    strange = [np.zeros(int(chosen.sum()), np.float32) for chosen in _moved(seen, here, in_blocks)]
+    for size in SIZES:
+        first = root(dense_sift(gray0, here, size))
+        total = first.sum(axis=0, dtype=np.int64)  # whole: the order of the points has no say
+        mean = (total / len(first) if len(first) >= FEW else 0 * total).astype(np.float32)
+        unlike += _unlike(first, root(dense_sift(warped, here, size)), mean)
+        for part, chosen, moved in zip(
+            strange, _moved(seen, here, in_blocks), _moves(warped), strict=True
+        ):
+            rows = np.flatnonzero(in_blocks)[chosen]
+            if len(rows):
+                part += _unlike(first[rows], root(dense_sift(moved, here[rows], size)), mean)
+    blocks = here[in_blocks]
+    means = [
+        _together(blocks[chosen], part, gray0.shape)
+        for part, chosen in zip(strange, _moved(seen, here, in_blocks), strict=True)
+    ]
+    strangers = np.concatenate(means)
+    bound = np.quantile(strangers, STRANGERS) if len(strangers) else 0
+    if bound <= 0:  # strangers are all the same: likeness tells nothing
         return result
-    result[known] = nearness / max(np.quantile(strangers, STRANGERS), 1e-6)
+    ratios = _together(here, unlike, gray0.shape) / np.float32(bound)
+    crowd = _share_about(here, ratios < 1, gray0.shape)
+    result[known] = np.where(crowd >= MAJORITY, ratios, np.inf)
     return result
 
 
-def _strangers(
-    shape: tuple[int, ...],
-    warped: np.ndarray,
-    seen: np.ndarray,
-    pixels: np.ndarray,
-    described: np.ndarray,
-    seed: int,
-) -> np.ndarray:
-    """Return the distances of points from places elsewhere, meant as their own are."""
-    in_blocks = _some_blocks(pixels, seed)
-    here, descriptors = pixels[in_blocks], described[in_blocks]
-    found = []
-    for across, down in MOVES:
-        move = round(down * shape[0]), round(across * shape[1])
-        moved, also = (np.roll(image, move, (0, 1)) for image in (warped, seen))
-        valid = also[here[:, 1], here[:, 0]]
-        if valid.any():
-            places = here[valid]
-            distances = _distances(descriptors[valid], _described(moved, places))
-            found.append(_together(places, distances, shape))
-    return np.concatenate(found) if found else np.empty(0)
+def _moves(image: np.ndarray) -> list[np.ndarray]:
+    """Return an image moved in several ways, what leaves it on one side coming in on the other."""
+    height, width = image.shape
+    return [
+        np.roll(image, (round(down * height), round(across * width)), (0, 1))
+        for across, down in MOVES
+    ]
+
+
+def _moved(seen: np.ndarray, pixels: np.ndarray, in_blocks: np.ndarray) -> list[np.ndarray]:
+    """Tell for each move which of the points in blocks then see the second image."""
+    here = pixels[in_blocks]
+    return [moved[here[:, 1], here[:, 0]] for moved in _moves(seen)]
 
 
 def _some_blocks(pixels: np.ndarray, seed: int) -> np.ndarray:
     """Choose the points of some blocks of the image: whole blocks, as neighbours are meant."""
     block = pixels // BLOCK
     number = block[:, 1] * 1_000_000 + block[:, 0]
-    numbers = np.unique(number)
-    chosen = np.random.default_rng(seed).permutation(numbers)[:BLOCKS]
+    chosen = np.random.default_rng(seed).permutation(np.unique(number))[:BLOCKS]
     return np.isin(number, chosen)
 
 
-def _described(gray: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    return root(dense_sift(gray, pixels, SIZE))
-
-
-def _distances(first: np.ndarray, second: np.ndarray, step: int = 20_000) -> np.ndarray:
-    """Return the Euclidean distance of each pair of rows, (N,) float32."""
+def _unlike(first: np.ndarray, second: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """Return 1 - correlation of each pair of rows less the mean row, (N,) float32 in [0, 2]."""
     result = np.empty(len(first), np.float32)
-    for start in range(0, len(first), step):
-        gap = first[start : start + step].astype(np.float32) - second[start : start + step]
-        result[start : start + step] = np.sqrt(np.einsum("ij,ij->i", gap, gap))
+    for start in range(0, len(first), STEP):
+        a, b = (part[start : start + STEP] - mean for part in (first, second))
+        lengths = np.einsum("ij,ij->i", a, a) * np.einsum("ij,ij->i", b, b)
+        result[start : start + STEP] = 1 - np.einsum("ij,ij->i", a, b) / np.sqrt(
+            np.maximum(lengths, 1e-3)
+        )
     return result
 
 
 def _together(pixels: np.ndarray, values: np.ndarray, shape: Sequence[int]) -> np.ndarray:
     """Return the weighted mean of the values of the points around each, (N,) float32."""
-    count, total = np.zeros(shape[:2], np.float32), np.zeros(shape[:2], np.float32)
-    count[pixels[:, 1], pixels[:, 0]] = 1
-    total[pixels[:, 1], pixels[:, 0]] = values
+    count, total = (_image(pixels, part, shape) for part in (np.float32(1), values))
     count, total = (cv2.GaussianBlur(image, (0, 0), TOGETHER) for image in (count, total))
     return (total / np.maximum(count, 1e-6))[pixels[:, 1], pixels[:, 0]]
+
+
+def _share_about(pixels: np.ndarray, agree: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    """Return the share of the points in the window about each that agree, (N,) float32."""
+    count, total = (_image(pixels, part, shape) for part in (np.float32(1), agree))
+    sums = [
+        cv2.boxFilter(image, -1, (CROWD, CROWD), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for image in (count, total)
+    ]
+    return (sums[1] / np.maximum(sums[0], 1))[pixels[:, 1], pixels[:, 0]]
+
+
+def _image(pixels: np.ndarray, values: np.ndarray | np.float32, shape: Sequence[int]) -> np.ndarray:
+    image = np.zeros(tuple(shape[:2]), np.float32)
+    image[pixels[:, 1], pixels[:, 0]] = values
+    return image

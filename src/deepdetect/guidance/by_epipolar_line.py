@@ -2,7 +2,7 @@
 
 The line leaves one direction open, so a partner is searched (`matchers.patchmatch`) in both
 images, and a pair stays when each is the other's best or beside it, when the pairs around it move
-alike, and when both places look alike by more than their own surroundings (`agreement_test`'s measure).
+alike, and when both places look alike by more than strangers do.
 """
 
 from __future__ import annotations

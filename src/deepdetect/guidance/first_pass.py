@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..errors import unknown_name
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.model_choice import has_depth
 from ..geometry.residuals import epipolar_errors, transfer_errors
@@ -24,6 +25,10 @@ LONGEST = 1200
 """Longer sides are shrunk to so many pixels: the first look need not be fine."""
 
 RATIO = 0.85
+
+PLACE = 2.0
+"""Pixels; matches that begin or end nearer together are one."""
+
 THRESHOLDS = {"homography": 3.0, "fundamental": 1.5}
 """Pixels (of the shrunk images) within which matches agree with a model."""
 
@@ -63,7 +68,12 @@ def first_pass(
 
     Returns:
         The geometry, or the kind "none".
+
+    Raises:
+        OptionError: the model is unknown.
     """
+    if model not in ("auto", *THRESHOLDS):
+        raise unknown_name("model", model, ("auto", *THRESHOLDS))
     (view0, scale0), (view1, scale1) = (shrunk(gray, LONGEST) for gray in (gray0, gray1))
     best = FirstPass("none", None, *np.empty((2, 0, 2)), 0, float("inf"), 0)
     simulated = 0
@@ -108,11 +118,13 @@ def _matched(first: SparseFeatures, second: SparseFeatures) -> tuple[np.ndarray,
 
 
 def _once(points0: np.ndarray, points1: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leave each match once: the same corner seen in several views is no further evidence."""
-    both = np.rint(np.column_stack([points0, points1]) / 2)
-    _, kept = np.unique(both, axis=0, return_index=True)
-    kept.sort()
-    return points0[kept], points1[kept]
+    """Leave each place once in each image: one corner in many views is no further evidence."""
+    for side in (0, 1):
+        places = np.rint((points0, points1)[side] / PLACE)
+        _, kept = np.unique(places, axis=0, return_index=True)
+        kept.sort()
+        points0, points1 = points0[kept], points1[kept]
+    return points0, points1
 
 
 def _estimate(

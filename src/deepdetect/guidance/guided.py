@@ -24,7 +24,7 @@ GUIDANCES = ("auto", "homography", "fundamental", "none")
 LONGEST = 1600
 """Longer sides are shrunk to so many pixels where the geometry is sharpened."""
 
-SHARPENING = RefinementOptions(rounds=2, windows=(15, 31), blurs=(), inlier_threshold=0.5)
+SHARPENING = RefinementOptions(rounds=3, windows=(15, 21, 41), blurs=(), inlier_threshold=0.5)
 
 ROUNDS = 2
 LEAST_MORE = 0.01

@@ -5,6 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+ALIAS = 0.5
+"""Blur before an image is shrunk, in units of sqrt(1 / scale^2 - 1) pixels."""
+
 
 def shrunk(gray: np.ndarray, longest: int) -> tuple[np.ndarray, float]:
     """Shrink an image so that its longer side has at most so many pixels.
@@ -15,8 +18,12 @@ def shrunk(gray: np.ndarray, longest: int) -> tuple[np.ndarray, float]:
     scale = min(1.0, longest / max(gray.shape))
     if scale == 1:
         return gray, 1.0
+    # Whole pixels of the smaller image seldom fill the sides exactly: blur and sample by the
+    # scale itself, so that one number holds for both sides.
     size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
-    return cv2.resize(gray, size, interpolation=cv2.INTER_AREA), scale
+    smooth = cv2.GaussianBlur(gray, (0, 0), ALIAS * np.sqrt(1 / scale**2 - 1))
+    affine = _scaling(scale)[:2]
+    return cv2.warpAffine(smooth, affine, size, borderMode=cv2.BORDER_REPLICATE), scale
 
 
 def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:

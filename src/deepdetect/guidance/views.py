@@ -35,7 +35,7 @@ def tilted_views(gray: np.ndarray, tilt: float, most: int) -> Iterator[SparseFea
     Yields:
         The features of each view, at their positions in the image itself.
     """
-    for turn in np.arange(0, 180, STEP / tilt):
+    for turn in np.linspace(0, 180, round(180 * tilt / STEP), endpoint=False):
         view, to_view = tilted(gray, tilt, float(turn))
         found = sparse_features(view, most)
         back = cv2.invertAffineTransform(to_view)
