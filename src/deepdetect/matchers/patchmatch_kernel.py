@@ -20,6 +20,16 @@ def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True, inline="always")
+def _with(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
+    """Return the best two rows and their distances when one more row is considered."""
+    if distance < nearer:
+        return row, best, distance, nearer
+    if distance < farther:
+        return best, row, nearer, distance
+    return best, second, nearer, farther
+
+
+@njit(nogil=True, cache=True, inline="always")
 def _scrambled(number):  # type: ignore[no-untyped-def]
     """Return a number that looks random, the same for the same number (Wellons's lowbias32)."""
     number = np.uint32(number)
@@ -64,11 +74,9 @@ def start_on_lines(  # type: ignore[no-untyped-def]
             row = at1[y, x]
             if row < 0 or row == best or row == second:  # noqa: SIM109
                 continue
-            distance = _distance(queries, query, base, row)
-            if distance < nearer:
-                best, second, nearer, farther = row, best, distance, nearer
-            elif distance < farther:
-                second, farther = row, distance
+            best, second, nearer, farther = _with(
+                row, _distance(queries, query, base, row), best, second, nearer, farther
+            )
         rows[query, 0], rows[query, 1] = best, second
         distances[query, 0], distances[query, 1] = nearer, farther
 
@@ -148,11 +156,9 @@ def sweep(  # type: ignore[no-untyped-def]
                         row = at1[y, x]
                         if row < 0 or row == best or row == second:  # noqa: SIM109
                             continue
-                        distance = _distance(queries, query, base, row)
-                        if distance < nearer:
-                            best, second, nearer, farther = row, best, distance, nearer
-                        elif distance < farther:
-                            second, farther = row, distance
+                        best, second, nearer, farther = _with(
+                            row, _distance(queries, query, base, row), best, second, nearer, farther
+                        )
             state = _scrambled(np.uint32(query) ^ _scrambled(np.uint32(seed + 7919 * (turn + 1))))
             for radius in radii:
                 state = _scrambled(state + np.uint32(1))
@@ -172,10 +178,8 @@ def sweep(  # type: ignore[no-untyped-def]
                 row = at1[y, x]
                 if row < 0 or row == best or row == second:  # noqa: SIM109
                     continue
-                distance = _distance(queries, query, base, row)
-                if distance < nearer:
-                    best, second, nearer, farther = row, best, distance, nearer
-                elif distance < farther:
-                    second, farther = row, distance
+                best, second, nearer, farther = _with(
+                    row, _distance(queries, query, base, row), best, second, nearer, farther
+                )
             rows[query, 0], rows[query, 1] = best, second
             distances[query, 0], distances[query, 1] = nearer, farther
