@@ -3,9 +3,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
-from deepdetect import Keypoints
+from deepdetect import Keypoints, OptionError
 from deepdetect.pictures import (
     GREEN,
     RED,
@@ -63,3 +64,14 @@ def test_captions_fit_narrow_pictures() -> None:
     assert picture.shape[1] == 60
     assert picture[20:].any()
     assert not picture[20:, -2:].any()
+
+
+def test_a_picture_ends_in_png_or_jpg(tmp_path: Path) -> None:
+    picture = np.full((20, 30, 3), (200, 30, 90), np.uint8)
+    for ending in (".png", ".jpg", ".JPEG"):
+        save_picture(picture, tmp_path / f"a{ending}")
+        with Image.open(tmp_path / f"a{ending}") as found:
+            assert np.abs(np.asarray(found).astype(int) - picture).max() < 8
+    with pytest.raises(OptionError, match="must end in"):
+        save_picture(picture, tmp_path / "a.bmp")
+    assert not (tmp_path / "a.bmp").exists()

@@ -9,20 +9,34 @@ import cv2
 import numpy as np
 
 from .atomic import atomic_path
+from .errors import OptionError
 from .keypoints import Keypoints
 from .labels import Label
 
 SPARSE = 5000
 """Up to so many keypoints are drawn as circles, more as single pixels."""
 
+ENDINGS = (".png", ".jpg", ".jpeg")
 CAPTION_HEIGHT = 28
 GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
 
 def save_picture(rgb: np.ndarray, path: str | Path) -> None:
-    """Write a (H, W, 3) uint8 RGB picture as PNG, whole or not at all."""
+    """Write a (H, W, 3) uint8 RGB picture, whole or not at all.
+
+    Args:
+        rgb: the picture.
+        path: ending in .png, .jpg or .jpeg.
+
+    Raises:
+        OptionError: the ending is another.
+        DeepDetectError: the file cannot be written.
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in ENDINGS:
+        raise OptionError(f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
     with atomic_path(path) as temporary:
-        data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1]
+        data = cv2.imencode(ending, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1]
         temporary.write_bytes(data.tobytes())
 
 

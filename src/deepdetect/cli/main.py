@@ -18,7 +18,9 @@ from .evaluate import evaluate
 from .evaluate_stereo import evaluate_stereo
 from .label import label
 from .match import match
+from .register import register
 from .shards import shards
+from .stitch import stitch
 from .train import train
 
 
@@ -66,6 +68,8 @@ def main() -> None:
 for command in (
     detect,
     match,
+    register,
+    stitch,
     label,
     shards,
     train,

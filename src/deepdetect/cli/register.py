@@ -1,0 +1,81 @@
+"""`deepdetect register`: one photograph laid onto another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .shared import (
+    PATH,
+    detector_options,
+    json_option,
+    make_detector,
+    output_option,
+    print_json,
+    print_table,
+    selection_options,
+)
+
+
+@click.command(short_help="One photograph laid onto another.")
+@click.argument("image0", type=PATH)
+@click.argument("image1", type=PATH)
+@output_option
+@selection_options
+@detector_options
+@json_option
+def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: Any) -> None:
+    """Lay IMAGE1 onto IMAGE0: for planes, and for photographs from one place.
+
+    Writes STEM1_on_STEM0.png (the second image in the frame of the first), the same as
+    _checkerboard.png and _difference.png with the first, and _homography.txt (3x3, from the
+    first image to the second).
+
+    \b
+    deepdetect register map.jpg photo-of-the-map.jpg -o registered
+    """
+    import numpy as np
+
+    from ..atomic import atomic_path
+    from ..pictures import save_picture
+    from ..registration import register as register_images
+
+    detector = make_detector(values)
+    names = ("threshold", "density", "max_keypoints", "nms_radius")
+    chosen = {name: values[name] for name in names if values.get(name) is not None}
+    found = register_images(image0, image1, detector, **chosen)
+    stem = f"{image1.stem}_on_{image0.stem}"
+    pictures = {
+        "": found.warped,
+        "_checkerboard": found.checkerboard(),
+        "_difference": found.difference(),
+    }
+    files = [output / f"{stem}{name}.png" for name in pictures]
+    for path, picture in zip(files, pictures.values(), strict=True):
+        save_picture(picture, path)
+    files.append(output / f"{stem}_homography.txt")
+    with atomic_path(files[-1]) as temporary:
+        np.savetxt(temporary, found.homography, fmt="%.12e")
+    numbers = {
+        "image0": image0,
+        "image1": image1,
+        "homography": found.homography.tolist(),
+        "matches": found.matches,
+        "overlap": round(float(found.seen.mean()), 4),
+        "correlation": round(found.agreement, 4),
+        "files": files,
+    }
+    if as_json:
+        print_json(numbers)
+        return
+    print_table(
+        [
+            ("matches", f"{found.matches:,}"),
+            ("overlap", f"{numbers['overlap']:.1%} of the first image"),
+            ("correlation", f"{found.agreement:.3f} (median of small windows; 1 is the same)"),
+            ("written", ", ".join(str(path) for path in files)),
+        ],
+        f"{image1} on {image0}",
+    )
