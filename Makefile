@@ -41,7 +41,7 @@ $(VENV)/.demo: $(VENV)/bin/hatchling pyproject.toml
 
 $(VENV)/.test: $(VENV)/bin/hatchling pyproject.toml
 	$(VENV)/bin/python -m pip install $(PIP_FLAGS) -c $(LOCK) --no-build-isolation \
-		-e '.[benchmark,data,demo,openvino,test,train]'
+		-e '.[benchmark,data,demo,faiss,openvino,test,train]'
 	touch $@
 
 $(VENV_OPENCV4)/.test: $(LOCK) pyproject.toml
