@@ -79,8 +79,9 @@ def _pasted(rgb: list[np.ndarray], homography: np.ndarray, detector: DeepDetect)
 
     shares = []
     height, width = rgb[1].shape[0] // 2, rgb[1].shape[1] // 2
-    for name in ("chelsea", "coffee", "rocket", "astronaut"):
-        strange = cv2.resize(getattr(data, name)(), (width, height), interpolation=cv2.INTER_AREA)
+    for name in ("chelsea", "coffee", "rocket", "astronaut", "grass"):
+        photograph = load_image(getattr(data, name)())
+        strange = cv2.resize(photograph, (width, height), interpolation=cv2.INTER_AREA)
         top, left = height // 2, width // 2
         second = rgb[1].copy()
         second[top : top + height, left : left + width] = strange

@@ -77,6 +77,20 @@ def test_the_table_tells_what_moved(refined: tuple[list, Path]) -> None:
     assert rows["bark 1-2"][3] == pytest.approx(0, abs=0.05)
 
 
+def test_a_file_that_is_there_already_is_compared(
+    folder: Path, refined: tuple[list, Path], tmp_path: Path
+) -> None:
+    shutil.copytree(folder, tmp_path / "oxford")
+    shutil.copy(refined[1] / "graf" / "H1to2p.refined", tmp_path / "oxford" / "graf")
+    # Written over the very file that it is compared with.
+    rows = {
+        row[0]: row
+        for row in refinement_table(refine_oxford(tmp_path / "oxford", tmp_path / "oxford")).rows
+    }
+    assert rows["graf 1-2"][5:7] == pytest.approx((0, 0), abs=1e-6)
+    assert rows["graf 1-3"][5:7] == (None, None)
+
+
 def test_the_command_writes_the_files_and_a_report(folder: Path, tmp_path: Path) -> None:
     words = ["benchmark", "refine-oxford", "--data", str(folder), "-o", str(tmp_path), "--json"]
     result = CliRunner().invoke(main, words)

@@ -75,24 +75,23 @@ def unlikeness(
     if not len(known):
         return result
     here = pixels[known]
-    in_blocks = _some_blocks(here, seed)
+    in_blocks = np.flatnonzero(_some_blocks(here, seed))
+    moved = _moves(warped)
+    # For each move the points in blocks that then see the second image.
+    strange = [in_blocks[part[tuple(here[in_blocks].T[::-1])]] for part in _moves(seen)]
     unlike = np.zeros(len(known), np.float32)
-    strange = [np.zeros(int(chosen.sum()), np.float32) for chosen in _moved(seen, here, in_blocks)]
+    stranger = [np.zeros(len(rows), np.float32) for rows in strange]
     for size in SIZES:
         first = root(dense_sift(gray0, here, size))
         total = first.sum(axis=0, dtype=np.int64)  # whole: the order of the points has no say
         mean = (total / len(first) if len(first) >= FEW else 0 * total).astype(np.float32)
         unlike += _unlike(first, root(dense_sift(warped, here, size)), mean)
-        for part, chosen, moved in zip(
-            strange, _moved(seen, here, in_blocks), _moves(warped), strict=True
-        ):
-            rows = np.flatnonzero(in_blocks)[chosen]
+        for values, rows, image in zip(stranger, strange, moved, strict=True):
             if len(rows):
-                part += _unlike(first[rows], root(dense_sift(moved, here[rows], size)), mean)
-    blocks = here[in_blocks]
+                values += _unlike(first[rows], root(dense_sift(image, here[rows], size)), mean)
     means = [
-        _together(blocks[chosen], part, gray0.shape)
-        for part, chosen in zip(strange, _moved(seen, here, in_blocks), strict=True)
+        _together(here[rows], values, gray0.shape)
+        for rows, values in zip(strange, stranger, strict=True)
     ]
     strangers = np.concatenate(means)
     bound = np.quantile(strangers, STRANGERS) if len(strangers) else 0
@@ -111,12 +110,6 @@ def _moves(image: np.ndarray) -> list[np.ndarray]:
         np.roll(image, (round(down * height), round(across * width)), (0, 1))
         for across, down in MOVES
     ]
-
-
-def _moved(seen: np.ndarray, pixels: np.ndarray, in_blocks: np.ndarray) -> list[np.ndarray]:
-    """Tell for each move which of the points in blocks then see the second image."""
-    here = pixels[in_blocks]
-    return [moved[here[:, 1], here[:, 0]] for moved in _moves(seen)]
 
 
 def _some_blocks(pixels: np.ndarray, seed: int) -> np.ndarray:
