@@ -8,11 +8,12 @@ import pytest
 
 from deepdetect import DeepDetect
 from deepdetect.benchmark import BenchmarkOptions
-from deepdetect.benchmark.oxford import paper_pairs
+from deepdetect.benchmark.oxford import chosen_pairs
 from deepdetect.benchmark.planar_paper import density_table, matches_table, repeatability_table
 from deepdetect.benchmark.workspace import Workspace
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.planar import PlanarScene
+from deepdetect.weights_quality import PAIRS
 
 DENSITY = {0.5: 0.525, 0.7: 0.486, 0.8: 0.462, 0.9: 0.431}
 REPEATABILITY = {
@@ -60,7 +61,7 @@ def test_matches(
     workspace: Workspace, weights: DeepDetect, scenes: list[PlanarScene], shared: Path
 ) -> None:
     options = BenchmarkOptions(weights, channels="bgr")
-    every = paper_pairs(load_oxford(shared / "data" / "oxford"))
+    every = chosen_pairs(load_oxford(shared / "data" / "oxford"), PAIRS)
     pairs = [pair for pair in every if pair.name in MATCHES]
     table = matches_table(workspace, [options.own()], pairs, "matches")
     found = dict(zip([pair.name for pair in pairs], table.rows[0][1::2], strict=True))

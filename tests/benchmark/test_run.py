@@ -18,8 +18,10 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError
-from deepdetect.benchmark import BENCHMARKS, BenchmarkOptions, Report, run_benchmarks
+from deepdetect.benchmark import BENCHMARKS, PROTOCOLS, BenchmarkOptions, Report, run_benchmarks
 from deepdetect.benchmark import run as run_module
+from deepdetect.benchmark.descriptor_speed import descriptor_steps
+from deepdetect.benchmark.whole_pairs import whole_pair_steps
 from deepdetect.benchmark.workspace import Workspace
 from deepdetect.methods import CLASSICAL, Features, Method
 from deepdetect.metrics import one_to_one
@@ -343,7 +345,7 @@ def test_every_benchmark_reports_the_steps_that_it_announces(
     workspace = Workspace(
         write_few(name), StageCache(tmp_path / "cache"), lambda steps, text: done.append(steps)
     )
-    both = dataclasses.replace(options, protocols=("paper", "standard"), classical=())
+    both = dataclasses.replace(options, protocols=PROTOCOLS, classical=())
     sections = BENCHMARKS[name].sections(workspace, both)
     assert sum(done) == BENCHMARKS[name].steps(workspace, both) > 0
     keys = [table.key for section in sections for table in section.tables]
@@ -359,7 +361,7 @@ def test_the_speed_reports_its_steps_and_reads_nothing_from_the_cache(
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(run_module, "progress", bar)
         report = run_benchmarks(["speed"], oxford_folder, few, cache=tmp_path / "cache")
-    assert sum(bar.done) == bar.total == 4 * 4
+    assert sum(bar.done) == bar.total == 4 * 4 + descriptor_steps() + whole_pair_steps()
     assert not (tmp_path / "cache").exists()
     rows = table(report, "speed")
     picture = gray(images(oxford_folder, "graf")[0])
@@ -370,6 +372,17 @@ def test_the_speed_reports_its_steps_and_reads_nothing_from_the_cache(
         assert all(row[f"{stage}, s"] > 0 for stage in ("describe", "match"))
         # To know how many random points are wanted, the detector runs that they follow.
         assert (row["detect, s"] is None) == name.startswith("control")
+    for row in table(report, "descriptors").values():
+        assert row["equal bytes"] > 0.999
+        assert row["largest difference"] <= 1
+        assert row["least"] <= row["times faster"] <= row["most"]
+    pairs = table(report, "whole_pairs")
+    assert list(pairs) == ["wall 1-6", "graf 1-3", "cones"]
+    assert set(list(pairs["cones"].values())[1:]) == {None}
+    assert [note for note in report.left_out if "cones" in note]
+    for name in ("wall 1-6", "graf 1-3"):
+        assert pairs[name]["published, s"] > 0
+        assert pairs[name]["ours, s"] > 0
 
 
 def test_unknown_names_and_missing_data_are_said(

@@ -20,7 +20,6 @@ Arrays = Mapping[str, np.ndarray]
 UNRELATED = frozenset(
     {
         *("cli", "training", "pictures.py", "progress.py", "provenance.py", "stereo_demo.py"),
-        *("geometry/photometric_refinement.py", "geometry/correlation.py"),
         *(
             f"benchmark/{name}"
             for name in (

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ..datasets.hpatches import is_illumination, is_usual, load_hpatches
-from ..datasets.planar import PlanarScene
+from ..datasets.planar import PlanarPair, PlanarScene
 from . import planar_paper
+from .guided import guided_section, guided_steps
 from .options import BenchmarkOptions
 from .paper_figures import drawn_figures, match_figure
 from .paper_numbers import MOST_MATCHES
@@ -26,6 +27,8 @@ def hpatches_steps(workspace: Workspace, options: BenchmarkOptions) -> int:
         steps += len(options.matching_methods()) * len(scenes)
     if "standard" in options.protocols:
         steps += sum(standard_steps(options, chosen) for _, chosen in _sets(scenes))
+    if "guided" in options.protocols:
+        steps += guided_steps(options, _last_pairs(scenes))
     return steps
 
 
@@ -41,7 +44,14 @@ def hpatches_sections(workspace: Workspace, options: BenchmarkOptions) -> list[S
             sections += standard_sections(
                 workspace, options, chosen, key, f"HPatches, {name}", "Judged by its own files."
             )
+    if "guided" in options.protocols:
+        truths = {"published": _last_pairs(scenes)}
+        sections.append(guided_section(workspace, options, truths, "hpatches_guided", "HPatches"))
     return sections
+
+
+def _last_pairs(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:
+    return [list(scene.pairs())[-1] for scene in scenes]
 
 
 def _sets(scenes: Sequence[PlanarScene]) -> list[tuple[str, list[PlanarScene]]]:
@@ -85,7 +95,7 @@ def _paper_section(
         tuple(rows),
         by_scene.note,
     )
-    last = [list(scene.pairs())[-1] for scene in scenes]
+    last = _last_pairs(scenes)
     matches = planar_paper.matches_table(
         workspace, options.matching_methods(), last, "hpatches_matches"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ..datasets.low_visibility import load_low_visibility
 from . import planar_paper
+from .guided import guided_section, guided_steps
 from .options import BenchmarkOptions
 from .paper_figures import drawn_figures, keypoint_figure, match_figure
 from .planar_sections import standard_sections, standard_steps
@@ -20,6 +21,8 @@ def low_visibility_steps(workspace: Workspace, options: BenchmarkOptions) -> int
         steps += len(options.matching_methods()) * len(scenes)
     if "standard" in options.protocols:
         steps += standard_steps(options, scenes)
+    if "guided" in options.protocols:
+        steps += guided_steps(options, [pair for scene in scenes for pair in scene.pairs()])
     return steps
 
 
@@ -58,4 +61,8 @@ def low_visibility_sections(workspace: Workspace, options: BenchmarkOptions) -> 
             "Low visibility",
             "Nothing moves between the two images of a scene.",
         )
+    if "guided" in options.protocols:
+        truths = {"published": pairs}
+        key = "low_visibility_guided"
+        sections.append(guided_section(workspace, options, truths, key, "Low visibility"))
     return sections

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from ..detector import DeepDetect
 from ..errors import OptionError, unknown_name
@@ -19,7 +20,7 @@ from ..methods import (
     random_method,
 )
 
-PROTOCOLS = ("paper", "standard")
+PROTOCOLS = ("paper", "standard", "guided")
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 LOW = ("sift-low", "orb-low", "brisk-low", "fast-low", "agast-low", "harris-low", "shi-tomasi-low")
 DEFAULT = ("sift", "orb", "brisk", "fast", "agast", "harris", "shi-tomasi")
@@ -31,11 +32,12 @@ class BenchmarkOptions:
 
     Attributes:
         detector: DeepDetect, with the weights that are judged.
-        protocols: "paper", "standard" or both.
+        protocols: one or more of "paper", "standard" and "guided".
         classical: names of the classical methods.
         others: further methods.
         channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
             feeds its own weights.
+        geometry_weights: the weights for stereo pairs.
 
     Raises:
         OptionError: a name is unknown, or nothing is left to do.
@@ -46,6 +48,7 @@ class BenchmarkOptions:
     classical: tuple[str, ...] = (*DEFAULT, *LOW)
     others: tuple[Method, ...] = ()
     channels: str = "rgb"
+    geometry_weights: str | Path = "geometry"
 
     def __post_init__(self) -> None:
         for protocol in self.protocols:
@@ -110,10 +113,14 @@ class BenchmarkOptions:
         return deepdetect_method(self._native(), name="deepdetect-native", title=title)
 
     def geometry(self) -> Method:
-        """Return the bundled weights for geometry, at the image's own size."""
-        detector = DeepDetect("geometry")
-        title = 'DeepDetect("geometry"), native resolution, all pixels over 0.5'
-        return deepdetect_method(detector, name="deepdetect-geometry", title=title)
+        """Return the weights for stereo pairs, at the image's own size."""
+        name = Path(self.geometry_weights).stem
+        title = f'DeepDetect("{name}"), native resolution, all pixels over 0.5'
+        return deepdetect_method(self.geometry_detector(), name="deepdetect-geometry", title=title)
+
+    def geometry_detector(self) -> DeepDetect:
+        """Return a detector with the weights for stereo pairs, at the image's own size."""
+        return DeepDetect(self.geometry_weights, channels=self.channels)
 
     def native_controls(self) -> tuple[Method, Method]:
         """Return as many random points as `native` finds, and every pixel."""

@@ -10,6 +10,7 @@ from ..datasets.planar import PlanarPair, PlanarScene
 from ..weights_quality import PAIRS
 from . import paper_figures, planar_paper
 from .charts import bar_chart
+from .guided import guided_section, guided_steps
 from .options import BenchmarkOptions
 from .paper_numbers import DENSITY, MATCHES, REPEATABILITY, SIX_SCENES
 from .planar_sections import standard_sections, standard_steps
@@ -19,6 +20,7 @@ from .workspace import Workspace
 PAPER = "DeepDetect, in the paper"
 PAPER_SIX = "DeepDetect, in the paper, graf, wall, bikes, leuven, trees, ubc"
 PAIRS_OF_OXFORD = 40
+GUIDED_PAIRS = (*PAIRS, ("boat", 6), ("bark", 6))
 
 
 def oxford_steps(workspace: Workspace, options: BenchmarkOptions) -> int:
@@ -31,6 +33,8 @@ def oxford_steps(workspace: Workspace, options: BenchmarkOptions) -> int:
         steps += planar_paper.steps(options.matching_methods(), (), PAIRS)  # type: ignore[arg-type]
     if "standard" in options.protocols:
         steps += 2 * standard_steps(options, scenes)
+    if "guided" in options.protocols:
+        steps += guided_steps(options, chosen_pairs(scenes, GUIDED_PAIRS))
     return steps
 
 
@@ -64,6 +68,13 @@ def oxford_sections(workspace: Workspace, options: BenchmarkOptions) -> list[Sec
                     f"refined homographies of {', '.join(missing)}: there is no file H1toKp.refined"
                     "; these pairs are judged by the published one in that section too"
                 )
+    if "guided" in options.protocols:
+        truths = {
+            truth: chosen_pairs(load_oxford(folder, truth), GUIDED_PAIRS)
+            for truth in ("refined", "published")
+            if truth == "published" or len(_without_refined(folder)) < PAIRS_OF_OXFORD
+        }
+        sections.append(guided_section(workspace, options, truths, "oxford_guided", "Oxford"))
     return sections
 
 
@@ -87,16 +98,18 @@ def _without_refined(folder: Path) -> list[str]:
     ]
 
 
-def paper_pairs(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:
-    """Return the pairs of Table II."""
-    return [list(find_scene(list(scenes), name).pairs())[number - 2] for name, number in PAIRS]
+def chosen_pairs(
+    scenes: Sequence[PlanarScene], chosen: Sequence[tuple[str, int]]
+) -> list[PlanarPair]:
+    """Return the pairs of scenes and numbers, as those of Table II."""
+    return [list(find_scene(list(scenes), name).pairs())[number - 2] for name, number in chosen]
 
 
 def _paper_section(
     workspace: Workspace, options: BenchmarkOptions, scenes: Sequence[PlanarScene]
 ) -> Section:
     methods = options.density_methods()
-    pairs = paper_pairs(scenes)
+    pairs = chosen_pairs(scenes, PAIRS)
     density = planar_paper.density_table(workspace, methods, scenes, "oxford_density")
     repeatability = planar_paper.repeatability_table(
         workspace, methods, scenes, "oxford_repeatability"

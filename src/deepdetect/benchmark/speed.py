@@ -1,4 +1,4 @@
-"""How long each stage takes, and how much memory: all methods in turn, several times."""
+"""How long each stage and a whole pair take, and how much memory: all in turn, several times."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ import numpy as np
 from ..datasets.oxford import find_scene, load_oxford
 from ..methods import Method
 from .cache import StageCache
+from .descriptor_speed import descriptor_steps, descriptor_table
 from .options import BenchmarkOptions
 from .planar_paper import PAPER_MATCHING
 from .report import Cell, Column, Section, Table
 from .stages import FoundFeatures, FoundMatches, find_keypoints, find_matches
+from .whole_pairs import whole_pair_steps, whole_pair_table
 from .workspace import Workspace
 
 PAIR = ("graf", 3)
@@ -20,7 +22,8 @@ REPEATS = 3
 def speed_steps(workspace: Workspace, options: BenchmarkOptions) -> int:
     """Return the number of steps that `speed_sections` reports."""
     load_oxford(workspace.folder("oxford"))
-    return (REPEATS + 1) * len(options.matching_methods())
+    rounds = (REPEATS + 1) * len(options.matching_methods())
+    return rounds + descriptor_steps() + whole_pair_steps()
 
 
 def speed_sections(workspace: Workspace, options: BenchmarkOptions) -> list[Section]:
@@ -55,7 +58,12 @@ def speed_sections(workspace: Workspace, options: BenchmarkOptions) -> list[Sect
         "largest growth of the process during the stage."
     )
     table = Table("speed", "Seconds and memory of each stage", columns, rows, note)
-    return [Section("Speed", (), (table,))]
+    tables = (
+        table,
+        descriptor_table(workspace, pair.first),
+        whole_pair_table(workspace, options),
+    )
+    return [Section("Speed", (), tables)]
 
 
 def _run(method: Method, images: tuple) -> tuple[FoundFeatures, FoundMatches]:  # type: ignore[type-arg]

@@ -30,7 +30,7 @@ NAMES = (
     "--protocol",
     "protocols",
     multiple=True,
-    help="paper or standard; may be repeated.  [default: both]",
+    help="paper, standard or guided; may be repeated.  [default: all]",
 )
 @click.option(
     "--method",
@@ -53,6 +53,12 @@ NAMES = (
 @click.option(
     "--cache", type=PATH, help="Folder of the stages' results.  [default: cache in the output]"
 )
+@click.option(
+    "--geometry-weights",
+    default="geometry",
+    show_default=True,
+    help="Weights for stereo pairs, as --weights.",
+)
 @detector_options
 @json_option
 def benchmark(
@@ -64,6 +70,7 @@ def benchmark(
     only: str | None,
     preset: str,
     cache: Path | None,
+    geometry_weights: str,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -106,6 +113,7 @@ def benchmark(
         classical,
         tuple(find_method(word) for word in words),
         "rgb" if heatmap is None else heatmap.channels,
+        geometry_weights,
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)
     paths = save_report(report, output)

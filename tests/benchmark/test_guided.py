@@ -1,0 +1,130 @@
+"""Unguided and guided counts beside each other, on pairs whose truth is known."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, match_images
+from deepdetect.benchmark import BenchmarkOptions, run_benchmarks
+from deepdetect.benchmark.cache import StageCache
+from deepdetect.benchmark.guided import SEEDS, find_guided, guided_section, guided_steps
+from deepdetect.benchmark.workspace import Workspace
+from deepdetect.datasets.planar import PlanarPair
+
+MOVE = np.array([[1.0, 0.02, -6], [-0.01, 1, 4], [0, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, write_scene) -> Path:
+    root = tmp_path_factory.mktemp("guided")
+    write_scene(root, (240, 200), MOVE, count=2)
+    return root
+
+
+@pytest.fixture(scope="module")
+def pair(folder: Path) -> PlanarPair:
+    return PlanarPair("scene", 2, folder / "img1.png", folder / "img2.png", MOVE)
+
+
+@pytest.fixture(scope="module")
+def options(edge_detector: DeepDetect) -> BenchmarkOptions:
+    return BenchmarkOptions(edge_detector, ("guided",), ())
+
+
+@pytest.fixture(scope="module")
+def section(options: BenchmarkOptions, pair: PlanarPair):
+    done: list[int] = []
+    workspace = Workspace(pair.first.parent, done=lambda steps, text: done.append(steps))
+    elsewhere = MOVE + [[0, 0, 40], [0, 0, 0], [0, 0, 0]]
+    wrong = dataclasses.replace(pair, homography=elsewhere)
+    truths = {"true": [pair], "wrong": [wrong]}
+    found = guided_section(workspace, options, truths, "key", "Scenes")
+    assert sum(done) == guided_steps(options, [pair]) == 3
+    assert not workspace.left_out
+    return found
+
+
+def rows(section, key: str) -> dict[str, dict[str, object]]:
+    (table,) = [table for table in section.tables if table.key == key]
+    titles = [column.title for column in table.columns]
+    return {str(row[1]): dict(zip(titles, row, strict=True)) for row in table.rows}
+
+
+def test_both_ways_and_both_controls_have_counts_and_precision(section) -> None:
+    found = rows(section, "key_true")
+    assert len(found) == 3
+    assert sum(name.startswith("control") for name in found) == 2
+    for row in found.values():
+        assert row["guided by"] == "homography"
+        for way in ("unguided", "guided"):
+            assert row[f"{way}: correct"] > 0
+            assert 0 < row[f"{way}: precision"] <= 1
+        assert row["guided: one to one"] <= row["guided: correct"] <= row["could be matched"]
+        assert row["guided: of what could be"] == row["guided: correct"] / row["could be matched"]
+        assert row["guided: corners off, px"] < 0.5
+
+
+def test_the_counts_are_those_of_match_images(
+    section, options: BenchmarkOptions, pair: PlanarPair
+) -> None:
+    row = rows(section, "key_true")["DeepDetect, threshold 0.5"]
+    counts = []
+    for seed in range(SEEDS):
+        found = match_images(pair.first, pair.second, options.detector, seed=seed)
+        mapped = np.c_[found.points0, np.ones(len(found))] @ MOVE.T
+        gaps = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - found.points1, axis=1)
+        counts.append(int((gaps < 1).sum()))
+    assert row["guided: correct"] == sorted(counts)[SEEDS // 2]
+
+
+def test_a_wrong_truth_finds_nothing_right(section) -> None:
+    """The truth judges only: the matches are the same, and none of them is right."""
+    true, wrong = rows(section, "key_true"), rows(section, "key_wrong")
+    for name, row in wrong.items():
+        assert row["guided: precision"] < 0.01
+        assert row["guided: corners off, px"] == pytest.approx(40, abs=1)
+        assert row["guided: seconds"] == true[name]["guided: seconds"]
+
+
+def test_a_second_run_reads_what_the_first_has_kept(
+    options: BenchmarkOptions, pair: PlanarPair, tmp_path: Path
+) -> None:
+    cache = StageCache(tmp_path)
+    workspace = Workspace(pair.first.parent, cache)
+    first = find_guided(workspace, options.own(), pair, 0)
+    made = cache.made
+    again = find_guided(workspace, options.own(), pair, 0)
+    assert cache.made == made
+    np.testing.assert_array_equal(first.points1, again.points1)
+    np.testing.assert_array_equal(first.matrix, again.matrix)
+    find_guided(workspace, options.own(), pair, 1)
+    assert cache.made == made + 1
+
+
+def test_strangers_are_said_to_be_unguided(
+    options: BenchmarkOptions, tmp_path: Path, write_scene
+) -> None:
+    write_scene(tmp_path, (100, 80), np.eye(3), count=2)
+    noise = np.random.default_rng(0).integers(0, 256, (80, 100, 3), np.uint8)
+    from PIL import Image
+
+    Image.fromarray(noise).save(tmp_path / "img2.png")
+    pair = PlanarPair("none", 2, tmp_path / "img1.png", tmp_path / "img2.png", np.eye(3))
+    found = guided_section(Workspace(tmp_path), options, {"true": [pair]}, "key", "None")
+    for row in rows(found, "key_true").values():
+        assert row["guided by"] == "none"
+        assert row["guided: correct"] is None
+        assert row["unguided: correct"] is not None
+
+
+def test_the_low_visibility_report_has_the_table(
+    low_visibility_folder: Path, options: BenchmarkOptions
+) -> None:
+    report = run_benchmarks(["low-visibility"], low_visibility_folder, options)
+    assert [table.key for table in report.tables()] == ["low_visibility_guided_published"]
+    (table,) = report.tables()
+    assert [row[0] for row in table.rows] == ["dusty 1-2"] * 3 + ["smoky 1-2"] * 3
