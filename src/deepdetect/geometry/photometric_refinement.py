@@ -172,6 +172,39 @@ def _track(
     options: RefinementOptions,
 ) -> np.ndarray | None:
     """Return the homography from the first image to the warped second one, by corners."""
+    corners = tracked_corners(gray0, warped, seen, window, options)
+    if corners is None:
+        return None
+    cv2.setRNGSeed(options.seed)
+    correction, _ = cv2.findHomography(
+        *corners,
+        cv2.USAC_MAGSAC,
+        options.inlier_threshold,
+        maxIters=5000,
+        confidence=0.9999,
+    )
+    return correction
+
+
+def tracked_corners(
+    gray0: np.ndarray,
+    warped: np.ndarray,
+    seen: np.ndarray,
+    window: int,
+    options: RefinementOptions,
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Track corners from the first image to the warped second one and back.
+
+    Args:
+        gray0: (H, W) uint8.
+        warped: (H, W) uint8, the second image in the frame of the first.
+        seen: (H, W) bool, where that has content.
+        window: side of the tracked windows in pixels.
+        options: number of corners, levels of the pyramid and round trip.
+
+    Returns:
+        (N, 2) float32 positions in both; None with fewer than `FEWEST`.
+    """
     # Equalised, so that light and shade do not pass for motion.
     equalise = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply
     first, second = equalise(gray0), equalise(warped)
@@ -191,13 +224,4 @@ def _track(
     good = (found.ravel() > 0) & (found_back.ravel() > 0) & (gap < options.round_trip)
     if good.sum() < FEWEST:
         return None
-    cv2.setRNGSeed(options.seed)
-    correction, _ = cv2.findHomography(
-        corners.reshape(-1, 2)[good],
-        there.reshape(-1, 2)[good],
-        cv2.USAC_MAGSAC,
-        options.inlier_threshold,
-        maxIters=5000,
-        confidence=0.9999,
-    )
-    return correction
+    return corners.reshape(-1, 2)[good], there.reshape(-1, 2)[good]

@@ -27,15 +27,15 @@ STRANGERS = 0.01
 TOGETHER = 2.5
 """Sigma in pixels of the mean over the points right around: neighbours agree together."""
 
-CROWD = 41
-MAJORITY = 0.6
+CROWD = 81
+MAJORITY = 0.5
 """Side in pixels of the window about a point, and the share of its points that must agree."""
 
 MOVES = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 """Shares of width and height that the strangers are apart."""
 
 BLOCK = 64
-BLOCKS = 24
+BLOCKS = 48
 """Side in pixels and number of the blocks of the image that strangers are taken from."""
 
 STEP = 20_000

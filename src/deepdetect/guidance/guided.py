@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import unknown_name
 from ..geometry import GeometryOptions, estimate_geometry
+from ..geometry.majority_fit import fit_to_majority
 from ..geometry.photometric_refinement import RefinementOptions, refine_homography
 from ..matchers import DescriptorMatches
 from .by_epipolar_line import matches_by_epipolar_line
@@ -24,7 +25,7 @@ GUIDANCES = ("auto", "homography", "fundamental", "none")
 LONGEST = 1600
 """Longer sides are shrunk to so many pixels where the geometry is sharpened."""
 
-SHARPENING = RefinementOptions(rounds=3, windows=(15, 21, 41), blurs=(), inlier_threshold=0.5)
+SHARPENING = RefinementOptions(rounds=2, windows=(15, 21, 41), inlier_threshold=0.5)
 
 ROUNDS = 2
 LEAST_MORE = 0.01
@@ -122,6 +123,7 @@ def sharpened(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> n
     (small0, scale0), (small1, scale1) = (shrunk(gray, LONGEST) for gray in (gray0, gray1))
     start = scaled_homography(homography, scale0, scale1)
     found = refine_homography(small0, small1, start, SHARPENING).homography
+    found = fit_to_majority(small0, small1, found)
     return scaled_homography(found, 1 / scale0, 1 / scale1)
 
 
