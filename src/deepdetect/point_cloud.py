@@ -116,7 +116,7 @@ def robust_box(cloud: PointCloud) -> RobustBox:
         ([1.0, 2.0, 0.0], [99.0, 198.0, 0.0], [50.0, 100.0, 0.0])
     """
     require_points(cloud)
-    low, high = np.percentile(cloud.points, (TAIL, 100 - TAIL), axis=0).astype(np.float64)
+    low, high = np.percentile(cloud.points.astype(np.float64), (TAIL, 100 - TAIL), axis=0)
     return RobustBox(low, high)
 
 
@@ -136,14 +136,14 @@ def angular_spacing(cloud: PointCloud) -> float:
         >>> y, x = np.indices((100, 100)).reshape(2, -1)
         >>> points = np.column_stack([x, y, np.full(10_000, 500.0)])
         >>> round(angular_spacing(PointCloud(points, np.zeros((10_000, 3), np.uint8), "mm")), 5)
-        0.00196
+        0.00198
     """
     require_points(cloud)
     ahead = cloud.points[cloud.points[:, 2] > 0]
     if not len(ahead):
         return SPARSEST
     seen = np.percentile(ahead[:, :2] / ahead[:, 2:], (TAIL, 100 - TAIL), axis=0)
-    width, height = (seen[1] - seen[0]).tolist()
+    width, height = ((seen[1] - seen[0]) / (1 - 2 * TAIL / 100)).tolist()
     return min(SPARSEST, float(np.sqrt(width * height / len(ahead)))) or SPARSEST
 
 
