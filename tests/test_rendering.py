@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import cv2
@@ -107,6 +108,15 @@ def test_the_width_is_in_pixels_and_centred() -> None:
         assert ink == pytest.approx(width**2, rel=0.01)
         assert abs(rows.mean() - 29.5) <= 0.5
         assert abs(columns.mean() - 39.5) <= 0.5
+
+
+def test_points_become_wider_as_the_viewer_comes_nearer() -> None:
+    cloud = PointCloud([[0.5, 0, 5], [-2.0, 0, 10]], np.zeros((2, 3), np.uint8), "mm")
+    near = dataclasses.replace(PLAIN, position=np.array([0.0, 0, 3]))
+    ink = (255 - render(cloud, near)[..., 0].astype(float)) / 255
+    # 50 pixels of focal length, 0.02 for few points, 1.4 of overlap; in half pixels.
+    assert ink[:, 40:].sum() == pytest.approx((round(2 * 1.4 * 5 / 2) / 2) ** 2, rel=0.01)
+    assert ink[:, :40].sum() == pytest.approx((round(2 * 1.4 * 10 / 7) / 2) ** 2, rel=0.01)
 
 
 def test_nothing_in_view_is_white() -> None:

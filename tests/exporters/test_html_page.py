@@ -160,6 +160,17 @@ def test_the_first_view_shows_the_cloud_upright(
     assert np.corrcoef(picture[near, 1], screen[:, 1])[0, 1] < -0.8
 
 
+def test_windows_of_any_shape_show_round_things_round(small: PointCloud, tmp_path: Path) -> None:
+    page = saved(small, tmp_path / "page.html")
+    square, wide, high = (
+        np.reshape(run_node(page, f"return [...clipMatrix(cloud, firstView(cloud), {a})];"), (4, 4))
+        for a in (1, 2, 0.5)
+    )
+    # The shorter side keeps its angle.
+    np.testing.assert_allclose(wide, square * [0.5, 1, 1, 1], rtol=1e-6)
+    np.testing.assert_allclose(high, square * [1, 0.5, 1, 1], rtol=1e-6)
+
+
 def _kept(cloud: PointCloud) -> np.ndarray:
     stored = page_points(cloud)
     high = stored.offset + 65535 * stored.step
