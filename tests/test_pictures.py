@@ -14,6 +14,7 @@ from deepdetect.pictures import (
     draw_keypoints,
     draw_matches,
     save_picture,
+    stacked,
     with_caption,
 )
 
@@ -75,3 +76,13 @@ def test_a_picture_ends_in_png_or_jpg(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="must end in"):
         save_picture(picture, tmp_path / "a.bmp")
     assert not (tmp_path / "a.bmp").exists()
+
+
+def test_stacked_rows_are_padded_with_white() -> None:
+    rows = [np.zeros((4, 10, 3), np.uint8), np.zeros((5, 6, 3), np.uint8)]
+    picture = stacked(rows, gap=2)
+    assert picture.shape == (11, 10, 3)
+    assert not picture[:4].any()
+    assert (picture[4:6] == 255).all()
+    assert not picture[6:, :6].any()
+    assert (picture[6:, 6:] == 255).all()

@@ -148,3 +148,15 @@ def side_by_side(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
         below = height - panel.shape[0]
         joined.append(np.pad(panel, ((0, below), (0, 0), (0, 0))))
     return np.concatenate(joined, axis=1)
+
+
+def stacked(rows: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
+    """Join pictures from top to bottom, with a white gap, and white beside narrower ones."""
+    width = max(row.shape[1] for row in rows)
+    joined = []
+    for row in rows:
+        if joined:
+            joined.append(np.full((gap, width, 3), 255, np.uint8))
+        beside = width - row.shape[1]
+        joined.append(np.pad(row, ((0, 0), (0, beside), (0, 0)), constant_values=255))
+    return np.concatenate(joined)
