@@ -12,6 +12,7 @@ as many fractions near 0 as near 0.5 (0.96 to 1.05 of the mean in ten bins, inst
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from ..threads import in_threads
@@ -57,32 +58,58 @@ def refine_along_rows(
     """
     from . import row_refinement_kernel as kernel
 
-    views = left.astype(np.float32), right.astype(np.float32)
-    values, slopes = np.zeros_like(views[0]), np.zeros_like(views[0])
+    gray, target = left.astype(np.float32), right.astype(np.float32)
+    framed = _framed(gray, REACH)
+    refined = disparity
     for _ in range(STEPS):
-        start = _smoothed(disparity, known, SMOOTHING)
-        disparity = start.copy()
-        kernel_arguments = (start, known, REACH, np.float32(JUMP), np.float32(NOISE), disparity)
+        start = _smoothed(refined, known, SMOOTHING)
+        values, slopes = np.empty_like(gray), np.empty_like(gray)
+        refined = np.empty_like(gray)
 
-        def sample(first: int, last: int, start: np.ndarray = start) -> None:
-            kernel.sample_rows(first, last, views[1], start, known, values, slopes)
-
-        def step(first: int, last: int, arguments: tuple = kernel_arguments) -> None:
-            kernel.step_rows(first, last, views[0], values, slopes, *arguments)
+        def sample(
+            first: int, last: int, start: np.ndarray = start, into: tuple = (values, slopes)
+        ) -> None:
+            kernel.sample_rows(first, last, target, start, *into)
 
         in_threads(len(start), sample)
+        frames = (
+            framed,
+            _framed(values, REACH),
+            _framed(slopes, REACH),
+            _framed(start, REACH, known),
+        )
+
+        def step(first: int, last: int, frames: tuple = frames, into: np.ndarray = refined) -> None:
+            kernel.step_rows(first, last, *frames, REACH, np.float32(JUMP), np.float32(NOISE), into)
+
         in_threads(len(start), step)
-    return _smoothed(disparity, known, LAST_SMOOTHING)
+    return np.where(known, _smoothed(refined, known, LAST_SMOOTHING), disparity)
 
 
 def _smoothed(disparity: np.ndarray, known: np.ndarray, reach: int) -> np.ndarray:
     from . import row_refinement_kernel as kernel
 
-    out = disparity.copy()
+    out = np.empty_like(disparity)
+    framed = _framed(disparity, reach, known)
     in_threads(
         len(out),
-        lambda first, last: kernel.smooth_rows(
-            first, last, disparity, known, reach, np.float32(JUMP), out
-        ),
+        lambda first, last: kernel.smooth_rows(first, last, framed, reach, np.float32(JUMP), out),
     )
-    return out
+    return np.where(known, out, np.float32(0))
+
+
+def _framed(values: np.ndarray, reach: int, known: np.ndarray | None = None) -> np.ndarray:
+    """Put a frame around an image; disparities that are not known are marked, the frame's too."""
+    from . import row_refinement_kernel as kernel
+
+    if known is not None:
+        values = np.where(known, values, kernel.UNKNOWN)
+    return cv2.copyMakeBorder(
+        values,
+        reach,
+        reach,
+        reach,
+        reach,
+        cv2.BORDER_CONSTANT,
+        value=float(kernel.UNKNOWN if known is not None else 0),
+    )

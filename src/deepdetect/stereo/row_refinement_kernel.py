@@ -1,58 +1,75 @@
-"""The compiled part of `row_refinement`. Importing it takes numba; the first call compiles."""
+"""The compiled part of `row_refinement`. Importing it takes numba; the first call compiles.
+
+Windows are summed with the pixels of a row innermost, many at once in the processor's wide
+registers. Arrays have a frame of `reach` pixels; the disparity of what is unknown is UNKNOWN there,
+so far from any other that it is never on the same surface.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+UNKNOWN = np.float32(1e9)
+
+LEAST_GAIN = np.float32(0.2)
+"""Where the right view's contrast fits with less, it shows something else: no step."""
+
+BLOCK = 128
+"""Pixels of a row that are done together: what is in the works stays in the nearest cache."""
+
 
 @njit(nogil=True, cache=True, fastmath=True)
-def smooth_rows(first, last, disparity, known, reach, step, out):  # type: ignore[no-untyped-def]
-    """Write the mean disparity of the window around each known pixel of some rows.
+def smooth_rows(first, last, disparity, reach, jump, out):  # type: ignore[no-untyped-def]
+    """Write the mean disparity of the same surface around each pixel of some rows.
+
+    Pixels of the window count in pairs, one on each side of its centre, so that the mean of a
+    slanted plane is its disparity at the centre, also beside an edge.
 
     Args:
         first, last: the rows.
-        disparity: (H, W) float32.
-        known: (H, W) bool.
+        disparity: (H + 2 reach, W + 2 reach) float32 in its frame.
         reach: of the window, pixels to each side.
-        step: pixels whose disparity differs by more belong to another surface.
-        out: (H, W) float32, written where known.
+        jump: pixels whose disparity differs by more belong to another surface.
+        out: (H, W) float32, written; of unknown pixels it means nothing.
     """
-    height, width = disparity.shape
+    width = out.shape[1]
+    total, weight = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     for y in range(first, last):
-        for x in range(width):
-            if not known[y, x]:
-                continue
-            here = disparity[y, x]
-            total, weight = np.float32(0), np.float32(0)
-            # The window is cut alike on both sides, so that a slope is kept at the border.
-            up = min(reach, y, height - 1 - y)
-            side = min(reach, x, width - 1 - x)
-            for j in range(y - up, y + up + 1):
-                for i in range(x - side, x + side + 1):
-                    there = disparity[j, i]
-                    if known[j, i] and abs(there - here) <= step:
-                        total += there
-                        weight += np.float32(1)
-            out[y, x] = total / weight
+        for start in range(0, width, BLOCK):
+            count = min(BLOCK, width - start)
+            here = disparity[y + reach, start + reach : start + reach + count]
+            total[:] = 0
+            weight[:] = 1
+            for j in range(reach + 1):
+                for i in range(-reach, reach + 1):
+                    if j == 0 and i <= 0:
+                        continue
+                    left, right = start + reach - i, start + reach + i
+                    above = disparity[y + reach - j, left : left + count]
+                    below = disparity[y + reach + j, right : right + count]
+                    for x in range(count):
+                        one, other = above[x] - here[x], below[x] - here[x]
+                        both = abs(one) <= jump and abs(other) <= jump
+                        total[x] += one + other if both else np.float32(0)
+                        weight[x] += np.float32(2) if both else np.float32(0)
+            for x in range(count):
+                out[y, start + x] = here[x] + total[x] / weight[x]
 
 
 @njit(nogil=True, cache=True, fastmath=True)
-def sample_rows(first, last, right, disparity, known, values, slopes):  # type: ignore[no-untyped-def]
+def sample_rows(first, last, right, disparity, values, slopes):  # type: ignore[no-untyped-def]
     """Read the right image at x - disparity by cubic interpolation (Catmull-Rom), with slopes.
 
     Args:
         first, last: the rows.
         right: (H, W) float32.
         disparity: (H, W) float32.
-        known: (H, W) bool.
-        values, slopes: (H, W) float32, written where known: grey, and grey a pixel to the right.
+        values, slopes: (H, W) float32, written: grey, and its change a pixel to the right.
     """
     width = right.shape[1]
     for y in range(first, last):
         for x in range(width):
-            if not known[y, x]:
-                continue
             place = min(max(np.float32(x) - disparity[y, x], np.float32(0)), np.float32(width - 1))
             at = min(int(place), width - 2)
             t = np.float32(place - np.float32(at))
@@ -69,54 +86,63 @@ def sample_rows(first, last, right, disparity, known, values, slopes):  # type: 
 
 @njit(nogil=True, cache=True, fastmath=True)
 def step_rows(  # type: ignore[no-untyped-def]
-    first, last, left, values, slopes, disparity, known, reach, step, noise, out
+    first, last, left, values, slopes, disparity, reach, jump, noise, out
 ):
     """Write the disparity after one step of Lucas-Kanade along the row.
 
-    For each window the left grey is fitted by gain * (values - change * slopes) + offset.
+    In each window the left grey is fitted by gain * (values - change * slopes) + offset, over
+    the pixels of the same surface.
 
     Args:
         first, last: the rows.
-        left: (H, W) float32.
-        values, slopes: as of `sample_rows`.
-        disparity, known, reach, step: as of `smooth_rows`.
+        left, values, slopes, disparity: (H + 2 reach, W + 2 reach) float32, each in its frame.
+        reach, jump: as of `smooth_rows`.
         noise: grey levels; the step shrinks where the slopes are no stronger.
-        out: (H, W) float32, written where known.
+        out: (H, W) float32, written.
     """
-    height, width = disparity.shape
+    width = out.shape[1]
+    n, l, v, s, vv, ss, vs, lv, ls = np.empty((9, BLOCK), np.float32)
     for y in range(first, last):
-        for x in range(width):
-            if not known[y, x]:
-                continue
-            here = disparity[y, x]
-            n = l = v = s = vv = ss = vs = lv = ls = np.float32(0)
-            middle, other = left[y, x], values[y, x]
-            for j in range(max(y - reach, 0), min(y + reach + 1, height)):
-                for i in range(max(x - reach, 0), min(x + reach + 1, width)):
-                    if known[j, i] and abs(disparity[j, i] - here) <= step:
-                        a, b, c = left[j, i] - middle, values[j, i] - other, slopes[j, i]
-                        n += np.float32(1)
-                        l += a
-                        v += b
-                        s += c
-                        vv += b * b
-                        ss += c * c
-                        vs += b * c
-                        lv += a * b
-                        ls += a * c
-            vv -= v * v / n
-            ss -= s * s / n
-            vs -= v * s / n
-            lv -= l * v / n
-            ls -= l * s / n
-            floor = n * noise * noise
-            vv += floor
-            lv += floor  # a flat window has gain 1
-            ss += floor
-            area = vv * ss - vs * vs
-            gain = (lv * ss - ls * vs) / area
-            moved = (ls * vv - lv * vs) / area
-            change = np.float32(0)
-            if gain > np.float32(0.2):
-                change = -moved / gain
-            out[y, x] = here + min(max(change, np.float32(-1)), np.float32(1))
+        for start in range(0, width, BLOCK):
+            count = min(BLOCK, width - start)
+            row, column = y + reach, start + reach
+            here = disparity[row, column : column + count]
+            # Less the greys at the centre: the sums stay small, and exact.
+            middle = left[row, column : column + count]
+            other = values[row, column : column + count]
+            for total in (n, l, v, s, vv, ss, vs, lv, ls):
+                total[:] = 0
+            for j in range(-reach, reach + 1):
+                for i in range(-reach, reach + 1):
+                    at = column + i
+                    depth = disparity[row + j, at : at + count]
+                    first_view = left[row + j, at : at + count]
+                    second_view = values[row + j, at : at + count]
+                    slope = slopes[row + j, at : at + count]
+                    for x in range(count):
+                        same = abs(depth[x] - here[x]) <= jump
+                        weight = np.float32(1) if same else np.float32(0)
+                        a = weight * (first_view[x] - middle[x])
+                        b = weight * (second_view[x] - other[x])
+                        c = weight * slope[x]
+                        n[x] += weight
+                        l[x] += a
+                        v[x] += b
+                        s[x] += c
+                        vv[x] += b * b
+                        ss[x] += c * c
+                        vs[x] += b * c
+                        lv[x] += a * b
+                        ls[x] += a * c
+            for x in range(count):
+                floor = n[x] * noise * noise
+                spread = vv[x] - v[x] * v[x] / n[x] + floor
+                steep = ss[x] - s[x] * s[x] / n[x] + floor
+                mixed = vs[x] - v[x] * s[x] / n[x]
+                alike = lv[x] - l[x] * v[x] / n[x] + floor  # a flat window has gain 1
+                moved = ls[x] - l[x] * s[x] / n[x]
+                area = spread * steep - mixed * mixed
+                gain = (alike * steep - moved * mixed) / area
+                change = (alike * mixed - moved * spread) / area
+                ratio = change / gain if gain > LEAST_GAIN else np.float32(0)
+                out[y, start + x] = here[x] + min(max(ratio, np.float32(-1)), np.float32(1))

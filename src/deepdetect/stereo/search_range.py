@@ -11,11 +11,17 @@ from .semi_global import SearchRange, semi_global
 WIDTH = 160
 """Width of the small copy in pixels."""
 
-ISLAND = 20
+ISLAND = 50
 """Pixels of the small copy; patches that are smaller do not count."""
 
+TAIL = 0.01
+"""Share of the disparities at each end that may be wrong."""
+
 MARGIN = 1.5
-"""Pixels of the small copy that are added at both ends of what is found there."""
+"""Pixels of the small copy that are added at both ends of what is found there ..."""
+
+MORE = 0.2
+"""... and so much of what lies between them, for what is too small to be seen there."""
 
 
 def find_search_range(left: np.ndarray, right: np.ndarray) -> SearchRange | None:
@@ -41,14 +47,17 @@ def find_search_range(left: np.ndarray, right: np.ndarray) -> SearchRange | None
     scale = max(width / WIDTH, 1.0)
     if scale > 1:
         size = (round(width / scale), max(round(height / scale), 1))
-        left, right = (cv2.resize(view, size, interpolation=cv2.INTER_AREA) for view in (left, right))
+        left, right = (
+            cv2.resize(view, size, interpolation=cv2.INTER_AREA) for view in (left, right)
+        )
         scale = width / size[0]
     half = left.shape[1] // 2
     found = semi_global(left, right, SearchRange(-half, half))
     known = without_islands(found.disparity, found.known, ISLAND)
     if not known.any():
         return None
-    values = found.disparity[known]
-    smallest = int(np.floor((values.min() - MARGIN) * scale))
-    largest = int(np.ceil((values.max() + MARGIN) * scale))
+    ends = np.quantile(found.disparity[known], [TAIL, 1 - TAIL])
+    margin = MARGIN + MORE * (ends[1] - ends[0])
+    smallest = int(np.floor((ends[0] - margin) * scale))
+    largest = int(np.ceil((ends[1] + margin) * scale))
     return SearchRange(max(smallest, 1 - width), min(largest, width - 1))

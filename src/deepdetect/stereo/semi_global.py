@@ -110,7 +110,9 @@ def semi_global(left: np.ndarray, right: np.ndarray, search: SearchRange) -> Dis
         bottom = min(top + rows, height)
         first, last = max(top - OVERLAP, 0), min(bottom + OVERLAP, height)
         total = _volume(left, *censuses, search.smallest, count, slice(first, last))
-        _choose(total, search.smallest, slice(top - first, bottom - first), slice(top, bottom), found)
+        _choose(
+            total, search.smallest, slice(top - first, bottom - first), slice(top, bottom), found
+        )
     return found
 
 
@@ -172,9 +174,7 @@ def _choose(
     from . import semi_global_kernel as kernel
 
     total = total[inside]
-    disparity, known, unique = (
-        part[rows] for part in (found.disparity, found.known, found.unique)
-    )
+    disparity, known, unique = (part[rows] for part in (found.disparity, found.known, found.unique))
     in_threads(
         len(total),
         lambda first, last: kernel.best_of_rows(
