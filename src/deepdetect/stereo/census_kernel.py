@@ -1,26 +1,9 @@
-"""The compiled part of the matching cost. Importing it takes numba; the first call compiles.
-
-The census transform (Zabih and Woodfill, "Non-parametric local transforms for computing visual
-correspondence", 1994) says of a pixel which of its neighbours are darker: it does not change with
-gain, offset or gamma. Its Hamming distance, summed over 3 x 3 pixels, is the cost of a disparity.
-"""
+"""The compiled part of `census`. Importing it takes numba; the first call compiles."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
-
-REACH_X = 4
-REACH_Y = 3
-"""The census window is 9 x 7 pixels: 62 comparisons, which fit a 64-bit word."""
-
-BITS = (2 * REACH_X + 1) * (2 * REACH_Y + 1) - 1
-
-OUTSIDE = np.uint8(BITS // 2)
-"""Distance to a place outside the right image: that to a wrong place, on average."""
-
-UNITS = 9 / 4
-"""Costs are sums over nine pixels, divided by four to fit a byte: so many for a bit a pixel."""
 
 
 @njit(nogil=True, cache=True)
@@ -29,19 +12,20 @@ def census_rows(first, last, gray, out):  # type: ignore[no-untyped-def]
 
     Args:
         first, last: the rows.
-        gray: (H + 2 REACH_Y, W + 2 REACH_X) uint8 image in a frame.
+        gray: uint8 image with a frame as wide as the window reaches.
         out: (H, W) uint64, written.
     """
-    width = out.shape[1]
+    height, width = out.shape
+    reach_y, reach_x = (gray.shape[0] - height) // 2, (gray.shape[1] - width) // 2
     for y in range(first, last):
         out[y] = 0
-        for j in range(-REACH_Y, REACH_Y + 1):
-            for i in range(-REACH_X, REACH_X + 1):
+        for j in range(-reach_y, reach_y + 1):
+            for i in range(-reach_x, reach_x + 1):
                 if i == 0 and j == 0:
                     continue
                 for x in range(width):
-                    here = gray[y + REACH_Y, x + REACH_X]
-                    darker = gray[y + REACH_Y + j, x + REACH_X + i] < here
+                    here = gray[y + reach_y, x + reach_x]
+                    darker = gray[y + reach_y + j, x + reach_x + i] < here
                     out[y, x] = (out[y, x] << np.uint64(1)) | np.uint64(darker)
 
 
@@ -57,7 +41,7 @@ def _count_bits(word):  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def _distances(left, right_mirrored, smallest, out):  # type: ignore[no-untyped-def]
+def _distances(left, right_mirrored, smallest, outside, out):  # type: ignore[no-untyped-def]
     """Write the Hamming distances of one row, (W, D) uint8."""
     width, count = out.shape
     for x in range(width):
@@ -65,23 +49,23 @@ def _distances(left, right_mirrored, smallest, out):  # type: ignore[no-untyped-
         start = width - 1 - x + smallest
         low = min(max(0, -start), count)
         high = max(min(count, width - start), low)
-        out[x, :low] = OUTSIDE
-        out[x, high:] = OUTSIDE
+        out[x, :low] = outside
+        out[x, high:] = outside
         word = left[x]
         for d in range(low, high):
             out[x, d] = np.uint8(_count_bits(word ^ right_mirrored[start + d]))
 
 
 @njit(nogil=True, cache=True)
-def cost_rows(first, last, left, right_mirrored, smallest, cost):  # type: ignore[no-untyped-def]
+def cost_rows(first, last, left, right_mirrored, smallest, outside, cost):  # type: ignore[no-untyped-def]
     """Write the costs of some rows.
 
     Args:
         first, last: the rows.
         left: (H, W) uint64 census of the left image.
-        right_mirrored: (H, W) uint64 census of the right image, mirrored left to right: so
-            growing disparities lie at growing addresses.
+        right_mirrored: (H, W) uint64 census of the right image, mirrored left to right.
         smallest: the disparity of `cost[..., 0]`.
+        outside: distance to a place outside the right image.
         cost: (H, W, D) uint8, written.
     """
     height, width, count = cost.shape
@@ -91,7 +75,7 @@ def cost_rows(first, last, left, right_mirrored, smallest, cost):  # type: ignor
     for y in range(first, last):
         for row in range(max(y - 1, done + 1), y + 2):
             at = min(max(row, 0), height - 1)
-            _distances(left[at], right_mirrored[at], smallest, line)
+            _distances(left[at], right_mirrored[at], smallest, outside, line)
             for x in range(width):
                 before, after = line[max(x - 1, 0)], line[min(x + 1, width - 1)]
                 here, out = line[x], sums[row % 3, x]

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import ImageError, OptionError
 from ..image import load_image, luma
+from .census import textured
 from .consistency import behind, depth_edges, without_islands
 from .row_refinement import refine_along_rows
 from .search_range import find_search_range
@@ -126,9 +127,8 @@ def match_rows(
             nothing.astype(np.int64), nothing.astype(np.float32), nothing.astype(bool), None
         )
     found = semi_global(*views, search)
-    known = without_islands(
-        found.disparity, found.known & (found.unique >= options.uniqueness), ISLAND
-    )
+    clear = found.known & (found.unique >= options.uniqueness) & textured(views[0])
+    known = without_islands(found.disparity, clear, ISLAND)
     disparity = refine_along_rows(*views, found.disparity, known)
     kept = known
     if options.edge_distance:

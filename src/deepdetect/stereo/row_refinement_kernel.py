@@ -101,7 +101,7 @@ def step_rows(  # type: ignore[no-untyped-def]
         out: (H, W) float32, written.
     """
     width = out.shape[1]
-    n, l, v, s, vv, ss, vs, lv, ls = np.empty((9, BLOCK), np.float32)
+    n, p, v, s, vv, ss, vs, pv, ps = np.empty((9, BLOCK), np.float32)
     for y in range(first, last):
         for start in range(0, width, BLOCK):
             count = min(BLOCK, width - start)
@@ -110,7 +110,8 @@ def step_rows(  # type: ignore[no-untyped-def]
             # Less the greys at the centre: the sums stay small, and exact.
             middle = left[row, column : column + count]
             other = values[row, column : column + count]
-            for total in (n, l, v, s, vv, ss, vs, lv, ls):
+            # Sums over the window: pixels, left grey, right grey, slope, and their products.
+            for total in (n, p, v, s, vv, ss, vs, pv, ps):
                 total[:] = 0
             for j in range(-reach, reach + 1):
                 for i in range(-reach, reach + 1):
@@ -126,21 +127,21 @@ def step_rows(  # type: ignore[no-untyped-def]
                         b = weight * (second_view[x] - other[x])
                         c = weight * slope[x]
                         n[x] += weight
-                        l[x] += a
+                        p[x] += a
                         v[x] += b
                         s[x] += c
                         vv[x] += b * b
                         ss[x] += c * c
                         vs[x] += b * c
-                        lv[x] += a * b
-                        ls[x] += a * c
+                        pv[x] += a * b
+                        ps[x] += a * c
             for x in range(count):
                 floor = n[x] * noise * noise
                 spread = vv[x] - v[x] * v[x] / n[x] + floor
                 steep = ss[x] - s[x] * s[x] / n[x] + floor
                 mixed = vs[x] - v[x] * s[x] / n[x]
-                alike = lv[x] - l[x] * v[x] / n[x] + floor  # a flat window has gain 1
-                moved = ls[x] - l[x] * s[x] / n[x]
+                alike = pv[x] - p[x] * v[x] / n[x] + floor  # a flat window has gain 1
+                moved = ps[x] - p[x] * s[x] / n[x]
                 area = spread * steep - mixed * mixed
                 gain = (alike * steep - moved * mixed) / area
                 change = (alike * mixed - moved * spread) / area

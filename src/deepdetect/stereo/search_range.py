@@ -11,6 +11,9 @@ from .semi_global import SearchRange, semi_global
 WIDTH = 160
 """Width of the small copy in pixels."""
 
+UNIQUENESS = 1.3
+"""Least ratio of the cost of any other place on the row: what has no match is rarely so clear."""
+
 ISLAND = 50
 """Pixels of the small copy; patches that are smaller do not count."""
 
@@ -53,7 +56,8 @@ def find_search_range(left: np.ndarray, right: np.ndarray) -> SearchRange | None
         scale = width / size[0]
     half = left.shape[1] // 2
     found = semi_global(left, right, SearchRange(-half, half))
-    known = without_islands(found.disparity, found.known, ISLAND)
+    clear = found.known & (found.unique >= UNIQUENESS)
+    known = without_islands(found.disparity, clear, ISLAND)
     if not known.any():
         return None
     ends = np.quantile(found.disparity[known], [TAIL, 1 - TAIL])

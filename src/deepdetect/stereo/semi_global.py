@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from ..errors import OptionError
 from ..threads import in_threads
+from .census import UNITS, census, matching_cost
 
 SMALL_STEP = 20
 LARGE_STEP = 100
@@ -97,7 +97,7 @@ def semi_global(left: np.ndarray, right: np.ndarray, search: SearchRange) -> Dis
     """
     height, width = left.shape
     count = -(-search.count // LANES) * LANES
-    censuses = _census(left), np.ascontiguousarray(_census(right)[:, ::-1])
+    censuses = census(left), census(right)
     found = DisparityMap(
         np.zeros((height, width), np.float32),
         np.zeros((height, width), bool),
@@ -109,47 +109,25 @@ def semi_global(left: np.ndarray, right: np.ndarray, search: SearchRange) -> Dis
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         first, last = max(top - OVERLAP, 0), min(bottom + OVERLAP, height)
-        total = _volume(left, *censuses, search.smallest, count, slice(first, last))
-        _choose(
-            total, search.smallest, slice(top - first, bottom - first), slice(top, bottom), found
-        )
+        parts = (part[first:last] for part in (left, *censuses))
+        total = _volume(*parts, search.smallest, count)
+        inside = total[top - first : bottom - first]
+        _choose(inside, search, slice(top, bottom), found)
     return found
 
 
-def _census(gray: np.ndarray) -> np.ndarray:
-    from . import census_kernel as kernel
-
-    reach = (kernel.REACH_Y, kernel.REACH_Y, kernel.REACH_X, kernel.REACH_X)
-    framed = cv2.copyMakeBorder(gray, *reach, cv2.BORDER_REPLICATE)
-    out = np.empty(gray.shape, np.uint64)
-    in_threads(len(gray), lambda first, last: kernel.census_rows(first, last, framed, out))
-    return out
-
-
 def _volume(
-    gray: np.ndarray,
-    left: np.ndarray,
-    right_mirrored: np.ndarray,
-    smallest: int,
-    count: int,
-    rows: slice,
+    gray: np.ndarray, left: np.ndarray, right: np.ndarray, smallest: int, count: int
 ) -> np.ndarray:
-    """Return the (h, W, D) uint16 costs of some rows, summed over the eight paths."""
-    from . import census_kernel, semi_global_kernel as kernel
+    """Return the (H, W, D) uint16 costs of a pair's censuses, summed over the eight paths."""
+    from . import semi_global_kernel as kernel
 
-    gray, left, right_mirrored = gray[rows], left[rows], right_mirrored[rows]
     height, width = gray.shape
-    cost = np.empty((height, width, count), np.uint8)
-    in_threads(
-        height,
-        lambda first, last: census_kernel.cost_rows(
-            first, last, left, right_mirrored, smallest, cost
-        ),
-    )
+    cost = matching_cost(left, right, smallest, count)
     total = np.zeros(cost.shape, np.uint16)
-    small = np.uint16(SMALL_STEP * census_kernel.UNITS)
+    small = np.uint16(SMALL_STEP * UNITS)
     large = np.maximum(LARGE_STEP / (1 + np.arange(256) / EDGE), 1.25 * SMALL_STEP)
-    steps = (small, (large * census_kernel.UNITS).astype(np.uint16))
+    steps = (small, (large * UNITS).astype(np.uint16))
     for direction in (1, -1):
         in_threads(
             height,
@@ -167,17 +145,14 @@ def _volume(
     return total
 
 
-def _choose(
-    total: np.ndarray, smallest: int, inside: slice, rows: slice, found: DisparityMap
-) -> None:
-    """Write the best disparities of the volume's rows `inside`, which are `rows` of the image."""
+def _choose(total: np.ndarray, search: SearchRange, rows: slice, found: DisparityMap) -> None:
+    """Write the best disparities of a volume into the rows of the map that it is of."""
     from . import semi_global_kernel as kernel
 
-    total = total[inside]
-    disparity, known, unique = (part[rows] for part in (found.disparity, found.known, found.unique))
+    into = (found.disparity[rows], found.known[rows], found.unique[rows])
     in_threads(
         len(total),
         lambda first, last: kernel.best_of_rows(
-            first, last, total, smallest, disparity, known, unique
+            first, last, total, search.smallest, search.count, *into
         ),
     )

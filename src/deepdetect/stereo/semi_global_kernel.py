@@ -91,19 +91,20 @@ def sum_along_columns(  # type: ignore[no-untyped-def]
 
 
 @njit(nogil=True, cache=True)
-def best_of_rows(first, last, total, smallest, disparity, known, unique):  # type: ignore[no-untyped-def]
+def best_of_rows(first, last, total, smallest, count, disparity, known, unique):  # type: ignore[no-untyped-def]
     """Choose the disparity of least cost for each pixel of some rows, in both views.
 
     Args:
         first, last: the rows.
         total: (H, W, D) uint16 sum over the paths.
         smallest: the disparity of `total[..., 0]`.
+        count: disparities that may be chosen, the first of the volume.
         disparity: (H, W) float32, written, with what a parabola through the least cost and its
             two neighbours adds.
         known: (H, W) bool, written: the right pixel's best disparity is the same within one.
         unique: (H, W) float32, written: the least cost elsewhere over the least cost.
     """
-    width, count = total.shape[1], total.shape[2]
+    width = total.shape[1]
     best = np.empty(width, np.int64)
     keys = np.empty(width, np.uint32)
     for y in range(first, last):
