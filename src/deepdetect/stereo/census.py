@@ -21,9 +21,6 @@ BITS = (2 * REACH_X + 1) * (2 * REACH_Y + 1) - 1
 UNITS = 9 / 4
 """Costs are sums over 3 x 3 pixels, divided by four to fit a byte: so many for a bit a pixel."""
 
-FLAT = 2
-"""Grey levels; a window whose greys differ by no more has nothing to be matched by."""
-
 
 def census(gray: np.ndarray) -> np.ndarray:
     """Return the census of each pixel of a (H, W) uint8 image, one bit a neighbour; uint64.
@@ -74,7 +71,9 @@ def matching_cost(left: np.ndarray, right: np.ndarray, smallest: int, count: int
 
 
 def textured(gray: np.ndarray) -> np.ndarray:
-    """Tell which pixels of a (H, W) uint8 image have more than a flat window; (H, W) bool.
+    """Tell which pixels of a (H, W) uint8 image have a window of more than one grey; (H, W) bool.
+
+    Others have nothing to be matched by: burnt out or black, or drawn.
 
     Example:
         >>> image = np.full((20, 20), 7, np.uint8)
@@ -83,4 +82,4 @@ def textured(gray: np.ndarray) -> np.ndarray:
         63
     """
     window = np.ones((2 * REACH_Y + 1, 2 * REACH_X + 1), np.uint8)
-    return cv2.subtract(cv2.dilate(gray, window), cv2.erode(gray, window)) > FLAT
+    return cv2.dilate(gray, window) > cv2.erode(gray, window)
