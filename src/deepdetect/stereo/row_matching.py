@@ -30,7 +30,7 @@ class RowMatchingOptions:
             this.
         edge_distance: keypoints so near to a jump of depth are left out, in pixels: the
             windows that are compared reach so far, and give what lies beside a near thing its
-            disparity. 0 leaves them in.
+            disparity. Things twice as wide or less vanish. 0 leaves them in.
         fill: give what the right image does not show, between two surfaces, the disparity of
             the farther one. Such points are no matches: `RowMatches.matched` tells them.
 

@@ -1,4 +1,8 @@
-"""Which disparities a rectified pair has: found on a small copy of it."""
+"""Which disparities a rectified pair has: found on a small copy of it.
+
+The constants were chosen so that the range holds all of the Motorcycle pair and of the Middlebury
+scenes of the benchmark, without being much wider.
+"""
 
 from __future__ import annotations
 
