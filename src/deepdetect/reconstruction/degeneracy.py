@@ -1,13 +1,13 @@
 """Why two images give no depth, said in one sentence before any cloud is made.
 
-Each check takes matches, raises `ReconstructionError` when its reason holds, and is silent on good
-pairs. They are meant to be run in the order of this module: `check_images`, then `check_matches`,
-and with a pose `check_pose`; for rectified pairs `check_disparities`.
+Each check raises `ReconstructionError` when its reason holds, and is silent on good pairs. They are
+meant to be run in the order of this module: `check_images`, `check_matches`, and with a pose
+`check_pose` and `check_focal`; for rectified pairs `check_images` and `check_disparities`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,8 +16,8 @@ from ..errors import ReconstructionError
 from ..geometry import GeometryOptions, epipolar_errors, estimate_geometry, transfer_errors
 from ..geometry.model_choice import has_depth
 from ..guidance.trust import LARGEST, false_alarms
-from .calibration import Calibration
-from .relative_pose import RelativePose
+from .calibration import Calibration, Camera
+from .relative_pose import RelativePose, estimate_relative_pose
 
 FEWEST = 30
 """Matches, one a cell, below which nothing is tried."""
@@ -27,10 +27,18 @@ CELL = 16
 side by side are no independent evidence."""
 
 THRESHOLD = 1.5
-"""Pixels within which a match agrees with a fundamental matrix or a homography here."""
+PLANE_THRESHOLD = 2.0
+"""Pixels within which a match agrees with a fundamental matrix (Sampson's distance, one direction
+of error) and with a homography (two directions)."""
+
+FLAT = 0.75
+"""A homography that explains less than this share of what the fundamental matrix does is no plane,
+whatever the other matches are."""
 
 STILL = 0.5
-"""Pixels: where nearly all matches move less, both images show the same view."""
+NOISE = 3.0
+"""Pixels: where half of the matches move less than the one, and nearly all less than the other,
+both images show the same view."""
 
 NEARLY_ALL = 0.95
 
@@ -43,6 +51,11 @@ essential matrix: a right calibration explains as much."""
 
 IN_FRONT = 0.75
 """Share of the inliers of a pose that must lie before both cameras."""
+
+FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
+BETTER = 0.5
+"""Other focal lengths that are tried, in units of the given one, and by how much the median error
+must shrink for one of them: a focal length that is a fifth off passes."""
 
 LEAST_SPREAD = 0.5
 """Pixels between the 5th and 95th percentile of the disparities of a scene with depth."""
@@ -117,28 +130,29 @@ def check_matches(
     first, second = points0[rows], points1[rows]
     space, plane = (
         estimate_geometry(
-            *(first, second), GeometryOptions(model=model, inlier_threshold=THRESHOLD, seed=seed)
+            *(first, second), GeometryOptions(model=model, inlier_threshold=threshold, seed=seed)
         )
-        for model in ("fundamental", "homography")
+        for model, threshold in (("fundamental", THRESHOLD), ("homography", PLANE_THRESHOLD))
     )
     if len(rows) < FEWEST or space.matrix is None:
         raise ReconstructionError(_no_overlap(len(points0)))
     alarms = [
-        false_alarms(errors, model, THRESHOLD, size1)
-        for model, errors in (
-            ("fundamental", epipolar_errors(first, second, space.matrix)),
-            ("homography", _plane_errors(first, second, plane.matrix)),
+        false_alarms(errors, model, threshold, size1)
+        for model, threshold, errors in (
+            ("fundamental", THRESHOLD, epipolar_errors(first, second, space.matrix)),
+            ("homography", PLANE_THRESHOLD, _plane_errors(first, second, plane.matrix)),
         )
     ]
     if min(alarms) > LARGEST:
         raise ReconstructionError(_no_overlap(len(points0)))
     moved = np.linalg.norm(second - first, axis=1)[space.inliers | plane.inliers]
-    if np.quantile(moved, NEARLY_ALL) < STILL:
+    if stands_still(moved):
         raise ReconstructionError(
             "nothing moves between the images: they show the same view, depth needs two "
             "photographs from two places"
         )
-    if not has_depth(plane.inliers, space.inliers):
+    flat = plane.inliers.sum() >= FLAT * space.inliers.sum()
+    if flat and not has_depth(plane.inliers, space.inliers):
         raise ReconstructionError(_no_depth(first, second, plane.inliers, calibration))
     return Evidence(
         rows, space.matrix, space.inliers, float(plane.inliers.mean()), float(alarms[0])
@@ -148,9 +162,6 @@ def check_matches(
 def check_pose(pose: RelativePose | None, evidence: Evidence, calibration: Calibration) -> None:
     """Refuse a pose that explains far less than is possible: the calibration is wrong.
 
-    A wrong focal length is not seen where the camera only moved sideways: any fits there, and
-    gives a scene that is stretched.
-
     Args:
         pose: of the same matches as the evidence; None when none could be estimated.
         evidence: of `check_matches`.
@@ -159,22 +170,62 @@ def check_pose(pose: RelativePose | None, evidence: Evidence, calibration: Calib
     Raises:
         ReconstructionError: too few matches agree with the pose, or too many points lie behind.
     """
-    advice = (
-        f"the focal length of {calibration.camera0.focal_px[0]:.0f} px ({calibration.source}) is "
-        "probably wrong for these images"
-    )
     if pose is None:
-        raise ReconstructionError(f"no pose of the cameras fits the matches: {advice}")
+        raise ReconstructionError(f"no pose of the cameras fits the matches: {_wrong(calibration)}")
     possible = np.count_nonzero(evidence.explained)
     explained = np.count_nonzero(pose.errors[evidence.rows] < THRESHOLD)
     if explained < CALIBRATED * possible:
         raise ReconstructionError(
             f"with this calibration only {explained:,} of {possible:,} matches fit one pose of "
-            f"the cameras: {advice}"
+            f"the cameras: {_wrong(calibration)}"
         )
     if pose.in_front < IN_FRONT:
         raise ReconstructionError(
-            f"only {pose.in_front:.0%} of the points would lie before both cameras: {advice}"
+            f"only {pose.in_front:.0%} of the points would lie before both cameras: "
+            f"{_wrong(calibration)}"
+        )
+
+
+def check_focal(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    pose: RelativePose,
+    evidence: Evidence,
+    calibration: Calibration,
+    seed: int = 0,
+) -> None:
+    """Refuse a focal length when quite another one fits the matches far better.
+
+    Where the camera only moved sideways every focal length fits as well, and a wrong one goes
+    unseen: it gives a scene that is stretched in depth.
+
+    Args:
+        points0, points1: (M, 2) the matches that the pose and the evidence come from.
+        pose, evidence, calibration: as of `check_pose`.
+        seed: of the random samples.
+
+    Raises:
+        ReconstructionError: another focal length halves the median error; it is named.
+    """
+    rows = evidence.rows[evidence.explained]
+    best, factor = BETTER * float(np.median(pose.errors[rows])), 1.0
+    for other in FOCAL_FACTORS:
+        scaled = replace(
+            calibration,
+            camera0=_with_focal(calibration.camera0, other),
+            camera1=_with_focal(calibration.camera1, other),
+        )
+        found = estimate_relative_pose(points0[rows], points1[rows], scaled, THRESHOLD, seed)
+        if found is None or found.in_front < IN_FRONT:
+            continue
+        error = float(np.median(found.errors))
+        if error < best:
+            best, factor = error, other
+    if factor != 1:
+        focal = calibration.camera0.focal_px[0]
+        raise ReconstructionError(
+            f"{_wrong(calibration)}: one of about {focal * factor:.0f} px fits the matches "
+            f"{np.median(pose.errors[rows]) / best:.1f} times as well"
         )
 
 
@@ -210,6 +261,17 @@ moved sideways, or both show one plane, and there is no depth
     )
 
 
+def stands_still(moved: np.ndarray) -> bool:
+    """Tell from how far matches move, in pixels, whether both images show the same view.
+
+    Example:
+        >>> stands_still(np.array([0.1, 0.0, 0.3])), stands_still(np.array([0.1, 0.2, 7.0]))
+        (True, False)
+    """
+    moved = np.abs(moved)
+    return bool(np.median(moved) < STILL and np.quantile(moved, NEARLY_ALL) < NOISE)
+
+
 def one_a_cell(points0: np.ndarray, seed: int = 0, cell: int = CELL) -> np.ndarray:
     """Choose a random match of each cell of the first image, (K,) rows in rising order.
 
@@ -226,6 +288,18 @@ def one_a_cell(points0: np.ndarray, seed: int = 0, cell: int = CELL) -> np.ndarr
     order = np.random.default_rng(seed).permutation(len(place))
     _, first = np.unique(place[order], axis=0, return_index=True)
     return np.sort(order[first])
+
+
+def _wrong(calibration: Calibration) -> str:
+    return (
+        f"the focal length of {calibration.camera0.focal_px[0]:.0f} px ({calibration.source}) is "
+        "probably wrong for these images"
+    )
+
+
+def _with_focal(camera: Camera, factor: float) -> Camera:
+    fx, fy = camera.focal_px
+    return replace(camera, focal_px=(fx * factor, fy * factor))
 
 
 def _plane_errors(
@@ -248,8 +322,8 @@ def _no_depth(
 ) -> str:
     if calibration is not None and _only_turned(points0[inliers], points1[inliers], calibration):
         return (
-            "the camera only turned between the photographs and there is no depth: move it "
-            "sideways"
+            "a turn of the camera explains all the matches and there is no depth: move it "
+            "sideways between the photographs"
         )
     return (
         "one homography explains all the matches: the photographs show a plane, or the camera "

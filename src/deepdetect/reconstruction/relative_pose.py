@@ -18,6 +18,10 @@ STEP = 1e-6
 SETTLED = 1e-9
 """A smaller change of the pose, in radians, ends the refinement."""
 
+REPEATS = 4
+LEAST_MORE = 0.01
+"""The pose is fitted anew to its own inliers while that gives so many more, so often at the most."""
+
 MOST = 50_000
 """Matches that the refinement takes, evenly from all: more do not make the pose any better."""
 
@@ -93,13 +97,16 @@ def estimate_relative_pose(
     if geometry.matrix is None or not geometry.inliers.any():
         return None
     kept = geometry.inliers
-    rotation, translation = _best_of_four(geometry.matrix, points0[kept], points1[kept], calibration)
-    if refine:
-        rotation, translation = refine_pose(
-            *(points0[kept], points1[kept], calibration, rotation, translation, inlier_threshold)
-        )
-    fundamental = fundamental_matrix(calibration, rotation, translation)
-    errors = epipolar_errors(points0, points1, fundamental)
+    pose = _best_of_four(geometry.matrix, points0[kept], points1[kept], calibration)
+    for _ in range(REPEATS if refine else 0):
+        pose = refine_pose(points0[kept], points1[kept], calibration, *pose, inlier_threshold)
+        before = np.count_nonzero(kept)
+        errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
+        kept = errors < inlier_threshold
+        if np.count_nonzero(kept) <= before * (1 + LEAST_MORE):
+            break
+    rotation, translation = pose
+    errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
     inliers = errors < inlier_threshold
     if not inliers.any():
         return None

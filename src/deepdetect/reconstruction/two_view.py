@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import OptionError, ReconstructionError
 from .calibration import Calibration
-from .degeneracy import check_images, check_matches, check_pose
+from .degeneracy import check_focal, check_images, check_matches, check_pose
 from .outlier_removal import disparity_space, statistical_inliers
 from .relative_pose import RelativePose, estimate_relative_pose
 from .subpixel import SubpixelOptions, refine_matches
@@ -148,6 +148,8 @@ def reconstruct_two_view(
         )
         check_pose(pose, evidence, calibration)
     assert pose is not None
+    with _timed(seconds, "focal length"):
+        check_focal(points0[rows], points1[rows], pose, evidence, calibration, options.seed)
     posed = rows
     baseline = calibration.baseline_mm
     length = 1.0 if baseline is None else baseline
