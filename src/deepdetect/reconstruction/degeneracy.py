@@ -40,7 +40,7 @@ NOISE = 3.0
 """Pixels: where half of the matches move less than the one, and nearly all less than the other,
 both images show the same view."""
 
-NEARLY_ALL = 0.95
+NEARLY_ALL = 0.9
 
 SAME = 0.5
 """Grey levels of mean difference under which two images are the same picture, stored anew."""
@@ -56,6 +56,9 @@ FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
 BETTER = 0.5
 """Other focal lengths that are tried, in units of the given one, and by how much the median error
 must shrink for one of them: a focal length that is a fifth off passes."""
+
+GOOD = 0.1
+"""Pixels of median error that no better focal length is looked for at."""
 
 LEAST_SPREAD = 0.5
 """Pixels between the 5th and 95th percentile of the disparities of a scene with depth."""
@@ -197,7 +200,8 @@ def check_focal(
     """Refuse a focal length when quite another one fits the matches far better.
 
     Where the camera only moved sideways every focal length fits as well, and a wrong one goes
-    unseen: it gives a scene that is stretched in depth.
+    unseen: it gives a scene that is stretched in depth. One that is too long shows less than one
+    that is too short.
 
     Args:
         points0, points1: (M, 2) the matches that the pose and the evidence come from.
@@ -208,7 +212,10 @@ def check_focal(
         ReconstructionError: another focal length halves the median error; it is named.
     """
     rows = evidence.rows[evidence.explained]
-    best, factor = BETTER * float(np.median(pose.errors[rows])), 1.0
+    given = float(np.median(pose.errors[rows]))
+    if given < GOOD:
+        return
+    best, factor = BETTER * given, 1.0
     for other in FOCAL_FACTORS:
         scaled = replace(
             calibration,
@@ -225,7 +232,7 @@ def check_focal(
         focal = calibration.camera0.focal_px[0]
         raise ReconstructionError(
             f"{_wrong(calibration)}: one of about {focal * factor:.0f} px fits the matches "
-            f"{np.median(pose.errors[rows]) / best:.1f} times as well"
+            f"{given / best:.1f} times as well"
         )
 
 
@@ -248,7 +255,7 @@ moved sideways, or both show one plane, and there is no depth
     known = np.asarray(disparity)[np.isfinite(disparity)]
     if not len(known):
         raise ReconstructionError("no disparity was found: the images do not overlap")
-    low, middle, high = np.quantile(known, [1 - NEARLY_ALL, 0.5, NEARLY_ALL])
+    low, middle, high = np.quantile(known, [0.05, 0.5, 0.95])
     if high - low >= LEAST_SPREAD:
         return
     if abs(middle) < STILL:

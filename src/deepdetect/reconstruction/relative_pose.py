@@ -9,7 +9,7 @@ import numpy as np
 
 from ..geometry import GeometryOptions, epipolar_errors, estimate_geometry
 from .calibration import Calibration
-from .triangulation import cross_matrix, fundamental_matrix, triangulate
+from .triangulation import fundamental_matrix, triangulate
 
 ROUNDS = 10
 STEP = 1e-6
@@ -20,7 +20,7 @@ SETTLED = 1e-9
 
 REPEATS = 4
 LEAST_MORE = 0.01
-"""The pose is fitted anew to its own inliers while that gives so many more, so often at the most."""
+"""How often the pose is fitted anew to its own inliers, while that gives so many more of them."""
 
 MOST = 50_000
 """Matches that the refinement takes, evenly from all: more do not make the pose any better."""
@@ -179,9 +179,7 @@ def _moved(
     return turn @ rotation, moved / np.linalg.norm(moved)
 
 
-def _signed_errors(
-    points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
-) -> np.ndarray:
+def _signed_errors(points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray) -> np.ndarray:
     lines1 = points0 @ fundamental[:, :2].T + fundamental[:, 2]
     lines0 = points1 @ fundamental[:2, :2] + fundamental[2, :2]
     algebraic = (points1 * lines1[:, :2]).sum(1) + lines1[:, 2]

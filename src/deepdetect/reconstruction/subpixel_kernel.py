@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+
 @njit(nogil=True, cache=True, inline="always")
 def _cubic(image, x, y):  # type: ignore[no-untyped-def]
     """Read an image between its pixels (Keys's cubic, a = -1/2); 1 to 2 pixels from the border."""
@@ -135,9 +136,7 @@ def align(  # type: ignore[no-untyped-def]
             j = 0
             for down in range(-reach, reach + 1):
                 for across in range(-reach, reach + 1):
-                    value = _cubic(
-                        image1, x1 + a * across + b * down, y1 + c * across + d * down
-                    )
+                    value = _cubic(image1, x1 + a * across + b * down, y1 + c * across + d * down)
                     seen[j] = value
                     mean += weight[j] * value
                     j += 1
