@@ -111,6 +111,15 @@ def test_one_disparity_and_unequal_heights_are_not_rectified() -> None:
     assert not same.rectified
 
 
+def test_a_slanted_plane_is_rectified_and_a_small_turn_is_not() -> None:
+    points = np.random.default_rng(0).uniform((0, 0), (640, 480), (2000, 2))
+    plane = points - np.column_stack([5 + points[:, 1] / 20, np.zeros(2000)])
+    assert judge_rectification(points, plane, (640, 480), (640, 480)).rectified
+    squeezed = points - np.column_stack([5 + points[:, 0] / 150, points[:, 1] / 500])
+    found = judge_rectification(points, squeezed, (640, 480), (640, 480))
+    assert "one homography explains" in found.reason
+
+
 def test_random_and_no_matches_are_not_rectified() -> None:
     generator = np.random.default_rng(0)
     for count in (0, 1, 2, 5, 40, 2000):

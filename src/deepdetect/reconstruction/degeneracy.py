@@ -154,8 +154,7 @@ def check_matches(
             "nothing moves between the images: they show the same view, depth needs two "
             "photographs from two places"
         )
-    flat = plane.inliers.sum() >= FLAT * space.inliers.sum()
-    if flat and not has_depth(plane.inliers, space.inliers):
+    if is_flat(plane.inliers, space.inliers):
         raise ReconstructionError(_no_depth(first, second, plane.inliers, calibration))
     return Evidence(
         rows, space.matrix, space.inliers, float(plane.inliers.mean()), float(alarms[0])
@@ -266,6 +265,16 @@ moved sideways, or both show one plane, and there is no depth
         f"all disparities are {middle:.3g} px: one image is the other moved sideways, or both "
         "show one plane, and there is no depth"
     )
+
+
+def is_flat(by_homography: np.ndarray, by_fundamental: np.ndarray) -> bool:
+    """Tell whether a homography explains all that can be explained, though many may be wrong.
+
+    Args:
+        by_homography, by_fundamental: (M,) bool, the matches that each explains.
+    """
+    nearly = np.count_nonzero(by_homography) >= FLAT * np.count_nonzero(by_fundamental)
+    return bool(nearly and not has_depth(by_homography, by_fundamental))
 
 
 def stands_still(moved: np.ndarray) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..geometry import GeometryOptions, estimate_geometry
 from ..guidance.trust import LARGEST, false_alarms
-from .degeneracy import one_a_cell, stands_still
+from .degeneracy import PLANE_THRESHOLD, is_flat, one_a_cell, stands_still
 
 ROWS = 1.0
 """Rows by which a match of a rectified pair may be off."""
@@ -24,6 +24,10 @@ AS_MANY = 0.9
 LEAST_SPREAD = 2.0
 """Pixels between the 5th and 95th percentile of the disparities of a pair with depth; whole pixels
 differ by one for nothing."""
+
+PLANE_SPREAD = 8.0
+"""The same for a pair that one homography explains: a slanted plane has as much, a camera that
+turned a little does not."""
 
 CELL = 8
 """Side in pixels of the cells of the left image that give one match each."""
@@ -110,6 +114,10 @@ def judge_rectification(
     reason = _reason(size0, size1, alarms, counts, offset, spread)
     if not reason and stands_still(disparity):
         reason = "nothing moves between the images"
+    if not reason and spread[2] - spread[0] < PLANE_SPREAD:
+        plane = GeometryOptions(model="homography", inlier_threshold=PLANE_THRESHOLD, seed=seed)
+        if is_flat(estimate_geometry(first, second, plane).inliers, space.inliers):
+            reason = "one homography explains all the matches: they move nearly alike"
     return Rectification(
         not reason,
         reason,

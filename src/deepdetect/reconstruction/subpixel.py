@@ -5,9 +5,9 @@ and offset of the light taken out. The patch is turned and sheared as its surrou
 as all matches are together (a similarity), then as the refined matches around it are (an affinity).
 
 Chosen by measurement, against a parabola through the correlation of the same patches, turned
-alike, at the nearest whole pixels. Share of the matches of the Motorcycle pair within 0.25 / 0.5 px of the
-truth, of those that converge (85 %): 65 / 83 % (parabola 49 / 73 %; before, of all, 36 / 63 %); with
-its views turned against each other by 11 degrees 61 / 79 % (parabola 30 / 57 %; before 9 / 29 %).
+alike, at the nearest whole pixels. Share of the matches of the Motorcycle pair within 0.25 / 0.5 px
+of the truth, of those that converge (85 %): 65 / 83 % (parabola 49 / 73 %; before, of all matches,
+36 / 63 %); with its views turned by 11 degrees 62 / 79 % (parabola 30 / 58 %; before 9 / 29 %).
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ RIDGE = 20.0
 those of one line, give no affinity of their own."""
 
 SETTLED = 0.01
-"""A smaller shift, in pixels, is no shift."""
+ROUGHLY = 0.05
+"""A smaller shift, in pixels, is no shift; in the first alignment, which only serves the second."""
 
 SAMPLE = 5000
 """Matches that the similarity is estimated from."""
@@ -133,7 +134,7 @@ def refine_matches(
     images = gray0.astype(np.float32), gray1.astype(np.float32)
     together = similarity(pixels0, start)
     shapes = np.broadcast_to(together, (len(pixels0), 2, 2))
-    found = _aligned(images, pixels0, start, shapes, options)
+    found = _aligned(images, pixels0, start, shapes, options, ROUGHLY)
     shapes = local_affinities(pixels0, found.points1, found.converged, gray0.shape, together)
     return _aligned(images, pixels0, found.points1, shapes, options)
 
@@ -205,6 +206,7 @@ def _aligned(
     start: np.ndarray,
     shapes: np.ndarray,
     options: SubpixelOptions,
+    settled: float = SETTLED,
 ) -> RefinedMatches:
     from .subpixel_kernel import align
 
@@ -215,7 +217,7 @@ def _aligned(
     correlation = np.empty(len(pixels0), np.float32)
     arguments = (
         *(*images, pixels0, start, np.ascontiguousarray(shapes, np.float32)),
-        *(window.astype(np.float32), int(options.rounds), SETTLED, float(options.farthest)),
+        *(window.astype(np.float32), int(options.rounds), settled, float(options.farthest)),
         *(np.float32(options.least_correlation), refined, converged, correlation),
     )
     in_threads(len(pixels0), lambda first, last: align(first, last, *arguments))

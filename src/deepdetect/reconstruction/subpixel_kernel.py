@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(nogil=True, cache=True, inline="always")
+@njit(nogil=True, fastmath=True, cache=True, inline="always")
 def _cubic(image, x, y):  # type: ignore[no-untyped-def]
     """Read an image between its pixels (Keys's cubic, a = -1/2); 1 to 2 pixels from the border."""
     column, row = np.int64(np.floor(x)), np.int64(np.floor(y))
@@ -29,7 +29,7 @@ def _cubic(image, x, y):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(nogil=True, cache=True)
+@njit(nogil=True, fastmath=True, cache=True)
 def align(  # type: ignore[no-untyped-def]
     first,
     last,

@@ -41,7 +41,7 @@ class TwoViewOptions:
     """
 
     inlier_threshold: float = 1.0
-    reprojection_threshold: float = 1.0
+    reprojection_threshold: float = 0.5
     least_parallax_px: float = 2.0
     neighbours: int = 16
     factor: float = 2.0
