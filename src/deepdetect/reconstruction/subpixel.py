@@ -4,10 +4,11 @@ Inverse compositional alignment (Baker and Matthews, "Lucas-Kanade 20 years on",
 and offset of the light taken out. The patch is turned and sheared as its surroundings are: first
 as all matches are together (a similarity), then as the refined matches around it are (an affinity).
 
-Chosen by measurement, against a parabola through the correlation of the same patches, turned
-alike, at the nearest whole pixels. Share of the matches of the Motorcycle pair within 0.25 / 0.5 px
-of the truth, of those that converge (85 %): 65 / 83 % (parabola 49 / 73 %; before, of all matches,
-36 / 63 %); with its views turned by 11 degrees 62 / 79 % (parabola 30 / 58 %; before 9 / 29 %).
+Chosen by measurement (benchmarks/two_view.py) against a parabola through the correlation of the
+same patches, turned alike, at the nearest whole pixels. Share of the matches of the Motorcycle pair
+within 0.25 / 0.5 px of the truth, of those that converge (88 %): 65 / 83 % (parabola 49 / 74 %;
+before, of all matches, 36 / 63 %); with its views turned against each other by 14 degrees (84 %)
+62 / 79 % (parabola 31 / 59 %; before 9 / 29 %).
 """
 
 from __future__ import annotations
