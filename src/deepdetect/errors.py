@@ -28,6 +28,10 @@ class WeightsError(DeepDetectError):
     """A weights file is missing, damaged, or does not fit the network."""
 
 
+class ReconstructionError(DeepDetectError):
+    """Two images give no depth: the error says which of the usual reasons it is."""
+
+
 class MissingExtraError(DeepDetectError):
     """An optional package is needed for what was asked and is not installed."""
 

@@ -1,0 +1,167 @@
+"""The compiled part of `subpixel`. Importing it takes numba; the first call compiles."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(nogil=True, fastmath=True, cache=True, inline="always")
+def _cubic(image, x, y):  # type: ignore[no-untyped-def]
+    """Read an image between its pixels (Keys's cubic, a = -1/2); 1 to 2 pixels from the border."""
+    column, row = np.int64(np.floor(x)), np.int64(np.floor(y))
+    u, v = np.float32(x - column), np.float32(y - row)
+    a0 = ((np.float32(-0.5) * u + np.float32(1.0)) * u - np.float32(0.5)) * u
+    a1 = (np.float32(1.5) * u - np.float32(2.5)) * u * u + np.float32(1.0)
+    a2 = ((np.float32(-1.5) * u + np.float32(2.0)) * u + np.float32(0.5)) * u
+    a3 = (np.float32(0.5) * u - np.float32(0.5)) * u * u
+    b0 = ((np.float32(-0.5) * v + np.float32(1.0)) * v - np.float32(0.5)) * v
+    b1 = (np.float32(1.5) * v - np.float32(2.5)) * v * v + np.float32(1.0)
+    b2 = ((np.float32(-1.5) * v + np.float32(2.0)) * v + np.float32(0.5)) * v
+    b3 = (np.float32(0.5) * v - np.float32(0.5)) * v * v
+    top, one, two, low = image[row - 1], image[row], image[row + 1], image[row + 2]
+    c = column
+    return (
+        b0 * (a0 * top[c - 1] + a1 * top[c] + a2 * top[c + 1] + a3 * top[c + 2])
+        + b1 * (a0 * one[c - 1] + a1 * one[c] + a2 * one[c + 1] + a3 * one[c + 2])
+        + b2 * (a0 * two[c - 1] + a1 * two[c] + a2 * two[c + 1] + a3 * two[c + 2])
+        + b3 * (a0 * low[c - 1] + a1 * low[c] + a2 * low[c + 1] + a3 * low[c + 2])
+    )
+
+
+@njit(nogil=True, fastmath=True, cache=True)
+def align(  # type: ignore[no-untyped-def]
+    first,
+    last,
+    image0,
+    image1,
+    pixels0,
+    points1,
+    shapes,
+    window,
+    rounds,
+    settled,
+    farthest,
+    least,
+    refined,
+    converged,
+    correlation,
+):
+    """Refine the matches from `first` to before `last`.
+
+    Inverse compositional: the patch of the first image is the template, so that its derivatives
+    and the matrix are made once; gain and offset are two more unknowns beside the shift.
+
+    Args:
+        first, last: rows of the matches.
+        image0, image1: (H, W) float32.
+        pixels0: (N, 2) int64 in the first image.
+        points1: (N, 2) float64 beginnings in the second.
+        shapes: (N, 2, 2) float32, the local affinity from the first to the second image.
+        window: (S, S) float32 weights of the patch.
+        rounds: at the most.
+        settled: a shift under this ends it, in pixels.
+        farthest: from the beginning, in pixels.
+        least: correlation at the end.
+        refined: (N, 2) float64, written; as at the beginning where nothing converges.
+        converged: (N,) bool, written.
+        correlation: (N,) float32 weighted, of both patches at the end, written.
+    """
+    side = window.shape[0]
+    reach = side // 2
+    height0, width0 = image0.shape
+    height1, width1 = image1.shape
+    count = side * side
+    template = np.empty(count, np.float32)
+    seen = np.empty(count, np.float32)
+    slope = np.empty((2, count), np.float32)
+    weight = window.reshape(-1)
+    total = np.float32(0)
+    for j in range(count):
+        total += weight[j]
+    for k in range(first, last):
+        x0, y0 = pixels0[k, 0], pixels0[k, 1]
+        refined[k, 0], refined[k, 1] = points1[k, 0], points1[k, 1]
+        converged[k], correlation[k] = False, 0
+        if x0 < reach + 1 or y0 < reach + 1 or x0 > width0 - reach - 2 or y0 > height0 - reach - 2:
+            continue
+        mean, mean_x, mean_y = np.float32(0), np.float32(0), np.float32(0)
+        j = 0
+        for down in range(-reach, reach + 1):
+            for across in range(-reach, reach + 1):
+                y, x = y0 + down, x0 + across
+                value = image0[y, x]
+                sx = np.float32(0.5) * (image0[y, x + 1] - image0[y, x - 1])
+                sy = np.float32(0.5) * (image0[y + 1, x] - image0[y - 1, x])
+                template[j], slope[0, j], slope[1, j] = value, sx, sy
+                mean += weight[j] * value
+                mean_x += weight[j] * sx
+                mean_y += weight[j] * sy
+                j += 1
+        mean, mean_x, mean_y = mean / total, mean_x / total, mean_y / total
+        # Without their means the offset drops out of the equations; the gain is taken out next.
+        tt, tx, ty = np.float32(0), np.float32(0), np.float32(0)
+        for j in range(count):
+            template[j] -= mean
+            slope[0, j] -= mean_x
+            slope[1, j] -= mean_y
+            tt += weight[j] * template[j] * template[j]
+            tx += weight[j] * template[j] * slope[0, j]
+            ty += weight[j] * template[j] * slope[1, j]
+        if tt < np.float32(1e-3) * total:
+            continue
+        xx, xy, yy = np.float32(0), np.float32(0), np.float32(0)
+        for j in range(count):
+            slope[0, j] -= tx / tt * template[j]
+            slope[1, j] -= ty / tt * template[j]
+            xx += weight[j] * slope[0, j] * slope[0, j]
+            xy += weight[j] * slope[0, j] * slope[1, j]
+            yy += weight[j] * slope[1, j] * slope[1, j]
+        determinant = xx * yy - xy * xy
+        if determinant <= np.float32(1e-6) * (xx + yy) * (xx + yy) or xx + yy <= 0:
+            continue
+        a, b, c, d = shapes[k, 0, 0], shapes[k, 0, 1], shapes[k, 1, 0], shapes[k, 1, 1]
+        spread_x = reach * (abs(a) + abs(b)) + 2
+        spread_y = reach * (abs(c) + abs(d)) + 2
+        x1, y1 = points1[k, 0], points1[k, 1]
+        for _ in range(rounds):
+            if (
+                x1 < spread_x
+                or y1 < spread_y
+                or x1 > width1 - 1 - spread_x
+                or y1 > height1 - 1 - spread_y
+            ):
+                break
+            mean = np.float32(0)
+            j = 0
+            for down in range(-reach, reach + 1):
+                for across in range(-reach, reach + 1):
+                    value = _cubic(image1, x1 + a * across + b * down, y1 + c * across + d * down)
+                    seen[j] = value
+                    mean += weight[j] * value
+                    j += 1
+            mean /= total
+            ts, ss, ex, ey = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
+            for j in range(count):
+                value = weight[j] * (seen[j] - mean)
+                ts += value * template[j]
+                ss += value * (seen[j] - mean)
+                ex += value * slope[0, j]
+                ey += value * slope[1, j]
+            gain = ts / tt
+            correlation[k] = ts / np.sqrt(max(ss * tt, np.float32(1e-12)))
+            if gain <= 0:
+                break
+            # slope is across the template, so what is left of `seen` is the gain times the shift
+            step_x = (yy * ex - xy * ey) / determinant / gain
+            step_y = (xx * ey - xy * ex) / determinant / gain
+            x1 -= a * step_x + b * step_y
+            y1 -= c * step_x + d * step_y
+            gone_x, gone_y = x1 - points1[k, 0], y1 - points1[k, 1]
+            if not gone_x * gone_x + gone_y * gone_y <= farthest * farthest:
+                break
+            if step_x * step_x + step_y * step_y < settled * settled:
+                if correlation[k] >= least:
+                    converged[k] = True
+                    refined[k, 0], refined[k, 1] = x1, y1
+                break

@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import OptionError
+from deepdetect.image import luma
+from deepdetect.reconstruction import subpixel
+from deepdetect.reconstruction.subpixel import (
+    SubpixelOptions,
+    local_affinities,
+    refine_matches,
+    similarity,
+)
+
+
+@pytest.fixture(scope="module")
+def gray(photo: np.ndarray) -> np.ndarray:
+    """The photograph, a little smooth so that it can be moved by parts of a pixel, not square."""
+    return cv2.GaussianBlur(luma(photo)[:220], (0, 0), 1)
+
+
+@pytest.fixture(scope="module")
+def pixels() -> np.ndarray:
+    grid = np.stack(np.meshgrid(np.arange(20, 236, 4), np.arange(20, 200, 4)), -1)
+    return grid.reshape(-1, 2)
+
+
+def moved(gray: np.ndarray, across: float, down: float) -> np.ndarray:
+    """Move an image by Fourier's theorem: exact, and no kernel of interpolation that we use."""
+    v, u = np.meshgrid(*(np.fft.fftfreq(side) for side in gray.shape), indexing="ij")
+    turned = np.fft.fft2(gray.astype(float)) * np.exp(-2j * np.pi * (u * across + v * down))
+    return np.clip(np.rint(np.fft.ifft2(turned).real), 0, 255).astype(np.uint8)
+
+
+def errors(found: Any, expected: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(found.points1 - expected, axis=1)[found.converged]
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, -0.2), (0.5, 0.5), (-0.9, 0.4), (1.2, 0.0)])
+def test_known_shifts_are_found(
+    gray: np.ndarray, pixels: np.ndarray, shift: tuple[float, float]
+) -> None:
+    found = refine_matches(gray, moved(gray, *shift), pixels, pixels)
+    assert found.converged.mean() > 0.7
+    assert np.median(errors(found, pixels + shift)) < 0.04
+    assert (errors(found, pixels + shift) < 0.25).mean() > 0.9
+    # No pull towards whole pixels.
+    bias = np.median((found.points1 - pixels - shift)[found.converged], axis=0)
+    assert np.abs(bias).max() < 0.02
+
+
+def test_the_light_does_not_matter(gray: np.ndarray, pixels: np.ndarray) -> None:
+    other = moved(gray, 0.4, -0.3)
+    dim = np.clip(other * 0.6 + 30, 0, 255).astype(np.uint8)
+    plain, lit = (refine_matches(gray, image, pixels, pixels) for image in (other, dim))
+    both = plain.converged & lit.converged
+    assert both.mean() > 0.65
+    gap = np.linalg.norm(plain.points1 - lit.points1, axis=1)[both]
+    assert np.median(gap) < 0.03
+    assert not refine_matches(gray, 255 - gray, pixels, pixels).converged.any()
+
+
+def test_a_turn_is_followed(gray: np.ndarray, pixels: np.ndarray) -> None:
+    turn = cv2.getRotationMatrix2D((128, 110), 12, 1.1)
+    other = cv2.warpAffine(gray, turn, gray.shape[::-1], flags=cv2.INTER_CUBIC)
+    true = pixels @ turn[:, :2].T + turn[:, 2]
+    found = refine_matches(gray, other, pixels, np.rint(true))
+    inside = ((true > 8) & (true < np.array(gray.shape[::-1]) - 9)).all(1)
+    assert found.converged[inside].mean() > 0.8
+    assert not found.converged[((true < 0) | (true > gray.shape[::-1])).any(1)].any()
+    assert np.median(errors(found, true)) < 0.04
+    np.testing.assert_allclose(similarity(pixels, true), turn[:, :2], atol=1e-6)
+
+
+def test_real_matches_come_nearer_to_the_truth(
+    turned: Any, turned_matches: tuple[np.ndarray, np.ndarray]
+) -> None:
+    points0, points1 = turned_matches
+    true = turned.match(points0)
+    known = np.isfinite(true).all(1)
+    found = refine_matches(*turned.grays, points0, points1)
+    assert found.converged.mean() > 0.7
+    before, after = (
+        np.linalg.norm(points - true, axis=1)[known & found.converged]
+        for points in (points1, found.points1)
+    )
+    assert (after < 0.25).mean() > 2 * (before < 0.25).mean()
+    assert np.median(after) < 0.6 * np.median(before)
+
+
+def test_what_cannot_be_aligned_stays_and_says_so(gray: np.ndarray) -> None:
+    pixels = np.array([[100, 100], [0, 0], [255, 219], [100, 100]])
+    start = np.array([[100.25, 100.0], [0, 0], [255, 219], [140, 30]])
+    found = refine_matches(gray, gray, pixels, start)
+    assert found.converged.tolist() == [True, False, False, False]
+    np.testing.assert_array_equal(found.points1[1:], start[1:])
+    assert found.points1[0] == pytest.approx((100, 100), abs=0.01)
+    flat = np.full_like(gray, 90)
+    for images in ((flat, gray), (gray, flat), (flat, flat)):
+        assert not refine_matches(*images, pixels, start).converged.any()
+    stripes = np.broadcast_to(np.uint8(100 + 80 * np.sin(np.arange(256) / 3)), (220, 256))
+    assert not refine_matches(stripes.copy(), stripes.copy(), pixels, start).converged.any()
+    outside = np.array([[1e6, 5.0], [-50, 3], [np.nan, 3], [100, np.inf]])
+    assert not refine_matches(gray, gray, pixels, outside).converged.any()
+
+
+def test_the_number_of_threads_does_not_matter(
+    gray: np.ndarray, pixels: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = moved(gray, 0.4, -0.3)
+    many = refine_matches(gray, other, pixels, pixels)
+    monkeypatch.setattr(subpixel, "in_threads", lambda count, work: work(0, count))
+    one = refine_matches(gray, other, pixels, pixels)
+    np.testing.assert_array_equal(many.points1, one.points1)
+    np.testing.assert_array_equal(many.converged, one.converged)
+
+
+def test_no_matches_and_few(gray: np.ndarray) -> None:
+    assert len(refine_matches(gray, gray, *np.empty((2, 0, 2))).points1) == 0
+    for count in (1, 2, 3):
+        points = np.array([[100, 100], [60, 80], [150, 120]])[:count]
+        assert refine_matches(gray, gray, points, points).converged.all()
+
+
+def test_affinities_are_those_of_the_motion_around() -> None:
+    pixels = np.stack(np.meshgrid(np.arange(60), np.arange(50)), -1).reshape(-1, 2)
+    one, other = np.array([[1.1, 0.1], [0, 0.9]]), np.array([[0.9, -0.1], [0.2, 1.2]])
+    left = pixels[:, 0] < 30
+    places = np.where(left[:, None], pixels @ one.T, pixels @ other.T + 500)
+    found = local_affinities(pixels, places, np.ones(3000, bool), (50, 60), np.eye(2))
+    inner = ((pixels > 7) & (pixels < [52, 42])).all(1)
+    # A tenth falls back on the affinity of all: 225 neighbours against 20.
+    for side, true in ((pixels[:, 0] < 22, one), (pixels[:, 0] > 37, other)):
+        expected = np.eye(2) + (true - np.eye(2)) * 225 / 245
+        np.testing.assert_allclose(
+            found[inner & side], np.broadcast_to(expected, found[inner & side].shape), atol=1e-3
+        )
+    alone = local_affinities(
+        np.array([[5, 5]]), np.array([[9.0, 9.0]]), np.ones(1, bool), (50, 60), one
+    )
+    np.testing.assert_allclose(alone[0], one, atol=1e-6)
+
+
+def test_what_is_wrong_is_said(gray: np.ndarray) -> None:
+    for points in ([[0.5, 3]], [[-1, 3]], [[256, 3]]):
+        with pytest.raises(OptionError, match="whole pixels of the image"):
+            refine_matches(gray, gray, np.array(points), np.array(points))
+    for options in (
+        {"reach": 0},
+        {"sigma": 0},
+        {"rounds": 0},
+        {"farthest": -1},
+        {"least_correlation": 2},
+    ):
+        with pytest.raises(OptionError):
+            SubpixelOptions(**options)
+
+
+def test_wrong_matches_around_do_not_bend_an_affinity() -> None:
+    pixels = np.stack(np.meshgrid(np.arange(60), np.arange(50)), -1).reshape(-1, 2)
+    places = pixels.astype(np.float64)
+    wrong = np.random.default_rng(0).random(len(pixels)) < 0.3
+    places[wrong] += 40
+    found = local_affinities(pixels, places, ~wrong, (50, 60), np.eye(2))
+    np.testing.assert_allclose(found, np.broadcast_to(np.eye(2), found.shape), atol=1e-6)
+    nowhere = local_affinities(pixels, places, np.zeros(3000, bool), (50, 60), 2 * np.eye(2))
+    np.testing.assert_allclose(nowhere, np.broadcast_to(2 * np.eye(2), found.shape), atol=1e-6)

@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, OptionError, match_images
+from deepdetect.errors import ReconstructionError
+from deepdetect.reconstruction.calibration import calibration_from_focal
+from deepdetect.reconstruction.two_view import (
+    TwoViewOptions,
+    TwoViewReconstruction,
+    reconstruct_two_view,
+)
+
+
+@pytest.fixture(scope="module")
+def found(turned: Any, turned_matches: Any) -> TwoViewReconstruction:
+    return reconstruct_two_view(*turned_matches, turned.calibration, turned.grays)
+
+
+def depth_errors(turned: Any, found: TwoViewReconstruction, points0: np.ndarray) -> np.ndarray:
+    """Return the shares by which depths are off, where the truth is known."""
+    true = turned.points(points0[found.rows])[:, 2]
+    return np.abs(found.points[:, 2] / true - 1)[np.isfinite(true)]
+
+
+def test_pose_and_depth_are_true(turned: Any, turned_matches: Any, found: Any) -> None:
+    assert len(found) > 0.6 * len(turned_matches[0])
+    assert turned.rotation_error(found.pose.rotation) < 0.1
+    assert turned.direction_error(found.pose.translation) < 1
+    errors = depth_errors(turned, found, turned_matches[0])
+    assert np.median(errors) < 0.015
+    assert (errors < 0.05).mean() > 0.9
+    assert found.unit == "baseline"
+    assert found.pose.in_front > 0.99
+
+
+def test_whole_pixels_give_a_worse_model(turned: Any, turned_matches: Any, found: Any) -> None:
+    coarse = reconstruct_two_view(*turned_matches, turned.calibration)
+    fine = depth_errors(turned, found, turned_matches[0])
+    assert np.median(fine) < 0.6 * np.median(depth_errors(turned, coarse, turned_matches[0]))
+    assert turned.rotation_error(found.pose.rotation) < turned.rotation_error(coarse.pose.rotation)
+
+
+def test_points_lie_where_their_pixels_look(turned: Any, turned_matches: Any, found: Any) -> None:
+    """x right, y down, z forward, and each point on the ray of its own match."""
+    points0, _ = turned_matches
+    calibration, pose = turned.calibration, found.pose
+    seen = calibration.camera0.project(found.points)
+    assert np.abs(seen - points0[found.rows]).max() < 1.5
+    there = calibration.camera1.project(found.points @ pose.rotation.T + pose.translation)
+    gaps = np.stack([seen - points0[found.rows], there - found.points1])
+    error = np.sqrt((gaps**2).sum((0, 2)) / 2)
+    np.testing.assert_allclose(error, found.reprojection_errors, atol=2e-3)
+    assert found.reprojection_errors.max() < 1
+    assert (found.points[:, 2] > 0).all()
+
+
+def test_all_matches_are_accounted_for(turned_matches: Any, found: Any) -> None:
+    assert len(found) + sum(found.dropped.values()) == len(turned_matches[0])
+    assert (np.diff(found.rows) > 0).all()
+    assert len(found.points) == len(found.points1) == len(found.reprojection_errors)
+    assert len(found.points) == len(found.parallax)
+    assert found.dropped["not refined"] == len(turned_matches[0]) - len(found.posed)
+    assert set(found.seconds) >= {"sub-pixel", "pose", "triangulation", "outlier removal"}
+
+
+def test_a_known_baseline_gives_millimetres(turned: Any, turned_matches: Any, found: Any) -> None:
+    calibration = replace(turned.calibration, baseline_mm=193.001)
+    metric = reconstruct_two_view(*turned_matches, calibration, turned.grays)
+    assert metric.unit == "mm"
+    np.testing.assert_array_equal(metric.rows, found.rows)
+    np.testing.assert_allclose(metric.points, found.points * 193.001, rtol=1e-5)
+
+
+def test_is_the_same_on_repetition(turned: Any, turned_matches: Any, found: Any) -> None:
+    again = reconstruct_two_view(*turned_matches, turned.calibration, turned.grays)
+    np.testing.assert_array_equal(again.points, found.points)
+
+
+def test_a_rectified_pair_is_only_a_special_case(level: Any, level_matches: Any) -> None:
+    found = reconstruct_two_view(*level_matches, level.calibration, level.grays)
+    assert level.rotation_error(found.pose.rotation) < 0.1
+    errors = depth_errors(level, found, level_matches[0])
+    assert np.median(errors) < 0.015
+
+
+def test_wrong_matches_are_taken_out(turned: Any, turned_matches: Any, found: Any) -> None:
+    points0, points1 = (part.copy() for part in turned_matches)
+    generator = np.random.default_rng(0)
+    wrong = generator.random(len(points1)) < 0.3
+    points1[wrong] = generator.integers((0, 0), (370, 250), (wrong.sum(), 2))
+    other = reconstruct_two_view(points0, points1, turned.calibration, turned.grays)
+    assert turned.rotation_error(other.pose.rotation) < 0.1
+    assert wrong[other.rows].mean() < 0.02
+    assert len(other) > 0.5 * len(found)
+
+
+def test_options_switch_stages_off(turned: Any, turned_matches: Any) -> None:
+    options = TwoViewOptions(neighbours=0, subpixel=None, least_parallax_px=0)
+    found = reconstruct_two_view(*turned_matches, turned.calibration, turned.grays, options)
+    assert "alone" not in found.dropped
+    assert "not refined" not in found.dropped
+    assert found.dropped["parallax"] == 0
+    far = reconstruct_two_view(
+        *turned_matches, turned.calibration, None, replace(options, least_parallax_px=40)
+    )
+    assert np.radians(far.parallax.min()) * turned.calibration.camera0.focal_px[0] >= 40
+    assert far.dropped["parallax"] > 0
+
+
+def test_what_is_wrong_is_said(turned: Any, turned_matches: Any, level: Any, one_line) -> None:
+    with pytest.raises(ReconstructionError, match="calibration is for images of 640x480") as error:
+        reconstruct_two_view(
+            *turned_matches, calibration_from_focal(500, (640, 480), (640, 480)), turned.grays
+        )
+    one_line(error.value)
+    gray = level.grays[0]
+    with pytest.raises(ReconstructionError, match="the same picture"):
+        reconstruct_two_view(*turned_matches, level.calibration, (gray, gray))
+    with pytest.raises(ReconstructionError, match="parallax: "):
+        reconstruct_two_view(
+            *turned_matches,
+            turned.calibration,
+            None,
+            TwoViewOptions(least_parallax_px=1e4),
+        )
+    for options in (
+        {"inlier_threshold": 0},
+        {"reprojection_threshold": -1},
+        {"least_parallax_px": -1},
+        {"neighbours": -1},
+        {"factor": float("nan")},
+        {"seed": -1},
+    ):
+        with pytest.raises(OptionError):
+            TwoViewOptions(**options)
+
+
+def test_a_camera_that_only_turned_gives_no_cloud(level: Any, only_turned: np.ndarray) -> None:
+    from deepdetect.image import luma
+
+    found = match_images(level.left, only_turned, DeepDetect("geometry"))
+    calibration = replace(level.calibration, camera1=level.calibration.camera0)
+    with pytest.raises(ReconstructionError, match="turn of the camera"):
+        reconstruct_two_view(
+            found.points0, found.points1, calibration, (level.grays[0], luma(only_turned))
+        )
