@@ -21,6 +21,7 @@ import numpy as np
 from ..errors import OptionError
 
 NEIGHBOURS = 16
+WINDOW = 9
 FACTOR = 2.0
 
 DISPARITY_WEIGHT = 2.0
@@ -62,6 +63,60 @@ def statistical_inliers(
         distances = mean_neighbour_distances(points[inliers], neighbours)
         inliers[inliers] = distances <= distances.mean() + factor * distances.std()
     return inliers
+
+
+def statistical_inliers_on_grid(
+    pixels: np.ndarray,
+    disparity: np.ndarray,
+    size: tuple[int, int],
+    window: int = WINDOW,
+    factor: float = FACTOR,
+) -> np.ndarray:
+    """Tell which keypoints of a rectified pair have about the depth of those around.
+
+    As `statistical_inliers`, with all keypoints in a window as neighbours and the root mean square
+    of the differences of disparity as distance: three box filters, however many points there are.
+
+    Args:
+        pixels: (N, 2) whole pixels of the left image.
+        disparity: (N,) in pixels.
+        size: (width, height) of the image.
+        window: side of the window in pixels.
+        factor: standard deviations above the mean; fewer remove more.
+
+    Returns:
+        (N,) bool. A keypoint with no other in its window is an outlier only where most have some.
+
+    Example:
+        >>> pixels = np.argwhere(np.ones((20, 20)))
+        >>> disparity = np.full(400, 7.0)
+        >>> disparity[210] = 9
+        >>> np.flatnonzero(~statistical_inliers_on_grid(pixels, disparity, (20, 20))).tolist()
+        [210]
+    """
+    if not len(pixels):
+        return np.ones(0, bool)
+    columns, rows = np.rint(pixels).astype(np.int64).T
+    middle = float(np.median(disparity))  # float32 squares of large numbers lose the differences
+    centred = (disparity - middle).astype(np.float64)
+
+    def around(values: np.ndarray | float) -> np.ndarray:
+        image = np.zeros(size[::-1])
+        image[rows, columns] = values
+        kernel = (window, window)
+        summed = cv2.boxFilter(image, -1, kernel, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        return summed[rows, columns]
+
+    others = around(1.0) - 1
+    total, squares = around(centred), around(centred**2)
+    differences = squares - 2 * centred * total + (others + 1) * centred**2
+    distances = np.sqrt(np.maximum(differences, 0) / np.maximum(others, 1))
+    some = others > 0.5
+    if not some.any():
+        return np.ones(len(pixels), bool)
+    bound = distances[some].mean() + factor * distances[some].std()
+    alone = ~some & (some.mean() > 0.5)
+    return (distances <= bound + 1e-6) & ~alone
 
 
 def mean_neighbour_distances(points: np.ndarray, neighbours: int = NEIGHBOURS) -> np.ndarray:

@@ -1,0 +1,364 @@
+"""Two photographs in, coloured points in space out (paper, Figure 8).
+
+    keypoints -> matches -> pose -> triangulation -> checks
+
+A rectified pair has one road less: its matches lie along the rows, their disparity is the depth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..detector import DeepDetect
+from ..errors import ReconstructionError
+from ..guidance.sparse import sparse_features
+from ..image import load_image, luma
+from ..keypoints import SelectionOptions, select_keypoints
+from ..matchers import get_matcher, match_descriptors
+from ..matching import HeatmapDetector, match_images
+from ..options import changed
+from ..point_cloud import PointCloud
+from ..presets import get_preset
+from ..stereo import COMPLETE, RowMatchingOptions, match_rows
+from .calibration import Calibration, calibration_from_focal, read_calibration
+from .degeneracy import check_disparities, check_images
+from .exif import calibration_from_exif
+from .outlier_removal import statistical_inliers_on_grid
+from .rectification import Rectification, judge_rectification
+from .relative_pose import RelativePose
+from .two_view import TwoViewOptions, reconstruct_two_view
+
+SPARSE_RATIO = 0.85
+"""Ratio test of the few matches that tell whether a pair is rectified."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructionOptions:
+    """How a pair becomes points.
+
+    Attributes:
+        selection: which pixels become keypoints.
+        rectified: whether matches lie on the same row of both images; None: found out.
+        rows: how rectified pairs are matched; None: `COMPLETE` when every pixel is asked for
+            (a density of 1), else the strict default.
+        two_view: all stages of pairs that are not rectified.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    rectified: bool | None = None
+    rows: RowMatchingOptions | None = None
+    two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
+
+    @property
+    def row_matching(self) -> RowMatchingOptions:
+        """The options for rectified pairs that hold."""
+        if self.rows is not None:
+            return self.rows
+        return COMPLETE if self.selection.density == 1 else RowMatchingOptions()
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """Points in space, and where they come from.
+
+    Attributes:
+        points: (N, 3) float32 in the frame of the left camera: x right, y down, z forward.
+        colors: (N, 3) uint8 sRGB, of the left image.
+        pixels: (N, 2) float32, where each point lies in the left image.
+        disparity: (N,) float32 in pixels for rectified pairs, else None: the match of the left
+            (x, y) is the right (x - disparity, y).
+        matched: (N,) bool: seen in both images; False for points that were filled in (only when
+            every pixel of a rectified pair is asked for).
+        unit: "mm" when the baseline is known, else "baseline": the distance of the cameras is 1,
+            and the true scale is not known.
+        size: (width, height) of the left image.
+        rectified: which road was taken.
+        rectification: the figures by which it was chosen; None when it was asked for.
+        calibration: of the cameras.
+        pose: of the right camera for pairs that are not rectified, else None.
+        keypoints: number of keypoints in the left image.
+        matches: number of matches that the points were made from.
+        dropped: how many of these each check took away, in order.
+        seconds: time of each stage.
+    """
+
+    points: np.ndarray
+    colors: np.ndarray
+    pixels: np.ndarray
+    disparity: np.ndarray | None
+    matched: np.ndarray
+    unit: str
+    size: tuple[int, int]
+    rectified: bool
+    rectification: Rectification | None
+    calibration: Calibration
+    pose: RelativePose | None
+    keypoints: int
+    matches: int
+    dropped: dict[str, int]
+    seconds: dict[str, float]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def cloud(self) -> PointCloud:
+        """The points with their colours, for the exporters."""
+        return PointCloud(self.points, self.colors, self.unit)
+
+    def depth_map(self) -> np.ndarray:
+        """Return the depth at each pixel of the left image, (H, W) float32; NaN where unknown."""
+        return self._map(self.points[:, 2])
+
+    def disparity_map(self) -> np.ndarray:
+        """Return the disparity at each pixel of the left image; NaN where it is unknown.
+
+        Raises:
+            ReconstructionError: the pair is not rectified.
+        """
+        if self.disparity is None:
+            raise ReconstructionError("only rectified pairs have disparities: take the depth map")
+        return self._map(self.disparity)
+
+    def _map(self, values: np.ndarray) -> np.ndarray:
+        result = np.full(self.size[::-1], np.nan, np.float32)
+        columns, rows = np.rint(self.pixels).astype(np.int64).T
+        result[rows, columns] = values
+        return result
+
+
+def reconstruct(
+    left: Any,
+    right: Any,
+    detector: HeatmapDetector | None = None,
+    *,
+    calibration: Calibration | str | Path | None = None,
+    focal_px: float | None = None,
+    options: ReconstructionOptions | None = None,
+    done: Callable[[str], object] = lambda stage: None,
+    **changes: Any,
+) -> Reconstruction:
+    """Reconstruct a scene from two photographs.
+
+    Args:
+        left, right: anything `load_image` takes. For a pair that is not rectified "left" is only
+            the first one, whose frame the points are in.
+        detector: a `DeepDetect`, or anything with its `heatmap` method; default
+            `DeepDetect("geometry")`.
+        calibration: a `Calibration` or the path of a calib.json (`calibration` tells its
+            format); without one the focal length is taken from `focal_px`, or from EXIF.
+        focal_px: focal length in pixels of both cameras, instead of a calibration.
+        options: all options at once.
+        done: called with the name of each stage when it is finished.
+        **changes: single options by name, also those of `SelectionOptions`, `TwoViewOptions`
+            and `SubpixelOptions`, as `density=1`, `rectified=True`, `neighbours=0`.
+
+    Returns:
+        The points, with everything that is known of them.
+
+    Raises:
+        ImageError: an image cannot be read or is not fit.
+        OptionError: an option is unknown or out of its range.
+        ReconstructionError: there is no calibration, it is wrong, or the pair gives no depth.
+
+    Example:
+        >>> from deepdetect.controls import EveryPixel
+        >>> rng = np.random.default_rng(0)
+        >>> import cv2
+        >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (96, 200)).astype(np.uint8), (0, 0), 1)
+        >>> x, y = np.meshgrid(np.arange(160, dtype=np.float32), np.arange(96, dtype=np.float32))
+        >>> left = cv2.remap(scene, x + 10 + y / 16, y, cv2.INTER_CUBIC)
+        >>> right = cv2.remap(scene, x + 20 + y / 8, y, cv2.INTER_CUBIC)
+        >>> found = reconstruct(left, right, EveryPixel(), focal_px=300, rectified=True)
+        >>> shift = 10 + found.pixels[:, 1] / 16
+        >>> bool(np.median(np.abs(found.disparity - shift)) < 0.1), found.unit
+        (True, 'baseline')
+    """
+    chosen = changed(options if options is not None else ReconstructionOptions(), **changes)
+    seconds: dict[str, float] = {}
+    images = load_image(left), load_image(right)
+    sizes = tuple((image.shape[1], image.shape[0]) for image in images)
+    known = _calibration(calibration, focal_px, (left, right), sizes)
+    grays = luma(images[0]), luma(images[1])
+    check_images(*grays)
+
+    @contextmanager
+    def stage(name: str) -> Iterator[None]:
+        started = time.perf_counter()
+        yield
+        seconds[name] = time.perf_counter() - started
+        done(name)
+
+    rectification = None
+    rectified = chosen.rectified
+    if rectified is None:
+        with stage("rectified or not"):
+            rectification = _judge(grays, sizes, known, chosen.two_view.seed)
+        rectified = rectification.rectified
+        if rectification.swapped:
+            raise ReconstructionError(
+                "this is a rectified pair with left and right exchanged: give the other one first"
+            )
+    if detector is None:
+        detector = DeepDetect("geometry")
+    make = _from_rows if rectified else _from_matches
+    return make(images, grays, detector, known, chosen, rectification, seconds, stage)
+
+
+Stage = Callable[[str], Any]
+Pair = tuple[np.ndarray, np.ndarray]
+
+
+def _from_rows(
+    images: Pair,
+    grays: Pair,
+    detector: HeatmapDetector,
+    calibration: Calibration,
+    options: ReconstructionOptions,
+    rectification: Rectification | None,
+    seconds: dict[str, float],
+    stage: Stage,
+) -> Reconstruction:
+    """Reconstruct a rectified pair."""
+    with stage("keypoints"):
+        keypoints = select_keypoints(detector.heatmap(images[0]), options.selection)
+    with stage("matching"):
+        found = match_rows(*grays, keypoints.xy, options.row_matching)
+    check_disparities(found.disparity)
+    pixels, disparity = keypoints.xy[found.rows], found.disparity
+    size = (images[0].shape[1], images[0].shape[0])
+    with stage("triangulation"):
+        depth = calibration.depth_mm(disparity)
+        rays = calibration.camera0.rays(pixels)
+    dropped = {"behind the camera": int(np.count_nonzero(~np.isfinite(depth)))}
+    kept = np.isfinite(depth)
+    points = rays[kept] * depth[kept, None]
+    strict = options.row_matching.edge_distance > 0
+    if options.two_view.neighbours and strict:
+        with stage("outlier removal"):
+            inliers = statistical_inliers_on_grid(
+                pixels[kept], disparity[kept], size, factor=options.two_view.factor
+            )
+        dropped["alone"] = int(np.count_nonzero(~inliers))
+        kept[kept] = inliers
+        points = points[inliers]
+    if not len(points):
+        raise ReconstructionError(
+            "no disparity gives a depth: the disparity offset of the calibration is wrong, or "
+            "left and right are exchanged"
+        )
+    pixels = pixels[kept]
+    columns, rows = pixels.astype(np.int64).T
+    return Reconstruction(
+        points.astype(np.float32),
+        images[0][rows, columns],
+        pixels.astype(np.float32),
+        disparity[kept],
+        found.matched[kept],
+        "baseline" if calibration.baseline_mm is None else "mm",
+        size,
+        True,
+        rectification,
+        calibration,
+        None,
+        len(keypoints),
+        len(found),
+        dropped,
+        seconds,
+    )
+
+
+def _from_matches(
+    images: Pair,
+    grays: Pair,
+    detector: HeatmapDetector,
+    calibration: Calibration,
+    options: ReconstructionOptions,
+    rectification: Rectification | None,
+    seconds: dict[str, float],
+    stage: Stage,
+) -> Reconstruction:
+    """Reconstruct a pair that is not rectified."""
+    with stage("keypoints and matching"):
+        found = match_images(
+            *images,
+            detector,
+            options=changed(get_preset("default"), selection=options.selection),
+            model="none",
+            seed=options.two_view.seed,
+        )
+    with stage("reconstruction"):
+        made = reconstruct_two_view(
+            found.points0, found.points1, calibration, grays, options.two_view
+        )
+    seconds.pop("reconstruction")
+    seconds.update(made.seconds)
+    pixels = found.points0[made.rows]
+    columns, rows = np.rint(pixels).astype(np.int64).T
+    return Reconstruction(
+        made.points,
+        images[0][rows, columns],
+        pixels,
+        None,
+        np.ones(len(pixels), bool),
+        made.unit,
+        (images[0].shape[1], images[0].shape[0]),
+        False,
+        rectification,
+        calibration,
+        made.pose,
+        len(found.keypoints0),
+        len(found),
+        made.dropped,
+        seconds,
+    )
+
+
+def _judge(
+    grays: Pair, sizes: tuple[tuple[int, int], ...], calibration: Calibration, seed: int
+) -> Rectification:
+    """Tell from few matches of SIFT whether the pair is rectified."""
+    first, second = (sparse_features(gray) for gray in grays)
+    found = match_descriptors(
+        first.descriptors,
+        second.descriptors,
+        get_matcher("exact"),
+        ratio=SPARSE_RATIO,
+        mutual=True,
+    )
+    return judge_rectification(
+        first.xy[found.rows0],
+        second.xy[found.rows1],
+        *sizes,
+        offset_px=calibration.disparity_offset_px,
+        seed=seed,
+    )
+
+
+def _calibration(
+    given: Calibration | str | Path | None,
+    focal_px: float | None,
+    images: tuple[Any, Any],
+    sizes: tuple[tuple[int, int], ...],
+) -> Calibration:
+    """Return the calibration that is given, or the one the photographs carry."""
+    if given is not None and focal_px is not None:
+        raise ReconstructionError("give a calibration or a focal length, not both")
+    if isinstance(given, Calibration):
+        given.check_sizes(*sizes)
+        return given
+    if given is not None:
+        return read_calibration(given, *sizes)
+    if focal_px is not None:
+        return calibration_from_focal(focal_px, *sizes)
+    return calibration_from_exif(*images, *sizes)
