@@ -54,6 +54,38 @@ def metered() -> Iterator[Meter]:
         meter.memory = max(_peak() - before, 0)
 
 
+class StageMeters:
+    """Measures stages that follow each other: `lap` ends one and begins the next.
+
+    Attributes:
+        stages: by name; stages of one name add up their seconds, the largest memory counts.
+
+    Example:
+        >>> meters = StageMeters()
+        >>> _ = sum(range(1000))
+        >>> meters.lap("summing")
+        >>> meters.stages["summing"].seconds > 0
+        True
+    """
+
+    def __init__(self) -> None:
+        self.stages: dict[str, Meter] = {}
+        self._begin()
+
+    def lap(self, name: str) -> None:
+        """End a stage."""
+        seconds = time.perf_counter() - self._started
+        memory = max(_peak() - self._before, 0)
+        meter = self.stages.setdefault(name, Meter())
+        meter.seconds += seconds
+        meter.memory = max(meter.memory, memory)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._before = _start()
+        self._started = time.perf_counter()
+
+
 def peak_memory() -> int:
     """Return the most memory that the process has held so far, in bytes.
 

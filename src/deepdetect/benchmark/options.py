@@ -37,7 +37,8 @@ class BenchmarkOptions:
         others: further methods.
         channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
             feeds its own weights.
-        geometry_weights: the weights for stereo pairs.
+        geometry_weights: the weights for stereo pairs, one or more; time is measured with the
+            first.
 
     Raises:
         OptionError: a name is unknown, or nothing is left to do.
@@ -48,12 +49,14 @@ class BenchmarkOptions:
     classical: tuple[str, ...] = (*DEFAULT, *LOW)
     others: tuple[Method, ...] = ()
     channels: str = "rgb"
-    geometry_weights: str | Path = "geometry"
+    geometry_weights: tuple[str | Path, ...] = ("geometry",)
 
     def __post_init__(self) -> None:
         for protocol in self.protocols:
             if protocol not in PROTOCOLS:
                 raise unknown_name("protocol", protocol, PROTOCOLS)
+        if not self.geometry_weights:
+            raise OptionError("name the weights for stereo pairs, as geometry")
         if not self.protocols:
             raise OptionError(f"choose a protocol: {' or '.join(PROTOCOLS)}")
         for name in self.classical:
@@ -112,15 +115,12 @@ class BenchmarkOptions:
         title = "DeepDetect, native resolution, all pixels over 0.5"
         return deepdetect_method(self._native(), name="deepdetect-native", title=title)
 
-    def geometry(self) -> Method:
-        """Return the weights for stereo pairs, at the image's own size."""
-        name = Path(self.geometry_weights).stem
-        title = f'DeepDetect("{name}"), native resolution, all pixels over 0.5'
-        return deepdetect_method(self.geometry_detector(), name="deepdetect-geometry", title=title)
-
-    def geometry_detector(self) -> DeepDetect:
-        """Return a detector with the weights for stereo pairs, at the image's own size."""
-        return DeepDetect(self.geometry_weights, channels=self.channels)
+    def geometry_detectors(self) -> dict[str, DeepDetect]:
+        """Return detectors with the weights for stereo pairs, at the image's own size, by name."""
+        return {
+            Path(weights).stem: DeepDetect(weights, channels=self.channels)
+            for weights in self.geometry_weights
+        }
 
     def native_controls(self) -> tuple[Method, Method]:
         """Return as many random points as `native` finds, and every pixel."""

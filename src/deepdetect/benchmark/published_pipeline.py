@@ -54,21 +54,68 @@ def published_pipeline(images: Sequence[np.ndarray], detector: DeepDetect, right
     Returns:
         The number of right matches.
     """
+    first, second, good = _matches(images, detector)
+    count = 0
+    for match in good:
+        count += right(*first[match.queryIdx].pt, *second[match.trainIdx].pt)
+    return count
+
+
+def published_points(
+    images: Sequence[np.ndarray],
+    detector: DeepDetect,
+    camera: np.ndarray,
+    done: Callable[[str], object] = lambda stage: None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Match a stereo pair and keep what the essential matrix leaves, the paper's "voxels".
+
+    RANSAC with 1 px and a confidence of 0.999, pose, and triangulation, by OpenCV.
+
+    Args:
+        images: two, (H, W, 3) uint8 RGB.
+        detector: of `published_detector`.
+        camera: (3, 3), of both images.
+        done: called with "keypoints", "matching" and "geometry" when that is finished.
+
+    Returns:
+        (M, 2) and (M, 2) float64 positions of the matches that are left.
+    """
+    first, second, good = _matches(images, detector, done)
+    points0 = np.array([first[match.queryIdx].pt for match in good]).reshape(-1, 2)
+    points1 = np.array([second[match.trainIdx].pt for match in good]).reshape(-1, 2)
+    done("matching")
+    if len(good) < 6:
+        return points0[:0], points1[:0]
+    essential, inliers = cv2.findEssentialMat(points0, points1, camera, cv2.RANSAC, 0.999, 1.0)
+    kept = inliers.ravel() > 0
+    points0, points1 = points0[kept], points1[kept]
+    _, rotation, translation, _ = cv2.recoverPose(essential[:3], points0, points1, camera)
+    poses = np.eye(3, 4), np.column_stack([rotation, translation])
+    cv2.triangulatePoints(*(camera @ pose for pose in poses), points0.T, points1.T)
+    done("geometry")
+    return points0, points1
+
+
+def _matches(
+    images: Sequence[np.ndarray],
+    detector: DeepDetect,
+    done: Callable[[str], object] = lambda stage: None,
+) -> tuple[Sequence[cv2.KeyPoint], Sequence[cv2.KeyPoint], list[cv2.DMatch]]:
     sift = cv2.SIFT_create()
-    described = []
+    keypoints = []
     for image in images:
         mask = detector.heatmap(image) > 0.5
-        keypoints = [cv2.KeyPoint(float(x), float(y), 3) for y, x in np.argwhere(mask)]
-        described.append(sift.compute(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), keypoints))
-    (first, descriptors0), (second, descriptors1) = described
+        keypoints.append([cv2.KeyPoint(float(x), float(y), 3) for y, x in np.argwhere(mask)])
+    done("keypoints")
+    (first, descriptors0), (second, descriptors1) = (
+        sift.compute(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), own)
+        for image, own in zip(images, keypoints, strict=True)
+    )
     if not first or not second:
-        return 0
+        return first, second, []
     matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 5}, {"checks": 50})
     good = []
     for best, next_best in matcher.knnMatch(descriptors0, descriptors1, k=2):
         if best.distance / (next_best.distance + 1e-12) < RATIO:
             good.append(best)
-    count = 0
-    for match in good:
-        count += right(*first[match.queryIdx].pt, *second[match.trainIdx].pt)
-    return count
+    return first, second, good

@@ -151,8 +151,12 @@ def _pairs(
         (pair.name, lambda pair=pair: _planar(pair, options.detector.configured(shown)))
         for pair in chosen
     ]
-    stereo = (STEREO, lambda: _stereo(workspace, options.geometry_detector().configured(shown)))
+    stereo = (STEREO, lambda: _stereo(workspace, _geometry(options, shown)))
     return [*planar, stereo]
+
+
+def _geometry(options: BenchmarkOptions, shown: HeatmapOptions) -> DeepDetect:
+    return DeepDetect(options.geometry_weights[0]).configured(shown)
 
 
 def _planar(pair: PlanarPair, detector: DeepDetect) -> WholePair:

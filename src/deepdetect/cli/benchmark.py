@@ -55,9 +55,9 @@ NAMES = (
 )
 @click.option(
     "--geometry-weights",
-    default="geometry",
-    show_default=True,
-    help="Weights for stereo pairs, as --weights.",
+    multiple=True,
+    default=("geometry",),
+    help="Weights for stereo pairs, as --weights; may be repeated.  [default: geometry]",
 )
 @detector_options
 @json_option
@@ -70,7 +70,7 @@ def benchmark(
     only: str | None,
     preset: str,
     cache: Path | None,
-    geometry_weights: str,
+    geometry_weights: tuple[str, ...],
     as_json: bool,
     **values: Any,
 ) -> None:

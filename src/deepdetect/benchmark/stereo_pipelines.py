@@ -1,0 +1,274 @@
+"""What reconstructs a rectified pair: ours, the published pipeline, SIFT, OpenCV's SGBM.
+
+Each is a function from a scene to its points with their disparities, and meters its stages under
+three names: keypoints, matching, geometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..controls import EveryPixel
+from ..detector import DeepDetect
+from ..geometry import GeometryOptions, estimate_geometry
+from ..heatmap import HeatmapOptions
+from ..image import load_image
+from ..matchers import get_matcher, match_descriptors
+from ..matching import HeatmapDetector, check_memory
+from ..methods import CLASSICAL, Method
+from ..reconstruction.calibration import Calibration, read_calibration
+from ..reconstruction.reconstruct import reconstruct
+from ..stereo.search_range import find_search_range
+from .cache import file_digest
+from .metering import Meter, StageMeters
+from .options import BenchmarkOptions
+from .planar_paper import PAPER_MATCHING
+from .published_pipeline import published_detector, published_points
+
+STAGES = ("keypoints", "matching", "geometry")
+INLIER_THRESHOLD = 1.0
+ROUNDS = 3
+"""Runs of what takes seconds; the one of median time is told."""
+
+PUBLISHED = "published pipeline"
+
+
+@dataclass(frozen=True, eq=False)
+class StereoScene:
+    """A rectified pair to be reconstructed.
+
+    Attributes:
+        name: of the scene.
+        left, right: (H, W, 3) uint8 RGB.
+        calibration: of calib.json.
+    """
+
+    name: str
+    left: np.ndarray
+    right: np.ndarray
+    calibration: Calibration
+
+
+@dataclass(frozen=True, eq=False)
+class StereoPoints:
+    """The points of a scene.
+
+    Attributes:
+        pixels: (N, 2) float32 positions in the left image.
+        disparity: (N,) float32 in pixels.
+        filled: how many of them were not matched, but filled in.
+        meters: of each of `STAGES` that the pipeline has.
+    """
+
+    pixels: np.ndarray
+    disparity: np.ndarray
+    filled: int
+    meters: Mapping[str, Meter]
+
+    @property
+    def seconds(self) -> float:
+        """Of all stages."""
+        return sum(meter.seconds for meter in self.meters.values())
+
+
+@dataclass(frozen=True, eq=False)
+class Pipeline:
+    """A way from two images to points.
+
+    Attributes:
+        title: how tables name it.
+        run: reconstructs a scene.
+        version: what results depend on besides the title.
+        rounds: how often it is run for its time.
+        drawn: its title in Figure 8; empty: not drawn.
+    """
+
+    title: str
+    run: Callable[[StereoScene], StereoPoints]
+    version: str = ""
+    rounds: int = ROUNDS
+    drawn: str = ""
+
+
+def load_scene(folder: Path) -> StereoScene:
+    """Load both views of a scene and its calibration.
+
+    Raises:
+        ImageError: an image is missing.
+        ReconstructionError: the calibration is.
+    """
+    left, right = load_image(folder / "left.png"), load_image(folder / "right.png")
+    sizes = tuple((image.shape[1], image.shape[0]) for image in (left, right))
+    return StereoScene(folder.name, left, right, read_calibration(folder / "calib.json", *sizes))
+
+
+def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
+    """Return what is compared, controls last."""
+    found = []
+    for name, detector in options.geometry_detectors().items():
+        version = (
+            f"{file_digest(detector.weights)[:16]} {detector.backend} {detector.heatmap_options}"
+        )
+        drawn = "ours" if not found else ""
+        found.append(Pipeline(f"ours, weights {name}", _ours(detector), version, drawn=drawn))
+    for name, detector in options.geometry_detectors().items():
+        squashing = detector.configured(HeatmapOptions(480, "bgr"))
+        title = f"{PUBLISHED}, weights {name}"
+        found.append(Pipeline(title, _published(squashing), file_digest(detector.weights)[:16], 1))
+    for name, drawn in (("sift", "SIFT default"), ("sift-low", "SIFT low")):
+        if name in options.classical:
+            method = CLASSICAL[name]
+            found.append(Pipeline(method.title, _classical(method), method.version, 1, drawn))
+    found.append(Pipeline("OpenCV's SGBM", sgbm))
+    detector = next(iter(options.geometry_detectors().values()))
+    version = file_digest(detector.weights)[:16]
+    found.append(Pipeline("control: as many random pixels as ours", _random(detector), version, 1))
+    found.append(Pipeline("control: every pixel", _ours(EveryPixel())))
+    found.append(Pipeline("every pixel, --density 1", _ours(EveryPixel(), density=1)))
+    return found
+
+
+def _ours(
+    detector: HeatmapDetector, density: float | None = None
+) -> Callable[[StereoScene], StereoPoints]:
+    def run(scene: StereoScene) -> StereoPoints:
+        _compiled()
+        return _reconstructed(scene, detector, density)
+
+    return run
+
+
+def _reconstructed(
+    scene: StereoScene, detector: HeatmapDetector, density: float | None
+) -> StereoPoints:
+    meters = StageMeters()
+
+    def done(stage: str) -> None:
+        meters.lap(stage if stage in STAGES else "geometry")
+
+    found = reconstruct(
+        scene.left,
+        scene.right,
+        detector,
+        calibration=scene.calibration,
+        rectified=True,
+        density=density,
+        done=done,
+    )
+    meters.lap("geometry")
+    assert found.disparity is not None
+    filled = int(np.count_nonzero(~found.matched))
+    return StereoPoints(found.pixels, found.disparity, filled, meters.stages)
+
+
+def _random(like: DeepDetect) -> Callable[[StereoScene], StereoPoints]:
+    def run(scene: StereoScene) -> StereoPoints:
+        _compiled()
+        density = float((like.heatmap(scene.left) > 0.5).mean())
+        generator = np.random.default_rng(0)
+
+        class Points:
+            def heatmap(self, image: np.ndarray) -> np.ndarray:
+                return generator.random(image.shape[:2], dtype=np.float32)
+
+        return _reconstructed(scene, Points(), density)
+
+    return run
+
+
+def _published(detector: DeepDetect) -> Callable[[StereoScene], StereoPoints]:
+    def run(scene: StereoScene) -> StereoPoints:
+        network = published_detector(detector)
+        network.heatmap(scene.left)  # the first run of a size takes longer
+        meters = StageMeters()
+        points0, points1 = published_points(
+            (scene.left, scene.right), network, scene.calibration.camera0.matrix, meters.lap
+        )
+        return _from_matches(points0, points1, meters)
+
+    return run
+
+
+def _classical(method: Method) -> Callable[[StereoScene], StereoPoints]:
+    def run(scene: StereoScene) -> StereoPoints:
+        images = scene.left, scene.right
+        meters = StageMeters()
+        features = [method.detect(image) for image in images]
+        meters.lap("keypoints")
+        check_memory([len(one) for one in features])
+        descriptors = [
+            method.describe(image, one) for image, one in zip(images, features, strict=True)
+        ]
+        found = match_descriptors(
+            *descriptors, get_matcher(PAPER_MATCHING.matcher), ratio=PAPER_MATCHING.ratio
+        )
+        meters.lap("matching")
+        points0, points1 = features[0].xy[found.rows0], features[1].xy[found.rows1]
+        geometry = GeometryOptions(
+            model="essential",
+            estimator="ransac",
+            inlier_threshold=INLIER_THRESHOLD,
+            camera0=scene.calibration.camera0.matrix,
+            camera1=scene.calibration.camera0.matrix,
+        )
+        inliers = estimate_geometry(points0, points1, geometry).inliers
+        meters.lap("geometry")
+        return _from_matches(points0[inliers], points1[inliers], meters)
+
+    return run
+
+
+def sgbm(scene: StereoScene) -> StereoPoints:
+    """Run OpenCV's semi-global matching: block 5, three ways, uniqueness 10, speckle filter.
+
+    With the range that ours finds, made a multiple of 16. Both views are continued on the left by
+    that range, so that it gives values at the left margin, too.
+    """
+    meters = StageMeters()
+    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
+    search = find_search_range(*gray)
+    largest = 64 if search is None else search.largest
+    count = max(16, -(-(largest + 1) // 16) * 16)
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=5,
+        P1=8 * 3 * 25,
+        P2=32 * 3 * 25,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    views = [
+        cv2.copyMakeBorder(
+            cv2.cvtColor(image, cv2.COLOR_RGB2BGR), 0, 0, count, 0, cv2.BORDER_REPLICATE
+        )
+        for image in (scene.left, scene.right)
+    ]
+    disparity = matcher.compute(*views)[:, count:].astype(np.float32) / 16
+    rows, columns = np.nonzero(disparity >= 0)
+    meters.lap("matching")
+    pixels = np.column_stack([columns, rows]).astype(np.float32)
+    return StereoPoints(pixels, disparity[rows, columns], 0, meters.stages)
+
+
+def _from_matches(points0: np.ndarray, points1: np.ndarray, meters: StageMeters) -> StereoPoints:
+    disparity = (points0[:, 0] - points1[:, 0]).astype(np.float32)
+    return StereoPoints(points0.astype(np.float32), disparity, 0, meters.stages)
+
+
+@lru_cache(maxsize=1)
+def _compiled() -> None:
+    """Run once on little, so that no scene's time holds the compilation."""
+    scene = np.random.default_rng(0).integers(0, 256, (96, 160), np.uint8)
+    scene = cv2.GaussianBlur(scene, (0, 0), 1)
+    column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (160, 96)))
+    right = cv2.remap(scene, column + 4 + row / 12, row, cv2.INTER_LINEAR)
+    reconstruct(scene, right, EveryPixel(), focal_px=100, rectified=True)

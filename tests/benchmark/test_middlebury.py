@@ -1,0 +1,165 @@
+"""The stereo benchmark on a corner of cones, beside the truth and beside known answers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetect
+from deepdetect.benchmark import BenchmarkOptions
+from deepdetect.benchmark.cache import StageCache
+from deepdetect.benchmark.middlebury import middlebury_sections, middlebury_steps, voxels
+from deepdetect.benchmark.published_pipeline import published_detector, published_points
+from deepdetect.benchmark.report import Section
+from deepdetect.benchmark.stereo_pipelines import STAGES, load_scene, pipelines, sgbm
+from deepdetect.benchmark.workspace import Workspace
+from deepdetect.heatmap import HeatmapOptions
+from deepdetect.reconstruction.calibration import Calibration, Camera
+
+pytest.importorskip("torch", reason="the published pipeline runs in torch")
+
+TOP, LEFT, HEIGHT, WIDTH = 120, 100, 160, 260
+
+
+@pytest.fixture(scope="module")
+def data(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A corner of cones, and the same without its truth."""
+    root = tmp_path_factory.mktemp("stereo")
+    source = shared / "data" / "middlebury" / "cones"
+    calibration = json.loads((source / "calib.json").read_text())
+    for name in ("cones", "nothing-known"):
+        folder = root / "middlebury" / name
+        folder.mkdir(parents=True)
+        known = dict(calibration, width=WIDTH, height=HEIGHT)
+        if name != "cones":
+            del known["ground_truth"]
+        (folder / "calib.json").write_text(json.dumps(known))
+        for file in ("left.png", "right.png", "disparity.png"):
+            with Image.open(source / file) as image:
+                image.crop((LEFT, TOP, LEFT + WIDTH, TOP + HEIGHT)).save(folder / file)
+    return root
+
+
+@pytest.fixture(scope="module")
+def options() -> BenchmarkOptions:
+    return BenchmarkOptions(DeepDetect(), ("paper",), ("sift", "sift-low"))
+
+
+@pytest.fixture(scope="module")
+def section(
+    data: Path, options: BenchmarkOptions, tmp_path_factory: pytest.TempPathFactory
+) -> Section:
+    done: list[int] = []
+    cache = StageCache(tmp_path_factory.mktemp("cache"))
+    workspace = Workspace(data, cache, lambda steps, text: done.append(steps))
+    (found,) = middlebury_sections(workspace, options)
+    assert sum(done) == middlebury_steps(workspace, options) > 0
+    made = cache.made
+    (again,) = middlebury_sections(workspace, options)
+    assert cache.made == made
+    assert again.tables == found.tables
+    assert [note for note in workspace.left_out if "nothing-known" in note]
+    return found
+
+
+def rows(section: Section, key: str) -> dict[str, dict[str, object]]:
+    (table,) = [table for table in section.tables if table.key == key]
+    titles = [column.title for column in table.columns]
+    return {str(row[0]): dict(zip(titles, row, strict=True)) for row in table.rows}
+
+
+def test_ours_is_exact_and_the_controls_are_there(section: Section) -> None:
+    found = rows(section, "middlebury_cones")
+    ours = found["ours, weights geometry"]
+    assert ours["points"] > 8_000
+    assert ours["within 1 px"] > 0.97
+    assert ours["within 2 px"] > 0.985
+    assert ours["of them filled"] == 0
+    every = found["every pixel, --density 1"]
+    assert every["completeness at 1 px"] > found["control: every pixel"]["completeness at 1 px"]
+    assert every["of them filled"] > 0
+    assert found["control: every pixel"]["points"] > ours["points"]
+    random = found["control: as many random pixels as ours"]
+    assert random["points"] == pytest.approx(ours["points"], rel=0.3)
+    assert found["OpenCV's SGBM"]["completeness at 1 px"] > 0.6
+    assert found["SIFT, low settings"]["points"] > found["SIFT"]["points"]
+    published = found["published pipeline, weights geometry"]
+    assert published["points in the paper"] == 49_979
+    assert ours["times faster than published"] == pytest.approx(
+        published["seconds"] / ours["seconds"]
+    )
+
+
+def test_every_pipeline_tells_what_its_stages_took(section: Section) -> None:
+    for name, row in rows(section, "middlebury_cones").items():
+        seconds = [row[f"{stage}, s"] for stage in STAGES]
+        known = [value for value in seconds if value is not None]
+        assert known, name
+        assert row["seconds"] == pytest.approx(sum(known))
+        assert (row["matching, s"] or 0) > 0, name
+
+
+def test_without_a_truth_nothing_is_judged(section: Section) -> None:
+    judged, blank = (rows(section, f"middlebury_{s}") for s in ("cones", "nothing-known"))
+    for name, row in blank.items():
+        assert row["within 1 px"] is None
+        assert row["F-score"] is None
+        if name.startswith(("ours", "every", "control: every", "OpenCV")):
+            assert row["points"] == judged[name]["points"]
+
+
+def test_figure_8_is_a_picture_with_counts(section: Section) -> None:
+    figures = {figure.key: figure for figure in section.figures}
+    assert list(figures) == ["figure8_cones", "figure8_nothing-known"]
+    figure = figures["figure8_cones"]
+    points = rows(section, "middlebury_cones")["ours, weights geometry"]["points"]
+    assert f"ours {points:,}" in figure.title
+    picture = cv2.imdecode(np.frombuffer(figure.png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.std() > 20
+
+
+def test_the_weights_are_named_in_rows_of_their_own(data: Path) -> None:
+    second = DeepDetect().weights
+    options = BenchmarkOptions(DeepDetect(), ("paper",), (), geometry_weights=("geometry", second))
+    titles = [way.title for way in pipelines(options)]
+    assert titles[:2] == ["ours, weights geometry", "ours, weights deepdetect"]
+    assert sum(title.startswith("published pipeline") for title in titles) == 2
+    assert len(set(titles)) == len(titles)
+
+
+def test_voxels_are_cubes_with_a_point() -> None:
+    camera = Camera((101, 101), 100.0)
+    calibration = Calibration(camera, camera, baseline_mm=10)
+    # Depth 1000 / disparity; at a depth of 100 mm a pixel is 1 mm.
+    pixels = np.array([[50.2, 50.2], [50.7, 50.2], [53.2, 50.2], [50.2, 50.2], [10, 10]])
+    disparity = np.array([10.0, 10, 10, 5, -1])
+    assert voxels(calibration, pixels, disparity, 2.0) == 3
+
+
+def test_sgbm_finds_a_shift() -> None:
+    texture = np.random.default_rng(0).integers(0, 256, (80, 200, 3), np.uint8)
+    texture = cv2.GaussianBlur(texture, (0, 0), 1)
+    left, right = texture[:, :180], texture[:, 9:189]
+    camera = Camera((180, 80), 100.0)
+    from deepdetect.benchmark.stereo_pipelines import StereoScene
+
+    found = sgbm(StereoScene("shift", left, right, Calibration(camera, camera)))
+    assert (np.abs(found.disparity - 9) < 0.5).mean() > 0.98
+    assert len(found.pixels) > 0.9 * 80 * 171
+
+
+def test_the_published_pipeline_keeps_what_lies_on_a_row(data: Path) -> None:
+    scene = load_scene(data / "middlebury" / "cones")
+    detector = published_detector(DeepDetect("geometry").configured(HeatmapOptions(480, "bgr")))
+    stages: list[str] = []
+    points0, points1 = published_points(
+        (scene.left, scene.right), detector, scene.calibration.camera0.matrix, stages.append
+    )
+    assert stages == list(STAGES)
+    assert len(points0) == len(points1) > 5_000
+    assert (np.abs(points0[:, 1] - points1[:, 1]) <= 1).mean() > 0.98
