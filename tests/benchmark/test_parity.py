@@ -10,9 +10,12 @@ from deepdetect import DeepDetect
 from deepdetect.benchmark import BenchmarkOptions
 from deepdetect.benchmark.oxford import chosen_pairs
 from deepdetect.benchmark.planar_paper import density_table, matches_table, repeatability_table
+from deepdetect.benchmark.published_pipeline import published_points
+from deepdetect.benchmark.stereo_pipelines import load_scene
 from deepdetect.benchmark.workspace import Workspace
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.planar import PlanarScene
+from deepdetect.heatmap import HeatmapOptions
 from deepdetect.weights_quality import PAIRS
 
 DENSITY = {0.5: 0.525, 0.7: 0.486, 0.8: 0.462, 0.9: 0.431}
@@ -66,3 +69,14 @@ def test_matches(
     table = matches_table(workspace, [options.own()], pairs, "matches")
     found = dict(zip([pair.name for pair in pairs], table.rows[0][1::2], strict=True))
     assert found == pytest.approx(MATCHES, rel=0.05)
+
+
+def test_voxels_of_cones(shared: Path) -> None:
+    """The paper's 49,979, with its second weights, within 1 %."""
+    scene = load_scene(shared / "data" / "middlebury" / "cones")
+    weights = shared / "reference" / "published_reconstruction.safetensors"
+    detector = DeepDetect(weights).configured(HeatmapOptions(480, "bgr"))
+    points, _ = published_points(
+        (scene.left, scene.right), detector, scene.calibration.camera0.matrix
+    )
+    assert len(points) == pytest.approx(49_979, rel=0.01)

@@ -29,10 +29,14 @@ from .cache import file_digest
 from .metering import Meter, StageMeters
 from .options import BenchmarkOptions
 from .planar_paper import PAPER_MATCHING
-from .published_pipeline import published_detector, published_points
+from .published_pipeline import (
+    STEREO_RATIO,
+    STEREO_THRESHOLD,
+    published_detector,
+    published_points,
+)
 
 STAGES = ("keypoints", "matching", "geometry")
-INLIER_THRESHOLD = 1.0
 ROUNDS = 3
 """Runs of what takes seconds; the one of median time is told."""
 
@@ -206,14 +210,14 @@ def _classical(method: Method) -> Callable[[StereoScene], StereoPoints]:
             method.describe(image, one) for image, one in zip(images, features, strict=True)
         ]
         found = match_descriptors(
-            *descriptors, get_matcher(PAPER_MATCHING.matcher), ratio=PAPER_MATCHING.ratio
+            *descriptors, get_matcher(PAPER_MATCHING.matcher), ratio=STEREO_RATIO
         )
         meters.lap("matching")
         points0, points1 = features[0].xy[found.rows0], features[1].xy[found.rows1]
         geometry = GeometryOptions(
             model="essential",
             estimator="ransac",
-            inlier_threshold=INLIER_THRESHOLD,
+            inlier_threshold=STEREO_THRESHOLD,
             camera0=scene.calibration.camera0.matrix,
             camera1=scene.calibration.camera0.matrix,
         )
