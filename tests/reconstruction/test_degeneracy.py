@@ -20,7 +20,6 @@ from deepdetect.image import load_image, luma
 from deepdetect.matchers import get_matcher, match_descriptors
 from deepdetect.reconstruction.calibration import Calibration, Camera, calibration_from_focal
 from deepdetect.reconstruction.degeneracy import (
-    check_disparities,
     check_focal,
     check_images,
     check_matches,
@@ -28,6 +27,7 @@ from deepdetect.reconstruction.degeneracy import (
     one_a_cell,
 )
 from deepdetect.reconstruction.relative_pose import RelativePose, estimate_relative_pose
+from deepdetect.reconstruction.row_degeneracy import check_disparities
 from deepdetect.reconstruction.subpixel import refine_matches
 
 SIZE = (370, 250)
