@@ -177,10 +177,7 @@ def _rows(found: Reconstruction, numbers: dict[str, Any]) -> list[tuple[str, str
     filled = f", {numbers['filled']:,} of them filled in" if numbers["filled"] else ""
     rows = [
         ("rectified", f"{'yes' if found.rectified else 'no'} ({numbers['rectified_why']})"),
-        (
-            "calibration",
-            f"{found.calibration.source}, {found.calibration.camera0.focal_px[0]:g} px",
-        ),
+        ("focal length", f"{numbers['calibration']['left']['focal_px'][0]:g} px ({source})"),
         ("keypoints", f"{found.keypoints:,}"),
         ("matches", f"{found.matches:,}"),
         *((f"dropped: {reason}", f"{count:,}") for reason, count in found.dropped.items()),

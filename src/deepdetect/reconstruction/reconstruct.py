@@ -138,6 +138,7 @@ def reconstruct(
         if rectification.swapped:
             raise ReconstructionError(
                 "this is a rectified pair with left and right exchanged: give the other one first"
+                + _or_offset(known)
             )
     if detector is None:
         detector = DeepDetect("geometry")
@@ -264,6 +265,12 @@ def _from_matches(
         made.dropped,
         seconds,
     )
+
+
+def _or_offset(calibration: Calibration) -> str:
+    """The other reason for disparities of the wrong sign, where there can be one."""
+    offset = calibration.disparity_offset_px
+    return f"; or the disparity offset of {offset:g} px is wrong" if offset else ""
 
 
 def _judge(
