@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, OptionError, ReconstructionError
+from deepdetect import DeepDetect, OptionError, ReconstructionError, threads
 from deepdetect.controls import EveryPixel
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.errors import ImageError
@@ -212,36 +209,29 @@ def test_is_the_same_on_repetition(found: Any, posed: Any, cones: Any, turned: A
     np.testing.assert_array_equal(again.points, posed.points)
 
 
-def test_is_the_same_for_any_number_of_threads(turned: Any, level: Any, tmp_path: Path) -> None:
-    """NumPy, OpenCV and numba read their number of threads when they start."""
-    np.savez(
-        tmp_path / "pairs.npz",
-        level0=level.left,
-        level1=level.right,
-        turned0=turned.left,
-        turned1=turned.right,
-    )
-    code = (
-        "import sys, hashlib, numpy as np, cv2;"
-        "cv2.setNumThreads(int(sys.argv[2]));"
-        "from deepdetect import reconstruct; from deepdetect.controls import EveryPixel;"
-        "pairs = np.load(sys.argv[1]);"
-        "print([hashlib.sha256(reconstruct(pairs[n + '0'], pairs[n + '1'], EveryPixel(),"
-        " focal_px=497, max_keypoints=15000).points.tobytes()).hexdigest()"
-        " for n in ('level', 'turned')])"
-    )
-    told = []
-    for threads in ("1", "2"):
-        variables = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-        done = subprocess.run(
-            [sys.executable, "-c", code, str(tmp_path / "pairs.npz"), threads],
-            capture_output=True,
-            text=True,
-            env={**os.environ, **dict.fromkeys(variables, threads)},
-        )
-        assert done.returncode == 0, done.stderr
-        told.append(done.stdout)
-    assert told[0] == told[1]
+def test_is_the_same_for_any_number_of_threads(
+    turned: Any, level: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = []
+    before = cv2.getNumThreads()
+    try:
+        for count in (1, 3):
+            monkeypatch.setattr(threads, "processor_count", lambda count=count: count)
+            cv2.setNumThreads(count)
+            results.append(
+                [
+                    reconstruct(
+                        *(pair.left, pair.right, EveryPixel()),
+                        calibration=pair.calibration,
+                        max_keypoints=15_000,
+                    ).points
+                    for pair in (level, turned)
+                ]
+            )
+    finally:
+        cv2.setNumThreads(before)
+    for one, three in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, three)
 
 
 def test_options_reach_their_stages(level: Any, detector: DeepDetect) -> None:
