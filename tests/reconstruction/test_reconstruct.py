@@ -246,9 +246,10 @@ def test_options_reach_their_stages(level: Any, detector: DeepDetect) -> None:
     assert stricter.dropped["alone"] > plain.dropped["alone"]
     at_edges = reconstruct(*pair, **known, rows=RowMatchingOptions(edge_distance=0))
     assert len(at_edges) > len(plain)
-    near = reconstruct(*pair, **known, least_parallax_px=20)
-    assert near.dropped["parallax"] > 0
-    assert (near.disparity + near.calibration.disparity_offset_px >= 20).all()
+    near = reconstruct(*pair, **known, least_parallax_px=20, neighbours=0)
+    offset = near.calibration.disparity_offset_px
+    assert near.disparity.min() + offset == pytest.approx(20, abs=0.5)
+    assert len(near) == np.count_nonzero(all_kept.disparity + offset >= 20) < len(all_kept)
     options = ReconstructionOptions(rectified=True)
     asked = reconstruct(*pair, **known, options=options)
     assert asked.rectification is None
