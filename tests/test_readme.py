@@ -126,6 +126,9 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
         "IMAGE1": "right.png",
         "DIR": "out",
         "PHOTOS": "photos",
+        "LEFT": "left.png",
+        "RIGHT": "right.png",
+        "PX": "995",
         "SAMPLES": "samples",
         "SCENES": "scene",
         "NAME": "foreground",
@@ -142,7 +145,7 @@ def test_the_calls_of_the_table_run(folder: Path, line: str) -> None:
 
     left = deepdetect.load_image("left.png")
     names = {
-        **{name: getattr(deepdetect, name) for name in ("DeepDetect", "match_images")},
+        **{name: getattr(deepdetect, name) for name in deepdetect.__all__},
         **{"detector": deepdetect.DeepDetect(), "image": left, "mask": left[..., 0] > 100},
         **{"a": left, "b": deepdetect.load_image("right.png")},
     }

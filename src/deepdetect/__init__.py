@@ -1,9 +1,10 @@
-"""DeepDetect: dense keypoints from a tiny network, and their matches.
+"""DeepDetect: dense keypoints from a tiny network, their matches, and models in space.
 
     >>> from deepdetect import DeepDetect, match_images
     >>> detector = DeepDetect()
 
-The road of the data: image -> heatmap -> keypoints -> descriptors -> matchers -> geometry.
+The road of the data: image -> heatmap -> keypoints -> descriptors -> matchers -> geometry ->
+reconstruction.
 """
 
 from __future__ import annotations
@@ -18,19 +19,27 @@ if TYPE_CHECKING:
         ImageError,
         MissingExtraError,
         OptionError,
+        ReconstructionError,
         WeightsError,
     )
+    from .exporters import save_point_cloud
     from .geometry import Geometry, GeometryOptions, estimate_geometry
     from .heatmap import HeatmapOptions
     from .image import load_image
     from .keypoints import Keypoints, SelectionOptions, select_keypoints
     from .labels import Label, LabelOptions, fuse
     from .matching import Matches, match_images
+    from .point_cloud import PointCloud
     from .presets import MatchingOptions
+    from .reconstruction.calibration import Calibration, Camera
+    from .reconstruction.reconstruct import ReconstructionOptions, reconstruct
+    from .reconstruction.result import Reconstruction
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Calibration": "reconstruction.calibration",
+    "Camera": "reconstruction.calibration",
     "DeepDetect": "detector",
     "DeepDetectError": "errors",
     "Geometry": "geometry",
@@ -44,16 +53,24 @@ _HOMES = {
     "MatchingOptions": "presets",
     "MissingExtraError": "errors",
     "OptionError": "errors",
+    "PointCloud": "point_cloud",
+    "Reconstruction": "reconstruction.result",
+    "ReconstructionError": "errors",
+    "ReconstructionOptions": "reconstruction.reconstruct",
     "SelectionOptions": "keypoints",
     "WeightsError": "errors",
     "estimate_geometry": "geometry",
     "fuse": "labels",
     "load_image": "image",
     "match_images": "matching",
+    "reconstruct": "reconstruction.reconstruct",
+    "save_point_cloud": "exporters",
     "select_keypoints": "keypoints",
 }
 
 __all__ = [
+    "Calibration",
+    "Camera",
     "DeepDetect",
     "DeepDetectError",
     "Geometry",
@@ -67,6 +84,10 @@ __all__ = [
     "MatchingOptions",
     "MissingExtraError",
     "OptionError",
+    "PointCloud",
+    "Reconstruction",
+    "ReconstructionError",
+    "ReconstructionOptions",
     "SelectionOptions",
     "WeightsError",
     "__version__",
@@ -74,6 +95,8 @@ __all__ = [
     "fuse",
     "load_image",
     "match_images",
+    "reconstruct",
+    "save_point_cloud",
     "select_keypoints",
 ]
 

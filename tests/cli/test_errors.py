@@ -148,7 +148,8 @@ def test_a_process_of_its_own_ends_the_same_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["", "detect", "match", "label", "train", "datasets", "evaluate", "demo"]
+    "command",
+    ["", "detect", "match", "reconstruct", "label", "train", "datasets", "evaluate", "demo"],
 )
 def test_help_has_words_for_every_option(run, command: str) -> None:
     result = run(*command.split(), "--help")

@@ -13,14 +13,12 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, match_images
-from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.errors import DeepDetectError, ReconstructionError
 from deepdetect.guidance.sparse import sparse_features
 from deepdetect.image import load_image, luma
 from deepdetect.matchers import get_matcher, match_descriptors
 from deepdetect.reconstruction.calibration import Calibration, Camera, calibration_from_focal
 from deepdetect.reconstruction.degeneracy import (
-    check_disparities,
     check_focal,
     check_images,
     check_matches,
@@ -224,24 +222,6 @@ def test_no_pose_and_points_behind(turned: Any, refined: Any, one_line) -> None:
 
 def _worse(pose: RelativePose) -> RelativePose:
     return replace(pose, errors=pose.errors + 2)
-
-
-def test_disparities_that_do_not_differ(shared: Path, one_line) -> None:
-    noise = np.random.default_rng(0).normal(0, 0.1, 1000)
-    for disparity, message in (
-        (noise, "without a baseline"),
-        (np.zeros(10), "without a baseline"),
-        (noise + 40, "all disparities are 40"),
-        (noise - 7, "all disparities are -7"),
-        (np.full(5, np.nan), "no disparity was found"),
-        (np.empty(0), "no disparity was found"),
-    ):
-        with pytest.raises(ReconstructionError, match=message) as error:
-            check_disparities(disparity)
-        one_line(error.value)
-    for name in ("art", "cones", "dolls"):
-        check_disparities(load_middlebury(shared / "data" / "middlebury" / name).disparity)
-    check_disparities(np.append(np.full(90, 7.0), np.full(10, 9.0)))
 
 
 def test_one_match_of_each_cell() -> None:

@@ -100,13 +100,14 @@ def test_dense_matches_of_the_whole_pipeline(
     assert not found.rectified
 
 
-def test_one_disparity_and_unequal_heights_are_not_rectified() -> None:
+def test_one_disparity_and_unequal_sizes_are_not_rectified() -> None:
     points = np.random.default_rng(0).uniform(0, 400, (800, 2))
     found = judge_rectification(points, points - [7, 0], (400, 400), (400, 400))
     assert not found.rectified
     assert "same disparity (7 px)" in found.reason
-    found = judge_rectification(points, points - [7, 0], (400, 400), (400, 390))
-    assert "differ in height" in found.reason
+    for other in ((400, 390), (390, 400)):
+        found = judge_rectification(points, points - [7, 0], (400, 400), other)
+        assert "differ in size" in found.reason
     same = judge_rectification(points, points, (400, 400), (400, 400))
     assert not same.rectified
 

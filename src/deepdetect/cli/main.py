@@ -18,6 +18,7 @@ from .evaluate import evaluate
 from .evaluate_stereo import evaluate_stereo
 from .label import label
 from .match import match
+from .reconstruct import reconstruct
 from .register import register
 from .shards import shards
 from .stitch import stitch
@@ -60,6 +61,7 @@ def main() -> None:
     \b
     deepdetect detect photo.jpg            keypoints of a photograph
     deepdetect match left.jpg right.jpg    matches between two photographs
+    deepdetect reconstruct left.jpg right.jpg --focal 1250    a model in space
 
     Each command has its own --help.
     """
@@ -70,6 +72,7 @@ for command in (
     match,
     register,
     stitch,
+    reconstruct,
     label,
     shards,
     train,

@@ -45,35 +45,42 @@ def combined(*options: Decorator) -> Decorator:
     return decorate
 
 
-detector_options = combined(
-    click.option(
-        "--weights",
-        default="matching",
-        show_default=True,
-        help="matching or geometry, the bundled weights; or an ONNX or safetensors file.",
-    ),
-    click.option(
-        "--resolution",
-        type=Resolution(),
-        default="native",
-        show_default=True,
-        help="Show the network the image as it is, or squashed to a square (paper: 480).",
-    ),
-    click.option(
-        "--backend",
-        default="auto",
-        show_default=True,
-        help="onnxruntime, openvino, torch, or auto: OpenVINO when it is installed.",
-    ),
-    click.option(
-        "--provider",
-        "providers",
-        multiple=True,
-        metavar="NAME",
-        help="Execution provider of ONNX Runtime, as CUDAExecutionProvider; may be repeated.",
-    ),
-    click.option("--threads", type=int, help="Number of threads.  [default: the backend's choice]"),
-)
+def detector_options_with(weights: str) -> Decorator:
+    """Make the options that choose a detector, with the weights that are taken by default."""
+    return combined(
+        click.option(
+            "--weights",
+            default=weights,
+            show_default=True,
+            help="matching or geometry, the bundled weights; or an ONNX or safetensors file.",
+        ),
+        click.option(
+            "--resolution",
+            type=Resolution(),
+            default="native",
+            show_default=True,
+            help="Show the network the image as it is, or squashed to a square (paper: 480).",
+        ),
+        click.option(
+            "--backend",
+            default="auto",
+            show_default=True,
+            help="onnxruntime, openvino, torch, or auto: OpenVINO when it is installed.",
+        ),
+        click.option(
+            "--provider",
+            "providers",
+            multiple=True,
+            metavar="NAME",
+            help="Execution provider of ONNX Runtime, as CUDAExecutionProvider; may be repeated.",
+        ),
+        click.option(
+            "--threads", type=int, help="Number of threads.  [default: the backend's choice]"
+        ),
+    )
+
+
+detector_options = detector_options_with("matching")
 
 selection_options = combined(
     click.option(

@@ -71,9 +71,11 @@ def robust_homography(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | 
         >>> robust_homography(points, points + (2, -1)).round(6)[:2, 2].tolist()
         [2.0, -1.0]
     """
+    if len(points0) < 4:
+        return None
     middle = points0.mean(axis=0)
     spread = float(np.abs(points0 - middle).mean())
-    if len(points0) < 4 or not spread > 0:
+    if not spread > 0:
         return None
     inwards = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, spread]]) / spread
     first, second = ((points - middle) / spread for points in (points0, points1))

@@ -2,7 +2,7 @@
 
 Each check raises `ReconstructionError` when its reason holds, and is silent on good pairs. They are
 meant to be run in the order of this module: `check_images`, `check_matches`, and with a pose
-`check_pose` and `check_focal`; for rectified pairs `check_images` and `check_disparities`.
+`check_pose` and `check_focal`; for rectified pairs `check_images`, then those of `row_degeneracy`.
 """
 
 from __future__ import annotations
@@ -59,9 +59,6 @@ must shrink for one of them: a focal length that is a fifth off passes."""
 
 GOOD = 0.1
 """Pixels of median error that no better focal length is looked for at."""
-
-LEAST_SPREAD = 0.5
-"""Pixels between the 5th and 95th percentile of the disparities of a scene with depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,38 +230,6 @@ def check_focal(
             f"{_wrong(calibration)}: one of about {focal * factor:.0f} px fits the matches "
             f"{given / best:.1f} times as well"
         )
-
-
-def check_disparities(disparity: np.ndarray) -> None:
-    """Refuse disparities of a rectified pair that are all one value.
-
-    Args:
-        disparity: (N,) in pixels; those that are not finite do not count.
-
-    Raises:
-        ReconstructionError: there are none, or they do not differ.
-
-    Example:
-        >>> check_disparities(np.full(100, 7.0))
-        Traceback (most recent call last):
-        ...
-        deepdetect.errors.ReconstructionError: all disparities are 7 px: one image is the other \
-moved sideways, or both show one plane, and there is no depth
-    """
-    known = np.asarray(disparity)[np.isfinite(disparity)]
-    if not len(known):
-        raise ReconstructionError("no disparity was found: the images do not overlap")
-    low, middle, high = np.quantile(known, [0.05, 0.5, 0.95])
-    if high - low >= LEAST_SPREAD:
-        return
-    if abs(middle) < STILL:
-        raise ReconstructionError(
-            "all disparities are 0: both images were taken from one place, without a baseline"
-        )
-    raise ReconstructionError(
-        f"all disparities are {middle:.3g} px: one image is the other moved sideways, or both "
-        "show one plane, and there is no depth"
-    )
 
 
 def is_flat(by_homography: np.ndarray, by_fundamental: np.ndarray) -> bool:

@@ -24,15 +24,15 @@ from ..keypoints import SelectionOptions, select_keypoints
 from ..matchers import get_matcher, match_descriptors
 from ..matching import HeatmapDetector, match_images
 from ..options import changed
-from ..point_cloud import PointCloud
 from ..presets import get_preset
 from ..stereo import COMPLETE, RowMatchingOptions, match_rows
 from .calibration import Calibration, calibration_from_focal, read_calibration
-from .degeneracy import check_disparities, check_images
+from .degeneracy import check_images
 from .exif import calibration_from_exif
 from .outlier_removal import statistical_inliers_on_grid
 from .rectification import Rectification, judge_rectification
-from .relative_pose import RelativePose
+from .result import Reconstruction
+from .row_degeneracy import check_depths, check_disparities, check_matched
 from .two_view import TwoViewOptions, reconstruct_two_view
 
 SPARSE_RATIO = 0.85
@@ -65,76 +65,6 @@ class ReconstructionOptions:
         if self.rows is not None:
             return self.rows
         return COMPLETE if self.selection.density == 1 else RowMatchingOptions()
-
-
-@dataclass(frozen=True, eq=False)
-class Reconstruction:
-    """Points in space, and where they come from.
-
-    Attributes:
-        points: (N, 3) float32 in the frame of the left camera: x right, y down, z forward.
-        colors: (N, 3) uint8 sRGB, of the left image.
-        pixels: (N, 2) float32, where each point lies in the left image.
-        disparity: (N,) float32 in pixels for rectified pairs, else None: the match of the left
-            (x, y) is the right (x - disparity, y).
-        matched: (N,) bool: seen in both images; False for points that were filled in (only when
-            every pixel of a rectified pair is asked for).
-        unit: "mm" when the baseline is known, else "baseline": the distance of the cameras is 1,
-            and the true scale is not known.
-        size: (width, height) of the left image.
-        rectified: which road was taken.
-        rectification: the figures by which it was chosen; None when it was asked for.
-        calibration: of the cameras.
-        pose: of the right camera for pairs that are not rectified, else None.
-        keypoints: number of keypoints in the left image.
-        matches: number of matches that the points were made from.
-        dropped: how many of these each check took away, in order.
-        seconds: time of each stage.
-    """
-
-    points: np.ndarray
-    colors: np.ndarray
-    pixels: np.ndarray
-    disparity: np.ndarray | None
-    matched: np.ndarray
-    unit: str
-    size: tuple[int, int]
-    rectified: bool
-    rectification: Rectification | None
-    calibration: Calibration
-    pose: RelativePose | None
-    keypoints: int
-    matches: int
-    dropped: dict[str, int]
-    seconds: dict[str, float]
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    @property
-    def cloud(self) -> PointCloud:
-        """The points with their colours, for the exporters."""
-        return PointCloud(self.points, self.colors, self.unit)
-
-    def depth_map(self) -> np.ndarray:
-        """Return the depth at each pixel of the left image, (H, W) float32; NaN where unknown."""
-        return self._map(self.points[:, 2])
-
-    def disparity_map(self) -> np.ndarray:
-        """Return the disparity at each pixel of the left image; NaN where it is unknown.
-
-        Raises:
-            ReconstructionError: the pair is not rectified.
-        """
-        if self.disparity is None:
-            raise ReconstructionError("only rectified pairs have disparities: take the depth map")
-        return self._map(self.disparity)
-
-    def _map(self, values: np.ndarray) -> np.ndarray:
-        result = np.full(self.size[::-1], np.nan, np.float32)
-        columns, rows = np.rint(self.pixels).astype(np.int64).T
-        result[rows, columns] = values
-        return result
 
 
 def reconstruct(
@@ -208,6 +138,7 @@ def reconstruct(
         if rectification.swapped:
             raise ReconstructionError(
                 "this is a rectified pair with left and right exchanged: give the other one first"
+                + _or_offset(known)
             )
     if detector is None:
         detector = DeepDetect("geometry")
@@ -234,17 +165,25 @@ def _from_rows(
         keypoints = select_keypoints(detector.heatmap(images[0]), options.selection)
     with stage("matching"):
         found = match_rows(*grays, keypoints.xy, options.row_matching)
+    row_options = options.row_matching
+    sure = row_options.uniqueness > 1
+    check_matched(np.count_nonzero(found.matched), len(keypoints), sure)
     check_disparities(found.disparity)
+    check_depths(found.disparity, calibration)
     pixels, disparity = keypoints.xy[found.rows], found.disparity
     size = (images[0].shape[1], images[0].shape[0])
     with stage("triangulation"):
         depth = calibration.depth_mm(disparity)
         rays = calibration.camera0.rays(pixels)
-    dropped = {"behind the camera": int(np.count_nonzero(~np.isfinite(depth)))}
-    kept = np.isfinite(depth)
+    moved = disparity + calibration.disparity_offset_px
+    in_front = moved > 0
+    kept = in_front & (moved >= options.two_view.least_parallax_px)
+    dropped = {
+        "behind a camera": int(np.count_nonzero(~in_front)),
+        "parallax": int(np.count_nonzero(in_front & ~kept)),
+    }
     points = rays[kept] * depth[kept, None]
-    strict = options.row_matching.edge_distance > 0
-    if options.two_view.neighbours and strict:
+    if options.two_view.neighbours and row_options.edge_distance:
         with stage("outlier removal"):
             inliers = statistical_inliers_on_grid(
                 pixels[kept], disparity[kept], size, factor=options.two_view.factor
@@ -254,8 +193,8 @@ def _from_rows(
         points = points[inliers]
     if not len(points):
         raise ReconstructionError(
-            "no disparity gives a depth: the disparity offset of the calibration is wrong, or "
-            "left and right are exchanged"
+            "no disparity tells a depth: all are too small, the scene is too far away for cameras "
+            "so close together"
         )
     pixels = pixels[kept]
     columns, rows = pixels.astype(np.int64).T
@@ -270,6 +209,7 @@ def _from_rows(
         True,
         rectification,
         calibration,
+        None,
         None,
         len(keypoints),
         len(found),
@@ -293,7 +233,9 @@ def _from_matches(
         found = match_images(
             *images,
             detector,
-            options=changed(get_preset("default"), selection=options.selection),
+            options=changed(
+                get_preset("default"), selection=options.selection, matcher="patchmatch"
+            ),
             model="none",
             seed=options.two_view.seed,
         )
@@ -317,11 +259,18 @@ def _from_matches(
         rectification,
         calibration,
         made.pose,
+        made.reprojection_errors,
         len(found.keypoints0),
         len(found),
         made.dropped,
         seconds,
     )
+
+
+def _or_offset(calibration: Calibration) -> str:
+    """The other reason for disparities of the wrong sign, where there can be one."""
+    offset = calibration.disparity_offset_px
+    return f"; or the disparity offset of {offset:g} px is wrong" if offset else ""
 
 
 def _judge(

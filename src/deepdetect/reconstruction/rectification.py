@@ -139,8 +139,8 @@ def _reason(
     spread: np.ndarray,
 ) -> str:
     on_rows, by_fundamental, by_other_rows = counts
-    if size0[1] != size1[1]:
-        return "the images differ in height"
+    if size0 != size1:
+        return "the images differ in size"
     if alarms > LARGEST:
         return "hardly any match is on the same row in both images"
     best = max(by_fundamental, by_other_rows)

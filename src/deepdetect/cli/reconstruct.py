@@ -1,0 +1,196 @@
+"""`deepdetect reconstruct`: two photographs to a model in space."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .shared import (
+    PATH,
+    detector_options_with,
+    json_option,
+    make_detector,
+    print_json,
+    print_table,
+    seconds_rows,
+    selection_options,
+)
+
+if TYPE_CHECKING:
+    from ..exporters import DepthPng
+    from ..reconstruction.result import Reconstruction
+
+STAGES = 5
+"""Of a reconstruction at most; the files are one more."""
+
+
+@click.command(short_help="Two photographs to a model in space.")
+@click.argument("left", type=PATH)
+@click.argument("right", type=PATH)
+@click.option("--calib", type=PATH, help="JSON file of the cameras, as docs/reconstruction.md.")
+@click.option(
+    "--focal",
+    type=float,
+    metavar="PX",
+    help="Focal length in pixels of these images.  [default: from EXIF]",
+)
+@click.option(
+    "--rectified/--not-rectified",
+    default=None,
+    help="Whether matches lie on the same row of both images.  [default: found out]",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    default=Path("deepdetect-output/model.ply"),
+    show_default=True,
+    help="The model, .ply, .glb or .html; the other files get its name and stand beside it.",
+)
+@selection_options
+@detector_options_with("geometry")
+@json_option
+def reconstruct(
+    left: Path,
+    right: Path,
+    calib: Path | None,
+    focal: float | None,
+    rectified: bool | None,
+    output: Path,
+    as_json: bool,
+    **values: Any,
+) -> None:
+    """Make a cloud of coloured points of a scene from the photographs LEFT and RIGHT.
+
+    Writes STEM.ply, STEM.glb (points in space), STEM.html (a page to turn them in, without
+    network), STEM_depth.png (16 bits, its scale inside), STEM_depth.npz (floats; disparities too
+    for rectified pairs), and STEM.json (counts, times and quality).
+
+    \b
+    deepdetect reconstruct left.png right.png --calib calib.json -o model.ply
+    deepdetect reconstruct left.jpg right.jpg --focal 1250 -o model.ply
+    deepdetect reconstruct phone1.jpg phone2.jpg
+    """
+    from ..exporters import get_exporter
+    from ..progress import progress
+    from ..reconstruction.reconstruct import reconstruct as reconstruct_pair
+
+    get_exporter(output)
+    files = _files(output, [path for path in (left, right, calib) if path is not None])
+    detector = make_detector(values)
+    chosen = {name: value for name, value in values.items() if value is not None}
+    # On a terminal only: what is logged stays readable.
+    with progress(STAGES + 1, "reconstructing", "stage", not sys.stderr.isatty()) as bar:
+
+        def done(stage: str) -> None:
+            bar.set_postfix_str(stage)
+            bar.update()
+
+        found = reconstruct_pair(
+            left,
+            right,
+            detector,
+            calibration=calib,
+            focal_px=focal,
+            rectified=rectified,
+            done=done,
+            **chosen,
+        )
+        bar.update(STAGES - bar.n)
+        numbers = _write(found, files, {"left": left, "right": right})
+        done("files")
+    if as_json:
+        print_json(numbers)
+        return
+    print_table(_rows(found, numbers), f"{left} and {right}")
+
+
+def _files(model: Path, inputs: list[Path]) -> dict[str, Path]:
+    """Name all files, and check that none of them is an input."""
+    from ..errors import OptionError
+    from ..exporters import EXPORTERS
+
+    endings = (*EXPORTERS, "_depth.png", "_depth.npz", ".json")
+    files = {ending: model.with_name(model.stem + ending) for ending in endings}
+    files[model.suffix.lower()] = model
+    taken = {path.resolve() for path in inputs}
+    for path in files.values():
+        if path.resolve() in taken:
+            raise OptionError(f"{path} would be written over: give the model another name by -o")
+    return files
+
+
+def _write(
+    found: Reconstruction, files: dict[str, Path], images: dict[str, Path]
+) -> dict[str, Any]:
+    """Write all files, the JSON last; return what it holds."""
+    import json
+
+    from ..atomic import atomic_path
+    from ..exporters import EXPORTERS, save_depth_npz, save_depth_png, save_point_cloud
+    from ..reconstruction.report import reconstruction_values
+
+    started = time.perf_counter()
+    values = reconstruction_values(found)
+    notes = {
+        "title": f"{images['left'].name} and {images['right'].name}",
+        "pair": "rectified" if found.rectified else "not rectified",
+        "calibration": found.calibration.source,
+        "scale": values["scale"],
+    }
+    for ending in EXPORTERS:
+        save_point_cloud(found.cloud, files[ending], notes)
+    depth = found.depth_map()
+    told = save_depth_png(depth, files["_depth.png"], found.unit)
+    arrays = {} if found.disparity is None else {"disparity": found.disparity_map()}
+    save_depth_npz(depth, files["_depth.npz"], found.unit, matched=found.matched_map(), **arrays)
+    values["seconds"]["files"] = round(time.perf_counter() - started, 4)
+    numbers = {
+        **images,
+        **values,
+        "depth_png": _told(told),
+        "files": list(files.values()),
+    }
+    with atomic_path(files[".json"]) as temporary:
+        temporary.write_text(json.dumps(numbers, indent=2, default=str) + "\n", encoding="utf-8")
+    return numbers
+
+
+def _told(told: DepthPng) -> dict[str, Any]:
+    return {
+        "unit": told.unit,
+        "value_per_unit": told.value_per_unit,
+        "unknown": 0,
+        "known_pixels": told.known,
+        "out_of_range": told.out_of_range,
+    }
+
+
+def _rows(found: Reconstruction, numbers: dict[str, Any]) -> list[tuple[str, str]]:
+    """Make the table of the terminal."""
+    unit = {"mm": "mm", "baseline": "baselines"}[found.unit]
+    depth, source = numbers["depth"], found.calibration.source
+    filled = f", {numbers['filled']:,} of them filled in" if numbers["filled"] else ""
+    rows = [
+        ("rectified", f"{'yes' if found.rectified else 'no'} ({numbers['rectified_why']})"),
+        ("focal length", f"{numbers['calibration']['left']['focal_px'][0]:g} px ({source})"),
+        ("keypoints", f"{found.keypoints:,}"),
+        ("matches", f"{found.matches:,}"),
+        *((f"dropped: {reason}", f"{count:,}") for reason, count in found.dropped.items()),
+        ("points", f"{len(found):,} ({numbers['density']:.1%} of the pixels{filled})"),
+        ("depth", f"{depth['5%']:.4g} to {depth['95%']:.4g} {unit}, median {depth['50%']:.4g}"),
+        ("scale", numbers["scale"]),
+        ("parallax", f"{numbers['median_parallax_degrees']:.2f} degrees (median)"),
+    ]
+    if found.reprojection_errors is not None:
+        error = numbers["median_reprojection_error_px"]
+        rows.append(("reprojection error", f"{error:.3f} px (median)"))
+    per_unit = numbers["depth_png"]["value_per_unit"]
+    rows += seconds_rows(numbers["seconds"])
+    rows.append(("depth PNG", f"value / {per_unit:g} = depth in {unit}; 0 is unknown"))
+    rows.append(("written", ", ".join(str(path) for path in numbers["files"])))
+    return rows

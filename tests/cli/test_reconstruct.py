@@ -1,0 +1,336 @@
+"""`deepdetect reconstruct`: whole files that other readers read, or one sentence and no file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect.exporters import load_depth_png
+
+FOCAL, OFFSET, BASELINE = 994.978, 31.086, 193.001
+"""In pixels and mm, of the page of skimage.data.stereo_motorcycle."""
+
+FILES = ["m.glb", "m.html", "m.json", "m.ply", "m_depth.npz", "m_depth.png"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rectified pair, the same turned, and all that gives no depth."""
+    from skimage import data
+
+    views = data.stereo_motorcycle()[:2]
+    folder = tmp_path_factory.mktemp("pairs")
+    level = [view[60:360, 250:650] for view in views]
+    turned = [
+        turn(view, angles) for view, angles in zip(level, ((1, 0, -1), (2, -3, 4)), strict=True)
+    ]
+    pictures = {
+        "left": level[0],
+        "right": level[1],
+        "turned0": turned[0],
+        "turned1": turned[1],
+        "only-turned": turn(level[0], (2, -5, 3)),
+        "cat": data.chelsea()[:300, :400],
+        "beside": views[1][60:360, :200],
+        "narrow": level[0][:, 200:],
+    }
+    for name, picture in pictures.items():
+        Image.fromarray(picture).save(folder / f"{name}.png")
+    calibration = {
+        "focal_px": FOCAL,
+        "cx": 311.193 - 250,
+        "cy": 254.877 - 60,
+        "width": 400,
+        "height": 300,
+        "disparity_offset_px": OFFSET,
+        "baseline_mm": BASELINE,
+    }
+    for name, changes in {
+        "calib": {},
+        "zero": {"baseline_mm": 0},
+        "other-size": {"width": 800},
+        "other-offset": {"disparity_offset_px": -60},
+        "no-focal": {"focal_px": None},
+    }.items():
+        (folder / f"{name}.json").write_text(json.dumps({**calibration, **changes}))
+    return folder
+
+
+def turn(image: np.ndarray, degrees: tuple[float, ...]) -> np.ndarray:
+    """Show an image as its camera sees it after a turn."""
+    height, width = image.shape[:2]
+    camera = np.array([[FOCAL, 0, (width - 1) / 2], [0, FOCAL, (height - 1) / 2], [0, 0, 1]])
+    turned = cv2.Rodrigues(np.radians(np.array(degrees, float)))[0]
+    homography = camera @ turned @ np.linalg.inv(camera)
+    return cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_CUBIC)
+
+
+def ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    trimesh = pytest.importorskip("trimesh", reason="needs trimesh, which reads the files back")
+    read = trimesh.load(path)
+    return np.asarray(read.vertices), np.asarray(read.colors)[:, :3]
+
+
+def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
+    result = run(
+        *("reconstruct", folder / "left.png", folder / "right.png"),
+        *("--calib", folder / "calib.json", "-o", "out/m.ply", "--json"),
+    )
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in Path("out").iterdir()) == FILES
+    told = json.loads(result.stdout)
+    assert told == json.loads(Path("out/m.json").read_text())
+    assert sorted(Path(file).name for file in told["files"]) == FILES
+
+    assert told["rectified"] is True
+    assert "on the same row" in told["rectified_why"]
+    assert (told["unit"], told["scale"]) == ("mm", "lengths are in mm")
+    assert told["points"] + sum(told["dropped"].values()) == told["matches"]
+    assert told["density"] == pytest.approx(told["points"] / (400 * 300), abs=1e-6)
+    assert told["filled"] == 0
+    assert told["pose"] is None is told["median_reprojection_error_px"]
+    assert told["calibration"]["baseline_mm"] == BASELINE
+    assert told["calibration"]["source"].endswith("calib.json")
+    assert set(told["seconds"]) >= {"rectified or not", "keypoints", "matching", "files"}
+
+    points, colors = ply_points(Path("out/m.ply"))
+    assert len(points) == told["points"] > 30_000
+    with np.load("out/m_depth.npz", allow_pickle=False) as file:
+        depth, disparity, matched = file["depth"], file["disparity"], file["matched"]
+        assert str(file["unit"]) == "mm"
+    known = np.isfinite(depth)
+    assert depth.shape == (300, 400)
+    np.testing.assert_array_equal(known, np.isfinite(disparity))
+    np.testing.assert_array_equal(known, matched)
+    np.testing.assert_allclose(
+        depth[known], FOCAL * BASELINE / (disparity[known] + OFFSET), rtol=1e-5
+    )
+    np.testing.assert_allclose(np.sort(points[:, 2]), np.sort(depth[known]), rtol=1e-5)
+    assert told["depth"]["50%"] == pytest.approx(np.median(depth[known]), rel=1e-4)
+    assert told["disparity"]["95%"] == pytest.approx(np.quantile(disparity[known], 0.95), rel=1e-4)
+    # Each point lies where its pixel looks, and has that pixel's colour.
+    picture = np.asarray(Image.open(folder / "left.png"))
+    column, row = np.rint(points[:, :2] / points[:, 2:] * FOCAL + [61.193, 194.877]).astype(int).T
+    np.testing.assert_array_equal(picture[row, column], colors)
+    # Half the angle between the cameras has the tangent of half the baseline over the depth.
+    angle = np.degrees(2 * np.arctan(BASELINE / 2 / told["depth"]["50%"]))
+    assert told["median_parallax_degrees"] == pytest.approx(angle, rel=0.05)
+
+    stored = cv2.imread("out/m_depth.png", cv2.IMREAD_UNCHANGED)
+    assert stored.dtype == np.uint16
+    step = told["depth_png"]["value_per_unit"]
+    assert told["depth_png"]["known_pixels"] == np.count_nonzero(stored) == told["points"]
+    np.testing.assert_allclose(stored[known] / step, depth[known], atol=0.51 / step)
+    read, unit = load_depth_png("out/m_depth.png")
+    assert unit == "mm"
+    np.testing.assert_array_equal(np.isfinite(read), known)
+    page = Path("out/m.html").read_text()
+    assert f"{told['points']:,}" in page or "Left out" in page
+    assert "left.png and right.png" in page
+    assert Path("out/m.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_the_depth_is_true(run, folder: Path) -> None:
+    pytest.importorskip("skimage.data")
+    from deepdetect.datasets import load_stereo_pair
+
+    true = load_stereo_pair("motorcycle").disparity[60:360, 250:650]
+    true = FOCAL * BASELINE / (true + OFFSET)
+    arguments = folder / "left.png", folder / "right.png", "--calib", folder / "calib.json"
+    for more, least, share in ((["--density", 1], 0.85, 0.85), ([], 0.3, 0.96)):
+        result = run("reconstruct", *arguments, "-o", "m.glb", "--json", *more)
+        told = json.loads(result.stdout)
+        depth = np.load("m_depth.npz")["depth"]
+        off = np.abs(depth / true - 1)[np.isfinite(depth) & np.isfinite(true)]
+        assert (off < 0.01).mean() > share
+        assert told["density"] > least
+        assert (told["filled"] > 0) == bool(more)
+
+
+def test_a_turned_pair_has_no_scale_and_says_so(run, folder: Path) -> None:
+    result = run(
+        *("reconstruct", folder / "turned0.png", folder / "turned1.png", "--focal", FOCAL),
+        *("-o", "m.html"),
+    )
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in Path().iterdir()) == FILES
+    assert "the true scale is not known (give baseline_mm in a calib.json)" in result.stdout
+    assert "baselines" in result.stdout
+    told = json.loads(Path("m.json").read_text())
+    assert told["rectified"] is False
+    assert "on the same row" in told["rectified_why"]
+    assert told["rectification"]["rectified"] is False
+    assert told["unit"] == "baseline"
+    assert told["calibration"]["source"] == "--focal"
+    assert 0 < told["median_reprojection_error_px"] < 0.2
+    assert told["pose"]["angle_degrees"] == pytest.approx(5.9, abs=0.3)
+    with np.load("m_depth.npz", allow_pickle=False) as file:
+        assert set(file.files) == {"depth", "unit", "matched"}
+        assert np.isfinite(file["depth"]).sum() == told["points"] > 10_000
+
+
+def test_selection_options_and_weights_reach_the_detector(run, folder: Path) -> None:
+    from deepdetect import DeepDetect
+
+    pair = folder / "left.png", folder / "right.png", "--focal", FOCAL, "--rectified", "--json"
+    told = json.loads(run("reconstruct", *pair, "--max-keypoints", 9000).stdout)
+    assert told["keypoints"] == 9000
+    assert told["rectified_why"] == "as asked for"
+    assert Path("deepdetect-output/model.ply").is_file()
+    for given, weights in (([], "geometry"), (["--weights", "matching"], "matching")):
+        told = json.loads(run("reconstruct", *pair, "--threshold", 0.7, *given).stdout)
+        expected = DeepDetect(weights).detect(folder / "left.png", threshold=0.7)
+        assert told["keypoints"] == len(expected)
+
+
+CASES = {
+    "identical images": ("left left --focal 995", "the same picture"),
+    "identical, said to be rectified": ("left left --focal 995 --rectified", "the same picture"),
+    "pure rotation": ("left only-turned --focal 995", "a turn of the camera explains all"),
+    "pure rotation, said to be rectified": (
+        "left only-turned --focal 995 --rectified",
+        "have a match on their row",
+    ),
+    "two unrelated photographs": ("left cat --focal 995", "do not overlap, or do not show"),
+    "unrelated, said to be rectified": (
+        "left cat --focal 995 --rectified",
+        "hardly overlap or show different scenes",
+    ),
+    "no overlap": ("narrow beside --focal 995", "overlap"),
+    "no overlap, said to be rectified": ("narrow beside --focal 995 --rectified", "overlap"),
+    "turned, said to be rectified": ("turned0 turned1 --focal 995 --rectified", "is not rectified"),
+    "a focal length far too short": ("turned0 turned1 --focal 250", "is probably wrong"),
+    "a calibration of another size": (
+        "left right --calib {}/other-size.json",
+        "images of 800x",
+    ),
+    "a wrong offset": (
+        "left right --calib {}/other-offset.json",
+        "or the disparity offset of -60 px is wrong",
+    ),
+    "a wrong offset, said to be rectified": (
+        "left right --calib {}/other-offset.json --rectified",
+        "would lie behind the cameras",
+    ),
+    "a baseline of zero": ("left right --calib {}/zero.json", "the baseline must be above 0 mm"),
+    "a calibration without focal length": ("left right --calib {}/no-focal.json", 'no "focal_px"'),
+    "no calibration there": ("left right --calib {}/nothing.json", "cannot be read"),
+    "a calibration that is no JSON": ("left right --calib {}/left.png", "no JSON file"),
+    "no EXIF": ("left right", "carries no focal length (EXIF): give --focal or --calib"),
+    "a focal length of zero": ("left right --focal 0", "focal length must be above 0"),
+    "a focal length that is no number": ("left right --focal nan", "must be finite"),
+    "two calibrations": ("left right --focal 995 --calib {}/calib.json", "not both"),
+    "left and right exchanged": ("right left --calib {}/calib.json", "left and right exchanged"),
+    "exchanged, said to be rectified": (
+        "right left --focal 995 --rectified",
+        "left and right are exchanged",
+    ),
+    "another size, said to be rectified": ("left narrow --focal 995 --rectified", "have one size"),
+    "an unknown ending": ("left right --focal 995 -o out/m.plyy", "did you mean '.ply'"),
+    "no ending": ("left right --focal 995 -o out/m", "unknown ending ''"),
+    "a density of nothing": ("left right --focal 995 --density 0", "density"),
+    "weights that are none": ("left right --focal 995 --weights geometri", "geometry"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), CASES.values(), ids=CASES.keys())
+def test_one_sentence_and_no_file(run, folder: Path, arguments: str, message: str) -> None:
+    first, second, *more = arguments.format(folder).split()
+    output = [] if "-o" in more else ["-o", "out/m.ply"]
+    result = run("reconstruct", folder / f"{first}.png", folder / f"{second}.png", *more, *output)
+    assert result.exit_code == 2, result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    assert result.stderr.startswith("deepdetect: ")
+    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+    assert message in result.stderr
+    assert not Path("out").exists()
+    assert result.stdout == ""
+
+
+def test_an_unknown_ending_ends_before_the_work(run, folder: Path) -> None:
+    result = run("reconstruct", "nothing.png", "nothing.png", "--focal", 995, "-o", "m.stl")
+    assert "unknown ending '.stl'" in result.stderr
+
+
+def test_inputs_are_not_written_over(run, folder: Path) -> None:
+    content = (folder / "calib.json").read_bytes()
+    Path("calib.json").write_bytes(content)
+    pair = folder / "left.png", folder / "right.png"
+    result = run("reconstruct", *pair, "--calib", "calib.json", "-o", "calib.ply")
+    assert result.exit_code == 2
+    assert "calib.json would be written over" in result.stderr
+    assert Path("calib.json").read_bytes() == content
+    assert [path.name for path in Path().iterdir()] == ["calib.json"]
+
+
+def test_models_of_before_survive_a_failure(
+    run, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full disk in the middle of the depth map: what is there stays whole."""
+    Path("m_depth.npz").write_bytes(b"of before")
+
+    def fail(file: Any, **arrays: Any) -> None:
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    result = run(
+        *("reconstruct", folder / "left.png", folder / "right.png", "--focal", FOCAL),
+        *("-o", "m.ply"),
+    )
+    assert result.exit_code == 2
+    assert "No space left" in result.stderr
+    assert Path("m_depth.npz").read_bytes() == b"of before"
+    assert not Path("m.json").exists()
+    assert not [path for path in Path().iterdir() if path.name.startswith(".")]
+
+
+def test_exif_gives_the_focal_length(run, folder: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 1
+    exif.get_ifd(0x8769).update({0xA405: 90})
+    for name in ("left", "right"):
+        Image.open(folder / f"{name}.png").save(f"{name}.png", exif=exif)
+    told = json.loads(run("reconstruct", "left.png", "right.png", "-o", "m.ply", "--json").stdout)
+    assert told["calibration"]["source"] == "EXIF"
+    focal = 90 * np.hypot(400, 300) / np.hypot(36, 24)
+    assert told["calibration"]["left"]["focal_px"] == pytest.approx([focal, focal])
+
+
+def test_the_progress_counts_every_stage(monkeypatch: pytest.MonkeyPatch, run, folder) -> None:
+    """On a terminal the bar ends full, whichever road was taken."""
+    import deepdetect.progress
+
+    bars = []
+
+    class Bar:
+        def __init__(self, total: int, *rest: Any) -> None:
+            self.total, self.n, self.stages = total, 0, []
+            bars.append(self)
+
+        def __enter__(self) -> Bar:
+            return self
+
+        def __exit__(self, *error: object) -> None:
+            pass
+
+        def update(self, count: int = 1) -> None:
+            assert count >= 0
+            self.n += count
+
+        def set_postfix_str(self, text: str) -> None:
+            self.stages.append(text)
+
+    monkeypatch.setattr(deepdetect.progress, "progress", Bar)
+    for pair, more in ((("left", "right"), []), (("turned0", "turned1"), ["--not-rectified"])):
+        paths = [folder / f"{name}.png" for name in pair]
+        assert run("reconstruct", *paths, "--focal", FOCAL, *more, "-o", "m.ply").exit_code == 0
+    assert [bar.n == bar.total for bar in bars] == [True, True]
+    assert bars[0].stages[:3] == ["rectified or not", "keypoints", "matching"]
+    assert bars[1].stages == ["keypoints and matching", "reconstruction", "files"]
