@@ -27,11 +27,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from deepdetect import DeepDetect
-from deepdetect.datasets.middlebury import load_middlebury
+from deepdetect.benchmark.stereo_pipelines import sgbm_disparity
+from deepdetect.benchmark.stereo_truth import truths
 from deepdetect.datasets.motorcycle import load_motorcycle
 from deepdetect.errors import ImageError
 from deepdetect.image import load_image
@@ -39,7 +39,6 @@ from deepdetect.stereo import COMPLETE, RowMatchingOptions, match_rows
 
 TOLERANCES = (0.5, 1.0, 2.0, 4.0)
 AT_EDGES = RowMatchingOptions(uniqueness=1.0, edge_distance=0)
-BASELINES_ASIDE = {"dolls": 2}
 SEARCH_WITHOUT_TRUTH = 64
 
 
@@ -50,16 +49,16 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3, help="the fastest counts (default: 3)")
     arguments = parser.parse_args()
     detector = DeepDetect("geometry")
-    for name, left, right, truths in scenes(arguments.data):
+    for name, left, right, known in scenes(arguments.data):
         keypoints = detector.detect(left).xy
-        for way, compute in ways(left, right, keypoints, search_count(truths)).items():
+        for way, compute in ways(left, right, keypoints, search_count(known)).items():
             compute()  # the first one compiles
             seconds = []
             for _ in range(arguments.repeats):
                 started = time.perf_counter()
                 found = compute()
                 seconds.append(time.perf_counter() - started)
-            for note, truth in truths.items():
+            for note, truth in known.items():
                 print(f"{name + note:22s} {way:22s} {judged(found, truth)} {min(seconds):6.2f} s")
 
 
@@ -74,8 +73,8 @@ def ways(
         f"every ({len(every):,})": lambda: ours(left, right, every),
         "edges": lambda: ours(left, right, every, AT_EDGES),
         "complete": lambda: ours(left, right, every, COMPLETE),
-        "SGBM": lambda: opencv(left, right, count, 0),
-        "SGBM, framed": lambda: opencv(left, right, count, count),
+        "SGBM": lambda: sgbm_disparity(left, right, count, 0),
+        "SGBM, framed": lambda: sgbm_disparity(left, right, count, count),
     }
 
 
@@ -87,30 +86,15 @@ def scenes(
     yield pair.name, pair.left, pair.right, {"": pair.disparity}
     for folder in sorted(path.parent for path in data.glob("*/left.png")):
         try:
-            truth = load_middlebury(folder).disparity
+            found: dict[str, np.ndarray | None] = dict(truths(folder))
         except ImageError:
-            truths: dict[str, np.ndarray | None] = {"": None}
-        else:
-            truths = {"": truth}
-            if folder.name in BASELINES_ASIDE:
-                truths[", truth moved"] = moved(truth, BASELINES_ASIDE[folder.name])
+            found = {"": None}
         yield (
             folder.name,
             load_image(folder / "left.png"),
             load_image(folder / "right.png"),
-            truths,
+            {f", {name}" if name else "": truth for name, truth in found.items()},
         )
-
-
-def moved(disparity: np.ndarray, baselines: int) -> np.ndarray:
-    """Show a true disparity from a view so many baselines to the right; NaN where hidden."""
-    rows, columns = np.nonzero(np.isfinite(disparity))
-    values = disparity[rows, columns]
-    columns = np.rint(columns - baselines * values).astype(int)
-    inside = columns >= 0
-    out = np.full(disparity.shape, -np.inf, np.float32)
-    np.maximum.at(out, (rows[inside], columns[inside]), values[inside])
-    return np.where(np.isfinite(out), out, np.nan)
 
 
 def ours(
@@ -127,35 +111,12 @@ def ours(
     return out
 
 
-def search_count(truths: dict[str, np.ndarray | None]) -> int:
+def search_count(known: dict[str, np.ndarray | None]) -> int:
     """Return how many disparities OpenCV tries."""
-    truth = truths[""]
+    truth = known[""]
     if truth is None:
         return SEARCH_WITHOUT_TRUTH
     return -(-(int(np.nanmax(truth)) + 2) // 16) * 16
-
-
-def opencv(left: np.ndarray, right: np.ndarray, count: int, frame: int) -> np.ndarray:
-    """Return OpenCV's disparities, NaN where it gives none."""
-    matcher = cv2.StereoSGBM_create(
-        minDisparity=0,
-        numDisparities=count,
-        blockSize=5,
-        P1=8 * 3 * 25,
-        P2=32 * 3 * 25,
-        uniquenessRatio=10,
-        speckleWindowSize=100,
-        speckleRange=2,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-    )
-    views = [
-        cv2.copyMakeBorder(
-            cv2.cvtColor(view, cv2.COLOR_RGB2BGR), 0, 0, frame, 0, cv2.BORDER_REPLICATE
-        )
-        for view in (left, right)
-    ]
-    disparity = matcher.compute(*views)[:, frame:].astype(np.float32) / 16
-    return np.where(disparity >= 0, disparity, np.nan)
 
 
 def judged(found: np.ndarray, truth: np.ndarray | None) -> str:

@@ -229,7 +229,7 @@ def _classical(method: Method) -> Callable[[StereoScene], StereoPoints]:
 
 
 def sgbm(scene: StereoScene) -> StereoPoints:
-    """Run OpenCV's semi-global matching: block 5, three ways, uniqueness 10, speckle filter.
+    """Run OpenCV's semi-global matching on every pixel.
 
     With the range that ours finds, made a multiple of 16. Both views are continued on the left by
     that range, so that it gives values at the left margin, too.
@@ -239,6 +239,24 @@ def sgbm(scene: StereoScene) -> StereoPoints:
     search = find_search_range(*gray)
     largest = 64 if search is None else search.largest
     count = max(16, -(-(largest + 1) // 16) * 16)
+    disparity = sgbm_disparity(scene.left, scene.right, count, count)
+    rows, columns = np.nonzero(np.isfinite(disparity))
+    meters.lap("matching")
+    pixels = np.column_stack([columns, rows]).astype(np.float32)
+    return StereoPoints(pixels, disparity[rows, columns], 0, meters.stages)
+
+
+def sgbm_disparity(left: np.ndarray, right: np.ndarray, count: int, frame: int) -> np.ndarray:
+    """Run OpenCV's semi-global matching: block 5, three ways, uniqueness 10, speckle filter.
+
+    Args:
+        left, right: (H, W, 3) uint8 RGB.
+        count: disparities that are tried, from 0; a multiple of 16.
+        frame: columns by which both views are continued on the left.
+
+    Returns:
+        (H, W) float32 in pixels, NaN where it gives none.
+    """
     matcher = cv2.StereoSGBM_create(
         minDisparity=0,
         numDisparities=count,
@@ -252,15 +270,12 @@ def sgbm(scene: StereoScene) -> StereoPoints:
     )
     views = [
         cv2.copyMakeBorder(
-            cv2.cvtColor(image, cv2.COLOR_RGB2BGR), 0, 0, count, 0, cv2.BORDER_REPLICATE
+            cv2.cvtColor(image, cv2.COLOR_RGB2BGR), 0, 0, frame, 0, cv2.BORDER_REPLICATE
         )
-        for image in (scene.left, scene.right)
+        for image in (left, right)
     ]
-    disparity = matcher.compute(*views)[:, count:].astype(np.float32) / 16
-    rows, columns = np.nonzero(disparity >= 0)
-    meters.lap("matching")
-    pixels = np.column_stack([columns, rows]).astype(np.float32)
-    return StereoPoints(pixels, disparity[rows, columns], 0, meters.stages)
+    disparity = matcher.compute(*views)[:, frame:].astype(np.float32) / 16
+    return np.where(disparity >= 0, disparity, np.nan)
 
 
 def _from_matches(points0: np.ndarray, points1: np.ndarray, meters: StageMeters) -> StereoPoints:
