@@ -143,28 +143,33 @@ def reconstruct(
     if detector is None:
         detector = DeepDetect("geometry")
     make = _from_rows if rectified else _from_matches
-    return make(images, grays, detector, known, chosen, rectification, seconds, stage)
+    return make(_Pair(images, grays, detector, known, chosen, rectification, seconds, stage))
 
 
-Stage = Callable[[str], Any]
-Pair = tuple[np.ndarray, np.ndarray]
+Images = tuple[np.ndarray, np.ndarray]
 
 
-def _from_rows(
-    images: Pair,
-    grays: Pair,
-    detector: HeatmapDetector,
-    calibration: Calibration,
-    options: ReconstructionOptions,
-    rectification: Rectification | None,
-    seconds: dict[str, float],
-    stage: Stage,
-) -> Reconstruction:
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """What both roads begin with."""
+
+    images: Images
+    grays: Images
+    detector: HeatmapDetector
+    calibration: Calibration
+    options: ReconstructionOptions
+    rectification: Rectification | None
+    seconds: dict[str, float]
+    stage: Callable[[str], Any]
+
+
+def _from_rows(pair: _Pair) -> Reconstruction:
     """Reconstruct a rectified pair."""
-    with stage("keypoints"):
-        keypoints = select_keypoints(detector.heatmap(images[0]), options.selection)
-    with stage("matching"):
-        found = match_rows(*grays, keypoints.xy, options.row_matching)
+    images, options, calibration = pair.images, pair.options, pair.calibration
+    with pair.stage("keypoints"):
+        keypoints = select_keypoints(pair.detector.heatmap(images[0]), options.selection)
+    with pair.stage("matching"):
+        found = match_rows(*pair.grays, keypoints.xy, options.row_matching)
     row_options = options.row_matching
     sure = row_options.uniqueness > 1
     check_matched(np.count_nonzero(found.matched), len(keypoints), sure)
@@ -172,7 +177,7 @@ def _from_rows(
     check_depths(found.disparity, calibration)
     pixels, disparity = keypoints.xy[found.rows], found.disparity
     size = (images[0].shape[1], images[0].shape[0])
-    with stage("triangulation"):
+    with pair.stage("triangulation"):
         depth = calibration.depth_mm(disparity)
         rays = calibration.camera0.rays(pixels)
     moved = disparity + calibration.disparity_offset_px
@@ -184,7 +189,7 @@ def _from_rows(
     }
     points = rays[kept] * depth[kept, None]
     if options.two_view.neighbours and row_options.edge_distance:
-        with stage("outlier removal"):
+        with pair.stage("outlier removal"):
             inliers = statistical_inliers_on_grid(
                 pixels[kept], disparity[kept], size, factor=options.two_view.factor
             )
@@ -207,41 +212,33 @@ def _from_rows(
         "baseline" if calibration.baseline_mm is None else "mm",
         size,
         True,
-        rectification,
+        pair.rectification,
         calibration,
         None,
         None,
         len(keypoints),
         len(found),
         dropped,
-        seconds,
+        pair.seconds,
     )
 
 
-def _from_matches(
-    images: Pair,
-    grays: Pair,
-    detector: HeatmapDetector,
-    calibration: Calibration,
-    options: ReconstructionOptions,
-    rectification: Rectification | None,
-    seconds: dict[str, float],
-    stage: Stage,
-) -> Reconstruction:
+def _from_matches(pair: _Pair) -> Reconstruction:
     """Reconstruct a pair that is not rectified."""
-    with stage("keypoints and matching"):
+    images, options, seconds = pair.images, pair.options, pair.seconds
+    with pair.stage("keypoints and matching"):
         found = match_images(
             *images,
-            detector,
+            pair.detector,
             options=changed(
                 get_preset("default"), selection=options.selection, matcher="patchmatch"
             ),
             model="none",
             seed=options.two_view.seed,
         )
-    with stage("reconstruction"):
+    with pair.stage("reconstruction"):
         made = reconstruct_two_view(
-            found.points0, found.points1, calibration, grays, options.two_view
+            found.points0, found.points1, pair.calibration, pair.grays, options.two_view
         )
     seconds.pop("reconstruction")
     seconds.update(made.seconds)
@@ -256,8 +253,8 @@ def _from_matches(
         made.unit,
         (images[0].shape[1], images[0].shape[0]),
         False,
-        rectification,
-        calibration,
+        pair.rectification,
+        pair.calibration,
         made.pose,
         made.reprojection_errors,
         len(found.keypoints0),
@@ -274,7 +271,7 @@ def _or_offset(calibration: Calibration) -> str:
 
 
 def _judge(
-    grays: Pair, sizes: tuple[tuple[int, int], ...], calibration: Calibration, seed: int
+    grays: Images, sizes: tuple[tuple[int, int], ...], calibration: Calibration, seed: int
 ) -> Rectification:
     """Tell from few matches of SIFT whether the pair is rectified."""
     first, second = (sparse_features(gray) for gray in grays)
