@@ -187,3 +187,30 @@ def test_tiny_images_are_taken(shape: tuple[int, int]) -> None:
     found = alike(gray, gray, everywhere(gray), every_pixel(gray))
     assert found.shape == (gray.size,)
     assert found.dtype == bool
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_points_far_apart_are_all_described(photo: np.ndarray, odd: int) -> None:
+    """Every second point stands for its neighbours; a point without any stands for itself."""
+    gray = luma(photo)
+    pixels = every_pixel(gray)
+    pixels = pixels[(pixels % 12 == (6, 6 + odd)).all(axis=1)]
+    assert (pixels.sum(axis=1) % 2 == odd).all()
+    second = np.roll(gray, 57, axis=1)  # the left half is right, the other is not
+    second[:, : gray.shape[1] // 2] = gray[:, : gray.shape[1] // 2]
+    scores = unlikeness(gray, second, everywhere(gray), pixels)
+    right = pixels[:, 0] < gray.shape[1] // 2 - 50
+    wrong = pixels[:, 0] > gray.shape[1] // 2 + 50
+    assert np.isfinite(scores[right]).mean() > 0.9
+    assert (scores[right] < 1).mean() > 0.9
+    assert (scores[wrong] < 1).mean() < 0.05
+
+
+def test_it_changes_little_which_points_are_described(photo: np.ndarray) -> None:
+    """Points on pixels of one colour of a chessboard agree like those of the other."""
+    gray = luma(photo)
+    pixels = every_pixel(gray)
+    even, odd = (pixels[pixels.sum(axis=1) % 2 == parity] for parity in (0, 1))
+    second = seen_again(gray)
+    shares = [alike(gray, second, everywhere(gray), part).mean() for part in (even, odd)]
+    assert abs(shares[0] - shares[1]) < 0.03

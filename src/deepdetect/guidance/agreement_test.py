@@ -6,7 +6,8 @@ taken away: all descriptors have much in common, those of noise-like texture nea
 What two places that have nothing to do with each other look like is measured on the pair itself,
 by comparing with the warped image moved by a third of its size. A point agrees when its
 descriptors, with those right around it, are more alike than all but a hundredth of such strangers,
-and when most points about it agree too.
+and when most points about it agree too. Every second point is described, as on a chessboard: its
+neighbours share what it says.
 """
 
 from __future__ import annotations
@@ -31,12 +32,15 @@ CROWD = 81
 MAJORITY = 0.5
 """Side in pixels of the window about a point, and the share of its points that must agree."""
 
+NEAR = 5
+"""Side in pixels of the window in which one of the described points must lie."""
+
 MOVES = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 """Shares of width and height that the strangers are apart."""
 
 BLOCK = 64
-BLOCKS = 48
-"""Side in pixels and number of the blocks of the image that strangers are taken from."""
+BLOCKS = 64
+"""Side in pixels and number of the blocks of the image that each move takes strangers from."""
 
 STEP = 20_000
 """Descriptors that are compared at a time, to bound the memory."""
@@ -75,29 +79,32 @@ def unlikeness(
     if not len(known):
         return result
     here = pixels[known]
-    in_blocks = np.flatnonzero(_some_blocks(here, seed))
+    described = here[_thinned(here, gray0.shape)]
     moved = _moves(warped)
-    # For each move the points in blocks that then see the second image.
-    strange = [in_blocks[part[tuple(here[in_blocks].T[::-1])]] for part in _moves(seen)]
-    unlike = np.zeros(len(known), np.float32)
+    # For each move the points in its blocks that then see the second image.
+    strange = [
+        rows[part[tuple(described[rows].T[::-1])]]
+        for rows, part in zip(_some_blocks(described, seed), _moves(seen), strict=True)
+    ]
+    unlike = np.zeros(len(described), np.float32)
     stranger = [np.zeros(len(rows), np.float32) for rows in strange]
     for size in SIZES:
-        first = root(dense_sift(gray0, here, size))
+        first = root(dense_sift(gray0, described, size))
         total = first.sum(axis=0, dtype=np.int64)  # whole: the order of the points has no say
         mean = (total / len(first) if len(first) >= FEW else 0 * total).astype(np.float32)
-        unlike += _unlike(first, root(dense_sift(warped, here, size)), mean)
+        unlike += _unlike(first, root(dense_sift(warped, described, size)), mean)
         for values, rows, image in zip(stranger, strange, moved, strict=True):
             if len(rows):
-                values += _unlike(first[rows], root(dense_sift(image, here[rows], size)), mean)
+                values += _unlike(first[rows], root(dense_sift(image, described[rows], size)), mean)
     means = [
-        _together(here[rows], values, gray0.shape)
+        _together(described[rows], values, described[rows], gray0.shape)
         for rows, values in zip(strange, stranger, strict=True)
     ]
     strangers = np.concatenate(means)
     bound = np.quantile(strangers, STRANGERS) if len(strangers) else 0
     if bound <= 0:  # strangers are all the same: likeness tells nothing
         return result
-    ratios = _together(here, unlike, gray0.shape) / np.float32(bound)
+    ratios = _together(described, unlike, here, gray0.shape) / np.float32(bound)
     crowd = _share_about(here, ratios < 1, gray0.shape)
     result[known] = np.where(crowd >= MAJORITY, ratios, np.inf)
     return result
@@ -112,12 +119,14 @@ def _moves(image: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def _some_blocks(pixels: np.ndarray, seed: int) -> np.ndarray:
-    """Choose the points of some blocks of the image: whole blocks, as neighbours are meant."""
+def _some_blocks(pixels: np.ndarray, seed: int) -> list[np.ndarray]:
+    """Choose the points of some blocks for each move: whole blocks, as neighbours are meant."""
     block = pixels // BLOCK
     number = block[:, 1] * 1_000_000 + block[:, 0]
-    chosen = np.random.default_rng(seed).permutation(np.unique(number))[:BLOCKS]
-    return np.isin(number, chosen)
+    order = np.random.default_rng(seed).permutation(np.unique(number))
+    # Other blocks for every move where there are enough, the same again where there are not.
+    turns = [np.roll(order, -move * BLOCKS)[:BLOCKS] for move in range(len(MOVES))]
+    return [np.flatnonzero(np.isin(number, chosen)) for chosen in turns]
 
 
 def _unlike(first: np.ndarray, second: np.ndarray, mean: np.ndarray) -> np.ndarray:
@@ -132,11 +141,21 @@ def _unlike(first: np.ndarray, second: np.ndarray, mean: np.ndarray) -> np.ndarr
     return result
 
 
-def _together(pixels: np.ndarray, values: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-    """Return the weighted mean of the values of the points around each, (N,) float32."""
+def _thinned(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    """Return the rows of every second point, and of those with none of these near."""
+    second = pixels.sum(axis=1) % 2 == 0
+    image = _image(pixels, second, shape)
+    near = cv2.dilate(image, np.ones((NEAR, NEAR), np.uint8))[pixels[:, 1], pixels[:, 0]] > 0
+    return np.flatnonzero(second | ~near)
+
+
+def _together(
+    pixels: np.ndarray, values: np.ndarray, places: np.ndarray, shape: Sequence[int]
+) -> np.ndarray:
+    """Return the weighted mean of the values of the points around each place, (N,) float32."""
     count, total = (_image(pixels, part, shape) for part in (np.float32(1), values))
     count, total = (cv2.GaussianBlur(image, (0, 0), TOGETHER) for image in (count, total))
-    return (total / np.maximum(count, 1e-6))[pixels[:, 1], pixels[:, 0]]
+    return (total / np.maximum(count, 1e-6))[places[:, 1], places[:, 0]]
 
 
 def _share_about(pixels: np.ndarray, agree: np.ndarray, shape: Sequence[int]) -> np.ndarray:
