@@ -62,13 +62,24 @@ class DeepDetect:
     ) -> None:
         self.weights = find_weights(weights)
         self.heatmap_options = HeatmapOptions(resolution, channels)
-        runtime = RuntimeOptions(backend, providers, threads)
-        self._network, self.backend = open_network(self.weights, runtime)
+        self._runtime = RuntimeOptions(backend, providers, threads)
+        self._network, self.backend = open_network(self.weights, self._runtime)
 
     def configured(self, heatmap_options: HeatmapOptions) -> DeepDetect:
         """Return a detector with the same loaded network and other heat map options."""
         other = copy.copy(self)
         other.heatmap_options = heatmap_options
+        return other
+
+    def with_weights(self, weights: str | Path) -> DeepDetect:
+        """Return a detector with other weights, and all other options as they are.
+
+        Raises:
+            WeightsError: the weights are missing, damaged or do not fit.
+        """
+        other = self.configured(self.heatmap_options)
+        other.weights = find_weights(weights)
+        other._network, other.backend = open_network(other.weights, self._runtime)
         return other
 
     def heatmap(self, image: Any) -> np.ndarray:

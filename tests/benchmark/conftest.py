@@ -14,6 +14,7 @@ from deepdetect import DeepDetect
 from deepdetect.bundled import bundled_weights
 from deepdetect.heatmap import HeatmapOptions
 from deepdetect.image import load_image, luma
+from deepdetect.runtime import RuntimeOptions
 
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
 MOVES = {
@@ -31,6 +32,7 @@ class EdgeDetector(DeepDetect):
         self.weights = bundled_weights()
         self.backend = "none"
         self.heatmap_options = HeatmapOptions()
+        self._runtime = RuntimeOptions()  # of `with_weights`
 
     def heatmap(self, image: object) -> np.ndarray:
         gray = luma(load_image(image)).astype(np.float32)

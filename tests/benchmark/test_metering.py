@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect.benchmark import metering
-from deepdetect.benchmark.metering import metered, peak_memory
+from deepdetect.benchmark.metering import StageMeters, metered, peak_memory
 
 
 def test_the_time_is_that_of_the_block() -> None:
@@ -27,6 +27,18 @@ def test_memory_that_is_freed_within_the_block_counts() -> None:
         time.sleep(0.1)
         del block
     assert 60e6 < meter.memory < 200e6
+
+
+@pytest.mark.skipif(not metering.STATUS.exists(), reason="the system does not tell its memory")
+def test_what_an_earlier_stage_holds_counts_in_the_whole() -> None:
+    meters = StageMeters()
+    held = [np.ones(8_000_000)]
+    meters.lap("first")
+    held.append(np.ones(8_000_000))
+    meters.lap("second")
+    assert all(60e6 < meter.memory < 100e6 for meter in meters.stages.values())
+    assert 120e6 < meters.memory < 180e6
+    assert len(held) == 2
 
 
 @pytest.mark.skipif(not metering.STATUS.exists(), reason="the system does not tell its memory")

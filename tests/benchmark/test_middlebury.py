@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -10,11 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect
+from deepdetect import DeepDetect, OptionError
 from deepdetect.benchmark import BenchmarkOptions
 from deepdetect.benchmark.cache import StageCache
 from deepdetect.benchmark.middlebury import middlebury_sections, middlebury_steps, voxels
-from deepdetect.benchmark.published_pipeline import published_detector, published_points
+from deepdetect.benchmark.published_pipeline import published_detector
+from deepdetect.benchmark.published_stereo import SETTINGS, published_points
 from deepdetect.benchmark.report import Section
 from deepdetect.benchmark.stereo_pipelines import STAGES, load_scene, pipelines, sgbm
 from deepdetect.benchmark.workspace import Workspace
@@ -132,6 +134,44 @@ def test_the_weights_are_named_in_rows_of_their_own(data: Path) -> None:
     assert len(set(titles)) == len(titles)
 
 
+def test_weights_of_one_name_are_refused(tmp_path: Path, one_line) -> None:
+    """One row would hide the other."""
+    with pytest.raises(OptionError, match="rename") as caught:
+        BenchmarkOptions(DeepDetect(), geometry_weights=("a/model.onnx", "b/model.onnx"))
+    one_line(caught.value)
+
+
+def test_the_weights_for_stereo_are_run_as_the_others() -> None:
+    detector = DeepDetect(backend="onnxruntime", threads=1)
+    found = BenchmarkOptions(detector, ("paper",), ()).geometry_detectors()["geometry"]
+    assert found.backend == "onnxruntime"
+    assert found.weights == DeepDetect("geometry").weights
+
+
+def test_times_of_other_runs_are_not_compared(data: Path, tmp_path: Path) -> None:
+    """What was measured earlier stays in the cache; only the points may be used then."""
+    cache = StageCache(tmp_path / "cache")
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "cones").symlink_to(data / "middlebury" / "cones")
+    options = BenchmarkOptions(DeepDetect(), ("paper",), ())
+
+    def faster(geometry: tuple[str | Path, ...]) -> dict[str, object]:
+        workspace = Workspace(tmp_path / "scenes", cache)
+        chosen = dataclasses.replace(options, geometry_weights=geometry)
+        (found,) = middlebury_sections(workspace, chosen)
+        return {
+            name: row["times faster than published"]
+            for name, row in rows(found, "middlebury_cones").items()
+        }
+
+    first = faster(("geometry",))
+    assert (first["ours, weights geometry"] or 0) > 1
+    assert faster(("geometry",)) == first
+    later = faster(("geometry", DeepDetect().weights))
+    assert later["ours, weights geometry"] == first["ours, weights geometry"]
+    assert later["ours, weights deepdetect"] is None
+
+
 def test_voxels_are_cubes_with_a_point() -> None:
     camera = Camera((101, 101), 100.0)
     calibration = Calibration(camera, camera, baseline_mm=10)
@@ -158,7 +198,7 @@ def test_the_published_pipeline_keeps_what_lies_on_a_row(data: Path) -> None:
     detector = published_detector(DeepDetect("geometry").configured(HeatmapOptions(480, "bgr")))
     stages: list[str] = []
     points0, points1 = published_points(
-        (scene.left, scene.right), detector, scene.calibration.camera0.matrix, stages.append
+        (scene.left, scene.right), detector, SETTINGS["cones"], stages.append
     )
     assert stages == list(STAGES)
     assert len(points0) == len(points1) > 5_000

@@ -9,13 +9,19 @@ import pytest
 from deepdetect import DeepDetect
 from deepdetect.benchmark import BenchmarkOptions
 from deepdetect.benchmark.oxford import chosen_pairs
+from deepdetect.benchmark.paper_numbers import SIFT_LOW_POINTS, STEREO_POINTS
 from deepdetect.benchmark.planar_paper import density_table, matches_table, repeatability_table
-from deepdetect.benchmark.published_pipeline import published_points
+from deepdetect.benchmark.published_stereo import (
+    published_points,
+    sift_points,
+    stereo_settings,
+)
 from deepdetect.benchmark.stereo_pipelines import load_scene
 from deepdetect.benchmark.workspace import Workspace
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.planar import PlanarScene
 from deepdetect.heatmap import HeatmapOptions
+from deepdetect.methods.sift import low_sift
 from deepdetect.weights_quality import PAIRS
 
 DENSITY = {0.5: 0.525, 0.7: 0.486, 0.8: 0.462, 0.9: 0.431}
@@ -72,11 +78,18 @@ def test_matches(
 
 
 def test_voxels_of_cones(shared: Path) -> None:
-    """The paper's 49,979, with its second weights, within 1 %."""
+    """The paper's 49,979, with its second weights, within 0.3 %."""
     scene = load_scene(shared / "data" / "middlebury" / "cones")
     weights = shared / "reference" / "published_reconstruction.safetensors"
     detector = DeepDetect(weights).configured(HeatmapOptions(480, "bgr"))
-    points, _ = published_points(
-        (scene.left, scene.right), detector, scene.calibration.camera0.matrix
-    )
-    assert len(points) == pytest.approx(49_979, rel=0.01)
+    settings = stereo_settings("cones", scene.calibration.camera0.matrix)
+    points, _ = published_points((scene.left, scene.right), detector, settings)
+    assert len(points) == pytest.approx(STEREO_POINTS["cones"], rel=0.003)
+
+
+def test_voxels_of_cones_by_sift(shared: Path) -> None:
+    """The authors' notebook prints 14,128 for SIFT with low settings, by an older OpenCV."""
+    scene = load_scene(shared / "data" / "middlebury" / "cones")
+    settings = stereo_settings("cones", scene.calibration.camera0.matrix)
+    points, _ = sift_points((scene.left, scene.right), low_sift(), settings)
+    assert len(points) == pytest.approx(SIFT_LOW_POINTS["cones"], rel=0.05)

@@ -59,6 +59,8 @@ class StageMeters:
 
     Attributes:
         stages: by name; stages of one name add up their seconds, the largest memory counts.
+        memory: bytes that the process grew by at the most since the first stage began: what an
+            earlier stage still holds counts, too.
 
     Example:
         >>> meters = StageMeters()
@@ -70,12 +72,16 @@ class StageMeters:
 
     def __init__(self) -> None:
         self.stages: dict[str, Meter] = {}
+        self.memory = 0
         self._begin()
+        self._first = self._before
 
     def lap(self, name: str) -> None:
         """End a stage."""
         seconds = time.perf_counter() - self._started
-        memory = max(_peak() - self._before, 0)
+        peak = _peak()
+        memory = max(peak - self._before, 0)
+        self.memory = max(self.memory, peak - self._first)
         meter = self.stages.setdefault(name, Meter())
         meter.seconds += seconds
         meter.memory = max(meter.memory, memory)

@@ -57,6 +57,11 @@ class BenchmarkOptions:
                 raise unknown_name("protocol", protocol, PROTOCOLS)
         if not self.geometry_weights:
             raise OptionError("name the weights for stereo pairs, as geometry")
+        stems = [Path(weights).stem for weights in self.geometry_weights]
+        if len(set(stems)) < len(stems):
+            raise OptionError(
+                f"two weights for stereo pairs are named alike ({', '.join(stems)}): rename a file"
+            )
         if not self.protocols:
             raise OptionError(f"choose a protocol: {' or '.join(PROTOCOLS)}")
         for name in self.classical:
@@ -117,8 +122,9 @@ class BenchmarkOptions:
 
     def geometry_detectors(self) -> dict[str, DeepDetect]:
         """Return detectors with the weights for stereo pairs, at the image's own size, by name."""
+        native = HeatmapOptions("native", self.channels)
         return {
-            Path(weights).stem: DeepDetect(weights, channels=self.channels)
+            Path(weights).stem: self.detector.with_weights(weights).configured(native)
             for weights in self.geometry_weights
         }
 

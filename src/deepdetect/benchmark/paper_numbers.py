@@ -37,3 +37,6 @@ STEREO_POINTS: dict[str, int] = {
     "cloth": 842_045,
 }
 """Figure 8: matches that are left after the essential matrix ("voxels")."""
+
+SIFT_LOW_POINTS: dict[str, int] = {"cones": 14_128}
+"""The same of SIFT with low settings, as the authors' notebook prints it."""

@@ -16,11 +16,8 @@ from ..errors import MissingExtraError, WeightsError
 
 RATIO = 0.99
 
-STEREO_RATIO = 0.8**0.5
-STEREO_THRESHOLD = 0.5
-"""For stereo: the ratio of distances (0.8 of their squares) and RANSAC's threshold in pixels. The
-paper does not tell them; with its second weights these give its counts on cones and cloth within
-half a per cent, and no nearer one on moebius (485,000 for 363,703)."""
+TREES = 5
+CHECKS = 50
 
 Judge = Callable[[float, float, float, float], bool]
 """Tells whether the match of (x, y) and (u, v) is right."""
@@ -60,56 +57,33 @@ def published_pipeline(images: Sequence[np.ndarray], detector: DeepDetect, right
     Returns:
         The number of right matches.
     """
-    first, second, good = _matches(images, detector)
+    first, second, good = published_matches(images, detector)
     count = 0
     for match in good:
         count += right(*first[match.queryIdx].pt, *second[match.trainIdx].pt)
     return count
 
 
-def published_points(
+def published_matches(
     images: Sequence[np.ndarray],
     detector: DeepDetect,
-    camera: np.ndarray,
+    ratio: float = RATIO,
+    trees: int = TREES,
+    checks: int = CHECKS,
     done: Callable[[str], object] = lambda stage: None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Match a stereo pair and keep what the essential matrix leaves, the paper's "voxels".
-
-    RANSAC with a confidence of 0.999, pose, and triangulation, by OpenCV.
+) -> tuple[Sequence[cv2.KeyPoint], Sequence[cv2.KeyPoint], list[cv2.DMatch]]:
+    """Detect, describe and match two images.
 
     Args:
         images: two, (H, W, 3) uint8 RGB.
         detector: of `published_detector`.
-        camera: (3, 3), of both images.
-        done: called with "keypoints", "matching" and "geometry" when that is finished.
+        ratio: of the ratio test.
+        trees, checks: of FLANN.
+        done: called with "keypoints" when these are found.
 
     Returns:
-        (M, 2) and (M, 2) float64 positions of the matches that are left.
+        The keypoints of both images and the matches that pass.
     """
-    first, second, good = _matches(images, detector, done, STEREO_RATIO)
-    points0 = np.array([first[match.queryIdx].pt for match in good]).reshape(-1, 2)
-    points1 = np.array([second[match.trainIdx].pt for match in good]).reshape(-1, 2)
-    done("matching")
-    if len(good) < 6:
-        return points0[:0], points1[:0]
-    essential, inliers = cv2.findEssentialMat(
-        points0, points1, camera, cv2.RANSAC, 0.999, STEREO_THRESHOLD
-    )
-    kept = inliers.ravel() > 0
-    points0, points1 = points0[kept], points1[kept]
-    _, rotation, translation, _ = cv2.recoverPose(essential[:3], points0, points1, camera)
-    poses = np.eye(3, 4), np.column_stack([rotation, translation])
-    cv2.triangulatePoints(*(camera @ pose for pose in poses), points0.T, points1.T)
-    done("geometry")
-    return points0, points1
-
-
-def _matches(
-    images: Sequence[np.ndarray],
-    detector: DeepDetect,
-    done: Callable[[str], object] = lambda stage: None,
-    ratio: float = RATIO,
-) -> tuple[Sequence[cv2.KeyPoint], Sequence[cv2.KeyPoint], list[cv2.DMatch]]:
     sift = cv2.SIFT_create()
     keypoints = []
     for image in images:
@@ -122,7 +96,7 @@ def _matches(
     )
     if not first or not second:
         return first, second, []
-    matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 5}, {"checks": 50})
+    matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": trees}, {"checks": checks})
     good = []
     for best, next_best in matcher.knnMatch(descriptors0, descriptors1, k=2):
         if best.distance / (next_best.distance + 1e-12) < ratio:

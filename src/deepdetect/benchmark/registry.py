@@ -30,11 +30,13 @@ class Benchmark:
         name: by which users choose it.
         steps: the number of steps that `sections` reports to the workspace.
         sections: measures, and returns the sections of the report.
+        weights: which it runs, "matching" or "geometry" or both.
     """
 
     name: str
     steps: Callable[[Workspace, BenchmarkOptions], int]
     sections: Callable[[Workspace, BenchmarkOptions], list[Section]]
+    weights: tuple[str, ...] = ("matching",)
 
 
 def _foreground_steps(workspace: Workspace, options: BenchmarkOptions) -> int:
@@ -53,9 +55,9 @@ BENCHMARKS: dict[str, Benchmark] = {
     for benchmark in (
         Benchmark("oxford", oxford_steps, oxford_sections),
         Benchmark("hpatches", hpatches_steps, hpatches_sections),
-        Benchmark("middlebury", middlebury_steps, middlebury_sections),
+        Benchmark("middlebury", middlebury_steps, middlebury_sections, ("geometry",)),
         Benchmark("foreground", _foreground_steps, _foreground_sections),
         Benchmark("low-visibility", low_visibility_steps, low_visibility_sections),
-        Benchmark("speed", speed_steps, speed_sections),
+        Benchmark("speed", speed_steps, speed_sections, ("matching", "geometry")),
     )
 }

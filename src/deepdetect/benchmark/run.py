@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..bundled import find_weights
 from ..errors import ImageError, look_up
 from ..progress import progress
 from ..provenance import provenance
@@ -57,15 +58,26 @@ def run_benchmarks(
             sections += benchmark.sections(workspace, options)
     origin = {
         **provenance(),
-        "weights": options.detector.weights.name,
+        **_weights(chosen, options),
         "results made, not found in the cache": str(store.made),
     }
-    origin["weights' SHA-256"] = file_digest(options.detector.weights)[:16]
     origin["minutes"] = f"{(time.monotonic() - started) / 60:.1f}"
     origin["peak memory"] = f"{peak_memory() / 1e9:.2f} GB"
     title = f"DeepDetect benchmark: {', '.join(names)}"
     left_out = tuple(dict.fromkeys(workspace.left_out))
     return Report(title, origin, tuple(sections), left_out)
+
+
+def _weights(chosen: Sequence[Benchmark], options: BenchmarkOptions) -> dict[str, str]:
+    """Return the names of the weights that were run, with the beginning of their SHA-256."""
+    files = {"matching": [options.detector.weights]}
+    files["geometry"] = [find_weights(weights) for weights in options.geometry_weights]
+    titles = {"matching": "weights (SHA-256)", "geometry": "weights for stereo pairs (SHA-256)"}
+    return {
+        title: ", ".join(f"{file.name} ({file_digest(file)[:16]})" for file in files[kind])
+        for kind, title in titles.items()
+        if any(kind in benchmark.weights for benchmark in chosen)
+    }
 
 
 def _has_data(benchmark: Benchmark, workspace: Workspace, options: BenchmarkOptions) -> bool:

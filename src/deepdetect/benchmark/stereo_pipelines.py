@@ -7,7 +7,7 @@ three names: keypoints, matching, geometry.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,24 +16,24 @@ import numpy as np
 
 from ..controls import EveryPixel
 from ..detector import DeepDetect
-from ..geometry import GeometryOptions, estimate_geometry
 from ..heatmap import HeatmapOptions
 from ..image import load_image
-from ..matchers import get_matcher, match_descriptors
-from ..matching import HeatmapDetector, check_memory
-from ..methods import CLASSICAL, Method
+from ..matching import HeatmapDetector
+from ..methods import CLASSICAL
+from ..methods.sift import low_sift
 from ..reconstruction.calibration import Calibration, read_calibration
 from ..reconstruction.reconstruct import reconstruct
 from ..stereo.search_range import find_search_range
 from .cache import file_digest
 from .metering import Meter, StageMeters
 from .options import BenchmarkOptions
-from .planar_paper import PAPER_MATCHING
-from .published_pipeline import (
-    STEREO_RATIO,
-    STEREO_THRESHOLD,
-    published_detector,
+from .paper_numbers import SIFT_LOW_POINTS, STEREO_POINTS
+from .published_pipeline import published_detector
+from .published_stereo import (
+    StereoSettings,
     published_points,
+    sift_points,
+    stereo_settings,
 )
 
 STAGES = ("keypoints", "matching", "geometry")
@@ -68,12 +68,16 @@ class StereoPoints:
         disparity: (N,) float32 in pixels.
         filled: how many of them were not matched, but filled in.
         meters: of each of `STAGES` that the pipeline has.
+        memory: bytes that the process grew by at the most, over all stages.
+        run: the run that measured them; results in the cache keep theirs.
     """
 
     pixels: np.ndarray
     disparity: np.ndarray
     filled: int
     meters: Mapping[str, Meter]
+    memory: int
+    run: int = 0
 
     @property
     def seconds(self) -> float:
@@ -91,6 +95,7 @@ class Pipeline:
         version: what results depend on besides the title.
         rounds: how often it is run for its time.
         drawn: its title in Figure 8; empty: not drawn.
+        paper: the points in the paper by scene.
     """
 
     title: str
@@ -98,6 +103,7 @@ class Pipeline:
     version: str = ""
     rounds: int = ROUNDS
     drawn: str = ""
+    paper: Mapping[str, int] = field(default_factory=dict)
 
 
 def load_scene(folder: Path) -> StereoScene:
@@ -123,12 +129,16 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
         found.append(Pipeline(f"ours, weights {name}", _ours(detector), version, drawn=drawn))
     for name, detector in options.geometry_detectors().items():
         squashing = detector.configured(HeatmapOptions(480, "bgr"))
-        title = f"{PUBLISHED}, weights {name}"
-        found.append(Pipeline(title, _published(squashing), file_digest(detector.weights)[:16], 1))
-    for name, drawn in (("sift", "SIFT default"), ("sift-low", "SIFT low")):
+        title, version = f"{PUBLISHED}, weights {name}", file_digest(detector.weights)[:16]
+        run = _published(squashing)
+        found.append(Pipeline(title, run, version, 1, paper=STEREO_POINTS))
+    for name, make, drawn, paper in (
+        ("sift", cv2.SIFT_create, "SIFT default", {}),
+        ("sift-low", low_sift, "SIFT low", SIFT_LOW_POINTS),
+    ):
         if name in options.classical:
             method = CLASSICAL[name]
-            found.append(Pipeline(method.title, _classical(method), method.version, 1, drawn))
+            found.append(Pipeline(method.title, _sift(make), method.version, 1, drawn, paper))
     found.append(Pipeline("OpenCV's SGBM", sgbm))
     detector = next(iter(options.geometry_detectors().values()))
     version = file_digest(detector.weights)[:16]
@@ -168,7 +178,7 @@ def _reconstructed(
     meters.lap("geometry")
     assert found.disparity is not None
     filled = int(np.count_nonzero(~found.matched))
-    return StereoPoints(found.pixels, found.disparity, filled, meters.stages)
+    return StereoPoints(found.pixels, found.disparity, filled, meters.stages, meters.memory)
 
 
 def _random(like: DeepDetect) -> Callable[[StereoScene], StereoPoints]:
@@ -191,41 +201,23 @@ def _published(detector: DeepDetect) -> Callable[[StereoScene], StereoPoints]:
         network = published_detector(detector)
         network.heatmap(scene.left)  # the first run of a size takes longer
         meters = StageMeters()
-        points0, points1 = published_points(
-            (scene.left, scene.right), network, scene.calibration.camera0.matrix, meters.lap
-        )
-        return _from_matches(points0, points1, meters)
+        found = published_points((scene.left, scene.right), network, _settings(scene), meters.lap)
+        return _from_matches(*found, meters)
 
     return run
 
 
-def _classical(method: Method) -> Callable[[StereoScene], StereoPoints]:
+def _sift(make: Callable[[], cv2.SIFT]) -> Callable[[StereoScene], StereoPoints]:
     def run(scene: StereoScene) -> StereoPoints:
-        images = scene.left, scene.right
         meters = StageMeters()
-        features = [method.detect(image) for image in images]
-        meters.lap("keypoints")
-        check_memory([len(one) for one in features])
-        descriptors = [
-            method.describe(image, one) for image, one in zip(images, features, strict=True)
-        ]
-        found = match_descriptors(
-            *descriptors, get_matcher(PAPER_MATCHING.matcher), ratio=STEREO_RATIO
-        )
-        meters.lap("matching")
-        points0, points1 = features[0].xy[found.rows0], features[1].xy[found.rows1]
-        geometry = GeometryOptions(
-            model="essential",
-            estimator="ransac",
-            inlier_threshold=STEREO_THRESHOLD,
-            camera0=scene.calibration.camera0.matrix,
-            camera1=scene.calibration.camera0.matrix,
-        )
-        inliers = estimate_geometry(points0, points1, geometry).inliers
-        meters.lap("geometry")
-        return _from_matches(points0[inliers], points1[inliers], meters)
+        found = sift_points((scene.left, scene.right), make(), _settings(scene), meters.lap)
+        return _from_matches(*found, meters)
 
     return run
+
+
+def _settings(scene: StereoScene) -> StereoSettings:
+    return stereo_settings(scene.name, scene.calibration.camera0.matrix)
 
 
 def sgbm(scene: StereoScene) -> StereoPoints:
@@ -243,7 +235,7 @@ def sgbm(scene: StereoScene) -> StereoPoints:
     rows, columns = np.nonzero(np.isfinite(disparity))
     meters.lap("matching")
     pixels = np.column_stack([columns, rows]).astype(np.float32)
-    return StereoPoints(pixels, disparity[rows, columns], 0, meters.stages)
+    return StereoPoints(pixels, disparity[rows, columns], 0, meters.stages, meters.memory)
 
 
 def sgbm_disparity(left: np.ndarray, right: np.ndarray, count: int, frame: int) -> np.ndarray:
@@ -280,7 +272,7 @@ def sgbm_disparity(left: np.ndarray, right: np.ndarray, count: int, frame: int) 
 
 def _from_matches(points0: np.ndarray, points1: np.ndarray, meters: StageMeters) -> StereoPoints:
     disparity = (points0[:, 0] - points1[:, 0]).astype(np.float32)
-    return StereoPoints(points0.astype(np.float32), disparity, 0, meters.stages)
+    return StereoPoints(points0.astype(np.float32), disparity, 0, meters.stages, meters.memory)
 
 
 @lru_cache(maxsize=1)

@@ -156,7 +156,7 @@ def _pairs(
 
 
 def _geometry(options: BenchmarkOptions, shown: HeatmapOptions) -> DeepDetect:
-    return DeepDetect(options.geometry_weights[0]).configured(shown)
+    return options.detector.with_weights(options.geometry_weights[0]).configured(shown)
 
 
 def _planar(pair: PlanarPair, detector: DeepDetect) -> WholePair:

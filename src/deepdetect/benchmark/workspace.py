@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,12 +35,14 @@ class Workspace:
         cache: of the stages.
         done: called with a number of finished steps and what is worked on next.
         left_out: what could not be measured, each with the reason.
+        run: a number of this run: times are compared within one only.
     """
 
     data: Path
     cache: StageCache = field(default_factory=lambda: StageCache(None))
     done: Callable[[int, str], object] = lambda steps, text: None
     left_out: list[str] = field(default_factory=list)
+    run: int = field(default_factory=time.time_ns)
 
     def folder(self, name: str) -> Path:
         """Return the folder of a data set: below `data`, or `data` itself."""
