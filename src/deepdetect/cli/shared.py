@@ -206,7 +206,7 @@ def check_inputs_survive(outputs: Iterable[Path], inputs: Sequence[Path], advice
     for output in outputs:
         # Not by name: links, and capitals on some systems, give one file several.
         if os.path.exists(output) and any(os.path.samefile(output, path) for path in there):
-            raise OptionError(f"{output} is an input and would be written over: {advice}")
+            raise OptionError(f"{output} would be written over, which is an input: {advice}")
 
 
 def report_failures(failures: Sequence[str], total: int) -> None:
