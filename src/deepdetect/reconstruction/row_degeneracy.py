@@ -40,7 +40,6 @@ walls are such planes, a turn bends them. Chosen on four views turned by half a 
 0.64, ratio 0.33 at worst) and as many drawn on slanted walls before two cameras (ratio 5.3 at
 least); Motorcycle and seven scenes of Middlebury ask for turns that would leave the rows."""
 
-
 OFF_ROW = 1.0
 """Pixels that a turn may take half of the matches off their rows: on rows they were found."""
 
