@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import Keypoints, OptionError
+from deepdetect import DeepDetectError, Keypoints, OptionError
 from deepdetect.pictures import (
     GREEN,
     RED,
@@ -86,3 +88,32 @@ def test_stacked_rows_are_padded_with_white() -> None:
     assert (picture[4:6] == 255).all()
     assert not picture[6:, :6].any()
     assert (picture[6:, 6:] == 255).all()
+
+
+def test_a_picture_too_large_for_its_format_is_refused(
+    tmp_path: Path, one_line: Callable[[BaseException], str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    wide = np.zeros((2, 65_501, 3), np.uint8)
+    for name in ("p.jpg", "p.JPEG"):
+        with pytest.raises(DeepDetectError, match="65501x2 pixels: give it a name") as error:
+            save_picture(wide, tmp_path / name)
+        one_line(error.value)
+    assert not list(tmp_path.iterdir())
+    assert capfd.readouterr().err == ""
+    save_picture(wide[:, :-1], tmp_path / "p.jpg")
+    save_picture(wide, tmp_path / "p.png")
+    with Image.open(tmp_path / "p.png") as picture:
+        assert picture.size == (65_501, 2)
+
+
+def test_a_picture_that_opencv_does_not_encode_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*given: object) -> None:
+        raise cv2.error("no memory")
+
+    for encode in (lambda *given: (False, ()), fail):
+        monkeypatch.setattr(cv2, "imencode", encode)
+        with pytest.raises(DeepDetectError, match="cannot hold a picture of 30x20 pixels: make"):
+            save_picture(np.zeros((20, 30, 3), np.uint8), tmp_path / "p.png")
+    assert not list(tmp_path.iterdir())

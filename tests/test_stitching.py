@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -73,3 +74,58 @@ def test_the_command_writes_the_file(views: list[np.ndarray], tmp_path: Path) ->
     alone = CliRunner().invoke(main, ["stitch", files[0], "-o", str(tmp_path / "no.jpg")])
     assert alone.exit_code == 2
     assert not (tmp_path / "no.jpg").exists()
+
+
+@pytest.fixture
+def files(views: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Two overlapping photographs in the folder that is worked in."""
+    monkeypatch.chdir(tmp_path)
+    for name, view in zip("ab", views[:2], strict=True):
+        Image.fromarray(view).save(f"{name}.png")
+    return [Path("a.png"), Path("b.png")]
+
+
+def refused(*arguments: object) -> str:
+    result = CliRunner().invoke(main, ["stitch", *map(str, arguments)])
+    assert result.exit_code == 2, result.output
+    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
+    return result.stderr
+
+
+def test_photographs_are_not_written_over(files: list[Path]) -> None:
+    Path("link.png").symlink_to("b.png")
+    before = {path: path.read_bytes() for path in files}
+    for output in ("a.png", Path("a.png").resolve(), "link.png"):
+        assert "would be written over, which is an input: give the panorama" in refused(
+            *files, "-o", output
+        )
+    Path("panorama.jpg").write_bytes(files[0].read_bytes())  # of the time before
+    assert "panorama.jpg would be written over" in refused(*files, "panorama.jpg")
+    assert Path("panorama.jpg").read_bytes() == before[files[0]]
+    assert {path: path.read_bytes() for path in files} == before
+    # A panorama that is no input is made anew.
+    assert CliRunner().invoke(main, ["stitch", *map(str, files)]).exit_code == 0
+    assert Path("panorama.jpg").read_bytes() != before[files[0]]
+
+
+@pytest.mark.parametrize("output", ["panorama", "panorama.tif"])
+def test_an_unknown_ending_ends_before_the_work(
+    files: list[Path], output: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("deepdetect.stitching.stitch", lambda images: pytest.fail("it worked"))
+    assert "must end in .png, .jpg or .jpeg" in refused(*files, "-o", output)
+
+
+def test_an_error_of_opencv_is_one_sentence(
+    views: list[np.ndarray], monkeypatch: pytest.MonkeyPatch, one_line: Any
+) -> None:
+    class Failing:
+        def stitch(self, images: list[np.ndarray]) -> None:
+            cv2.resize(np.empty((0, 0), np.uint8), (3, 3))  # an error of OpenCV itself
+
+    monkeypatch.setattr(cv2.Stitcher, "create", lambda mode: Failing())
+    with pytest.raises(
+        DeepDetectError, match="make no panorama: OpenCV's stitcher failed"
+    ) as error:
+        stitch(views)
+    one_line(error.value)

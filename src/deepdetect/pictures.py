@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from .atomic import atomic_path
-from .errors import OptionError
+from .errors import DeepDetectError, OptionError
 from .keypoints import Keypoints
 from .labels import Label
 
@@ -17,6 +17,9 @@ SPARSE = 5000
 """Up to so many keypoints are drawn as circles, more as single pixels."""
 
 ENDINGS = (".png", ".jpg", ".jpeg")
+JPEG_SIDE = 65_500
+"""Pixels of width and height that libjpeg writes at most."""
+
 CAPTION_HEIGHT = 28
 GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
@@ -30,14 +33,44 @@ def save_picture(rgb: np.ndarray, path: str | Path) -> None:
 
     Raises:
         OptionError: the ending is another.
-        DeepDetectError: the file cannot be written.
+        DeepDetectError: the file cannot be written, or its format holds no picture of this size.
+    """
+    ending = picture_ending(path)
+    data = _encoded(rgb, ending)
+    if data is None:
+        size = f"{rgb.shape[1]}x{rgb.shape[0]}"
+        advice = "make it smaller" if ending == ".png" else "give it a name that ends in .png"
+        raise DeepDetectError(f"{path} cannot hold a picture of {size} pixels: {advice}")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def picture_ending(path: str | Path) -> str:
+    """Return the ending of a picture's file, in small letters, before any work is done for it.
+
+    Raises:
+        OptionError: `save_picture` does not write such files.
+
+    Example:
+        >>> picture_ending("panorama.JPG")
+        '.jpg'
     """
     ending = Path(path).suffix.lower()
     if ending not in ENDINGS:
         raise OptionError(f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
-    with atomic_path(path) as temporary:
-        data = cv2.imencode(ending, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1]
-        temporary.write_bytes(data.tobytes())
+    return ending
+
+
+def _encoded(rgb: np.ndarray, ending: str) -> bytes | None:
+    """Return the file's content, or None where the format does not hold such a picture."""
+    # Asked before OpenCV is, which would also log it.
+    if ending != ".png" and max(rgb.shape[:2]) > JPEG_SIDE:
+        return None
+    try:
+        done, data = cv2.imencode(ending, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    except cv2.error:
+        return None
+    return data.tobytes() if done else None
 
 
 def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:

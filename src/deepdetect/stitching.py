@@ -53,7 +53,14 @@ def stitch(images: Sequence[Any]) -> Panorama:
     bgr = [cv2.cvtColor(load_image(image), cv2.COLOR_RGB2BGR) for image in images]
     cv2.setRNGSeed(0)
     stitcher = cv2.Stitcher.create(cv2.Stitcher_PANORAMA)
-    status, panorama = stitcher.stitch(bgr)
+    try:
+        status, panorama = stitcher.stitch(bgr)
+    except cv2.error as error:
+        # Mostly too little memory: cameras that are estimated badly ask for a huge canvas.
+        raise DeepDetectError(
+            f"these {len(images)} photographs make no panorama: OpenCV's stitcher failed "
+            f"({' '.join(str(error.err or error).split())}): leave some out, or make them smaller"
+        ) from error
     if status != cv2.Stitcher_OK:
         reason = REASONS.get(status, "OpenCV's stitcher failed")
         raise DeepDetectError(f"these {len(images)} photographs make no panorama: {reason}")

@@ -57,6 +57,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "other-size": {"width": 800},
         "other-offset": {"disparity_offset_px": -60},
         "no-focal": {"focal_px": None},
+        "two-focals": {"right": {"focal_px": 1.2 * FOCAL}},
+        "two-rows": {"right": {"cy": 100}},
     }.items():
         (folder / f"{name}.json").write_text(json.dumps({**calibration, **changes}))
     return folder
@@ -217,6 +219,14 @@ CASES = {
     "a wrong offset, said to be rectified": (
         "left right --calib {}/other-offset.json --rectified",
         "would lie behind the cameras",
+    ),
+    "two focal lengths": (
+        "left right --calib {}/two-focals.json",
+        "those of a rectified pair are one",
+    ),
+    "two centres, said to be rectified": (
+        "left right --calib {}/two-rows.json --rectified",
+        "cy of the left and the right view are 194.877 and 100 px",
     ),
     "a baseline of zero": ("left right --calib {}/zero.json", "the baseline must be above 0 mm"),
     "a calibration without focal length": ("left right --calib {}/no-focal.json", 'no "focal_px"'),

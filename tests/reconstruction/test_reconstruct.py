@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from deepdetect import DeepDetect, OptionError, ReconstructionError, threads
 from deepdetect.controls import EveryPixel
@@ -327,6 +329,80 @@ def test_pairs_only_said_to_be_rectified_give_no_cloud(
     assert "left and right are exchanged" in refusal(one_line, *exchanged, **options)
     shifted = np.ascontiguousarray(level.left[:, 9:]), np.ascontiguousarray(level.left[:, :-9])
     assert "all disparities are -9 px" in refusal(one_line, *shifted, **options)
+
+
+@pytest.mark.parametrize("rectified", [None, True, False])
+@pytest.mark.parametrize("quality", [80, 95])
+def test_a_copy_as_jpeg_gives_no_depth(
+    level: Any, detector: DeepDetect, quality: int, rectified: bool | None, one_line: Any
+) -> None:
+    file = io.BytesIO()
+    Image.fromarray(level.left).save(file, "JPEG", quality=quality)
+    with pytest.raises(ReconstructionError) as error:
+        reconstruct(level.left, file.getvalue(), detector, focal_px=497.5, rectified=rectified)
+    assert ("without a baseline" if rectified else "nothing moves") in one_line(error.value)
+
+
+def test_a_pair_taken_in_the_dark_has_depth(level: Any) -> None:
+    """Of a mean of 6 grey levels."""
+    factor = 6 / level.left.mean()
+    dark = [np.rint(view * factor).astype(np.uint8) for view in (level.left, level.right)]
+    found = reconstruct(*dark, EveryPixel(), calibration=level.calibration, rectified=True)
+    column, row = found.pixels.astype(int).T
+    off = np.abs(found.disparity - level.disparity[row, column])
+    assert len(found) > 10_000
+    assert np.nanmedian(off) < 0.5
+
+
+def test_no_keypoint_is_said(level: Any, detector: DeepDetect, one_line: Any) -> None:
+    class Sure:
+        """Nowhere is a keypoint."""
+
+        def heatmap(self, image: Any) -> np.ndarray:
+            return np.full(level.left.shape[:2], 0.25, np.float32)
+
+    for rectified, message in (
+        (True, "no pixel of the left image is above the threshold of 0.5: lower it"),
+        (None, "no pixel of the left image is above the threshold of 0.5: lower it"),
+        (False, "or no pixel of one is above the threshold"),
+    ):
+        with pytest.raises(ReconstructionError) as error:
+            reconstruct(level.left, level.right, Sure(), focal_px=497.5, rectified=rectified)
+        assert message in one_line(error.value)
+    blank = np.full_like(level.left, 128)
+    with pytest.raises(ReconstructionError, match="above the threshold"):
+        reconstruct(blank, level.right, detector, focal_px=497.5, rectified=True)
+
+
+def test_cameras_that_contradict_rectified_rows_are_refused(level: Any, one_line: Any) -> None:
+    calibration = level.calibration
+    right = calibration.camera1
+    assert right.centre is not None
+    pair = level.left, level.right
+    for other in (
+        replace(right, focal_px=1.2 * right.focal_px[0]),
+        replace(right, centre=(right.centre[0], right.centre[1] + 20)),
+    ):
+        wrong = replace(calibration, camera1=other)
+        for rectified in (True, None):
+            message = refusal(
+                one_line, *pair, focal_px=None, calibration=wrong, rectified=rectified
+            )
+            assert "mend the calibration (calib.json), or give --not-rectified" in message
+
+
+@pytest.mark.parametrize("density", [None, 1])
+def test_a_small_turn_said_to_be_rectified_gives_no_cloud(
+    density: int | None, level: Any, one_line: Any
+) -> None:
+    camera = level.calibration.camera0
+    known = {"focal_px": None, "calibration": Calibration(camera, camera), "rectified": True}
+    for degrees in (-1.0, 1.0):
+        rotation = cv2.Rodrigues(np.radians([0, degrees, 0]))[0]
+        warp = camera.matrix @ rotation @ np.linalg.inv(camera.matrix)
+        other = cv2.warpPerspective(level.left, warp, camera.size, flags=cv2.INTER_CUBIC)
+        message = refusal(one_line, level.left, other, density=density, **known)
+        assert "a turn of the camera explains most disparities" in message
 
 
 def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> None:

@@ -2,20 +2,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.errors import ReconstructionError
+from deepdetect.image import luma
+from deepdetect.keypoints import SelectionOptions
 from deepdetect.reconstruction.calibration import Calibration, Camera
 from deepdetect.reconstruction.row_degeneracy import (
     LEAST_MATCHED,
     LEAST_SURE,
+    check_cameras,
     check_depths,
     check_disparities,
+    check_keypoints,
     check_matched,
+    check_turn,
 )
+from deepdetect.stereo import COMPLETE, RowMatchingOptions, match_rows
 
 
 @pytest.mark.parametrize(("sure", "least"), [(True, LEAST_SURE), (False, LEAST_MATCHED)])
@@ -66,3 +74,118 @@ def test_what_is_very_far_away_is_not_behind() -> None:
     camera = Camera((400, 300), 500.0)
     noise = np.random.default_rng(0).normal(0, 0.3, 1000)
     check_depths(np.append(noise, np.full(200, 5.0)), Calibration(camera, camera))
+
+
+def test_cameras_that_no_rectified_pair_has(one_line) -> None:
+    left = Camera((640, 480), 500.0, (320.0, 240.0))
+
+    def told(**changes: Any) -> str:
+        with pytest.raises(ReconstructionError) as error:
+            check_cameras(Calibration(left, replace(left, **changes), source="c.json"))
+        message = one_line(error.value)
+        assert "mend the calibration (c.json), or give --not-rectified" in message
+        return message
+
+    assert "are 500 and 510 px" in told(focal_px=(510.0, 500.0))
+    assert "are 500 and 490 px" in told(focal_px=(500.0, 490.0))
+    assert "cy of the left and the right view are 240 and 243 px" in told(centre=(320.0, 243.0))
+    for changes in ({"focal_px": 504.0}, {"centre": (390.0, 240.0)}, {"centre": (320.0, 238.5)}):
+        check_cameras(Calibration(left, replace(left, **changes)))
+
+
+def test_no_keypoints(one_line) -> None:
+    for selection, message in (
+        (SelectionOptions(threshold=0.75), "above the threshold of 0.75: lower it, or give a"),
+        (SelectionOptions(density=1e-7), "a density of 1e-07 gives no keypoint"),
+    ):
+        check_keypoints(1, selection)
+        with pytest.raises(ReconstructionError, match=message) as error:
+            check_keypoints(0, selection)
+        one_line(error.value)
+
+
+PIXELS = np.stack(np.meshgrid(np.arange(0, 640, 8.0), np.arange(0, 480, 8.0)), -1).reshape(-1, 2)
+
+
+def turned_disparity(calibration: Calibration, degrees: tuple[float, ...]) -> np.ndarray:
+    rotation = cv2.Rodrigues(np.radians(np.array(degrees)))[0]
+    rays = calibration.camera0.rays(PIXELS)
+    seen = calibration.camera1.project(rays @ rotation.T)
+    return PIXELS[:, 0] - seen[:, 0] + np.random.default_rng(0).normal(0, 0.1, len(PIXELS))
+
+
+@pytest.mark.parametrize("degrees", [(0, -1, 0), (0, 2, 0), (0, -0.5, 0), (0.05, -1, 0.2)])
+def test_a_turn_is_known_by_its_bend(degrees: tuple[float, ...], one_line) -> None:
+    camera = Camera((640, 480), 600.0)
+    right = replace(camera, focal_px=602.0, centre=(350.0, 239.5))
+    for calibration in (Calibration(camera, camera), Calibration(camera, right)):
+        disparity = turned_disparity(calibration, degrees)
+        wrong = np.random.default_rng(1).random(len(PIXELS)) < 0.3
+        disparity[wrong] += 9
+        with pytest.raises(ReconstructionError, match="a turn of the camera explains") as error:
+            check_turn(PIXELS, disparity, calibration)
+        one_line(error.value)
+
+
+@pytest.mark.parametrize("focal", [300.0, 600.0, 3000.0])
+@pytest.mark.parametrize("slant", [(0, 0), (2e-3, 0), (0, 3e-3), (0.01, -0.01), (0.1, 0)])
+def test_a_wall_before_two_cameras_is_no_turn(slant: tuple[float, float], focal: float) -> None:
+    camera = Camera((640, 480), focal)
+    noise = np.random.default_rng(0).normal(0, 0.1, len(PIXELS))
+    for shift in (0, 5, 40):
+        check_turn(PIXELS, shift + PIXELS @ slant + noise, Calibration(camera, camera))
+
+
+def test_bent_surfaces_are_no_turn() -> None:
+    """Random quadrics of little depth, which a turn with a roll comes near to."""
+    camera = Camera((640, 480), 1200.0)
+    generator = np.random.default_rng(0)
+    x, y = ((PIXELS - [320, 240]) / [320, 240]).T
+    for _ in range(100):
+        bent = np.column_stack([x, y, x * x, x * y, y * y]) @ generator.normal(size=5)
+        bent *= generator.uniform(0.5, 4) / np.ptp(np.quantile(bent, [0.05, 0.95]))
+        disparity = generator.uniform(0, 60) + bent + generator.normal(0, 0.1, len(x))
+        check_turn(PIXELS, disparity, Calibration(camera, camera))
+
+
+def test_too_few_matches_and_impossible_focal_lengths_tell_no_turn() -> None:
+    camera = Camera((640, 480), 600.0)
+    calibration = Calibration(camera, camera)
+    disparity = turned_disparity(calibration, (0, -2, 0))
+    check_turn(PIXELS[::300], disparity[::300], calibration)
+    tiny = Camera((640, 480), 1.0)
+    check_turn(PIXELS, disparity, Calibration(tiny, tiny))
+
+
+@pytest.mark.parametrize("name", ["art", "cones", "dolls", "moebius", "teddy"])
+def test_scenes_with_depth_are_no_turn(shared: Path, name: str) -> None:
+    true = load_middlebury(shared / "data" / "middlebury" / name).disparity
+    row, column = np.nonzero(np.isfinite(true))
+    pixels = np.stack([column, row], 1).astype(np.float64)
+    for focal in (0.5, 1, 3):
+        camera = Camera(true.shape[::-1], focal * true.shape[1])
+        check_turn(pixels, true[row, column], Calibration(camera, camera))
+
+
+@pytest.mark.parametrize("options", [RowMatchingOptions(), COMPLETE], ids=["strict", "complete"])
+@pytest.mark.parametrize("degrees", [0.5, 1, 2, 4])
+def test_a_photograph_of_a_turned_camera(
+    level: Any, options: RowMatchingOptions, degrees: float
+) -> None:
+    camera = level.calibration.camera0
+    rotation = cv2.Rodrigues(np.radians([0, -degrees, 0]))[0]
+    warp = camera.matrix @ rotation @ np.linalg.inv(camera.matrix)
+    other = cv2.warpPerspective(level.left, warp, camera.size, flags=cv2.INTER_CUBIC)
+    pixels = np.indices(camera.size).reshape(2, -1).T[::3].astype(np.float32)
+    for right, calibration in (
+        (other, Calibration(camera, camera)),
+        (level.right, level.calibration),
+    ):
+        found = match_rows(luma(level.left), luma(right), pixels, options)
+        matches = pixels[found.rows][found.matched], found.disparity[found.matched]
+        check_disparities(matches[1])
+        if right is level.right:
+            check_turn(*matches, calibration)
+            continue
+        with pytest.raises(ReconstructionError, match="a turn of the camera explains"):
+            check_turn(*matches, calibration)

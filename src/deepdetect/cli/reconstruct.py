@@ -11,6 +11,7 @@ import click
 
 from .shared import (
     PATH,
+    check_inputs_survive,
     detector_options_with,
     json_option,
     make_detector,
@@ -111,16 +112,12 @@ def reconstruct(
 
 def _files(model: Path, inputs: list[Path]) -> dict[str, Path]:
     """Name all files, and check that none of them is an input."""
-    from ..errors import OptionError
     from ..exporters import EXPORTERS
 
     endings = (*EXPORTERS, "_depth.png", "_depth.npz", ".json")
     files = {ending: model.with_name(model.stem + ending) for ending in endings}
     files[model.suffix.lower()] = model
-    taken = {path.resolve() for path in inputs}
-    for path in files.values():
-        if path.resolve() in taken:
-            raise OptionError(f"{path} would be written over: give the model another name by -o")
+    check_inputs_survive(files.values(), inputs, "give the model another name by -o")
     return files
 
 

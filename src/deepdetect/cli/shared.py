@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import os.path
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -188,6 +189,24 @@ def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
             )
         seen[image.stem] = image
     return list(seen.values())
+
+
+def check_inputs_survive(outputs: Iterable[Path], inputs: Sequence[Path], advice: str) -> None:
+    """Check that no file to be written is one of those that are read, under whatever name.
+
+    Args:
+        outputs: the files to be written.
+        inputs: the files that are read; they need not be there.
+        advice: what to do, as "give the model another name by -o".
+
+    Raises:
+        OptionError: an input would be written over.
+    """
+    there = [path for path in inputs if os.path.exists(path)]
+    for output in outputs:
+        # Not by name: links, and capitals on some systems, give one file several.
+        if os.path.exists(output) and any(os.path.samefile(output, path) for path in there):
+            raise OptionError(f"{output} would be written over, which is an input: {advice}")
 
 
 def report_failures(failures: Sequence[str], total: int) -> None:

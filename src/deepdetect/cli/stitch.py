@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from .shared import PATH, json_option, print_json, print_table
+from .shared import PATH, check_inputs_survive, json_option, print_json, print_table
 
 
 @click.command(short_help="A panorama of overlapping photographs.")
@@ -26,9 +26,12 @@ def stitch(images: tuple[Path, ...], output: Path, as_json: bool) -> None:
     \b
     deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
     """
-    from ..pictures import save_picture
+    from ..pictures import picture_ending, save_picture
     from ..stitching import stitch as stitch_images
 
+    # Before the work, which would else be lost.
+    picture_ending(output)
+    check_inputs_survive([output], images, "give the panorama another name by -o")
     panorama = stitch_images(images)
     save_picture(panorama.picture, output)
     height, width = panorama.picture.shape[:2]

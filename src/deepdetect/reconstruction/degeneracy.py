@@ -43,7 +43,13 @@ both images show the same view."""
 NEARLY_ALL = 0.9
 
 SAME = 0.5
-"""Grey levels of mean difference under which two images are the same picture, stored anew."""
+NOWHERE = 8.0
+OF_CONTRAST = 0.5
+"""Two images are the same picture, stored anew, when they differ by fewer grey levels than the one
+in the mean, and than the other nearly everywhere; and also nearly everywhere by less than this
+share of what the picture differs from itself moved by a pixel: dark views differ by few levels."""
+
+NEARLY_EVERYWHERE = 0.999
 
 CALIBRATED = 0.75
 """Of the matches that agree with a fundamental matrix, the share that must agree with the
@@ -81,7 +87,9 @@ class Evidence:
 
 
 def check_images(gray0: np.ndarray, gray1: np.ndarray) -> None:
-    """Refuse two copies of one picture, also when one was stored anew.
+    """Refuse two copies of one picture, also when one was stored anew without visible loss.
+
+    Copies that lost more show the same view: `check_matches` and `check_disparities` refuse them.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
@@ -96,7 +104,7 @@ def check_images(gray0: np.ndarray, gray1: np.ndarray) -> None:
         deepdetect.errors.ReconstructionError: both images are the same picture: depth needs two \
 photographs from two places
     """
-    if gray0.shape == gray1.shape and cv2.absdiff(gray0, gray1).mean() < SAME:
+    if gray0.shape == gray1.shape and _same(gray0, gray1):
         raise ReconstructionError(
             "both images are the same picture: depth needs two photographs from two places"
         )
@@ -232,6 +240,15 @@ def check_focal(
         )
 
 
+def _same(gray0: np.ndarray, gray1: np.ndarray) -> bool:
+    difference = cv2.absdiff(gray0, gray1)
+    if difference.mean() >= SAME:
+        return False
+    largest = np.quantile(difference, NEARLY_EVERYWHERE)
+    contrast = np.quantile(cv2.absdiff(gray0[:, 1:], gray0[:, :-1]), NEARLY_EVERYWHERE)
+    return bool(largest <= min(NOWHERE, OF_CONTRAST * contrast))
+
+
 def is_flat(by_homography: np.ndarray, by_fundamental: np.ndarray) -> bool:
     """Tell whether a homography explains all that can be explained, though many may be wrong.
 
@@ -292,6 +309,11 @@ def _plane_errors(
 
 
 def _no_overlap(matches: int) -> str:
+    if not matches:
+        return (
+            "there are no matches: the photographs do not overlap, or do not show the same scene, "
+            "or no pixel of one is above the threshold (lower it, or give a density)"
+        )
     return (
         f"too few of the {matches:,} matches agree with one geometry: the photographs do not "
         "overlap, or do not show the same scene"

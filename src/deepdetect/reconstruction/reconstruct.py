@@ -32,7 +32,14 @@ from .exif import calibration_from_exif
 from .outlier_removal import statistical_inliers_on_grid
 from .rectification import Rectification, judge_rectification
 from .result import Reconstruction
-from .row_degeneracy import check_depths, check_disparities, check_matched
+from .row_degeneracy import (
+    check_cameras,
+    check_depths,
+    check_disparities,
+    check_keypoints,
+    check_matched,
+    check_turn,
+)
 from .two_view import TwoViewOptions, reconstruct_two_view
 
 SPARSE_RATIO = 0.85
@@ -166,16 +173,19 @@ class _Pair:
 def _from_rows(pair: _Pair) -> Reconstruction:
     """Reconstruct a rectified pair."""
     images, options, calibration = pair.images, pair.options, pair.calibration
+    check_cameras(calibration)
     with pair.stage("keypoints"):
         keypoints = select_keypoints(pair.detector.heatmap(images[0]), options.selection)
+    check_keypoints(len(keypoints), options.selection)
     with pair.stage("matching"):
         found = match_rows(*pair.grays, keypoints.xy, options.row_matching)
     row_options = options.row_matching
     sure = row_options.uniqueness > 1
     check_matched(np.count_nonzero(found.matched), len(keypoints), sure)
     check_disparities(found.disparity)
-    check_depths(found.disparity, calibration)
     pixels, disparity = keypoints.xy[found.rows], found.disparity
+    check_turn(pixels[found.matched], disparity[found.matched], calibration)
+    check_depths(disparity, calibration)
     size = (images[0].shape[1], images[0].shape[0])
     with pair.stage("triangulation"):
         depth = calibration.depth_mm(disparity)
