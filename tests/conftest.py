@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import hypothesis
@@ -32,6 +33,75 @@ def photo() -> np.ndarray:
     rgb = np.ascontiguousarray(data.astronaut()[::2, ::2])
     rgb.setflags(write=False)
     return rgb
+
+
+@dataclass(frozen=True, eq=False)
+class Facade:
+    """Two views of a wall, 10 baselines away, and of a post before it at half that distance.
+
+    `near` (H, W) bool tells where the left view shows the post, `match` takes (N, 2) pixels of
+    that view to their places in the right one.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    near: np.ndarray
+    camera: np.ndarray
+    homographies: tuple[np.ndarray, np.ndarray]
+
+    def match(self, pixels: np.ndarray) -> np.ndarray:
+        import cv2
+
+        on_wall, on_post = (
+            cv2.perspectiveTransform(np.asarray(pixels, np.float64)[None], homography)[0]
+            for homography in self.homographies
+        )
+        column, row = np.rint(pixels).astype(int).T
+        return np.where(self.near[row, column][:, None], on_post, on_wall)
+
+
+@pytest.fixture(scope="session")
+def facade() -> Callable[[float], Facade]:
+    """Draw a wall with a post that takes a share of the left view, of photographs."""
+    import cv2
+
+    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    size, focal, wall_depth, post_depth, wall_width = (400, 300), 400.0, 10.0, 5.0, 16.0
+    camera = np.array([[focal, 0, 199.5], [0, focal, 149.5], [0, 0, 1]])
+    rotation = cv2.Rodrigues(np.radians([1.0, -3.0, 2.0]))[0]
+    translation = -rotation @ [1.0, 0.06, 0.1]
+
+    def draw(share: float) -> Facade:
+        wall = cv2.resize(data.astronaut(), (1000, 700), interpolation=cv2.INTER_CUBIC)
+        post = np.ascontiguousarray(data.coffee()[:, 100 : 100 + max(1, round(400 * share))])
+        post_width = share * size[0] / focal * post_depth
+        poses = (np.eye(3), np.zeros(3)), (rotation, translation)
+        layers = (
+            (wall, wall_depth, wall_width, 0.4),
+            (post, post_depth, post_width, 1.0),
+        )
+        views = []
+        for turn, move in poses:
+            view = np.zeros((size[1], size[0], 3))
+            for texture, depth, width, middle in layers:
+                rows, columns = texture.shape[:2]
+                scale = width / columns
+                left, top = middle - width / 2, -scale * rows / 2
+                plane = np.array([[scale, 0, left], [0, scale, top], [0, 0, depth]])
+                seen = camera @ (turn @ plane + np.outer(move, [0, 0, 1]))
+                opaque = np.full((rows, columns), 1, np.float32)
+                mask = cv2.warpPerspective(opaque, seen, size)
+                drawn = cv2.warpPerspective(texture, seen, size)
+                view = view * (1 - mask[..., None]) + drawn * mask[..., None]
+            views.append((view.round().astype(np.uint8), mask > 0.5))
+        (left_view, near), (right_view, _) = views
+        homographies = tuple(
+            camera @ (rotation + np.outer(translation, [0, 0, 1 / depth])) @ np.linalg.inv(camera)
+            for depth in (wall_depth, post_depth)
+        )
+        return Facade(left_view, right_view, near & (share > 0), camera, homographies)
+
+    return draw
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from deepdetect import DeepDetectError
+from deepdetect import DeepDetectError, OptionError
 from deepdetect.cli import main
 from deepdetect.metrics.homography_accuracy import corner_error
 from deepdetect.registration import register
@@ -48,6 +48,24 @@ def test_images_of_different_things_are_refused(photo: np.ndarray) -> None:
     noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
     with pytest.raises(DeepDetectError, match="no homography can be trusted"):
         register(photo, noise)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"model": "homography"}, {"guidance": "none"}, {"homography": np.eye(3)}, {"estimator": "x"}],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_options_that_are_fixed_are_refused(photo: np.ndarray, changes: dict, one_line) -> None:
+    with pytest.raises(OptionError, match="a registration is by a homography") as error:
+        register(photo, photo, **changes)
+    assert f"the option {next(iter(changes))}:" in one_line(error.value)
+
+
+def test_other_options_are_taken(photo: np.ndarray, second: np.ndarray) -> None:
+    few = register(photo, second, max_keypoints=2000, seed=3, mutual=True)
+    assert 0 < few.matches <= 2000
+    with pytest.raises(OptionError, match="did you mean 'mutual'"):
+        register(photo, second, mutal=True)
 
 
 def test_the_command_writes_pictures_and_the_homography(

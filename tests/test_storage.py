@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from deepdetect import DeepDetectError, Keypoints, Matches, OptionError
+from deepdetect.guidance import Guidance
 from deepdetect.storage import load_keypoints, save_keypoints, save_matches
 
 
@@ -57,6 +58,23 @@ def test_matches_are_plain_arrays(tmp_path: Path, model: np.ndarray | None) -> N
         np.testing.assert_array_equal(file["inliers"], matches.inliers)
         assert file["model"].shape == ((0, 0) if model is None else (3, 3))
         assert str(file["kind"]) == kind
+
+
+@pytest.mark.parametrize("kind", [None, "none", "homography", "fundamental"])
+def test_what_guided_is_in_the_file(tmp_path: Path, kind: str | None) -> None:
+    points = keypoints(5)
+    guidance = None if kind is None else Guidance(kind, None, 0, 0, float("inf"), 0)
+    matches = Matches(
+        *(points.xy, points.xy, points.scores, None, np.ones(5, bool), "none", points, points),
+        guidance=guidance,
+    )
+    save_matches(matches, tmp_path / "m.npz")
+    with np.load(tmp_path / "m.npz", allow_pickle=False) as file:
+        assert (file["guided"].dtype, file["guided"].shape) == (np.bool_, ())
+        assert bool(file["guided"]) == matches.guided == (kind in ("homography", "fundamental"))
+        assert str(file["guidance"]) == (kind or "none")
+    save_matches(matches, tmp_path / "m.csv")
+    assert (tmp_path / "m.csv").read_text().splitlines()[0] == "x0,y0,x1,y1,ratio,inlier"
 
 
 @pytest.mark.parametrize("name", ["k.pkl", "k", "k.npy"])

@@ -19,13 +19,20 @@ from .guidance import Guidance, guided_matches
 from .heatmap import HeatmapOptions
 from .image import load_image, luma
 from .keypoints import Keypoints, select_keypoints
-from .matchers import DescriptorMatches, get_matcher, match_descriptors
+from .matchers import DescriptorMatches, get_matcher, match_descriptors, one_to_one
 from .memory import free_memory
 from .options import changed
 from .presets import MatchingOptions, get_preset
 
 BYTES_A_KEYPOINT = 1500
 """Memory that matching takes: 128 float32 of the descriptor, twice with FLANN's trees and copy."""
+
+GUIDING_MODELS = {
+    "homography": "homography",
+    "fundamental": "fundamental",
+    "essential": "fundamental",
+}
+"""Geometries that guide when they are asked for; any other model leaves the choice open."""
 
 
 class HeatmapDetector(Protocol):
@@ -44,7 +51,7 @@ class Matches:
         points0, points1: (M, 2) float32 positions in the first and in the second
             image, matched row by row; centre of the first pixel (0, 0).
         ratios: (M,) float32: small is sure. Unguided, the distance to the best over that to the
-            second-best descriptor; guided, the distance over that of strangers.
+            second-best descriptor; guided (`guided`), the distance over that of strangers.
         model: (3, 3) float64 geometry between the images, or None.
         inliers: (M,) bool, the matches that agree with the model.
         kind: what `model` is: "homography", "fundamental", "essential" or "none".
@@ -94,10 +101,13 @@ def match_images(
             and channels.
         options: all options at once, instead of a preset.
         **changes: single options by name: those of `MatchingOptions`, `SelectionOptions`
-            and `GeometryOptions`, as `ratio=0.9, density=0.1, model="homography"`.
+            and `GeometryOptions`, as `mutual=True, density=0.1, model="homography"`. The
+            options `descriptor`, `keypoint_size`, `angle`, `matcher` and `ratio` have a say only
+            in unguided matching: with `guidance="none"`, or where no geometry can be trusted.
 
     Returns:
-        The matches that pass the ratio test, the geometry, and which agree with it.
+        The matches, the geometry, and which agree with it. Guided they are those that look alike
+        where the geometry points, unguided those that pass the ratio test.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
@@ -129,7 +139,9 @@ def match_images(
                 chosen.geometry.seed,
             )
     if found is None:
-        found = _unguided(grays, keypoints, chosen, seconds)
+        found = unguided_matches(grays, [points.xy for points in keypoints], chosen, seconds)
+    elif chosen.mutual:
+        found = one_to_one(found)
     points0 = keypoints[0].xy[found.rows0]
     points1 = keypoints[1].xy[found.rows1]
     with _timed(seconds, "geometry"):
@@ -147,19 +159,29 @@ def match_images(
     )
 
 
-def _unguided(
+def unguided_matches(
     grays: Sequence[np.ndarray],
-    keypoints: Sequence[Keypoints],
+    points: Sequence[np.ndarray],
     chosen: MatchingOptions,
     seconds: dict[str, float],
 ) -> DescriptorMatches:
-    """Match all descriptors with all others."""
-    check_memory([len(points) for points in keypoints])
+    """Match all descriptors with all others.
+
+    Args:
+        grays: (H, W) uint8 luma of both images.
+        points: (N, 2) float32 keypoints of both.
+        chosen: the options; their guidance is not looked at.
+        seconds: takes the time of each stage.
+
+    Raises:
+        OptionError: there are too many keypoints for the memory.
+    """
+    check_memory([len(xy) for xy in points])
     with _timed(seconds, "descriptors"):
         describe = get_descriptor(chosen.descriptor)
         descriptors = [
-            describe(gray, points.xy, chosen.keypoint_size, chosen.angle)
-            for gray, points in zip(grays, keypoints, strict=True)
+            describe(gray, xy, chosen.keypoint_size, chosen.angle)
+            for gray, xy in zip(grays, points, strict=True)
         ]
     with _timed(seconds, "matching"):
         return match_descriptors(
@@ -168,14 +190,15 @@ def _unguided(
             ratio=chosen.ratio,
             mutual=chosen.mutual,
             seed=chosen.geometry.seed,
-            positions=(keypoints[0].xy, keypoints[1].xy),
+            positions=(points[0], points[1]),
         )
 
 
 def _guiding_model(chosen: MatchingOptions) -> str:
-    """A plane that is asked for guides; any other geometry leaves the choice open."""
-    asked = chosen.geometry.model
-    return asked if chosen.guidance == "auto" and asked == "homography" else chosen.guidance
+    """What is asked for guides, where nothing else is said: a plane would drop all depth."""
+    if chosen.guidance != "auto":
+        return chosen.guidance
+    return GUIDING_MODELS.get(chosen.geometry.model, "auto")
 
 
 def _geometry(

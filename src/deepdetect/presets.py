@@ -12,10 +12,16 @@ from .heatmap import HeatmapOptions
 from .keypoints import SelectionOptions
 from .matchers import get_matcher
 
+UNGUIDED_ONLY = ("descriptor", "keypoint_size", "angle", "matcher", "ratio")
+"""Options of `MatchingOptions` that have no say in matches that a geometry guided."""
+
 
 @dataclass(frozen=True, eq=False)
 class MatchingOptions:
     """How two images are matched.
+
+    Those of `UNGUIDED_ONLY` (descriptor, keypoint_size, angle, matcher, ratio) have a say only in
+    unguided matching: with the guidance "none", or where no geometry can be trusted.
 
     Attributes:
         heatmap: how the network sees the images; None leaves the detector's own way.
@@ -26,10 +32,11 @@ class MatchingOptions:
         matcher: "flann", "exact", "faiss" or "patchmatch" ("hamming" is for binary
             descriptors).
         ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
-        mutual: keep only pairs that are each other's nearest.
+        mutual: keep only pairs that are each other's nearest; guided, of those that share a
+            keypoint of the second image only the one with the smallest ratio.
         guidance: "auto", "homography" or "fundamental": a geometry from few points proposes the
-            matches ("auto" chooses which; `guidance.guided`), and the matcher and its ratio only
-            serve where none can be trusted; "none": the matcher alone.
+            matches; "auto" chooses which (`guidance.guided`), but takes the one that `model` asks
+            for. "none": the matcher alone.
         geometry: which geometry is estimated, and how.
 
     Raises:

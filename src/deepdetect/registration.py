@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import cv2
 import numpy as np
 
-from .errors import DeepDetectError
+from .errors import DeepDetectError, OptionError
+from .geometry import GeometryOptions
 from .geometry.correlation import agreement
 from .image import load_image, luma
 from .matching import HeatmapDetector, match_images
 
 SQUARES = 8
 """Squares of the checkerboard along the shorter side."""
+
+FIXED = {"guidance", *(field.name for field in fields(GeometryOptions))} - {"seed"}
+"""Options of `match_images` that a registration does not take: it is by a homography."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +65,11 @@ def register(
     Args:
         image0, image1: anything `DeepDetect.heatmap` takes.
         detector: as of `match_images`.
-        **changes: options of `match_images`, but for those of the geometry.
+        **changes: options of `match_images`, but for `guidance` and those of the geometry
+            (`GeometryOptions`, without its `seed`).
 
     Raises:
+        OptionError: an option is unknown, out of its range, or one of those.
         DeepDetectError: no homography between the images can be trusted.
 
     Example:
@@ -75,6 +81,12 @@ def register(
         >>> found.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
+    for name in changes:
+        if name in FIXED:
+            raise OptionError(
+                f"a registration is by a homography and does not take the option {name}: leave it "
+                "out, or call match_images"
+            )
     first, second = load_image(image0), load_image(image1)
     found = match_images(
         first, second, detector, **changes, guidance="homography", model="homography"

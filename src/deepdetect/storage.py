@@ -59,8 +59,10 @@ def save_matches(matches: Matches, path: str | Path) -> None:
     Args:
         matches: the matches.
         path: ending in .npz (arrays `points0` and `points1` (M, 2) float32, `ratios`
-            (M,) float32, `inliers` (M,) bool, `model` (3, 3), or (0, 0) without one,
-            and `kind`) or .csv (columns x0, y0, x1, y1, ratio, inlier).
+            (M,) float32, `inliers` (M,) bool, `model` (3, 3), or (0, 0) without one, `kind` of
+            that model, `guided` bool, and `guidance`: what guided, "homography" or
+            "fundamental", or "none") or .csv (columns x0, y0, x1, y1, ratio, inlier; it does
+            not say what guided). What the ratios are depends on `guided` (`Matches`).
 
     Raises:
         OptionError: the file's ending is another.
@@ -75,6 +77,8 @@ def save_matches(matches: Matches, path: str | Path) -> None:
             inliers=matches.inliers,
             model=np.empty((0, 0)) if matches.model is None else matches.model,
             kind=np.array(matches.kind),
+            guided=np.array(matches.guided),
+            guidance=np.array("none" if matches.guidance is None else matches.guidance.kind),
         )
     else:
         columns = [matches.points0, matches.points1, matches.ratios, matches.inliers]

@@ -11,7 +11,14 @@ import pytest
 from deepdetect import DeepDetect, match_images
 from deepdetect.benchmark import BenchmarkOptions, run_benchmarks
 from deepdetect.benchmark.cache import StageCache
-from deepdetect.benchmark.guided import SEEDS, find_guided, guided_section, guided_steps
+from deepdetect.benchmark.guided import (
+    SEEDS,
+    FoundGuided,
+    _guided_cells,
+    find_guided,
+    guided_section,
+    guided_steps,
+)
 from deepdetect.benchmark.workspace import Workspace
 from deepdetect.datasets.planar import PlanarPair
 
@@ -65,6 +72,7 @@ def test_both_ways_and_both_controls_have_counts_and_precision(section) -> None:
             assert 0 < row[f"{way}: precision"] <= 1
         assert row["guided: one to one"] <= row["guided: correct"] <= row["could be matched"]
         assert row["guided: of what could be"] == row["guided: correct"] / row["could be matched"]
+        assert 0 < row["least"] <= row["guided: of what could be"]
         assert row["guided: corners off, px"] < 0.5
 
 
@@ -79,6 +87,7 @@ def test_the_counts_are_those_of_match_images(
         gaps = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - found.points1, axis=1)
         counts.append(int((gaps < 1).sum()))
     assert row["guided: correct"] == sorted(counts)[SEEDS // 2]
+    assert row["least"] == min(counts) / row["could be matched"]
 
 
 def test_a_wrong_truth_finds_nothing_right(section) -> None:
@@ -117,8 +126,44 @@ def test_strangers_are_said_to_be_unguided(
     found = guided_section(Workspace(tmp_path), options, {"true": [pair]}, "key", "None")
     for row in rows(found, "key_true").values():
         assert row["guided by"] == "none"
-        assert row["guided: correct"] is None
+        assert row["guided: corners off, px"] is None
+        assert row["guided: seconds"] > 0
         assert row["unguided: correct"] is not None
+    workspace = Workspace(tmp_path)
+    for seed in range(2):
+        counted = find_guided(workspace, options.own(), pair, seed)
+        given = match_images(pair.first, pair.second, options.detector, seed=seed)
+        assert not given.guided
+        assert len(given) > 0
+        np.testing.assert_array_equal(counted.points0, given.points0)
+        np.testing.assert_array_equal(counted.points1, given.points1)
+
+
+@pytest.mark.parametrize(
+    ("found", "said", "middle", "least"),
+    [
+        ((("homography", 8), ("none", 3), ("homography", 9)), "homography, 2 of 3", 8, 3),
+        ((("none", 2), ("none", 3), ("homography", 9)), "homography, 1 of 3", 3, 2),
+        ((("homography", 8), ("fundamental", 5)), "homography or fundamental", 5, 5),
+        ((("none", 4), ("none", 3), ("none", 9)), "none", 4, 3),
+    ],
+)
+def test_seeds_that_fall_back_count(
+    pair: PlanarPair, found: tuple, said: str, middle: int, least: int
+) -> None:
+    """Of ten matches each so many are right."""
+    still = dataclasses.replace(pair, homography=np.eye(3))
+    points0 = np.arange(20.0).reshape(10, 2)
+    seeds = []
+    for kind, right in found:
+        points1 = points0 + np.where(np.arange(10) < right, 0, 5)[:, None]
+        matrix = np.eye(3) if kind == "homography" else None
+        seeds.append(FoundGuided(kind, matrix, points0, points1, 1.0, 0))
+    cells = _guided_cells(seeds, still, 20, (240, 200))
+    assert cells[0] == (f"{said} seeds guided" if "of" in said.split() else said)
+    assert cells[1] == middle
+    assert cells[2] == pytest.approx(np.std([right for _, right in found], ddof=1))
+    assert cells[3:6] == (middle / 10, middle / 20, least / 20)
 
 
 def test_the_low_visibility_report_has_the_table(

@@ -117,13 +117,82 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
     assert score.share > plain.share + 0.03
 
 
-def test_a_plane_that_is_asked_for_guides(shared: Path) -> None:
-    pair = load_middlebury(shared / "data" / "middlebury" / "art")
-    matches = match_images(pair.left, pair.right, Everywhere(), guidance="homography")
-    assert matches.guidance.kind in ("homography", "none")
-    by_model = match_images(pair.left, pair.right, Everywhere(), model="homography")
-    assert by_model.kind == "homography"
-    assert by_model.guidance.kind == matches.guidance.kind
+@pytest.mark.parametrize("name", ["art", "cones"])
+def test_a_plane_that_is_asked_for_guides(shared: Path, name: str) -> None:
+    """In scenes with depth, where nothing else would choose a plane."""
+    pair = load_middlebury(shared / "data" / "middlebury" / name)
+    for asked in ({"guidance": "homography"}, {"model": "homography"}):
+        matches = match_images(pair.left, pair.right, Everywhere(), **asked)
+        assert matches.guidance.kind == "homography"
+        assert matches.kind == "homography"
+    assert match_images(pair.left, pair.right, Everywhere()).guidance.kind == "fundamental"
+
+
+@pytest.mark.parametrize("model", ["fundamental", "essential"])
+def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
+    """A homography explains nine tenths of the matches, and would drop what stands before."""
+    pair = facade(0.07)
+    camera = pair.camera
+    detector = DeepDetect("geometry")
+    images = pair.left, pair.right, detector
+    assert match_images(*images).guidance.kind == "homography"
+    found = match_images(*images, model=model, camera0=camera, camera1=camera)
+    assert found.guidance.kind == "fundamental"
+    assert found.kind == model
+    x, y = found.points0.astype(int).T
+    near = pair.near[y, x]
+    assert near.sum() > 1000
+    errors = np.linalg.norm(found.points1 - pair.match(found.points0), axis=1)
+    for part in (near, ~near):
+        assert (errors[part] < 2).mean() > 0.9
+    plane = match_images(
+        *images, model=model, camera0=camera, camera1=camera, guidance="homography"
+    )
+    assert plane.guidance.kind == "homography"
+
+
+def test_mutual_matches_are_one_to_one(photo: np.ndarray, second: np.ndarray) -> None:
+    plain, mutual = (
+        match_images(photo, second, Everywhere(), mutual=mutual) for mutual in (False, True)
+    )
+    assert plain.guided
+    assert mutual.guided
+    rows: dict[tuple[float, ...], list[int]] = {}
+    for row, place in enumerate(map(tuple, plain.points1.tolist())):
+        rows.setdefault(place, []).append(row)
+    assert len(rows) < 0.95 * len(plain)
+    # The smallest ratio, then the first; in the order of the first image.
+    expected = sorted(min(of, key=lambda row: (plain.ratios[row], row)) for of in rows.values())
+    for name in ("points0", "points1", "ratios", "inliers"):
+        np.testing.assert_array_equal(getattr(mutual, name), getattr(plain, name)[expected])
+
+
+def test_the_command_says_which_options_have_no_say(
+    photo: np.ndarray, second: np.ndarray, tmp_path: Path
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
+    for name, image in (("a", photo), ("b", second), ("c", noise)):
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+
+    def said(other: str, *options: str) -> list[str]:
+        words = ["match", str(tmp_path / "a.png"), str(tmp_path / f"{other}.png"), "--json"]
+        words += ["--max-keypoints", "3000", "--no-pictures", "-o", str(tmp_path / "out")]
+        result = CliRunner().invoke(main, [*words, *options])
+        assert result.exit_code == 0, result.output
+        assert json.loads(result.stdout)["guided"] == (other == "b" and "none" not in options)
+        return result.stderr.splitlines()
+
+    assert said("b", "--ratio", "0.9") == [
+        "--ratio has a say only in unguided matching: add --guidance none"
+    ]
+    several = ("--matcher", "exact", "--descriptor", "rootsift", "--keypoint-size", "4")
+    assert said("b", *several, "--mutual") == [
+        "--descriptor and --keypoint-size and --matcher have a say only in unguided matching: add "
+        "--guidance none"
+    ]
+    for quiet in (("b",), ("b", "--mutual"), ("b", "--ratio", "0.9", "--guidance", "none")):
+        assert said(*quiet) == []
+    assert said("c", "--ratio", "0.9") == []  # unguided after all
 
 
 def test_is_the_same_on_repetition(photo: np.ndarray, second: np.ndarray) -> None:

@@ -140,6 +140,50 @@ def test_a_pair_that_is_not_rectified_has_true_depths(posed: Any, turned: Any) -
         posed.disparity_map()
 
 
+def test_a_post_before_a_wall_is_not_left_out(
+    facade: Any, detector: DeepDetect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A homography explains nine tenths of the pair, and must not choose the matches."""
+    pair = facade(0.07)
+    given: list[np.ndarray] = []
+
+    def stop(points0: np.ndarray, points1: np.ndarray, *rest: Any) -> None:
+        given.extend([points0, points1])
+        raise ReconstructionError("seen enough")
+
+    monkeypatch.setattr("deepdetect.reconstruction.reconstruct.reconstruct_two_view", stop)
+    with pytest.raises(ReconstructionError, match="seen enough"):
+        reconstruct(pair.left, pair.right, detector, focal_px=400)
+    column, row = given[0].astype(int).T
+    near = pair.near[row, column]
+    errors = np.linalg.norm(given[1] - pair.match(given[0]), axis=1)
+    for part, fewest in ((near, 1000), (~near, 20_000)):
+        assert np.count_nonzero(errors[part] < 2) > fewest
+        assert (errors[part] < 2).mean() > 0.9
+
+
+def test_a_post_before_a_wall_has_points_of_both_depths(facade: Any, detector: DeepDetect) -> None:
+    pair = facade(0.12)
+    camera = Camera((400, 300), 400.0)
+    made = reconstruct(pair.left, pair.right, detector, calibration=Calibration(camera, camera))
+    assert not made.rectified
+    column, row = made.pixels.astype(int).T
+    near = pair.near[row, column]
+    baseline = np.linalg.norm([1.0, 0.06, 0.1])
+    for part, depth, fewest in ((near, 5, 1000), (~near, 10, 20_000)):
+        assert np.count_nonzero(part) > fewest
+        off = np.abs(made.points[part, 2] * baseline / depth - 1)
+        assert np.median(off) < 0.02
+        assert (off < 0.1).mean() > 0.9
+
+
+def test_a_wall_alone_gives_no_depth(facade: Any, detector: DeepDetect, one_line: Any) -> None:
+    pair = facade(0)
+    with pytest.raises(ReconstructionError, match="one homography explains all") as error:
+        reconstruct(pair.left, pair.right, detector, focal_px=400)
+    one_line(error.value)
+
+
 def test_the_right_camera_is_where_it_is_seen_from(posed: Any, turned: Any) -> None:
     """Points seen from there lie on their true matches, and the parallax is the rays' angle."""
     there = (posed.points - posed.right_centre) @ posed.pose.rotation.T

@@ -17,8 +17,11 @@ from ..geometry.residuals import transfer_errors
 from ..guidance import guided_matches
 from ..guidance.by_homography import nearest_pixel
 from ..image import load_image, luma
+from ..matching import unguided_matches
 from ..methods import Method
 from ..metrics.homography_accuracy import corner_error
+from ..options import changed
+from ..presets import get_preset
 from ..weights_quality import CORRECT
 from .cache import file_digest
 from .metering import metered
@@ -33,13 +36,14 @@ SEEDS = 3
 
 @dataclass(frozen=True, eq=False)
 class FoundGuided:
-    """The guided matches of a pair by one seed.
+    """The matches of a pair by one seed, as `match_images` gives them.
 
     Attributes:
-        kind: what guided, as of `Guidance`.
+        kind: what guided, as of `Guidance`; with "none" the matches are unguided.
         matrix: the geometry, or None.
-        points0, points1: (M, 2) matched positions; none when no geometry was trusted.
-        seconds, memory: of the guided matching, keypoints not included.
+        points0, points1: (M, 2) matched positions.
+        seconds, memory: of the guided matching alone, also where it found nothing: neither heat
+            map and keypoints nor unguided matches are included.
     """
 
     kind: str
@@ -111,6 +115,7 @@ COLUMNS = (
     Column("± of correct", ",.0f"),
     Column("guided: precision", ".2%"),
     Column("guided: of what could be", ".1%"),
+    Column("least", ".1%"),
     Column("guided: one to one", ",d"),
     Column("guided: corners off, px", ".2f"),
     Column("guided: seconds", ".2f"),
@@ -120,10 +125,13 @@ NOTE = (
     f"Correct: strictly under {CORRECT:g} px by the true homography; each point of the first image "
     "counts once. Could be matched: points of the first image with any point of the second so near "
     "to their true place. One to one: correct matches, each point of the second image once. "
-    f"Guided: median, and standard deviation (±) of the count, over {SEEDS} seeds; where no "
-    "geometry was trusted the result is the unguided one, and the row says none. Seconds: of "
-    "the guided matching, the keypoints not included. The controls' count is what the same "
-    "geometry makes of points that know nothing of the image."
+    f"Guided: the seed of the median count, the lower of two, of {SEEDS} seeds; ± is the counts' "
+    "standard deviation, least the smallest of them as a share of what could be matched. A seed by "
+    "which no geometry is trusted counts with the unguided matches that match_images gives then; "
+    "the row tells how many seeds were guided where not all were. Corners: median over the seeds "
+    "that a homography guided. Seconds: median of the guided matching alone, without heat map, "
+    "keypoints and unguided matches; they may be those of an earlier run, from the cache. The "
+    "controls' count is what the same geometry makes of points that know nothing of the image."
 )
 
 
@@ -158,26 +166,34 @@ def _measure(
 def _guided_cells(
     guided: Sequence[FoundGuided], pair: PlanarPair, could: int, size: tuple[int, int]
 ) -> tuple[Cell, ...]:
-    kinds = " or ".join(dict.fromkeys(found.kind for found in guided))
-    trusted = [found for found in guided if found.kind != "none"]
-    if not trusted:
-        return (kinds, *(None,) * 7)
-    right = [_right(found.points0, found.points1, pair) for found in trusted]
+    right = [_right(found.points0, found.points1, pair) for found in guided]
     counts = [int(one.sum()) for one in right]
-    middle = int(np.argsort(counts)[len(counts) // 2])
-    once = np.unique(trusted[middle].points1[right[middle]], axis=0)
-    planes = [found.matrix for found in trusted if found.kind == "homography"]
+    middle = int(np.argsort(counts, kind="stable")[(len(counts) - 1) // 2])
+    once = np.unique(guided[middle].points1[right[middle]], axis=0)
+    planes = [found.matrix for found in guided if found.kind == "homography"]
     corners = [corner_error(matrix, pair.homography, size) for matrix in planes]
     return (
-        kinds,
+        _guided_by([found.kind for found in guided]),
         counts[middle],
         float(np.std(counts, ddof=1)) if len(counts) > 1 else None,
-        float(right[middle].mean()),
+        float(right[middle].mean()) if len(right[middle]) else None,
         counts[middle] / could if could else None,
+        min(counts) / could if could else None,
         len(once),
         float(np.median(corners)) if corners else None,
-        float(np.median([found.seconds for found in trusted])),
+        float(np.median([found.seconds for found in guided])),
     )
+
+
+def _guided_by(kinds: Sequence[str]) -> str:
+    """Tell what guided, and by how many of the seeds where not by all."""
+    trusted = [kind for kind in kinds if kind != "none"]
+    if not trusted:
+        return "none"
+    names = " or ".join(dict.fromkeys(trusted))
+    if len(trusted) == len(kinds):
+        return names
+    return f"{names}, {len(trusted)} of {len(kinds)} seeds guided"
 
 
 def _right(points0: np.ndarray, points1: np.ndarray, pair: PlanarPair) -> np.ndarray:
@@ -185,7 +201,7 @@ def _right(points0: np.ndarray, points1: np.ndarray, pair: PlanarPair) -> np.nda
 
 
 def find_guided(workspace: Workspace, method: Method, pair: PlanarPair, seed: int) -> FoundGuided:
-    """Match a pair guided, or read its matches from the cache.
+    """Match a pair guided, unguided where no geometry is trusted, or read that from the cache.
 
     Args:
         workspace: with the cache.
@@ -200,12 +216,14 @@ def find_guided(workspace: Workspace, method: Method, pair: PlanarPair, seed: in
         grays = [luma(load_image(image)) for image in images]
         with metered() as meter:
             guidance, found = guided_matches(*grays, *points, seed=seed)
-        rows = [np.empty(0, np.int32)] * 2 if found is None else [found.rows0, found.rows1]
+        if found is None:
+            options = changed(get_preset("default"), seed=seed)
+            found = unguided_matches(grays, points, options, {})
         return {
             "kind": np.array(guidance.kind),
             "matrix": np.empty((0, 3)) if guidance.matrix is None else guidance.matrix,
-            "rows0": rows[0].astype(np.int32),
-            "rows1": rows[1].astype(np.int32),
+            "rows0": found.rows0.astype(np.int32),
+            "rows1": found.rows1.astype(np.int32),
             "meter": np.array([meter.seconds, meter.memory], np.float64),
         }
 

@@ -33,11 +33,25 @@ from .shared import (
     help="Options to start from: default, or published (exactly the paper's code).",
 )
 @selection_options
-@click.option("--descriptor", help="sift, rootsift or sift-opencv.  [default: sift]")
-@click.option("--keypoint-size", type=float, help="Size for the descriptor, pixels.  [default: 3]")
-@click.option("--matcher", help="flann, exact, faiss or patchmatch.  [default: flann]")
-@click.option("--ratio", type=float, help="Ratio test: keep matches under it.  [default: 0.99]")
-@click.option("--mutual/--no-mutual", default=None, help="Keep mutual nearest neighbours only.")
+@click.option("--descriptor", help="Unguided only: sift, rootsift or sift-opencv.  [default: sift]")
+@click.option(
+    "--keypoint-size",
+    type=float,
+    help="Unguided only: size for the descriptor, pixels.  [default: 3]",
+)
+@click.option(
+    "--matcher", help="Unguided only: flann, exact, faiss or patchmatch.  [default: flann]"
+)
+@click.option(
+    "--ratio",
+    type=float,
+    help="Unguided only: the ratio test keeps matches under it.  [default: 0.99]",
+)
+@click.option(
+    "--mutual/--no-mutual",
+    default=None,
+    help="Keep mutual nearest neighbours only; guided: the surest match of each keypoint.",
+)
 @click.option(
     "--guidance",
     help="A geometry from few points proposes the matches: auto, homography (planes, pure "
@@ -78,16 +92,18 @@ def match(
     """Match the keypoints of IMAGE0 and IMAGE1.
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their ratios,
-    the estimated geometry and which matches agree with it, and a picture of them.
+    the estimated geometry and which matches agree with it, and a picture of them. Options that
+    are "unguided only" have a say with --guidance none, and where no geometry can be trusted.
 
     \b
     deepdetect match left.jpg right.jpg
-    deepdetect match page1.jpg page2.jpg --model homography --ratio 0.9
+    deepdetect match page1.jpg page2.jpg --model homography --mutual
+    deepdetect match left.jpg right.jpg --guidance none --ratio 0.9 --mutual
     deepdetect match a.png b.png --preset published --homography H1to2p
     """
     from ..image import load_image
     from ..matching import match_images
-    from ..presets import get_preset
+    from ..presets import UNGUIDED_ONLY, get_preset
     from ..storage import save_matches
 
     rgb0, rgb1 = load_image(image0), load_image(image1)
@@ -129,6 +145,10 @@ def match(
         "file": file,
         "picture": picture,
     }
+    if matches.guided and (unused := [name for name in UNGUIDED_ONLY if name in given]):
+        words = " and ".join("--" + name.replace("_", "-") for name in unused)
+        verb = "has" if len(unused) == 1 else "have"
+        click.echo(f"{words} {verb} a say only in unguided matching: add --guidance none", err=True)
     if as_json:
         print_json(numbers)
         return

@@ -71,3 +71,23 @@ def match_descriptors(
         kept &= nearest[rows[:, 0]] == np.arange(len(rows))
     rows0 = np.flatnonzero(kept).astype(np.int32)
     return DescriptorMatches(rows0, rows[rows0, 0].astype(np.int32), ratios[rows0])
+
+
+def one_to_one(found: DescriptorMatches) -> DescriptorMatches:
+    """Keep of the matches that share a row of the second set the one with the smallest ratio.
+
+    Args:
+        found: matches with every row of the first set once; of equal ratios the lowest such row
+            stays.
+
+    Example:
+        >>> rows0, rows1 = np.array([0, 1, 2, 3]), np.array([5, 4, 5, 4])
+        >>> found = DescriptorMatches(rows0, rows1, np.array([0.5, 0.2, 0.4, 0.2], np.float32))
+        >>> kept = one_to_one(found)
+        >>> kept.rows0.tolist(), kept.rows1.tolist()
+        ([1, 2], [4, 5])
+    """
+    best_first = np.lexsort((found.rows0, found.ratios, found.rows1))
+    _, first = np.unique(found.rows1[best_first], return_index=True)
+    kept = np.sort(best_first[first])
+    return DescriptorMatches(found.rows0[kept], found.rows1[kept], found.ratios[kept])

@@ -243,6 +243,8 @@ def _from_matches(pair: _Pair) -> Reconstruction:
             options=changed(
                 get_preset("default"), selection=options.selection, matcher="patchmatch"
             ),
+            # A homography would keep the points of one plane, and drop all that stands before it.
+            guidance="fundamental",
             model="none",
             seed=options.two_view.seed,
         )
