@@ -163,7 +163,7 @@ def test_a_post_before_a_wall_is_not_left_out(
 
 
 def test_a_post_before_a_wall_has_points_of_both_depths(facade: Any, detector: DeepDetect) -> None:
-    pair = facade(0.12)
+    pair = facade(0.07)
     camera = Camera((400, 300), 400.0)
     made = reconstruct(pair.left, pair.right, detector, calibration=Calibration(camera, camera))
     assert not made.rectified
