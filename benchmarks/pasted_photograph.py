@@ -1,16 +1,18 @@
 """What guided matching matches where nothing can be matched: under a photograph that is pasted in.
 
-    python benchmarks/pasted_photograph.py OXFORD [--weights FILE] [--seeds N]
+    python benchmarks/pasted_photograph.py [OXFORD] [--middlebury DATA] [--weights FILE] [--seeds N]
 
-OXFORD holds refined homographies (`H1toKp.refined`). A photograph that has nothing to
-do with the pair covers a quarter of the second image, its middle; of the keypoints that
-belong under it the share is printed that is matched nevertheless, the median and the largest over
-the seeds. The truth only tells which keypoints these are.
+OXFORD holds refined homographies (`H1toKp.refined`), DATA the stereo scenes cones, teddy and art. A
+photograph that has nothing to do with the pair covers a quarter of the second image, its middle; of
+the keypoints that belong under it the share is printed that is matched nevertheless, the median and
+the largest over the seeds. The truth only tells which keypoints these are, and how many matches
+of the stereo pairs are right (within 1 px) without the photograph.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -19,39 +21,81 @@ from skimage import data
 
 from deepdetect import DeepDetect, HeatmapOptions, Matches, match_images
 from deepdetect.benchmark.oxford import GUIDED_PAIRS, chosen_pairs
+from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.geometry import transform_points
 from deepdetect.image import load_image
+from deepdetect.metrics import stereo_score
 
 PHOTOGRAPHS = ("chelsea", "coffee", "rocket", "astronaut", "grass")
+SCENES = ("cones", "teddy", "art")
 
 
 def main() -> None:
     """Print a line for each pair."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("oxford", type=Path)
+    parser.add_argument("oxford", type=Path, nargs="?")
+    parser.add_argument("--middlebury", type=Path, help="folder of the stereo scenes")
     parser.add_argument("--weights", default="matching")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--pair", action="append", help="as 'ubc 1-6'; default all nine")
     arguments = parser.parse_args()
-    detector = DeepDetect(arguments.weights).configured(HeatmapOptions(480))
-    for pair in chosen_pairs(load_oxford(arguments.oxford, "refined"), GUIDED_PAIRS):
-        if arguments.pair and pair.name not in arguments.pair:
-            continue
-        first, second = (load_image(image) for image in (pair.first, pair.second))
-        told = []
-        for name in PHOTOGRAPHS:
-            pasted, box = paste(second, load_image(getattr(data, name)()))
-            shares, guided = [], True
-            for seed in range(arguments.seeds):
-                found = match_images(first, pasted, detector, seed=seed)
-                shares.append(share_under(found, pair.homography, box))
-                guided &= found.guided
-            text = f"{np.median(shares):.2%}"
-            if arguments.seeds > 1:
-                text += f" (at most {max(shares):.2%})"
-            told.append(f"{name} {text}{'' if guided else ' unguided'}")
-        print(f"{pair.name}: matched under {', '.join(told)}", flush=True)
+    if arguments.oxford is None and arguments.middlebury is None:
+        parser.error("name the folder OXFORD, or --middlebury DATA, or both")
+    detector = DeepDetect(arguments.weights)
+    if arguments.oxford is not None:
+        squashed = detector.configured(HeatmapOptions(480))
+        for pair in chosen_pairs(load_oxford(arguments.oxford, "refined"), GUIDED_PAIRS):
+            if arguments.pair and pair.name not in arguments.pair:
+                continue
+            first, second = (load_image(image) for image in (pair.first, pair.second))
+
+            def moved(points: np.ndarray, homography: np.ndarray = pair.homography) -> np.ndarray:
+                return transform_points(points, homography)
+
+            told = under_photographs(first, second, moved, squashed, arguments.seeds)
+            print(f"{pair.name}: matched under {told}", flush=True)
+    for name in SCENES if arguments.middlebury is not None else ():
+        scene = load_middlebury(arguments.middlebury / name)
+        whole = match_images(scene.left, scene.right, detector)
+        score = stereo_score(whole.points0, whole.points1, scene.disparity)
+
+        def by_depth(points: np.ndarray, disparity: np.ndarray = scene.disparity) -> np.ndarray:
+            return moved_by_disparity(points, disparity)
+
+        told = under_photographs(scene.left, scene.right, by_depth, detector, arguments.seeds)
+        print(
+            f"{name}: {score.right:,} right ({score.share:.3f}), matched under {told}", flush=True
+        )
+
+
+def under_photographs(
+    first: np.ndarray,
+    second: np.ndarray,
+    moved: Callable[[np.ndarray], np.ndarray],
+    detector: DeepDetect,
+    seeds: int,
+) -> str:
+    """Return the shares under each photograph as text; `moved` is the truth."""
+    told = []
+    for name in PHOTOGRAPHS:
+        pasted, box = paste(second, load_image(getattr(data, name)()))
+        shares, guided = [], True
+        for seed in range(seeds):
+            found = match_images(first, pasted, detector, seed=seed)
+            shares.append(share_under(found, moved, box))
+            guided &= found.guided
+        text = f"{np.median(shares):.2%}"
+        if seeds > 1:
+            text += f" (at most {max(shares):.2%})"
+        told.append(f"{name} {text}{'' if guided else ' unguided'}")
+    return ", ".join(told)
+
+
+def moved_by_disparity(points: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Return where whole pixels of the left view are in the right one, NaN where unknown."""
+    x, y = np.asarray(points).astype(int).T
+    return np.column_stack([x - disparity[y, x], y])
 
 
 def paste(
@@ -67,12 +111,16 @@ def paste(
     return result, (left, top, width, height)
 
 
-def share_under(found: Matches, homography: np.ndarray, box: tuple[int, int, int, int]) -> float:
+def share_under(
+    found: Matches,
+    moved: Callable[[np.ndarray], np.ndarray],
+    box: tuple[int, int, int, int],
+) -> float:
     """Return which share of the first image's keypoints under the box is matched."""
     left, top, width, height = box
 
     def under(points: np.ndarray) -> np.ndarray:
-        x, y = (transform_points(points, homography) + 0.5).T
+        x, y = (moved(points) + 0.5).T
         return (x > left) & (x < left + width) & (y > top) & (y < top + height)
 
     return float(under(found.points0).sum() / max(under(found.keypoints0.xy).sum(), 1))

@@ -1,9 +1,19 @@
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
-from deepdetect.guidance.by_epipolar_line import BAND, matches_by_epipolar_line, move_alike
+from deepdetect import DeepDetect, match_images
+from deepdetect.datasets.middlebury import load_middlebury
+from deepdetect.guidance.by_epipolar_line import (
+    BAND,
+    in_crowd,
+    matches_by_epipolar_line,
+    move_alike,
+)
 from deepdetect.image import luma
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -37,16 +47,33 @@ def test_each_depth_finds_its_shift(pair: tuple[np.ndarray, np.ndarray]) -> None
     assert (ratios < 1).all()
 
 
-def test_what_one_image_hides_is_not_matched(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    first, second = pair
-    generator = np.random.default_rng(0)
-    second = second.copy()
-    second[60:120, 100:180] = generator.integers(0, 256, (60, 80))
-    xy = every_pixel(first.shape)
-    rows0, _, _ = matches_by_epipolar_line(first, second, xy, xy, ROWS)
-    x, y = xy[rows0].T
-    hidden = (y >= 64) & (y < 116) & (x >= 113) & (x < 185)
-    assert hidden.sum() < 0.03 * 52 * 72
+@pytest.mark.parametrize(
+    ("name", "photograph"),
+    [("cones", "chelsea"), ("teddy", "astronaut"), ("art", "rocket"), ("art", "astronaut")],
+)
+def test_what_a_photograph_hides_is_not_matched(name: str, photograph: str, shared: Path) -> None:
+    """It covers the middle quarter of the right view."""
+    skimage = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    pair = load_middlebury(shared / "data" / "middlebury" / name)
+    height, width = pair.right.shape[0] // 2, pair.right.shape[1] // 2
+    left, top = width // 2, height // 2
+    right = pair.right.copy()
+    right[top : top + height, left : left + width] = cv2.resize(
+        getattr(skimage, photograph)(), (width, height), interpolation=cv2.INTER_AREA
+    )
+    found = match_images(pair.left, right, DeepDetect("matching"))
+    assert found.guided
+    assert found.guidance.kind == "fundamental"
+
+    def under(points: np.ndarray) -> np.ndarray:
+        x, y = points.astype(int).T
+        there = x - pair.disparity[y, x]
+        return (there > left) & (there < left + width) & (y > top) & (y < top + height)
+
+    hidden = under(found.keypoints0.xy).sum()
+    assert hidden > 5000
+    assert under(found.points0).sum() < 0.02 * hidden
+    assert len(found) > 0.3 * (len(found.keypoints0) - hidden)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -67,3 +94,19 @@ def test_a_pair_that_moves_otherwise_is_told() -> None:
 
 def test_a_pair_alone_is_not_trusted() -> None:
     assert move_alike(np.array([[3, 3]]), np.array([[5, 3]]), (9, 9)).tolist() == [False]
+
+
+def test_few_matches_among_many_keypoints_are_dropped() -> None:
+    keypoints = every_pixel((80, 160))
+    left = keypoints[keypoints[:, 0] < 80]
+    some = keypoints[(keypoints[:, 0] >= 110) & (keypoints.sum(axis=1) % 7 == 0)]
+    kept = in_crowd(np.concatenate([left, some]), keypoints, (80, 160))
+    assert kept[: len(left)].all()
+    assert not kept[len(left) :].any()
+
+
+def test_where_all_match_seldom_seldom_is_enough() -> None:
+    keypoints = every_pixel((80, 160))
+    some = keypoints[keypoints.sum(axis=1) % 7 == 0]
+    assert in_crowd(some, keypoints, (80, 160)).all()
+    assert in_crowd(some[:0], keypoints, (80, 160)).tolist() == []

@@ -2,7 +2,8 @@
 
 The line leaves one direction open, so a partner is searched (`matchers.patchmatch`) in both
 images, and a pair stays when each is the other's best or beside it, when the pairs around it move
-alike, and when both places look alike by more than strangers do.
+alike, when both places look alike by more than strangers do, and when many of the keypoints
+around it are matched: of those under something that only one image shows a few find a partner.
 """
 
 from __future__ import annotations
@@ -30,6 +31,12 @@ ALIKE = 1.5
 
 SHARE = 0.8
 """Share of the pairs in the window that must move so."""
+
+CROWD = 31
+MATCHED = 0.35
+USUAL = 0.5
+"""Side in pixels of the window around a pair, the share of its keypoints that must be matched, and
+the share of what is usual in this image that is enough: scattered keypoints are matched less."""
 
 STRANGERS = 0.02
 """Share of pairs of places that have nothing to do with each other that would pass."""
@@ -74,6 +81,8 @@ def matches_by_epipolar_line(
     kept = ratios < 1
     rows0, rows1, ratios = rows0[kept], rows1[kept], ratios[kept]
     kept = move_alike(xy0[rows0], xy1[rows1], gray0.shape)
+    rows0, rows1, ratios = rows0[kept], rows1[kept], ratios[kept]
+    kept = in_crowd(xy0[rows0], xy0, gray0.shape)
     return rows0[kept], rows1[kept], ratios[kept]
 
 
@@ -106,6 +115,34 @@ def move_alike(points0: np.ndarray, points1: np.ndarray, shape: tuple[int, ...])
             others += np.isfinite(there[:, 0])
             alike += (np.abs(there - motion) <= ALIKE).all(1)
     return alike >= np.maximum(SHARE * others, 1)
+
+
+def in_crowd(points: np.ndarray, keypoints: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Tell which matched points lie where many keypoints are matched.
+
+    Args:
+        points: (N, 2) whole pixels of the first image that are matched, each once.
+        keypoints: (M, 2) all its keypoints.
+        shape: (H, W) of the first image.
+
+    Returns:
+        (N,) bool: at least a share `MATCHED` of the keypoints in the window is matched, or the
+        share `USUAL` of the median over all points where that is less.
+    """
+    if not len(points):
+        return np.empty(0, bool)
+    matched, everything = (np.asarray(xy).astype(np.int64) for xy in (points, keypoints))
+    counts = []
+    for xy in (matched, everything):
+        image = np.zeros(tuple(shape[:2]), np.float32)
+        image[xy[:, 1], xy[:, 0]] = 1
+        counts.append(
+            cv2.boxFilter(
+                image, -1, (CROWD, CROWD), normalize=False, borderType=cv2.BORDER_CONSTANT
+            )[matched[:, 1], matched[:, 0]]
+        )
+    shares = counts[0] / np.maximum(counts[1], 1)
+    return shares >= min(MATCHED, USUAL * float(np.median(shares)))
 
 
 def _strange_distance(first: np.ndarray, second: np.ndarray, seed: int) -> float:

@@ -19,6 +19,7 @@ from .by_epipolar_line import matches_by_epipolar_line
 from .by_homography import matches_by_homography
 from .first_pass import FirstPass, first_pass
 from .scaling import scaled_homography, shrunk
+from .straightening import affinity_between, straightened
 
 GUIDANCES = ("auto", "homography", "fundamental", "none")
 
@@ -89,7 +90,7 @@ def guided_matches(
         matrix = sharpened(gray0, gray1, first.matrix)
         rows0, rows1, ratios = matches_by_homography(gray0, gray1, xy0, xy1, matrix, seed)
     else:
-        matrix, (rows0, rows1, ratios) = _by_lines(gray0, gray1, xy0, xy1, first.matrix, seed)
+        matrix, (rows0, rows1, ratios) = _by_lines(gray0, gray1, xy0, xy1, first, seed)
     if len(rows0) < FEWEST * min(len(xy0), len(xy1)):
         return _guidance(replace(first, kind="none", points0=first.points0[:0]), None), None
     return _guidance(first, matrix), DescriptorMatches(rows0, rows1, ratios)
@@ -100,18 +101,33 @@ def _by_lines(
     gray1: np.ndarray,
     xy0: np.ndarray,
     xy1: np.ndarray,
-    fundamental: np.ndarray,
+    first: FirstPass,
     seed: int,
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Match by a fundamental matrix; take a new one from the matches while that gives more."""
-    best = fundamental, matches_by_epipolar_line(gray0, gray1, xy0, xy1, fundamental, seed)
+    """Match by a fundamental matrix; take a new one from the matches while that gives more.
+
+    The second image is turned as the first one stands where it does not stand so already.
+    """
+    affinity = affinity_between(first.points0, first.points1)
+    view = None if affinity is None else straightened(gray0, gray1, xy1, affinity)
+
+    def matched(fundamental: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if view is None:
+            return matches_by_epipolar_line(gray0, gray1, xy0, xy1, fundamental, seed)
+        rows0, rows1, ratios = matches_by_epipolar_line(
+            view.gray0, view.gray1, xy0, view.xy1, view.fundamental(fundamental), seed
+        )
+        return rows0, view.rows1[rows1], ratios
+
+    assert first.matrix is not None
+    best = first.matrix, matched(first.matrix)
     for _ in range(ROUNDS):
         rows0, rows1, _ = best[1]
         options = GeometryOptions(model="fundamental", inlier_threshold=1.0, seed=seed)
         matrix = estimate_geometry(xy0[rows0], xy1[rows1], options).matrix
         if matrix is None:
             break
-        found = matches_by_epipolar_line(gray0, gray1, xy0, xy1, matrix, seed)
+        found = matched(matrix)
         if len(found[0]) <= len(rows0) * (1 + LEAST_MORE):
             break
         best = matrix, found
