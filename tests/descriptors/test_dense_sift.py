@@ -89,6 +89,16 @@ def test_what_it_cannot_describe_is_refused(xy: list, size: float) -> None:
         dense_sift(np.zeros((9, 9), np.uint8), np.array(xy), size)
 
 
+def test_root_in_place_is_the_same(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    sift = dense_sift(gray, every_pixel(gray)[:500])
+    kept = sift.copy()
+    expected = root(sift)
+    np.testing.assert_array_equal(sift, kept)
+    assert root(sift, overwrite=True) is sift
+    np.testing.assert_array_equal(sift, expected)
+
+
 def test_root_is_the_root_of_each_share(photo: np.ndarray) -> None:
     gray = luma(photo)[:60, :60]
     sift = dense_sift(gray, every_pixel(gray))

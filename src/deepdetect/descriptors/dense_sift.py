@@ -76,20 +76,21 @@ def on_pixels(xy: np.ndarray, shape: tuple[int, ...]) -> bool:
     return bool(inside and (xy == np.rint(xy)).all())
 
 
-def root(descriptors: np.ndarray) -> np.ndarray:
+def root(descriptors: np.ndarray, overwrite: bool = False) -> np.ndarray:
     """Turn SIFT descriptors into RootSIFT (Arandjelovic, 2012).
 
     Its Euclidean distance is the Hellinger distance of SIFT.
 
     Args:
         descriptors: (N, 128) uint8.
+        overwrite: put the result where the descriptors are, which saves the time of a copy.
 
     Returns:
         (N, 128) uint8: the square roots of the L1-normalised ones times 512, at most 255.
     """
     from .dense_kernel import square_root
 
-    result = descriptors.copy()
+    result = descriptors if overwrite else descriptors.copy()
     in_threads(len(result), lambda first, last: square_root(first, last, result))
     return result
 

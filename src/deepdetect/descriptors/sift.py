@@ -59,4 +59,4 @@ def root_sift_descriptors(
     gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
 ) -> np.ndarray:
     """Compute RootSIFT, the root of L1-normalised SIFT, as whole numbers (`dense_sift.root`)."""
-    return root(sift_descriptors(gray, xy, size, angle))
+    return root(sift_descriptors(gray, xy, size, angle), overwrite=True)

@@ -89,13 +89,15 @@ def unlikeness(
     unlike = np.zeros(len(described), np.float32)
     stranger = [np.zeros(len(rows), np.float32) for rows in strange]
     for size in SIZES:
-        first = root(dense_sift(gray0, described, size))
+        first = root(dense_sift(gray0, described, size), overwrite=True)
         total = first.sum(axis=0, dtype=np.int64)  # whole: the order of the points has no say
         mean = (total / len(first) if len(first) >= FEW else 0 * total).astype(np.float32)
-        unlike += _unlike(first, root(dense_sift(warped, described, size)), mean)
+        second = root(dense_sift(warped, described, size), overwrite=True)
+        unlike += _unlike(first, second, mean)
         for values, rows, image in zip(stranger, strange, moved, strict=True):
             if len(rows):
-                values += _unlike(first[rows], root(dense_sift(image, described[rows], size)), mean)
+                moving = root(dense_sift(image, described[rows], size), overwrite=True)
+                values += _unlike(first[rows], moving, mean)
     means = [
         _together(described[rows], values, described[rows], gray0.shape)
         for rows, values in zip(strange, stranger, strict=True)

@@ -67,7 +67,10 @@ def matches_by_epipolar_line(
     nothing = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
     if len(xy0) < 2 or len(xy1) < 2:
         return nothing
-    first, second = (root(dense_sift(gray, xy, SIZE)) for gray, xy in ((gray0, xy0), (gray1, xy1)))
+    first, second = (
+        root(dense_sift(gray, xy, SIZE), overwrite=True)
+        for gray, xy in ((gray0, xy0), (gray1, xy1))
+    )
     there, distances = epipolar_neighbours(first, second, seed, (xy0, xy1), fundamental, BAND)
     back, _ = epipolar_neighbours(second, first, seed, (xy1, xy0), fundamental.T, BAND)
     # Nearly each other's best: dense keypoints have equally good ones beside them.

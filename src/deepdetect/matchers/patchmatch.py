@@ -96,8 +96,9 @@ def _search(
 
     pixels = [_pixels(xy) for xy in positions]
     # In the order of reading: a sweep builds on what it has just found.
-    order = np.lexsort((pixels[0][:, 0], pixels[0][:, 1]))
-    queries, pixels[0] = queries[order], pixels[0][order]
+    order = _order_of_reading(pixels[0])
+    if order is not None:
+        queries, pixels[0] = queries[order], pixels[0][order]
     at0, at1 = (_grid(xy) for xy in pixels)
     edges = np.arange(0, at0.shape[0] + BAND, BAND)
     bands = np.searchsorted(pixels[0][:, 1], edges)
@@ -124,10 +125,19 @@ def _search(
             )
 
         in_threads(len(bands) - 1, work)
-    found = np.empty_like(rows), np.empty(rows.shape, np.float32)
     gaps = np.sqrt(distances.astype(np.float32))
-    found[0][order], found[1][order] = rows, np.where(distances == kernel.FAR, np.inf, gaps)
-    return found[0][:, :count], found[1][:, :count]
+    gaps[distances == kernel.FAR] = np.inf
+    if order is not None:
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        rows, gaps = rows[back], gaps[back]
+    return rows[:, :count], gaps[:, :count]
+
+
+def _order_of_reading(pixels: np.ndarray) -> np.ndarray | None:
+    """Return the rows by lines and columns; None when they stand so already, as detectors do."""
+    number = pixels[:, 1].astype(np.int64) * (int(pixels[:, 0].max()) + 1) + pixels[:, 0]
+    return None if (number[1:] >= number[:-1]).all() else np.argsort(number, kind="stable")
 
 
 def _pixels(xy: np.ndarray) -> np.ndarray:
