@@ -25,7 +25,7 @@ from .workspace import Workspace
 
 PLANAR = (("wall", 6), ("graf", 3))
 STEREO = "cones"
-ROUNDS = 3
+ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False)
