@@ -10,7 +10,15 @@ from PIL import Image
 from deepdetect import DeepDetect
 from deepdetect.datasets.oxford import SCENES, load_oxford
 from deepdetect.heatmap import HeatmapOptions
-from deepdetect.weights_quality import PAIRS, THRESHOLDS, oxford_quality, oxford_steps
+from deepdetect.image import luma
+from deepdetect.labels import fuse
+from deepdetect.weights_quality import (
+    PAIRS,
+    THRESHOLDS,
+    LabelMasks,
+    oxford_quality,
+    oxford_steps,
+)
 
 SIZE = 160
 
@@ -77,6 +85,40 @@ def test_the_command_prints_weights_side_by_side(run_evaluate, folder: Path) -> 
         cells = line.split(word)[1].replace(" / ", "/").split()
         assert len(cells) == 2
         assert cells[0] == cells[1], "the same weights give the same"
+
+
+def test_the_labels_join_as_weights_without_error(run_evaluate, folder: Path) -> None:
+    text = run_evaluate("--labels", "--oxford", folder)
+    for word in ("graf 1-6", "tau 0.9", "bark"):
+        line = next(line for line in text.splitlines() if word in line)
+        cells = line.split(word)[1].replace(" / ", "/").split()
+        assert len(cells) == 2
+        assert cells[0] != cells[1]
+    densities = [line.split()[-1] for line in text.splitlines() if "tau" in line]
+    assert float(densities[0]) > 0.1
+
+
+def test_label_masks_are_those_of_the_image_as_the_network_sees_it() -> None:
+    from skimage import data
+
+    image = data.astronaut()[:480, :480]
+    truth = fuse(luma(image)).mask
+    found = LabelMasks().heatmap(image)
+    assert 0.1 < truth.mean() < 0.9
+    np.testing.assert_array_equal(found, truth)
+    wide = LabelMasks().heatmap(cv2.resize(image, (960, 480)))
+    assert wide.shape == (480, 960)
+
+
+def test_labels_without_oxford_are_refused(tmp_path: Path) -> None:
+    from click.testing import CliRunner
+
+    from deepdetect.cli import main
+
+    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--labels"])
+    assert result.exit_code == 2
+    assert "--oxford" in result.output
+    assert "Traceback" not in result.output
 
 
 def test_all_weights_see_the_images_alike(run_evaluate, tmp_path: Path) -> None:

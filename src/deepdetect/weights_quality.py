@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,10 +12,11 @@ from .datasets.oxford import find_scene
 from .datasets.planar import PlanarPair, PlanarScene
 from .detector import DeepDetect
 from .geometry.residuals import transfer_errors
-from .heatmap import HeatmapOptions
-from .image import load_image
+from .heatmap import HeatmapOptions, compute_heatmap
+from .image import load_image, luma
 from .keypoints import Keypoints, SelectionOptions, select_keypoints
-from .matching import match_images
+from .labels import fuse
+from .matching import HeatmapDetector, match_images
 from .metrics import published_repeatability
 
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
@@ -48,19 +50,45 @@ class OxfordQuality:
     matches: dict[str, int]
 
 
+class LabelMasks:
+    """What weights without any error would predict: the label of the image as they see it.
+
+    Its numbers say how much of a measure learning the labels better can give: weights that are
+    above them are so by their errors.
+
+    Example:
+        >>> image = np.zeros((480, 480, 3), np.uint8)
+        >>> image[100:200, 100:200] = 255
+        >>> sorted(set(LabelMasks().heatmap(image).ravel().tolist()))
+        [0.0, 1.0]
+    """
+
+    def heatmap(self, image: Any) -> np.ndarray:
+        """Map an image to the (H, W) float32 mask of its label at 480x480, enlarged again."""
+        return compute_heatmap(load_image(image), _label_network, HeatmapOptions(RESOLUTION))
+
+
+def _label_network(planes: np.ndarray) -> np.ndarray:
+    """Do what the network is trained for: (1, 3, H, W) RGB in [0, 1] to (1, 1, H, W)."""
+    rgb = np.rint(planes[0].transpose(1, 2, 0) * 255).astype(np.uint8)
+    return fuse(luma(rgb)).mask[None, None].astype(np.float32)
+
+
 def oxford_quality(
-    detector: DeepDetect,
+    detector: DeepDetect | LabelMasks,
     scenes: list[PlanarScene],
     done: Callable[[int], object] = lambda _: None,
 ) -> OxfordQuality:
-    """Measure weights on the Oxford scenes.
+    """Measure weights, or the labels themselves, on the Oxford scenes.
 
     Args:
         detector: its weights are measured; its own resolution is not used.
         scenes: of `load_oxford`.
         done: called with 1 after each of `oxford_steps` steps.
     """
-    squashing = detector.configured(HeatmapOptions(RESOLUTION))
+    squashing: HeatmapDetector = detector
+    if isinstance(detector, DeepDetect):
+        squashing = detector.configured(HeatmapOptions(RESOLUTION))
     densities: dict[float, list[float]] = {threshold: [] for threshold in THRESHOLDS}
     repeatability = {}
     for scene in scenes:
@@ -75,7 +103,7 @@ def oxford_quality(
     correct, matches = {}, {}
     for name, number in PAIRS:
         pair = list(find_scene(scenes, name).pairs())[number - 2]
-        correct[pair.name], matches[pair.name] = count_correct(detector, pair)
+        correct[pair.name], matches[pair.name] = count_correct(squashing, pair)
         done(1)
     density = {threshold: float(np.mean(found)) for threshold, found in densities.items()}
     return OxfordQuality(density, repeatability, correct, matches)
@@ -94,8 +122,12 @@ def _scene_repeatability(scene: PlanarScene, points: list[Keypoints]) -> float:
     return float(np.mean(values))
 
 
-def count_correct(detector: DeepDetect, pair: PlanarPair) -> tuple[int, int]:
+def count_correct(detector: HeatmapDetector, pair: PlanarPair) -> tuple[int, int]:
     """Match a pair the paper's way, but with the channels in the order of the training.
+
+    Args:
+        detector: shows the network squashed images.
+        pair: the images and their homography.
 
     Returns:
         The number of correct matches, and of all; means of `SEEDS` seeds, rounded.
@@ -107,7 +139,7 @@ def count_correct(detector: DeepDetect, pair: PlanarPair) -> tuple[int, int]:
             pair.second,
             detector,
             preset="published",
-            heatmap=HeatmapOptions(RESOLUTION),
+            heatmap=None,
             seed=seed,
         )
         errors = transfer_errors(found.points0, found.points1, pair.homography)

@@ -9,7 +9,12 @@ import pytest
 from deepdetect import DeepDetect
 from deepdetect.benchmark import BenchmarkOptions
 from deepdetect.benchmark.oxford import chosen_pairs
-from deepdetect.benchmark.paper_numbers import SIFT_LOW_POINTS, STEREO_POINTS
+from deepdetect.benchmark.paper_numbers import (
+    NOTEBOOK_KEYPOINTS,
+    NOTEBOOK_MATCHES,
+    SIFT_LOW_POINTS,
+    STEREO_POINTS,
+)
 from deepdetect.benchmark.planar_paper import density_table, matches_table, repeatability_table
 from deepdetect.benchmark.published_stereo import (
     published_points,
@@ -21,7 +26,8 @@ from deepdetect.benchmark.workspace import Workspace
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.planar import PlanarScene
 from deepdetect.heatmap import HeatmapOptions
-from deepdetect.methods.sift import low_sift
+from deepdetect.methods import Method
+from deepdetect.methods.sift import SIFT_LOW, low_sift
 from deepdetect.weights_quality import PAIRS
 
 DENSITY = {0.5: 0.525, 0.7: 0.486, 0.8: 0.462, 0.9: 0.431}
@@ -75,6 +81,31 @@ def test_matches(
     table = matches_table(workspace, [options.own()], pairs, "matches")
     found = dict(zip([pair.name for pair in pairs], table.rows[0][1::2], strict=True))
     assert found == pytest.approx(MATCHES, rel=0.05)
+
+
+def _keypoints_of_wall(workspace: Workspace, method: Method, shared: Path) -> tuple[int, ...]:
+    scenes = load_oxford(shared / "data" / "oxford")
+    (pair,) = chosen_pairs(scenes, [("wall", 6)])
+    images = (pair.first, pair.second)
+    return tuple(len(workspace.keypoints(method, image).features) for image in images)
+
+
+def test_keypoints_of_wall(workspace: Workspace, weights: DeepDetect, shared: Path) -> None:
+    """By the network, whose float32 sums differ from those of the authors' GPU."""
+    own = BenchmarkOptions(weights, channels="bgr").own()
+    found = _keypoints_of_wall(workspace, own, shared)
+    assert found == pytest.approx(NOTEBOOK_KEYPOINTS["DeepDetect"], rel=1e-4)
+
+
+def test_sift_low_on_wall_as_in_the_notebook(workspace: Workspace, shared: Path) -> None:
+    found = _keypoints_of_wall(workspace, SIFT_LOW, shared)
+    assert found == NOTEBOOK_KEYPOINTS["SIFT, low settings"]
+    pairs = chosen_pairs(load_oxford(shared / "data" / "oxford"), [("wall", 6)])
+    table = matches_table(workspace, [SIFT_LOW], pairs, "matches")
+    correct, precision = table.rows[0][1:]
+    expected, of_all = NOTEBOOK_MATCHES["SIFT, low settings"]["wall 1-6"]
+    assert correct == pytest.approx(expected, rel=0.15)
+    assert correct / precision == pytest.approx(of_all, rel=0.001)
 
 
 def test_voxels_of_cones(shared: Path) -> None:

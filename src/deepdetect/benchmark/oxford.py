@@ -12,7 +12,7 @@ from . import paper_figures, planar_paper
 from .charts import bar_chart
 from .guided import guided_section, guided_steps
 from .options import BenchmarkOptions
-from .paper_numbers import DENSITY, MATCHES, REPEATABILITY, SIX_SCENES
+from .paper_numbers import DENSITY, MATCHES, NOTEBOOK_MATCHES, REPEATABILITY, SIX_SCENES
 from .planar_sections import standard_sections, standard_steps
 from .report import Cell, Figure, Section, Table
 from .workspace import Workspace
@@ -122,12 +122,12 @@ def _paper_section(
     for pair in pairs:
         counts += [MATCHES.get(pair.name), None]
     tables = (
-        _with_row(density, (PAPER, DENSITY, *blank)),
-        _with_row(
-            _with_row(repeatability, (PAPER, REPEATABILITY, *blank)),
-            (PAPER_SIX, SIX_SCENES, *blank),
+        _with_rows(density, [(PAPER, DENSITY, *blank)]),
+        _with_rows(
+            repeatability,
+            [(PAPER, REPEATABILITY, *blank), (PAPER_SIX, SIX_SCENES, *blank)],
         ),
-        _with_row(matches, (PAPER, *counts)),
+        _with_rows(matches, [(PAPER, *counts), *_notebook_rows(pairs)]),
     )
     return Section(
         "Oxford, the paper's protocol",
@@ -135,8 +135,9 @@ def _paper_section(
             "Tables I, II and the Oxford half of III, Figures 1, 2, 4, 5 and 6. "
             "DeepDetect sees images squashed to "
             f"480x480 as {options.channels.upper()}; the classical detectors see them as they are. "
-            "The paper's numbers stand in rows of their own; those of the classical detectors are "
-            "not known to us, and are dashes.",
+            "The paper's numbers stand in rows of their own, and so do those that its authors' "
+            "public notebooks print; the paper's own of the classical detectors are not known to "
+            "us, and are dashes.",
         ),
         tables,
         (
@@ -146,8 +147,19 @@ def _paper_section(
     )
 
 
-def _with_row(table: Table, row: tuple[Cell, ...]) -> Table:
-    return Table(table.key, table.title, table.columns, (*table.rows, row), table.note)
+def _notebook_rows(pairs: Sequence[PlanarPair]) -> list[tuple[Cell, ...]]:
+    rows = []
+    for title, known in NOTEBOOK_MATCHES.items():
+        cells: list[Cell] = []
+        for pair in pairs:
+            found = known.get(pair.name)
+            cells += [None, None] if found is None else [found[0], found[0] / found[1]]
+        rows.append((f"{title}, in the authors' notebook", *cells))
+    return rows
+
+
+def _with_rows(table: Table, rows: Sequence[tuple[Cell, ...]]) -> Table:
+    return Table(table.key, table.title, table.columns, (*table.rows, *rows), table.note)
 
 
 def _repeatability_figure(table: Table) -> Figure:

@@ -16,6 +16,18 @@ MATCHES: dict[str, int] = {
 }
 """Table II: correct matches of DeepDetect at a threshold of 0.5."""
 
+NOTEBOOK_MATCHES: dict[str, dict[str, tuple[int, int]]] = {
+    "DeepDetect": {"wall 1-6": (4_770, 479_562)},
+    "SIFT, low settings": {"wall 1-6": (52, 163_510)},
+}
+"""Correct matches, and all, that the authors' public notebooks print: Table II's protocol."""
+
+NOTEBOOK_KEYPOINTS: dict[str, tuple[int, int]] = {
+    "DeepDetect": (605_433, 477_060),
+    "SIFT, low settings": (184_084, 118_628),
+}
+"""The keypoints of both images of wall 1-6 that they print."""
+
 DENSITY = 0.5143
 """Table I: mean density of DeepDetect at a threshold of 0.5, on Oxford."""
 

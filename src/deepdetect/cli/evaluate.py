@@ -37,6 +37,11 @@ WIDTH = 12
     help="Measure density, repeatability and correct matches on the eight Oxford scenes too.",
 )
 @click.option(
+    "--labels",
+    is_flag=True,
+    help="With --oxford: measure the labels too, which weights without error would give.",
+)
+@click.option(
     "--scale",
     "scales",
     type=float,
@@ -49,6 +54,7 @@ def evaluate(
     samples: Path,
     against: tuple[str, ...],
     oxford: Path | None,
+    labels: bool,
     scales: tuple[float, ...],
     as_json: bool,
     **values: Any,
@@ -58,7 +64,8 @@ def evaluate(
     Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), apart
     for normal and for low-visibility images; with --oxford also what the paper's protocol
     gives: images squashed to 480x480, FLANN (mean of three seeds), ratio 0.99, correct under
-    1 px. With --scale, whether the quality holds on larger and smaller images.
+    1 px; with --labels also what the labels give there. With --scale, whether the quality
+    holds on larger and smaller images.
 
     \b
     deepdetect evaluate samples/
@@ -66,16 +73,19 @@ def evaluate(
     deepdetect evaluate samples/ --scale 0.5 --scale 1 --scale 2
     """
     from ..datasets.oxford import load_oxford
+    from ..errors import OptionError
     from ..mask_scores import score_samples
     from ..scale_quality import check_scales
 
     check_scales(scales)
+    if labels and oxford is None:
+        raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")
     scenes = load_oxford(oxford) if oxford is not None else []
     weights = [values["weights"], *against]
     detectors = [make_detector({**values, "weights": path}) for path in weights]
     scores = [score_samples(each.heatmap, samples, quiet=as_json) for each in detectors]
     at_scales = _measure_scales(detectors, samples, scales, as_json) if scales else []
-    on_oxford = _measure_oxford(detectors, scenes, as_json) if scenes else []
+    on_oxford = _measure_oxford(detectors, labels, scenes, as_json) if scenes else []
     if as_json:
         results = []
         for k, (detector, score) in enumerate(zip(detectors, scores, strict=True)):
@@ -89,7 +99,10 @@ def evaluate(
             if on_oxford:
                 result["oxford"] = asdict(on_oxford[k])
             results.append(result)
-        print_json({**results[0], "against": results[1:]} if against else results[0])
+        further: dict[str, Any] = {"against": results[1:]} if against else {}
+        if labels:
+            further["labels"] = {"oxford": asdict(on_oxford[-1])}
+        print_json({**results[0], **further})
         return
     names = _short_names([detector.weights for detector in detectors])
     _print_scores(names, scores)
@@ -98,18 +111,18 @@ def evaluate(
         _print_scales(names, at_scales)
     if on_oxford:
         click.echo()
-        _print_oxford(names, on_oxford)
+        _print_oxford([*names, "labels"] if labels else names, on_oxford)
 
 
 def _measure_oxford(
-    detectors: Sequence[DeepDetect], scenes: list[PlanarScene], quiet: bool
+    detectors: Sequence[DeepDetect], labels: bool, scenes: list[PlanarScene], quiet: bool
 ) -> list[OxfordQuality]:
     from ..progress import progress
-    from ..weights_quality import oxford_quality, oxford_steps
+    from ..weights_quality import LabelMasks, oxford_quality, oxford_steps
 
-    total = oxford_steps(scenes) * len(detectors)
-    with progress(total, "Oxford", "step", quiet) as bar:
-        return [oxford_quality(detector, scenes, bar.update) for detector in detectors]
+    rows = [*detectors, LabelMasks()] if labels else detectors
+    with progress(oxford_steps(scenes) * len(rows), "Oxford", "step", quiet) as bar:
+        return [oxford_quality(row, scenes, bar.update) for row in rows]
 
 
 def _measure_scales(
