@@ -36,3 +36,16 @@ def test_a_marked_pixel_counts_by_its_weight(weight: float) -> None:
     for step in range(1, 300):
         learner.learn(rgb, masks, 0.05 * (1 - step / 300), step)
     assert learner.network.logit.item() == pytest.approx(math.log(weight / 3), abs=0.01)
+
+
+def test_dark_images_have_a_weight_of_their_own() -> None:
+    """Half of the crops are dark: the first loss is the mean of both kinds."""
+    learner = Learner(Constant(), PLAIN, marked_weight=3.0, dark_marked_weight=1.0)
+    rgb = np.zeros((2, 16, 16, 3), np.uint8)
+    rgb[:, 8:] = np.array([200, 40], np.uint8)[:, None, None, None]  # grey levels spanned
+    masks = np.zeros((2, 16, 16), bool)
+    masks[0, :8] = True
+    only_in_normal = learner.learn(rgb, masks, 0.0, 0)
+    assert only_in_normal == pytest.approx(math.log(2) * (2.0 + 1.0) / 2, rel=1e-5)
+    only_in_dark = learner.learn(rgb, masks[::-1].copy(), 0.0, 1)
+    assert only_in_dark == pytest.approx(math.log(2), rel=1e-5)

@@ -32,6 +32,7 @@ def test_bad_stages_are_refused(text: str) -> None:
         {"variations": -1},
         {"marked_weight": 0.0},
         {"marked_weight": float("nan")},
+        {"dark_marked_weight": 0.0},
         {"color_changes": 1.5},
         {"validations": 0},
         {"learning_rate": -1.0},

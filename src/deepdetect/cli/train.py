@@ -91,6 +91,11 @@ if TYPE_CHECKING:
     type=float,
     help="Weight of marked pixels in the loss: above 1 gives more keypoints.  [default: 1]",
 )
+@click.option(
+    "--dark-marked-weight",
+    type=float,
+    help="The same in crops of low visibility.  [default: that of all others]",
+)
 @detectors_option
 @label_settings_option
 @click.option("--validations", type=int, help="How often the loss is validated.  [default: 12]")

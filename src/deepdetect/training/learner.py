@@ -10,6 +10,8 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ..errors import OptionError
+from ..image import luma
+from ..labels import visibility_of
 from .batch_norm import freeze_batch_norm
 from .device import DeviceOptions, Engine
 from .optimizers import make_optimizers
@@ -24,6 +26,7 @@ class Learner:
         optimizer: name of the optimiser.
         frozen_batch_norm: keep the statistics of the batch normalisation as they are.
         marked_weight: weight of a marked pixel in the loss; others have 1.
+        dark_marked_weight: the same in images of low visibility; None: as in all others.
     """
 
     def __init__(
@@ -33,13 +36,14 @@ class Learner:
         optimizer: str = "adam",
         frozen_batch_norm: bool = False,
         marked_weight: float = 1.0,
+        dark_marked_weight: float | None = None,
     ) -> None:
         self.frozen_batch_norm = frozen_batch_norm
         self.engine = Engine(network, device)
         self.network = self.engine.network
         self.optimizers = make_optimizers(optimizer, self.network, self.engine.share)
-        weight = np.full(1, marked_weight, np.float32)
-        self.weight = None if marked_weight == 1 else self.engine.place_tensor(weight)
+        dark = marked_weight if dark_marked_weight is None else dark_marked_weight
+        self.marked_weights = {"normal": marked_weight, "low": dark}
 
     def learn(self, rgb: np.ndarray, masks: np.ndarray, rate: float, step: int) -> float:
         """Make one optimiser step.
@@ -66,7 +70,8 @@ class Learner:
         images = self.engine.images(rgb)
         truth = self.engine.place_tensor(masks)[:, None].float()
         logits = self.engine.logits(images)
-        loss = binary_cross_entropy_with_logits(logits, truth, pos_weight=self.weight)
+        weight = self._weight_of_marked(rgb)
+        loss = binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
         self.engine.backward(loss)
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         value = self.engine.mean_over_processes(loss.detach()).item()
@@ -79,3 +84,13 @@ class Learner:
         for optimizer in self.optimizers:
             optimizer.step()
         return value
+
+    def _weight_of_marked(self, rgb: np.ndarray) -> torch.Tensor | None:
+        """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
+        normal, dark = self.marked_weights["normal"], self.marked_weights["low"]
+        if normal == dark:
+            weights = np.full(1, normal, np.float32)
+        else:
+            found = [self.marked_weights[visibility_of(luma(image))] for image in rgb]
+            weights = np.array(found, np.float32)[:, None, None, None]
+        return None if normal == dark == 1 else self.engine.place_tensor(weights)

@@ -97,6 +97,7 @@ class TrainingOptions:
         marked_weight: weight of a marked pixel in the loss. With 1, where the network is not sure
             it marks too little, since most pixels are not marked: the keypoints above a
             probability of 0.5 are fewer than the labels'. Above 1 there are more of them.
+        dark_marked_weight: the same in crops of low visibility; None: as in all others.
         detectors: label detectors to fuse.
         label_changes: settings of label detectors that differ from the paper's.
         validations: how often the validation loss is taken.
@@ -125,6 +126,7 @@ class TrainingOptions:
     warm_up: int = 0
     frozen_batch_norm: bool | None = None
     marked_weight: float = 1.0
+    dark_marked_weight: float | None = None
     detectors: tuple[str, ...] = DETECTOR_NAMES
     label_changes: tuple[SettingChange, ...] = ()
     validations: int = 12
@@ -163,10 +165,11 @@ class TrainingOptions:
             raise OptionError(f"the variations must not be negative, not {self.variations}")
         if self.dark_variants < 1 or self.validations < 1:
             raise OptionError("dark variants and validations must be at least 1")
-        if not 0.1 <= self.marked_weight <= 10:
-            raise OptionError(
-                f"the weight of marked pixels must lie in [0.1, 10], not {self.marked_weight}"
-            )
+        for weight in (self.marked_weight, self.dark_marked_weight):
+            if weight is not None and not 0.1 <= weight <= 10:
+                raise OptionError(
+                    f"the weight of marked pixels must lie in [0.1, 10], not {weight}"
+                )
         if self.warm_up < 0:
             raise OptionError(f"the warm-up must not be negative, not {self.warm_up} steps")
         if not 0 <= self.seed < 2**31:

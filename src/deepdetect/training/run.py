@@ -92,6 +92,7 @@ class Run:
             options.optimizer,
             bool(options.frozen_batch_norm),
             options.marked_weight,
+            options.dark_marked_weight,
         )
         self.engine, self.network = self.learner.engine, self.learner.network
         self.place = self.engine.place
