@@ -41,6 +41,7 @@ class Server(http.server.ThreadingHTTPServer):
     break_after: int | None = None
     knows_ranges = True
     status: int | None = None
+    stated: str | None = None
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
@@ -61,6 +62,13 @@ class Handler(http.server.BaseHTTPRequestHandler):
         self.server.ranges.append(asked)
         if self.server.status is not None:
             self.send_error(self.server.status)
+            return
+        if self.path.startswith("/resolve/"):  # as a hub that keeps large files elsewhere
+            self.send_response(302)
+            self.send_header("X-Linked-Etag", f'"{self.server.stated}"')
+            self.send_header("Location", self.path.removeprefix("/resolve"))
+            self.send_header("Content-Length", "0")
+            self.end_headers()
             return
         first = 0
         content = self.server.contents.get(self.path, self.server.content)
@@ -345,6 +353,35 @@ def test_a_damaged_tar_is_refused_without_a_checksum(
     with pytest.raises(DeepDetectError, match="no archive"):
         get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")
     assert not (tmp_path / "tiny").exists()
+
+
+@pytest.mark.parametrize("broken_off", [False, True])
+def test_the_checksum_that_a_host_states_is_checked(
+    dataset: RemoteDataset, server: Server, tmp_path: Path, broken_off: bool
+) -> None:
+    url = server.url.replace("/train.zip", "/resolve/train.zip")
+    unknown = with_file(dataset, urls=(url,), checksum=None)
+    server.stated = hashlib.sha256(server.content).hexdigest()
+    if broken_off:
+        server.break_after = 300_000
+        with pytest.raises(DeepDetectError, match="go on where it stopped"):
+            get_dataset(unknown, tmp_path / "tiny")
+        server.break_after = None
+    folder = get_dataset(unknown, tmp_path / "tiny")
+    assert unpacked(folder) == NAMES
+    if broken_off:
+        assert server.ranges[-1] is not None, "it went on, and the whole was checked"
+
+
+def test_bytes_that_the_host_did_not_state_are_refused(
+    dataset: RemoteDataset, server: Server, tmp_path: Path
+) -> None:
+    url = server.url.replace("/train.zip", "/resolve/train.zip")
+    server.stated = hashlib.sha256(b"something else").hexdigest()
+    with pytest.raises(DeepDetectError, match="which the host states") as refused:
+        get_dataset(with_file(dataset, urls=(url,), checksum=None), tmp_path / "tiny")
+    assert "\n" not in str(refused.value)
+    assert not any(tmp_path.iterdir()), "nothing stays"
 
 
 def test_what_is_no_archive_is_refused(

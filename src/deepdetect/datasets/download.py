@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +26,8 @@ class RemoteFile:
     Attributes:
         urls: its official host first, then mirrors; the next one is asked when one fails.
         size: bytes, roughly.
-        checksum: "md5:..." or "sha256:..."; None where only the contents of the data set tell.
+        checksum: "md5:..." or "sha256:..."; None where none is known: then the SHA-256 that the
+            host itself states is checked, if it does, and the contents of the data set.
         into: in the data set, the folder that an archive is unpacked into, or the path of a
             single file.
         inside: folder of the archive whose contents are taken.
@@ -113,11 +115,15 @@ def _download_from(url: str, file: RemoteFile, path: Path, quiet: bool) -> None:
         ) from None
     except ValueError:  # pooch's word for a wrong checksum
         part.unlink(missing_ok=True)
-        raise DeepDetectError(
-            f"{url} has another checksum than {file.checksum}: "
-            "it has changed or was damaged on the way; try again later"
-        ) from None
+        raise _wrong_bytes(url, str(file.checksum)) from None
     part.unlink(missing_ok=True)
+
+
+def _wrong_bytes(url: str, checksum: str) -> DeepDetectError:
+    return DeepDetectError(
+        f"{url} has another checksum than {checksum}: "
+        "it has changed or was damaged on the way; try again later"
+    )
 
 
 def _resuming(part: Path, file: RemoteFile, quiet: bool) -> Callable[..., None]:
@@ -150,9 +156,26 @@ def _resuming(part: Path, file: RemoteFile, quiet: bool) -> Callable[..., None]:
                     bar.update(len(chunk))
         if length and part.stat().st_size < total:
             raise requests.ConnectionError("the connection broke off")
+        if file.checksum is None:
+            _check_stated(url, response, part)
         _second_name(part, Path(output))
 
     return fetch
+
+
+def _check_stated(url: str, response: Any, part: Path) -> None:
+    """Check a file against the SHA-256 that its host states on the way to it.
+
+    Hugging Face's hub names that of a large file in a header of its redirection (`X-Linked-Etag`
+    in huggingface_hub's file_download.py).
+    """
+    import pooch
+
+    for answer in (*response.history, response):
+        stated = answer.headers.get("X-Linked-Etag", "").strip('"').lower()
+        if re.fullmatch("[0-9a-f]{64}", stated) and pooch.file_hash(part, "sha256") != stated:
+            part.unlink()
+            raise _wrong_bytes(url, f"sha256:{stated}, which the host states")
 
 
 def _second_name(part: Path, output: Path) -> None:
