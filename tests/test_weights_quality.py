@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect
+from deepdetect import DeepDetect, weights_quality
 from deepdetect.datasets.oxford import SCENES, load_oxford
 from deepdetect.heatmap import HeatmapOptions
 from deepdetect.image import luma
@@ -119,6 +121,30 @@ def test_labels_without_oxford_are_refused(tmp_path: Path) -> None:
     assert result.exit_code == 2
     assert "--oxford" in result.output
     assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(("correct", "seeds"), [(1000, 3), (999, 16), (0, 16)])
+def test_few_matches_are_counted_with_many_seeds(
+    correct: int, seeds: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twenty further matches are wrong in each seed."""
+    tried: list[int] = []
+
+    def matched(*_: object, seed: int, **__: object) -> SimpleNamespace:
+        tried.append(seed)
+        points = np.zeros((correct + 20, 2), np.float32)
+        ends = points.copy()
+        ends[correct:] = 50
+        return Found(points0=points, points1=ends)
+
+    class Found(SimpleNamespace):
+        def __len__(self) -> int:
+            return len(self.points0)
+
+    monkeypatch.setattr(weights_quality, "match_images", matched)
+    pair = replace(next(iter(load_oxford(folder)[0].pairs())), homography=np.eye(3))
+    assert weights_quality.count_correct(LabelMasks(), pair) == (correct, correct + 20)
+    assert tried == list(range(seeds))
 
 
 def test_all_weights_see_the_images_alike(run_evaluate, tmp_path: Path) -> None:
