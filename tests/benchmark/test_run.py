@@ -21,6 +21,7 @@ from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError
 from deepdetect.benchmark import BENCHMARKS, PROTOCOLS, BenchmarkOptions, Report, run_benchmarks
 from deepdetect.benchmark import run as run_module
 from deepdetect.benchmark.descriptor_speed import descriptor_steps
+from deepdetect.benchmark.paper_numbers import NOTEBOOK_MATCHES
 from deepdetect.benchmark.whole_pairs import whole_pair_steps
 from deepdetect.benchmark.workspace import Workspace
 from deepdetect.methods import CLASSICAL, Features, Method
@@ -138,7 +139,15 @@ def test_all_rows_and_columns_are_there(runs: Runs) -> None:
         assert list(table(runs.first, key)) == rows + more
         assert list(table(runs.first, key)["FAST"])[1:] == ["mean", *SCENES]
     matches = table(runs.first, "oxford_matches")
-    assert list(matches) == [row for row in rows if row[-3:] not in ("AST", "0.7", "0.8", "0.9")]
+    expected = [row for row in rows if row[-3:] not in ("AST", "0.7", "0.8", "0.9")]
+    printed = {f"{title}, in the authors' notebook": of for title, of in NOTEBOOK_MATCHES.items()}
+    assert list(matches) == [*expected, *printed]
+    for title, known in printed.items():
+        correct, of_all = known["wall 1-6"]
+        cells = matches[title]
+        assert cells["wall 1-6"] == correct
+        assert cells["wall 1-6, precision"] == pytest.approx(correct / of_all)
+        assert cells["graf 1-6"] is None
     columns = [name for pair in PAIRS for name in (pair, f"{pair}, precision")]
     assert list(matches["ORB, low settings"])[1:] == columns
     assert runs.first.left_out == ()
