@@ -88,9 +88,9 @@ class Learner:
     def _weight_of_marked(self, rgb: np.ndarray) -> torch.Tensor | None:
         """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
         normal, dark = self.marked_weights["normal"], self.marked_weights["low"]
-        if normal == dark:
-            weights = np.full(1, normal, np.float32)
-        else:
-            found = [self.marked_weights[visibility_of(luma(image))] for image in rgb]
-            weights = np.array(found, np.float32)[:, None, None, None]
-        return None if normal == dark == 1 else self.engine.place_tensor(weights)
+        if normal == dark == 1:
+            return None
+        if normal == dark:  # the images need not be looked at
+            return self.engine.place_tensor(np.full(1, normal, np.float32))
+        found = [self.marked_weights[visibility_of(luma(image))] for image in rgb]
+        return self.engine.place_tensor(np.array(found, np.float32)[:, None, None, None])
