@@ -215,6 +215,35 @@ def test_frozen_batch_norm_keeps_the_statistics_and_trains_the_rest(
     assert "frozen_batch_norm" in again.stderr
 
 
+@pytest.mark.parametrize("batch_norm", ["--frozen-batch-norm", "--batch-norm"])
+def test_only_the_decoder_may_be_trained(
+    photographs: Path, tmp_path: Path, batch_norm: str
+) -> None:
+    arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels"), batch_norm]
+    arguments += ["--start", "matching", "--layers", "decoder", "--optimizer", "soap"]
+    subprocess.run(arguments, check=True, capture_output=True)
+    before = load_network(bundled_weights("matching", ".safetensors")).state_dict()
+    after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
+    kept = {name for name in before if torch.equal(before[name], after[name])}
+    encoder = {name for name in before if name.startswith("encoder.")}
+    assert encoder <= kept
+    decoder = {name for name in before if name.endswith("weight")} - encoder
+    assert len(decoder) > 10
+    assert not decoder & kept
+    subprocess.run(arguments, check=True, capture_output=True)  # its checkpoint is read
+
+
+def test_training_the_decoder_alone_needs_trained_weights(
+    photographs: Path, tmp_path: Path
+) -> None:
+    arguments = command(photographs, tmp_path / "run", tmp_path / "labels")
+    for layers, hint in (("decoder", "--start"), ("decodr", "decoder")):
+        done = subprocess.run([*arguments, "--layers", layers], capture_output=True, text=True)
+        assert done.returncode == 2
+        assert hint in done.stderr
+        assert "Traceback" not in done.stderr
+
+
 def test_frozen_batch_norm_needs_trained_weights(photographs: Path, tmp_path: Path) -> None:
     arguments = command(photographs, tmp_path / "run", tmp_path / "labels")
     done = subprocess.run([*arguments, "--frozen-batch-norm"], capture_output=True, text=True)

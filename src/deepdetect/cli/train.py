@@ -96,6 +96,10 @@ if TYPE_CHECKING:
     type=float,
     help="The same in crops of low visibility.  [default: that of all others]",
 )
+@click.option(
+    "--layers",
+    help="all, or decoder: the encoder stays as it is.  [default: all]",
+)
 @detectors_option
 @label_settings_option
 @click.option("--validations", type=int, help="How often the loss is validated.  [default: 12]")

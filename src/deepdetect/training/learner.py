@@ -27,6 +27,7 @@ class Learner:
         frozen_batch_norm: keep the statistics of the batch normalisation as they are.
         marked_weight: weight of a marked pixel in the loss; others have 1.
         dark_marked_weight: the same in images of low visibility; None: as in all others.
+        layers: "all", or "decoder": the network's `encoder` stays as it is.
     """
 
     def __init__(
@@ -37,8 +38,12 @@ class Learner:
         frozen_batch_norm: bool = False,
         marked_weight: float = 1.0,
         dark_marked_weight: float | None = None,
+        layers: str = "all",
     ) -> None:
         self.frozen_batch_norm = frozen_batch_norm
+        self.frozen_encoder = layers == "decoder"
+        if self.frozen_encoder:  # before it is compiled, which then leaves its gradients out
+            network.encoder.requires_grad_(False)
         self.engine = Engine(network, device)
         self.network = self.engine.network
         self.optimizers = make_optimizers(optimizer, self.network, self.engine.share)
@@ -63,6 +68,8 @@ class Learner:
         self.network.train()
         if self.frozen_batch_norm:
             freeze_batch_norm(self.network)
+        elif self.frozen_encoder:
+            freeze_batch_norm(self.network.encoder)
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
             for group in optimizer.param_groups:

@@ -18,7 +18,7 @@ def adam(network: nn.Module, share: Share) -> list[Optimizer]:
     """Adam for everything."""
     import torch
 
-    return [torch.optim.Adam(network.parameters(), fused=True)]
+    return [torch.optim.Adam(_trained(network), fused=True)]
 
 
 def soap(network: nn.Module, share: Share) -> list[Optimizer]:
@@ -27,9 +27,13 @@ def soap(network: nn.Module, share: Share) -> list[Optimizer]:
 
     from .soap import Soap
 
-    kernels = [parameter for parameter in network.parameters() if parameter.ndim > 1]
-    vectors = [parameter for parameter in network.parameters() if parameter.ndim <= 1]
+    kernels = [parameter for parameter in _trained(network) if parameter.ndim > 1]
+    vectors = [parameter for parameter in _trained(network) if parameter.ndim <= 1]
     return [Soap(kernels, share=share), torch.optim.Adam(vectors, fused=True)]
+
+
+def _trained(network: nn.Module) -> list[nn.Parameter]:
+    return [parameter for parameter in network.parameters() if parameter.requires_grad]
 
 
 OPTIMIZERS: dict[str, Callable[[nn.Module, Share], list[Optimizer]]] = {"adam": adam, "soap": soap}
@@ -38,7 +42,7 @@ OPTIMIZERS: dict[str, Callable[[nn.Module, Share], list[Optimizer]]] = {"adam": 
 def make_optimizers(
     name: str, network: nn.Module, share: Share = lambda tensor: None
 ) -> list[Optimizer]:
-    """Make the optimisers that together move all parameters of a network.
+    """Make the optimisers that together move a network's parameters, but those held still.
 
     Args:
         name: as in `OPTIMIZERS`.

@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass, field
+from typing import Literal
 
-from ..errors import OptionError, look_up
+from ..errors import OptionError, look_up, unknown_name
 from ..labels import DETECTOR_NAMES, LabelOptions, SettingChange
 from .darkening import DarkeningRange
 from .optimizers import OPTIMIZERS
+
+LAYERS = ("all", "decoder")
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,9 @@ class TrainingOptions:
             it marks too little, since most pixels are not marked: the keypoints above a
             probability of 0.5 are fewer than the labels'. Above 1 there are more of them.
         dark_marked_weight: the same in crops of low visibility; None: as in all others.
+        layers: "all", or "decoder": the encoder, nearly all of the weights, stays as it is, a
+            step takes a third of the time, and what the start weights know is kept. For few
+            photographs, and for changes of how many pixels are marked.
         detectors: label detectors to fuse.
         label_changes: settings of label detectors that differ from the paper's.
         validations: how often the validation loss is taken.
@@ -127,6 +133,7 @@ class TrainingOptions:
     frozen_batch_norm: bool | None = None
     marked_weight: float = 1.0
     dark_marked_weight: float | None = None
+    layers: Literal["all", "decoder"] = "all"
     detectors: tuple[str, ...] = DETECTOR_NAMES
     label_changes: tuple[SettingChange, ...] = ()
     validations: int = 12
@@ -135,6 +142,8 @@ class TrainingOptions:
     def __post_init__(self) -> None:
         object.__setattr__(self, "detectors", LabelOptions(self.detectors).detectors)
         look_up("optimizer", self.optimizer, OPTIMIZERS)
+        if self.layers not in LAYERS:
+            raise unknown_name("layers", self.layers, LAYERS)
         if not self.stages:
             raise OptionError("a training run needs at least one stage")
         if not self.short_sides or min(self.short_sides) < 16:

@@ -58,7 +58,7 @@ def train(
     Raises:
         ImageError: a folder is missing or empty, or a photograph cannot be read.
         OptionError: the folder holds a run with other options, or the batch normalisation
-            of random weights is to be frozen.
+            or the encoder of random weights is to stay as it is.
         WeightsError: the weights to start from are missing or do not fit.
 
     Example:
@@ -129,6 +129,11 @@ def _start(
         raise OptionError(
             "random weights have no batch statistics to keep: name trained ones with --start, "
             "or leave out --frozen-batch-norm"
+        )
+    if options.layers != "all":
+        raise OptionError(
+            "an encoder of random weights would stay random: name trained weights with --start, "
+            "or leave out --layers"
         )
     torch.manual_seed(options.seed)
     return dataclasses.replace(options, frozen_batch_norm=False), ESPNet()
