@@ -38,6 +38,25 @@ def test_a_marked_pixel_counts_by_its_weight(weight: float) -> None:
     assert learner.network.logit.item() == pytest.approx(math.log(weight / 3), abs=0.01)
 
 
+@pytest.mark.parametrize(("marked_rows", "weight"), [(4, 3.0), (4, 1.5), (1, 3.0), (12, 2.0)])
+def test_only_doubtful_marks_may_count_more(marked_rows: int, weight: float) -> None:
+    """The least loss is where odds are those of the marked pixels times the weight *there*."""
+    learner = Learner(Constant(), PLAIN, marked_weight=weight, doubtful_only=True)
+    rgb = np.zeros((2, 16, 16, 3), np.uint8)
+    masks = np.zeros((2, 16, 16), bool)
+    masks[:, :marked_rows] = True
+    share = marked_rows / 16
+    first = learner.learn(rgb, masks, 0.05, 0)
+    assert first == pytest.approx(math.log(2) * (1 - share + share * weight), rel=1e-5)
+    for step in range(1, 400):
+        learner.learn(rgb, masks, 0.05 * (1 - step / 400), step)
+    logit = learner.network.logit.item()
+    probability = 1 / (1 + math.exp(-logit))
+    there = 1 + (weight - 1) * 4 * probability * (1 - probability)
+    assert logit == pytest.approx(math.log(there * share / (1 - share)), abs=0.01)
+    assert there <= weight
+
+
 def test_dark_images_have_a_weight_of_their_own() -> None:
     """Half of the crops are dark: the first loss is the mean of both kinds."""
     learner = Learner(Constant(), PLAIN, marked_weight=3.0, dark_marked_weight=1.0)

@@ -97,6 +97,11 @@ if TYPE_CHECKING:
     help="The same in crops of low visibility.  [default: that of all others]",
 )
 @click.option(
+    "--doubtful-only/--all-marked",
+    default=None,
+    help="These weights only where the network is not sure.  [default: wherever it is]",
+)
+@click.option(
     "--layers",
     help="all, or decoder: the encoder stays as it is.  [default: all]",
 )

@@ -27,6 +27,8 @@ class Learner:
         frozen_batch_norm: keep the statistics of the batch normalisation as they are.
         marked_weight: weight of a marked pixel in the loss; others have 1.
         dark_marked_weight: the same in images of low visibility; None: as in all others.
+        doubtful_only: these weights are those of pixels at a probability of one half, and come
+            to 1 where the network is sure.
         layers: "all", or "decoder": the network's `encoder` stays as it is.
     """
 
@@ -38,6 +40,7 @@ class Learner:
         frozen_batch_norm: bool = False,
         marked_weight: float = 1.0,
         dark_marked_weight: float | None = None,
+        doubtful_only: bool = False,
         layers: str = "all",
     ) -> None:
         self.frozen_batch_norm = frozen_batch_norm
@@ -49,6 +52,7 @@ class Learner:
         self.optimizers = make_optimizers(optimizer, self.network, self.engine.share)
         dark = marked_weight if dark_marked_weight is None else dark_marked_weight
         self.marked_weights = {"normal": marked_weight, "low": dark}
+        self.doubtful_only = doubtful_only
 
     def learn(self, rgb: np.ndarray, masks: np.ndarray, rate: float, step: int) -> float:
         """Make one optimiser step.
@@ -78,6 +82,9 @@ class Learner:
         truth = self.engine.place_tensor(masks)[:, None].float()
         logits = self.engine.logits(images)
         weight = self._weight_of_marked(rgb)
+        if self.doubtful_only and weight is not None:
+            probability = logits.detach().sigmoid()
+            weight = 1 + (weight - 1) * 4 * probability * (1 - probability)
         loss = binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
         self.engine.backward(loss)
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]

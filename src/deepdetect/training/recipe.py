@@ -101,6 +101,9 @@ class TrainingOptions:
             it marks too little, since most pixels are not marked: the keypoints above a
             probability of 0.5 are fewer than the labels'. Above 1 there are more of them.
         dark_marked_weight: the same in crops of low visibility; None: as in all others.
+        doubtful_only: these weights are those of pixels at a probability of one half; the surer
+            the network is, the nearer to 1 they come. What it is sure of stays calibrated, and the
+            loss rises half as much for as many more keypoints.
         layers: "all", or "decoder": the encoder, nearly all of the weights, stays as it is, a
             step takes a third of the time, and what the start weights know is kept. For few
             photographs, and for changes of how many pixels are marked.
@@ -133,6 +136,7 @@ class TrainingOptions:
     frozen_batch_norm: bool | None = None
     marked_weight: float = 1.0
     dark_marked_weight: float | None = None
+    doubtful_only: bool = False
     layers: Literal["all", "decoder"] = "all"
     detectors: tuple[str, ...] = DETECTOR_NAMES
     label_changes: tuple[SettingChange, ...] = ()

@@ -93,6 +93,7 @@ class Run:
             bool(options.frozen_batch_norm),
             options.marked_weight,
             options.dark_marked_weight,
+            options.doubtful_only,
             options.layers,
         )
         self.engine, self.network = self.learner.engine, self.learner.network
