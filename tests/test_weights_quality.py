@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,9 +9,12 @@ from PIL import Image
 
 from deepdetect import DeepDetect, weights_quality
 from deepdetect.datasets.oxford import SCENES, load_oxford
+from deepdetect.geometry.residuals import transfer_errors
 from deepdetect.heatmap import HeatmapOptions
 from deepdetect.image import luma
 from deepdetect.labels import fuse
+from deepdetect.matchers.ratio import DescriptorMatches
+from deepdetect.matching import match_images
 from deepdetect.weights_quality import (
     PAIRS,
     THRESHOLDS,
@@ -123,28 +124,41 @@ def test_labels_without_oxford_are_refused(tmp_path: Path) -> None:
     assert "Traceback" not in result.output
 
 
-@pytest.mark.parametrize(("correct", "seeds"), [(1000, 3), (999, 16), (0, 16)])
+@pytest.mark.parametrize(("correct", "seeds"), [(1000, 3), (999, 64), (0, 64)])
 def test_few_matches_are_counted_with_many_seeds(
     correct: int, seeds: int, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Twenty further matches are wrong in each seed."""
     tried: list[int] = []
 
-    def matched(*_: object, seed: int, **__: object) -> SimpleNamespace:
+    def matched(*_: object, seed: int, **__: object) -> DescriptorMatches:
         tried.append(seed)
-        points = np.zeros((correct + 20, 2), np.float32)
-        ends = points.copy()
-        ends[correct:] = 50
-        return Found(points0=points, points1=ends)
+        rows = np.zeros(correct + 20, int)
+        return DescriptorMatches(rows, rows, np.zeros(correct + 20, np.float32))
 
-    class Found(SimpleNamespace):
-        def __len__(self) -> int:
-            return len(self.points0)
-
-    monkeypatch.setattr(weights_quality, "match_images", matched)
-    pair = replace(next(iter(load_oxford(folder)[0].pairs())), homography=np.eye(3))
+    errors = np.repeat([0.5, 50.0], [correct, 20])
+    monkeypatch.setattr(weights_quality, "match_descriptors", matched)
+    monkeypatch.setattr(weights_quality, "transfer_errors", lambda *_: errors)
+    pair = next(iter(load_oxford(folder)[0].pairs()))
     assert weights_quality.count_correct(LabelMasks(), pair) == (correct, correct + 20)
     assert tried == list(range(seeds))
+
+
+def test_counts_are_those_of_the_published_matching(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(weights_quality, "MANY_SEEDS", 2)
+    pair = next(iter(load_oxford(folder)[0].pairs()))
+    counts = []
+    for seed in range(2):
+        found = match_images(
+            pair.first, pair.second, LabelMasks(), preset="published", heatmap=None, seed=seed
+        )
+        errors = transfer_errors(found.points0, found.points1, pair.homography)
+        counts.append([np.count_nonzero(errors < 1), len(found)])
+    expected = np.rint(np.mean(counts, axis=0)).astype(int).tolist()
+    assert expected[1] > 0
+    assert list(weights_quality.count_correct(LabelMasks(), pair)) == expected
 
 
 def test_all_weights_see_the_images_alike(run_evaluate, tmp_path: Path) -> None:
