@@ -33,6 +33,8 @@ def test_bad_stages_are_refused(text: str) -> None:
         {"marked_weight": 0.0},
         {"marked_weight": float("nan")},
         {"dark_marked_weight": 0.0},
+        {"doubtful_only": True},
+        {"layers": "decodr"},
         {"color_changes": 1.5},
         {"validations": 0},
         {"learning_rate": -1.0},

@@ -183,6 +183,8 @@ class TrainingOptions:
                 raise OptionError(
                     f"the weight of marked pixels must lie in [0.1, 10], not {weight}"
                 )
+        if self.doubtful_only and {self.marked_weight, self.dark_marked_weight or 1} == {1}:
+            raise OptionError("doubtful_only needs a weight of marked pixels: give --marked-weight")
         if self.warm_up < 0:
             raise OptionError(f"the warm-up must not be negative, not {self.warm_up} steps")
         if not 0 <= self.seed < 2**31:
