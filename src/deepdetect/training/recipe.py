@@ -102,10 +102,9 @@ class TrainingOptions:
             probability of 0.5 are fewer than the labels'. Above 1 there are more of them.
         dark_marked_weight: the same in crops of low visibility; None: as in all others.
         doubtful_only: these weights are those of pixels at a probability of one half; the surer
-            the network is, the nearer to 1 they come. What it is sure of stays calibrated, and the
-            loss rises half as much for as many more keypoints.
+            the network is, the nearer to 1 they come, so that what it is sure of hardly moves.
         layers: "all", or "decoder": the encoder, nearly all of the weights, stays as it is, a
-            step takes a third of the time, and what the start weights know is kept. For few
+            step takes about half of the time, and what the start weights know is kept. For few
             photographs, and for changes of how many pixels are marked.
         detectors: label detectors to fuse.
         label_changes: settings of label detectors that differ from the paper's.
