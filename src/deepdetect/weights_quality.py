@@ -35,7 +35,7 @@ SEEDS = 3
 """FLANN's trees are random, and counts of one seed differ by some per cent: means are told."""
 
 FEW = 1000
-MANY_SEEDS = 16
+MANY_SEEDS = 64
 """So few correct matches (graf's are a hundred) differ by a tenth from seed to seed."""
 
 

@@ -63,7 +63,7 @@ def evaluate(
 
     Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), apart
     for normal and for low-visibility images; with --oxford also what the paper's protocol
-    gives: images squashed to 480x480, FLANN (mean of three seeds, of sixteen where fewer than
+    gives: images squashed to 480x480, FLANN (mean of three seeds, of 64 where fewer than
     1,000 matches are correct), ratio 0.99, correct under 1 px; with --labels also what the
     labels give there. With --scale, whether the quality holds on larger and smaller images.
 

@@ -39,8 +39,9 @@ MOVES = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 """Shares of width and height that the strangers are apart."""
 
 BLOCK = 64
-BLOCKS = 64
-"""Side in pixels and number of the blocks of the image that each move takes strangers from."""
+BLOCKS = 256
+"""Side in pixels of the blocks of the image that each move takes strangers from, and how many: all
+of them up to a megapixel, so that chance has no say there."""
 
 STEP = 20_000
 """Descriptors that are compared at a time, to bound the memory."""
