@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.guidance.agreement_test import STRANGERS, alike, unlikeness
+from deepdetect.guidance.agreement_test import (
+    BLOCK,
+    BLOCKS,
+    STRANGERS,
+    alike,
+    unlikeness,
+)
 from deepdetect.image import load_image, luma
 
 HALF = 128
@@ -151,11 +157,20 @@ def test_takes_keypoints_in_single_precision(photo: np.ndarray) -> None:
 
 def test_the_seed_decides_and_hardly_matters(photo: np.ndarray) -> None:
     """More blocks than are taken: the choice of strangers differs."""
-    gray = cv2.resize(luma(photo), (512, 448))
-    pixels = edges(gray)[::3]
+    gray = cv2.resize(luma(photo), (1472, 1280))
+    pixels = every_pixel(gray)[::31]
+    assert len(np.unique(pixels // BLOCK, axis=0)) > BLOCKS
     found = [alike(gray, seen_again(gray), everywhere(gray), pixels, seed) for seed in (0, 0, 5)]
     np.testing.assert_array_equal(found[0], found[1])
     assert (found[0] == found[2]).mean() > 0.95
+
+
+def test_up_to_a_megapixel_the_seed_has_no_say(photo: np.ndarray) -> None:
+    gray = cv2.resize(luma(photo), (1000, 700))  # the largest of Oxford
+    pixels = every_pixel(gray)[::31]
+    assert 64 < len(np.unique(pixels // BLOCK, axis=0)) <= BLOCKS
+    found = [unlikeness(gray, seen_again(gray), everywhere(gray), pixels, seed) for seed in (0, 5)]
+    np.testing.assert_array_equal(found[0], found[1])
 
 
 def test_no_points_give_no_answers(photo: np.ndarray) -> None:
