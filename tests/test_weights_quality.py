@@ -26,6 +26,12 @@ from deepdetect.weights_quality import (
 SIZE = 160
 
 
+@pytest.fixture
+def few_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small images have few matches, whose sixty-four seeds would take minutes."""
+    monkeypatch.setattr(weights_quality, "MANY_SEEDS", 4)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Eight scenes of small crops, each image shifted by whole pixels against the first."""
@@ -45,6 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.usefixtures("few_seeds")
 def test_shifted_images_repeat_and_match(folder: Path) -> None:
     scenes = load_oxford(folder)
     steps: list[int] = []
@@ -78,6 +85,7 @@ def test_the_bundled_weights_are_as_dense_as_the_paper_s(shared: Path) -> None:
     np.testing.assert_allclose(ours, theirs, atol=0.04)
 
 
+@pytest.mark.usefixtures("few_seeds")
 def test_the_command_prints_weights_side_by_side(run_evaluate, folder: Path) -> None:
     weights = "src/deepdetect/weights/deepdetect.onnx"
     text = run_evaluate("--against", weights, "--oxford", folder)
@@ -90,6 +98,7 @@ def test_the_command_prints_weights_side_by_side(run_evaluate, folder: Path) -> 
         assert cells[0] == cells[1], "the same weights give the same"
 
 
+@pytest.mark.usefixtures("few_seeds")
 def test_the_labels_join_as_weights_without_error(run_evaluate, folder: Path) -> None:
     text = run_evaluate("--labels", "--oxford", folder)
     for word in ("graf 1-6", "tau 0.9", "bark"):
