@@ -40,15 +40,19 @@ def test_weights_tell_where_they_come_from(name: str) -> None:
     pytest.importorskip("torch", reason="needs torch, which is for training only")
     from deepdetect.network.weights import read_notes
 
-    notes = read_notes(bundled_weights(name, ".safetensors"))
-    runs = [notes]
-    if "parts" in notes:
-        assert notes["command"].startswith("deepdetect average ")
-        runs = json.loads(notes["parts"])
+    means, runs = [], []
+    found = [read_notes(bundled_weights(name, ".safetensors"))]
+    while found:  # a mean's parts may be means
+        notes = found.pop()
+        (means if "parts" in notes else runs).append(notes)
+        found += json.loads(notes.get("parts", "[]"))
+    assert runs
+    for mean in means:
+        assert mean["command"].startswith("deepdetect average ")
     for run in runs:
         assert run["command"].startswith("deepdetect train photos/train ")
         for word in ("options", "photographs_digest", "versions", "machine", "start", "point"):
             assert run[word]
-    for one in (notes, *runs):
+    for one in (*means, *runs):
         assert " /" not in one["command"], "no folder of one machine"
         assert len(one["commit"]) == 40
