@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
+from deepdetect.guidance import strangers
 from deepdetect.guidance.agreement_test import (
-    BLOCK,
-    BLOCKS,
     STRANGERS,
     alike,
     unlikeness,
 )
+from deepdetect.guidance.strangers import BLOCK, BLOCKS
 from deepdetect.image import load_image, luma
 
 HALF = 128
@@ -171,6 +171,24 @@ def test_up_to_a_megapixel_the_seed_has_no_say(photo: np.ndarray) -> None:
     assert 64 < len(np.unique(pixels // BLOCK, axis=0)) <= BLOCKS
     found = [unlikeness(gray, seen_again(gray), everywhere(gray), pixels, seed) for seed in (0, 5)]
     np.testing.assert_array_equal(found[0], found[1])
+
+
+def test_what_is_known_of_the_unmoved_image_is_not_described_again_and_the_same(
+    photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gray = cv2.resize(luma(photo), (300, 240))
+    pixels, second = edges(gray), seen_again(np.roll(gray, 40, 1))
+    second[:, :200] = seen_again(gray)[:, :200]
+    found = {}
+    for edge in (strangers.EDGE, 10_000, 0):  # beyond the image: all moved images are described
+        monkeypatch.setattr(strangers, "EDGE", edge)
+        found[edge] = unlikeness(gray, second, everywhere(gray), pixels)
+    real, plain, none = found.values()
+    assert 0.3 < (plain < 1).mean() < 0.95
+    np.testing.assert_array_equal(np.isinf(real), np.isinf(plain))
+    some = np.isfinite(plain)
+    np.testing.assert_allclose(real[some], plain[some], rtol=1e-4)
+    assert not np.allclose(none[some], plain[some], rtol=1e-3)  # at edges it is not the same
 
 
 def test_no_points_give_no_answers(photo: np.ndarray) -> None:

@@ -4,10 +4,10 @@ The second image is warped into the frame of the first, and descriptors are take
 same pixels, small and large ones. They are compared by their correlation, with the mean descriptor
 taken away: all descriptors have much in common, those of noise-like texture nearly everything.
 What two places that have nothing to do with each other look like is measured on the pair itself,
-by comparing with the warped image moved by a third of its size. A point agrees when its
-descriptors, with those right around it, are more alike than all but a hundredth of such strangers,
-and when most points about it agree too. Every second point is described, as on a chessboard: its
-neighbours share what it says.
+by comparing with the warped image moved by a third of its size and more (`strangers`). A point
+agrees when its descriptors, with those right around it, are more alike than all but a hundredth of
+such strangers, and when most points about it agree too. Every second point is described, as on a
+chessboard: its neighbours share what it says.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from ..descriptors.correlation import less_correlated
 from ..descriptors.dense_sift import dense_sift, root
+from .strangers import choose_strangers, numbered
 
 SIZES = (3.0, 8.0)
 """Diameters of the keypoints for these descriptors, in pixels."""
@@ -34,17 +36,6 @@ MAJORITY = 0.5
 
 NEAR = 5
 """Side in pixels of the window in which one of the described points must lie."""
-
-MOVES = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
-"""Shares of width and height that the strangers are apart."""
-
-BLOCK = 64
-BLOCKS = 256
-"""Side in pixels of the blocks of the image that each move takes strangers from, and how many: all
-of them up to a megapixel, so that chance has no say there."""
-
-STEP = 20_000
-"""Descriptors that are compared at a time, to bound the memory."""
 
 FEW = 100
 """With fewer points no mean is taken away: theirs would be near to themselves."""
@@ -81,27 +72,28 @@ def unlikeness(
         return result
     here = pixels[known]
     described = here[_thinned(here, gray0.shape)]
-    moved = _moves(warped)
-    # For each move the points in its blocks that then see the second image.
-    strange = [
-        rows[part[tuple(described[rows].T[::-1])]]
-        for rows, part in zip(_some_blocks(described, seed), _moves(seen), strict=True)
-    ]
+    moves = choose_strangers(described, warped, seen, seed)
+    # Each place of the second image is described once, however often it is a stranger.
+    used = [described, *(move.places[move.whole] for move in moves)]
+    places, number = numbered(np.concatenate(used), seen.shape)
     unlike = np.zeros(len(described), np.float32)
-    stranger = [np.zeros(len(rows), np.float32) for rows in strange]
+    stranger = [np.zeros(len(move.rows), np.float32) for move in moves]
     for size in SIZES:
         first = root(dense_sift(gray0, described, size), overwrite=True)
         total = first.sum(axis=0, dtype=np.int64)  # whole: the order of the points has no say
         mean = (total / len(first) if len(first) >= FEW else 0 * total).astype(np.float32)
-        second = root(dense_sift(warped, described, size), overwrite=True)
-        unlike += _unlike(first, second, mean)
-        for values, rows, image in zip(stranger, strange, moved, strict=True):
-            if len(rows):
-                moving = root(dense_sift(image, described[rows], size), overwrite=True)
-                values += _unlike(first[rows], moving, mean)
+        second = root(dense_sift(warped, places, size), overwrite=True)
+        own = number[described[:, 1], described[:, 0]]
+        unlike += less_correlated(first, np.arange(len(first)), second, own, mean)
+        for values, move in zip(stranger, moves, strict=True):
+            x, y = move.places[move.whole].T
+            rows, cut = move.rows[move.whole], move.rows[~move.whole]
+            values[move.whole] += less_correlated(first, rows, second, number[y, x], mean)
+            others = root(dense_sift(move.moved, described[cut], size), overwrite=True)
+            values[~move.whole] += less_correlated(first, cut, others, np.arange(len(cut)), mean)
     means = [
-        _together(described[rows], values, described[rows], gray0.shape)
-        for rows, values in zip(strange, stranger, strict=True)
+        _together(described[move.rows], values, described[move.rows], gray0.shape)
+        for move, values in zip(moves, stranger, strict=True)
     ]
     strangers = np.concatenate(means)
     bound = np.quantile(strangers, STRANGERS) if len(strangers) else 0
@@ -110,37 +102,6 @@ def unlikeness(
     ratios = _together(described, unlike, here, gray0.shape) / np.float32(bound)
     crowd = _share_about(here, ratios < 1, gray0.shape)
     result[known] = np.where(crowd >= MAJORITY, ratios, np.inf)
-    return result
-
-
-def _moves(image: np.ndarray) -> list[np.ndarray]:
-    """Return an image moved in several ways, what leaves it on one side coming in on the other."""
-    height, width = image.shape
-    return [
-        np.roll(image, (round(down * height), round(across * width)), (0, 1))
-        for across, down in MOVES
-    ]
-
-
-def _some_blocks(pixels: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Choose the points of some blocks for each move: whole blocks, as neighbours are meant."""
-    block = pixels // BLOCK
-    number = block[:, 1] * 1_000_000 + block[:, 0]
-    order = np.random.default_rng(seed).permutation(np.unique(number))
-    # Other blocks for every move where there are enough, the same again where there are not.
-    turns = [np.roll(order, -move * BLOCKS)[:BLOCKS] for move in range(len(MOVES))]
-    return [np.flatnonzero(np.isin(number, chosen)) for chosen in turns]
-
-
-def _unlike(first: np.ndarray, second: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Return 1 - correlation of each pair of rows less the mean row, (N,) float32 in [0, 2]."""
-    result = np.empty(len(first), np.float32)
-    for start in range(0, len(first), STEP):
-        a, b = (part[start : start + STEP] - mean for part in (first, second))
-        lengths = np.einsum("ij,ij->i", a, a) * np.einsum("ij,ij->i", b, b)
-        result[start : start + STEP] = 1 - np.einsum("ij,ij->i", a, b) / np.sqrt(
-            np.maximum(lengths, 1e-3)
-        )
     return result
 
 
