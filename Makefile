@@ -12,8 +12,9 @@ PIP_FLAGS := --quiet --disable-pip-version-check
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
 
+# Two processes, each with whole files: what a file sets up is set up once.
 test: $(VENV)/.test test-opencv4
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest -n 2 --dist loadfile
 
 # The label detectors live in other modules of OpenCV 4 than of OpenCV 5.
 test-opencv4: $(VENV_OPENCV4)/.test
