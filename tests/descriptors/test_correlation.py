@@ -53,3 +53,12 @@ def test_takes_none_and_one(count: int) -> None:
     some = np.arange(128, dtype=np.uint8)[None]
     rows = np.zeros(count, np.int64)
     assert less_correlated(some, rows, some, rows, np.zeros(128, np.float32)).shape == (count,)
+
+
+def test_equal_descriptors_are_exactly_alike() -> None:
+    """What tells strangers that are all the same from strangers that are nearly so."""
+    generator = np.random.default_rng(0)
+    first = generator.integers(0, 256, (20_000, 128)).astype(np.uint8)
+    rows = np.arange(len(first))
+    for mean in (np.zeros(128, np.float32), first.mean(axis=0).astype(np.float32)):
+        assert not less_correlated(first, rows, first.copy(), rows, mean).any()

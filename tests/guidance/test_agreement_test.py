@@ -214,6 +214,15 @@ def test_flat_images_tell_nothing(photo: np.ndarray) -> None:
         assert alike(*pair, everywhere(flat), pixels).mean() < 1.5 * STRANGERS
 
 
+@pytest.mark.parametrize("width", range(120, 280, 20))
+def test_images_that_are_flat_for_a_large_part_tell_nothing(width: int) -> None:
+    """A hundredth of the strangers are equal, flat ones: nothing can be more alike than they."""
+    gray = np.full((300, 400), 235, np.uint8)
+    noise = np.random.default_rng(width).normal(size=(300, width))
+    gray[:, :width] = np.clip(128 + 150 * cv2.GaussianBlur(noise, (0, 0), 1.5), 0, 255)
+    assert np.isinf(unlikeness(gray, gray, everywhere(gray), every_pixel(gray))).all()
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (5, 5), (1, 30), (16, 16)])
 def test_tiny_images_are_taken(shape: tuple[int, int]) -> None:
     gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)

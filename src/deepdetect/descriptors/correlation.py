@@ -22,8 +22,8 @@ def less_correlated(
         mean: (D,) float32, taken away from both.
 
     Returns:
-        (K,) float32: 1 - correlation, from 0 where the two differ by a factor only to 2; 1 where
-        one of them is the mean.
+        (K,) float32: 1 - correlation, from 0 to 2: 0 where the two are equal, 0 but for rounding
+        where they differ by a factor; 1 where one of them is the mean.
 
     Example:
         >>> a = np.array([[10, 20, 30], [30, 20, 10]], np.uint8)

@@ -9,7 +9,8 @@ LEAST = 1e-3
 """Of the product of the squared lengths: below it descriptors are the mean, and tell nothing."""
 
 
-@njit(nogil=True, fastmath=True, cache=True)
+# No full fastmath: its approximate division and root do not give 0 for equal descriptors.
+@njit(nogil=True, fastmath={"reassoc", "nsz", "contract"}, cache=True)
 def compare(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]
     """Write 1 - correlation of the pairs from `start` to before `stop` into `out`."""
     for k in range(start, stop):

@@ -37,6 +37,9 @@ MAJORITY = 0.5
 NEAR = 5
 """Side in pixels of the window in which one of the described points must lie."""
 
+SAME = 1e-6
+"""Rounding: so unlike are equal descriptors at most."""
+
 FEW = 100
 """With fewer points no mean is taken away: theirs would be near to themselves."""
 
@@ -97,7 +100,7 @@ def unlikeness(
     ]
     strangers = np.concatenate(means)
     bound = np.quantile(strangers, STRANGERS) if len(strangers) else 0
-    if bound <= 0:  # strangers are all the same: likeness tells nothing
+    if bound <= SAME:  # strangers are all the same: likeness tells nothing
         return result
     ratios = _together(described, unlike, here, gray0.shape) / np.float32(bound)
     crowd = _share_about(here, ratios < 1, gray0.shape)

@@ -1,8 +1,9 @@
 """Which places of the second image have nothing to do with points of the first.
 
 The second image, warped into the frame of the first, is moved by a large share of its size: what
-then lies under a point is a stranger to it, of the same kind of scene and light. Most strangers
-are places whose descriptors are known from the image that is not moved.
+then lies under a point is a stranger to it, of the same kind of scene and light. Far from edges a
+descriptor is the same with and without the move: there the image that is not moved is described,
+once for all moves.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def choose_strangers(
 
 def numbered(pixels: np.ndarray, shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the different ones of some pixels, (P, 2), and the (H, W) image of their rows."""
-    number = np.full(tuple(shape[:2]), -1, np.int64)
+    number = np.full(tuple(shape[:2]), -1, np.int32)
     number[pixels[:, 1], pixels[:, 0]] = 0
     row, column = np.nonzero(number == 0)
     number[row, column] = np.arange(len(row))
