@@ -79,6 +79,7 @@ def unlikeness(
     # Each place of the second image is described once, however often it is a stranger.
     used = [described, *(move.places[move.whole] for move in moves)]
     places, number = numbered(np.concatenate(used), seen.shape)
+    own = number[described[:, 1], described[:, 0]]
     unlike = np.zeros(len(described), np.float32)
     stranger = [np.zeros(len(move.rows), np.float32) for move in moves]
     for size in SIZES:
@@ -86,7 +87,6 @@ def unlikeness(
         total = first.sum(axis=0, dtype=np.int64)  # whole: the order of the points has no say
         mean = (total / len(first) if len(first) >= FEW else 0 * total).astype(np.float32)
         second = root(dense_sift(warped, places, size), overwrite=True)
-        own = number[described[:, 1], described[:, 0]]
         unlike += less_correlated(first, np.arange(len(first)), second, own, mean)
         for values, move in zip(stranger, moves, strict=True):
             x, y = move.places[move.whole].T
