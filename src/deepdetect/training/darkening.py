@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from ..errors import OptionError
@@ -62,13 +63,14 @@ def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
     # Pillow blends in float32 and truncates.
     levels = np.arange(256, dtype=np.float32)
     dimmed = (levels * np.float32(darkening.brightness)).astype(np.uint8)
-    dark = dimmed[rgb]
+    dark = cv2.LUT(rgb, dimmed)
     mean = np.float32(int(_pillow_luma(dark).mean() + 0.5))
     flattened = (mean + (levels - mean) * np.float32(darkening.contrast)).astype(np.uint8)
-    return flattened[dark]
+    return cv2.LUT(dark, flattened)
 
 
 def _pillow_luma(rgb: np.ndarray) -> np.ndarray:
     """Return Pillow's luma; for one colour in 800 it differs from OpenCV's by one level."""
-    weights = np.array([19595, 38470, 7471], np.uint32)
-    return (rgb.astype(np.uint32) @ weights + 0x8000) >> 16
+    # Whole numbers up to 2 ** 24, which float32 holds exactly.
+    weights = np.array([[19595, 38470, 7471, 0x8000]], np.float32)
+    return cv2.transform(rgb.astype(np.float32), weights).astype(np.uint32) >> 16
