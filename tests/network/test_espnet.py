@@ -100,11 +100,14 @@ def test_onnx_gives_the_same_probabilities_at_any_size(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("dilation", [1, 2, 4, 8, 16])
 @pytest.mark.parametrize("layout", [torch.channels_last, torch.contiguous_format])
-def test_dilated_gradients_in_bfloat16(dilation: int, layout: torch.memory_format) -> None:
+@pytest.mark.parametrize(("inputs", "outputs"), [(12, 12), (12, 16), (25, 25), (25, 28), (2, 2)])
+def test_dilated_gradients_in_bfloat16(
+    dilation: int, layout: torch.memory_format, inputs: int, outputs: int
+) -> None:
     torch.manual_seed(dilation)
-    layer = DilatedConvolution(12, 16, dilation).to(memory_format=layout)
-    x = torch.randn(2, 12, 40, 36).to(memory_format=layout).requires_grad_()
-    wanted = torch.randn(2, 16, 40, 36)
+    layer = DilatedConvolution(inputs, outputs, dilation).to(memory_format=layout)
+    x = torch.randn(2, inputs, 40, 36).to(memory_format=layout).requires_grad_()
+    wanted = torch.randn(2, outputs, 40, 36)
     expected = torch.autograd.grad((layer(x) * wanted).sum(), (x, layer.conv.weight))
     with torch.autocast("cpu", torch.bfloat16):
         made = layer(x)

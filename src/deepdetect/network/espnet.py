@@ -10,7 +10,9 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv2d
+from torch.nn.functional import conv2d, pad
+
+from .norm_activation import join_and_activate, normalize_and_activate
 
 EPSILON = 1e-3  # of every batch normalisation, as published
 DILATIONS = (1, 2, 4, 8, 16)
@@ -32,9 +34,10 @@ class Convolution(nn.Module):
 class _DilatedBfloat16(torch.autograd.Function):
     """A dilated 3x3 convolution in bfloat16 on the CPU, with gradients that are right.
 
-    In bfloat16 with channels_last PyTorch's own gradients of dilated convolutions are NaN
-    (torch 2.13). The gradient of the input is a convolution again, with the kernel turned
-    round, and may be computed in bfloat16; that of the weights is computed in float32.
+    In bfloat16 with channels_last PyTorch's own gradients of dilated convolutions are NaN, or
+    wrong (torch 2.13). The gradient of the input is a convolution again, with the kernel turned
+    round; that of the weights is right where the input has up to 16 channels, or whole blocks of
+    16: zeros fill the last block.
     """
 
     @staticmethod
@@ -48,13 +51,21 @@ class _DilatedBfloat16(torch.autograd.Function):
     def backward(context: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         x, weight = context.saved_tensors
         d = context.dilation
+        gradient = gradient.contiguous(memory_format=torch.channels_last)  # once, for both
         turned = weight.flip(2, 3).transpose(0, 1).contiguous(memory_format=torch.channels_last)
         of_input = conv2d(gradient, turned, padding=d, dilation=d)
+        filled_x = _fill_block(x)
         of_weight = torch.ops.aten.convolution_backward(
-            *(gradient.float(), x.float(), weight.float(), None),
+            *(gradient, filled_x, weight.new_empty(weight.shape[0], filled_x.shape[1], 3, 3), None),
             *([1, 1], [d, d], [d, d], False, [0, 0], 1, [False, True, False]),
         )[1]
-        return of_input, of_weight, None
+        return of_input, of_weight[:, : weight.shape[1]].float(), None
+
+
+def _fill_block(x: Tensor) -> Tensor:
+    """Fill (B, C, H, W) with channels of zeros to whole blocks of 16; up to 16 stay as they are."""
+    missing = -x.shape[1] % 16 if x.shape[1] > 16 else 0
+    return pad(x, (0, 0, 0, 0, 0, missing)) if missing else x
 
 
 class DilatedConvolution(nn.Module):
@@ -80,7 +91,11 @@ class NormActivation(nn.Module):
         self.act = nn.PReLU(channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.act(self.bn(x))
+        return normalize_and_activate(x, self.bn, self.act)
+
+    def join(self, parts: list[Tensor]) -> Tensor:
+        """Join maps by their channels, normalise and activate."""
+        return join_and_activate(parts, self.bn, self.act)
 
 
 class ConvolutionNormActivation(nn.Module):
@@ -95,7 +110,7 @@ class ConvolutionNormActivation(nn.Module):
         self.act = nn.PReLU(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.act(self.bn(self.conv(x)))
+        return normalize_and_activate(self.conv(x), self.bn, self.act)
 
 
 class SpatialPyramid(nn.Module):
@@ -136,7 +151,7 @@ class DownsamplingPyramid(SpatialPyramid):
         self.act = nn.PReLU(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.act(self.bn(self.branches(x)))
+        return normalize_and_activate(self.branches(x), self.bn, self.act)
 
 
 class ResidualPyramid(SpatialPyramid):
@@ -171,15 +186,15 @@ class Encoder(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         half = self.halve(image)
         quarter = self.halve(half)
-        level1 = self.b1(torch.cat([self.level1(image), half], 1))
+        level1 = self.b1.join([self.level1(image), half])
         start = level2 = self.level2_0(level1)
         for block in self.level2:
             level2 = block(level2)
-        level2 = self.b2(torch.cat([level2, start, quarter], 1))
+        level2 = self.b2.join([level2, start, quarter])
         start = level3 = self.level3_0(level2)
         for block in self.level3:
             level3 = block(level3)
-        level3 = self.b3(torch.cat([start, level3], 1))
+        level3 = self.b3.join([start, level3])
         return level1, level2, level3
 
 
