@@ -9,7 +9,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-# OpenMP is that of torch, which is loaded already: its threads do the work.
+# With g++ OpenMP is that of torch, which is loaded already: its threads do the work.
 FLAGS = "-O3 -march=native -fno-math-errno -fno-trapping-math -fopenmp -fPIC -shared"
 
 
@@ -27,16 +27,16 @@ def native_library(name: str) -> ctypes.CDLL | None:
         >>> native_library("no such file") is None
         True
     """
-    compiler = next(filter(None, map(shutil.which, ("g++", "clang++"))), None)
+    compiler = shutil.which("g++")
     source = Path(__file__).with_name(f"{name}.cpp")
     if compiler is None or not source.exists():
         return None
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / f"{name}.so"
-        try:
+    try:
+        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+            library = Path(folder) / f"{name}.so"
             subprocess.run(
                 [compiler, *FLAGS.split(), "-o", library, source], check=True, capture_output=True
             )
             return ctypes.CDLL(str(library))
-        except (OSError, subprocess.CalledProcessError):
-            return None
+    except (OSError, subprocess.CalledProcessError):
+        return None

@@ -168,7 +168,8 @@ void forward(const bfloat16* x, Index channels, Index pixels, const float* weigh
     });
     for (Index c = 0; c < channels; ++c) {
         mean[c] = totals[0][c] / pixels;
-        variance[c] = std::max(0.0, totals[1][c] / pixels - mean[c] * mean[c]);
+        variance[c] = totals[1][c] / pixels - mean[c] * mean[c];
+        if (variance[c] < 0) variance[c] = 0;  // by rounding; what is no number stays so
     }
     const Line line(channels, mean, variance, weight, bias, epsilon);
     const auto gain = stretches.repeat(line.gain), offset = stretches.repeat(line.offset);

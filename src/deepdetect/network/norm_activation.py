@@ -49,7 +49,7 @@ def join_and_activate(
     Returns:
         (B, sum of C, H, W).
     """
-    if not any(_is_fast(part, norm) for part in parts):
+    if not (_fits(parts, norm, activation) and any(map(_is_fast, parts))):
         return activation(norm(torch.cat(list(parts), 1) if len(parts) > 1 else parts[0]))
     made = []
     first = 0
@@ -58,11 +58,11 @@ def join_and_activate(
         first = own.stop
         weight, bias, slope = norm.weight[own], norm.bias[own], activation.weight[own]
         mean, variance = norm.running_mean[own], norm.running_var[own]
-        if _is_fast(part, norm):
+        if _is_fast(part):
             result, new_mean, new_variance = _forward(part, weight, bias, slope, norm.eps)
             count = part.numel() // part.shape[1]
             mean.lerp_(new_mean.detach().float(), norm.momentum)
-            unbiased = new_variance.detach() * (count / max(count - 1, 1))
+            unbiased = new_variance.detach() * (count / (count - 1))
             variance.lerp_(unbiased.float(), norm.momentum)
         else:
             normal = batch_norm(part, mean, variance, weight, bias, True, norm.momentum, norm.eps)
@@ -72,14 +72,23 @@ def join_and_activate(
     return torch.cat(made, 1) if len(made) > 1 else made[0]
 
 
-def _is_fast(x: Tensor, norm: nn.BatchNorm2d) -> bool:
+def _fits(parts: Sequence[Tensor], norm: nn.BatchNorm2d, activation: nn.PReLU) -> bool:
+    """Whether these layers are what the loops do; torch does, or refuses, all else."""
+    channels = sum(part.shape[1] for part in parts)
     return (
-        x.dtype == torch.bfloat16
-        and x.device.type == "cpu"
+        type(norm) is nn.BatchNorm2d  # not one whose statistics are of several processes
         and norm.training
-        and type(norm) is nn.BatchNorm2d  # not one whose statistics are of several processes
-        and _loops_exist()
+        and norm.affine
+        and norm.track_running_stats
+        and norm.momentum is not None
+        and channels == norm.num_features == activation.num_parameters
+        and norm.weight.dtype == activation.weight.dtype == torch.float32
+        and parts[0].numel() > parts[0].shape[1]  # one pixel has no variance
     )
+
+
+def _is_fast(x: Tensor) -> bool:
+    return x.dtype == torch.bfloat16 and x.device.type == "cpu" and _loops_exist()
 
 
 @torch.compiler.assume_constant_result
@@ -94,7 +103,7 @@ def _forward(
     """Return the activated map, and the channels' means and biased variances in float64."""
     x = _dense(x)
     made = torch.empty_like(x)
-    mean, variance = (torch.empty(weight.shape, dtype=torch.float64) for _ in range(2))
+    mean, variance = (torch.empty_like(weight, dtype=torch.float64) for _ in range(2))
     native_library("norm_activation").forward(
         _pointer(x), *_size(x), *_floats(weight, bias, slope), ctypes.c_double(epsilon),
         *map(_pointer, (mean, variance, made)),
@@ -117,7 +126,7 @@ def _backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the gradients of x, weight, bias and slope."""
     x, gradient = _dense(x), _dense(gradient)
-    made = torch.empty_like(x), *(torch.empty(weight.shape) for _ in range(3))
+    made = torch.empty_like(x), *(torch.empty_like(weight) for _ in range(3))
     native_library("norm_activation").backward(
         _pointer(x), _pointer(gradient), *_size(x), *_floats(weight, bias, slope),
         _pointer(mean), _pointer(variance), ctypes.c_double(epsilon), *map(_pointer, made),
@@ -145,13 +154,13 @@ def _size(x: Tensor) -> tuple[ctypes.c_int64, ctypes.c_int64]:
 @_forward.register_fake
 def _(x: Tensor, weight: Tensor, *_: Any) -> tuple[Tensor, Tensor, Tensor]:
     made = torch.empty_like(x, memory_format=torch.channels_last)
-    return made, *(weight.new_empty(weight.shape, dtype=torch.float64) for _ in range(2))
+    return made, *(torch.empty_like(weight, dtype=torch.float64) for _ in range(2))
 
 
 @_backward.register_fake
 def _(gradient: Tensor, x: Tensor, weight: Tensor, *_: Any) -> tuple[Tensor, ...]:
     of_x = torch.empty_like(x, memory_format=torch.channels_last)
-    return of_x, *(weight.new_empty(weight.shape) for _ in range(3))
+    return of_x, *(torch.empty_like(weight) for _ in range(3))
 
 
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
