@@ -1,7 +1,7 @@
 """Batch normalisation followed by PReLU, fast when it is trained in bfloat16 on a CPU.
 
-The loops of norm_activation.cpp read every map twice and make nothing in between, where the code that
-torch 2.13 compiles passes through maps in float32 (docs/training.md, Speed).
+The loops of norm_activation.cpp read every map twice and make nothing in between, where the
+code that torch 2.13 compiles passes through maps in float32 (docs/training.md, Speed).
 """
 
 from __future__ import annotations
