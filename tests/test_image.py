@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import io
+import os
 import struct
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image, ImageOps
+from PIL import EpsImagePlugin, Image, ImageOps
+from PIL.PngImagePlugin import PngInfo
 
 from deepdetect.errors import ImageError
 from deepdetect.image import IMAGE_SUFFIXES, MINIMUM_SIDE, find_images, load_image, luma
@@ -73,6 +76,7 @@ def test_arrays(kind: str) -> None:
     np.testing.assert_array_equal(loaded, expected)
 
 
+DEEP_GREY = triple(shallow(DEEP))
 PALETTE = Image.fromarray(RGB).quantize(16)
 PIL_IMAGES = {
     "RGB": (Image.fromarray(RGB), RGB),
@@ -81,8 +85,8 @@ PIL_IMAGES = {
     "LA": (Image.fromarray(np.dstack([GREY, ALPHA])), triple(GREY)),
     "P": (PALETTE, np.array(PALETTE.getpalette(), np.uint8).reshape(-1, 3)[np.asarray(PALETTE)]),
     "1": (Image.fromarray(GREY > 99), triple(np.where(GREY > 99, 255, 0))),
-    "I;16": (Image.fromarray(DEEP), triple(shallow(DEEP))),
-    "I": (Image.fromarray(DEEP.astype(np.int32)), triple(shallow(DEEP))),
+    "I;16": (Image.fromarray(DEEP), DEEP_GREY),
+    "I;16B": (Image.frombytes("I;16B", (25, 18), DEEP.astype(">u2").tobytes()), DEEP_GREY),
     "F": (Image.fromarray((GREY / 255).astype(np.float32)), triple(GREY)),
 }
 
@@ -96,7 +100,7 @@ def test_pil_images(mode: str) -> None:
     np.testing.assert_array_equal(loaded, expected)
 
 
-@pytest.mark.parametrize("mode", [mode for mode in PIL_IMAGES if mode not in ("I", "F")])
+@pytest.mark.parametrize("mode", [mode for mode in PIL_IMAGES if mode not in ("I;16B", "F")])
 @pytest.mark.parametrize("as_text", [True, False])
 def test_files(mode: str, as_text: bool, tmp_path: Path) -> None:
     given, expected = PIL_IMAGES[mode]
@@ -125,27 +129,99 @@ def test_palette_with_transparency_loads_in_silence(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_image(path), PIL_IMAGES["P"][1])
 
 
-@pytest.mark.parametrize(
-    ("orientation", "upright"),
-    [
-        (1, lambda a: a),
-        (2, lambda a: a[:, ::-1]),
-        (3, lambda a: a[::-1, ::-1]),
-        (4, lambda a: a[::-1]),
-        (5, lambda a: a.swapaxes(0, 1)),
-        (6, lambda a: np.rot90(a, -1)),
-        (7, lambda a: a.swapaxes(0, 1)[::-1, ::-1]),
-        (8, lambda a: np.rot90(a)),
-    ],
-)
-def test_exif_orientation(
-    orientation: int, upright: Callable[[np.ndarray], np.ndarray], tmp_path: Path
-) -> None:
+UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: np.rot90(a, -1),
+    7: lambda a: a.swapaxes(0, 1)[::-1, ::-1],
+    8: lambda a: np.rot90(a),
+}
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+@pytest.mark.parametrize("kind", ["RGB", "L", "I;16"])
+def test_exif_orientation(orientation: int, kind: str, tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
     path = tmp_path / "turned.png"
-    Image.fromarray(RGB).save(path, exif=exif)
-    np.testing.assert_array_equal(load_image(path), upright(RGB))
+    image, expected = PIL_IMAGES[kind]
+    image.save(path, exif=exif)
+    np.testing.assert_array_equal(load_image(path), UPRIGHT[orientation](expected))
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+@pytest.mark.parametrize("kind", ["RGB", "L", "I;16", "I;16B", "F"])
+@pytest.mark.parametrize("compression", [None, "tiff_lzw"])
+def test_tiff_orientation(
+    orientation: int, kind: str, compression: str | None, tmp_path: Path
+) -> None:
+    # Pillow turns TIFF itself, and scrambles what it maps into memory; once must be enough.
+    path = tmp_path / "turned.tif"
+    image, expected = PIL_IMAGES[kind]
+    image.save(path, tiffinfo={0x0112: orientation}, compression=compression)
+    upright = UPRIGHT[orientation](expected)
+    np.testing.assert_array_equal(load_image(path), upright)
+    np.testing.assert_array_equal(load_image(path.read_bytes()), upright)
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_tiff_whose_xmp_repeats_the_orientation(orientation: int, tmp_path: Path) -> None:
+    xmp = f'<rdf:Description tiff:Orientation="{orientation}"/>'.encode()
+    path = tmp_path / "turned.tif"
+    Image.fromarray(RGB).save(path, tiffinfo={0x0112: orientation, 700: xmp})
+    np.testing.assert_array_equal(load_image(path), UPRIGHT[orientation](RGB))
+
+
+def tiff(array: np.ndarray) -> bytes:
+    """Return an uncompressed TIFF file of one band of integers."""
+    height, width = array.shape
+    bits, sample_format = 8 * array.dtype.itemsize, 2 if array.dtype.kind == "i" else 1
+    tags = {256: width, 257: height, 258: bits, 259: 1, 262: 1, 273: 8, 277: 1, 278: height}
+    tags |= {279: array.nbytes, 339: sample_format}
+    directory = b"".join(struct.pack("<HHIHxx", tag, 3, 1, tags[tag]) for tag in tags)
+    header = b"II*\0" + struct.pack("<I", 8 + array.nbytes)
+    return header + array.tobytes() + struct.pack("<H", len(tags)) + directory + bytes(4)
+
+
+@pytest.mark.parametrize("kind", ["u1", "<u2", "i1", "<i2", "<i4", "<u4"])
+def test_integer_tiff_has_the_types_of_arrays(kind: str, one_line: OneLine) -> None:
+    values = {"u1": GREY, "<u2": DEEP}.get(kind, GREY // 2).astype(kind)
+    if kind in ("u1", "<u2"):
+        np.testing.assert_array_equal(load_image(tiff(values)), load_image(values))
+        return
+    with pytest.raises(ImageError) as caught:
+        load_image(tiff(values))
+    assert "16 bits without sign" in one_line(caught.value)
+
+
+BAD_PIL_IMAGES = {
+    "of 8 bits": Image.fromarray(GREY).convert("I"),
+    "of 16 bits": Image.fromarray(DEEP.astype(np.int32)),
+    "with negative values": Image.fromarray(DEEP.astype(np.int32) - 9),
+    "of 32 bits": Image.fromarray(DEEP.astype(np.int32) * 2**15),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_PIL_IMAGES)
+def test_pil_images_of_32_bit_integers(kind: str, one_line: OneLine) -> None:
+    with pytest.raises(ImageError) as caught:
+        load_image(BAD_PIL_IMAGES[kind])
+    message = one_line(caught.value)
+    assert "8 bits (mode L or RGB), 16 bits without sign (mode I;16)" in message
+
+
+@pytest.mark.parametrize("kind", ["PNG", "PPM"])
+@pytest.mark.parametrize("opened", [True, False])
+def test_16_bit_grey_that_pillow_may_hold_in_32_bits(kind: str, opened: bool) -> None:
+    file = io.BytesIO(b"P5 25 18 65535\n" + DEEP.astype(">u2").tobytes())
+    if kind == "PNG":
+        file = io.BytesIO()
+        Image.fromarray(DEEP).save(file, kind)
+    given = Image.open(file) if opened else file.getvalue()
+    np.testing.assert_array_equal(load_image(given), DEEP_GREY)
 
 
 def encoded(rgb: np.ndarray, kind: str) -> bytes:
@@ -173,10 +249,7 @@ BAD_FILES = {
     "empty": (write("empty.png", b""), "is not an image that can be read"),
     "half a PNG": (write("half.png", PNG[: len(PNG) // 2]), "damaged or truncated"),
     "half a JPEG": (write("half.jpg", JPEG[: len(JPEG) // 2]), "damaged or truncated"),
-    "broken PNG": (
-        write("broken.png", PNG.replace(b"IDAT", b"IDAX")),
-        "is not an image that can be read",
-    ),
+    "broken PNG": (write("broken.png", PNG.replace(b"IDAT", b"IDAX")), "damaged or truncated"),
 }
 
 
@@ -212,6 +285,71 @@ def test_a_cut_file_is_an_error_or_whole(
     # What Pillow takes for whole lacks no pixel.
     with Image.open(io.BytesIO(content)) as whole:
         np.testing.assert_array_equal(loaded, np.asarray(whole))
+
+
+def test_one_flipped_bit_of_a_png_is_an_error(one_line: OneLine) -> None:
+    text = PngInfo()
+    text.add_text("before", "the pixels")
+    text.add(b"ruNe", b"after the pixels", after_idat=True)  # a chunk that nobody knows
+    file = io.BytesIO()
+    Image.fromarray(RGB).save(file, "PNG", pnginfo=text)
+    content = file.getvalue()
+    assert content.index(b"before") < content.index(b"IDAT") < content.index(b"after")
+    np.testing.assert_array_equal(load_image(content), RGB)
+    signature = 8
+    for place in range(signature, len(content)):
+        flipped = bytearray(content)
+        flipped[place] ^= 1 << place % 8
+        with pytest.raises(ImageError) as caught:
+            load_image(bytes(flipped))
+        assert "damaged or truncated" in one_line(caught.value)
+
+
+def test_a_png_without_its_last_bytes_is_an_error() -> None:
+    for cut in range(1, 20):
+        with pytest.raises(ImageError, match="damaged or truncated"):
+            load_image(PNG[:-cut])
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the program is a shell script")
+def test_a_file_starts_no_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_line: OneLine
+) -> None:
+    # Pillow has Ghostscript (gs) draw PostScript, whatever the name of the file.
+    program, started = tmp_path / "gs", tmp_path / "started"
+    program.write_text(f"#!/bin/sh\ntouch '{started}'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)  # found by an earlier test
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 20 20\n%%EndComments\nshowpage\n"
+    )
+    with Image.open(path) as opened:
+        assert opened.format == "EPS"
+    with pytest.raises(ImageError) as caught:
+        load_image(path)
+    assert "is not an image that can be read" in one_line(caught.value)
+    assert not started.exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_named_pipe_is_not_waited_for(tmp_path: Path, one_line: OneLine) -> None:
+    path = tmp_path / "photo.png"
+    os.mkfifo(path)
+    with pytest.raises(ImageError) as caught:
+        load_image(path)
+    assert f"{path} is a pipe or a device" in one_line(caught.value)
+
+
+def test_large_images_load_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 300)  # RGB has 450; an error comes at 600
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.resetwarnings()
+        np.testing.assert_array_equal(load_image(PNG), RGB)
+    assert caught == []
+    with pytest.raises(ImageError, match="decompression bomb"):  # warnings are errors in tests
+        load_image(PNG)
 
 
 def test_a_pil_image_of_a_cut_file() -> None:
@@ -327,7 +465,7 @@ def test_broken_exif_is_no_broken_picture(tmp_path: Path) -> None:
     exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 2) + entries + struct.pack("<Iii", 0, -1, 0)
     path = tmp_path / "photo.jpg"
     Image.new("RGB", (30, 20)).save(path, exif=exif)
-    with Image.open(path) as opened, pytest.raises(struct.error):
+    with Image.open(path) as opened, pytest.raises((struct.error, ZeroDivisionError)):
         ImageOps.exif_transpose(opened)
     assert load_image(path).shape == (30, 20, 3)
 

@@ -6,9 +6,12 @@ Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 from __future__ import annotations
 
 import io
+import stat
+import warnings
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -21,6 +24,17 @@ MINIMUM_SIDE = 16
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
 """File name endings that are taken for images when a folder is searched."""
 
+FORMATS = (
+    *("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "AVIF"),
+    *("PSD", "QOI", "SGI", "PCX"),
+    *("HEIF", "JXL"),  # where a plug-in of Pillow has registered them
+    "TGA",  # has no signature, so it comes last
+)
+"""Formats that are read: all are decoded in this process, unlike EPS, which starts Ghostscript."""
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+SAMPLE_FORMAT, SIGNED = 339, 2  # a tag of TIFF, and its value for signed integers
+
 
 def load_image(image: Any) -> np.ndarray:
     """Read an image of any usual kind as 8-bit RGB.
@@ -29,14 +43,16 @@ def load_image(image: Any) -> np.ndarray:
         image: a path; the content of an image file as bytes; a PIL image; or an array
             (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) in the order RGB(A): uint8, uint16 (full
             range 0..65535) or float in [0, 1]. The alpha channel is dropped. Files, also as
-            bytes, are turned upright by their EXIF tag.
+            bytes, are turned upright by their EXIF tag. Pixels of files and PIL images are
+            of these types too, signed and 32-bit integers are refused.
 
     Returns:
         (H, W, 3) uint8 RGB.
 
     Raises:
-        ImageError: the file is missing, truncated or no image, the array has a wrong
-            shape, type or range or holds NaN, or a side is shorter than 16 pixels.
+        ImageError: the file is missing, truncated, damaged (as far as its format lets one
+            see) or no image, the array has a wrong shape, type or range or holds NaN, or a
+            side is shorter than 16 pixels.
 
     Example:
         >>> load_image(np.zeros((20, 30), np.uint16)).shape
@@ -110,8 +126,14 @@ def _read_file(file: Path | io.BytesIO, name: str) -> np.ndarray:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(file) as opened:
-            return _from_pil(_upright(opened), name)
+        if isinstance(file, io.BytesIO):
+            return _decode(file, name)
+        mode = file.stat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise ImageError(f"{name} is a pipe or a device: save the image as a file first")
+        # Pillow gets no path: it would map uncompressed TIFF into memory, and turn it wrongly.
+        with file.open("rb") as opened:
+            return _decode(opened, name)
     except FileNotFoundError:
         raise ImageError(f"there is no file {name}: check the path") from None
     except IsADirectoryError:
@@ -128,10 +150,49 @@ def _read_file(file: Path | io.BytesIO, name: str) -> np.ndarray:
         raise _damaged(name, error) from None
 
 
-def _upright(image: Any) -> Any:
-    """Turn a picture by its EXIF tag; a broken tag is no broken picture."""
+def _decode(file: BinaryIO, name: str) -> np.ndarray:
     from PIL import Image
 
+    _check_png(file, name)
+    _hide_warning_of_large_images()
+    Image.init()  # registers all formats; that of AVIF is not in every Pillow
+    with Image.open(file, formats=[key for key in FORMATS if key in Image.OPEN]) as opened:
+        return _from_pil(opened, name, upright=True)
+
+
+def _check_png(file: BinaryIO, name: str) -> None:
+    """Check the checksums of a PNG file, if it is one: Pillow leaves out those of the pixels."""
+    if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
+        kind = b""
+        while kind != b"IEND":
+            header = file.read(8)
+            left, kind = int.from_bytes(header[:4], "big"), header[4:]
+            checksum = zlib.crc32(kind)
+            # In pieces, as a damaged length may be 4 GB.
+            while left and (piece := file.read(min(left, 1 << 20))):
+                checksum = zlib.crc32(piece, checksum)
+                left -= len(piece)
+            if file.read(4) != checksum.to_bytes(4, "big"):
+                raise _damaged(name, "a checksum of the PNG file is wrong or missing")
+    file.seek(0)
+
+
+def _hide_warning_of_large_images() -> None:
+    """Hide Pillow's warning of 89 to 178 million pixels, unless the program filters it itself."""
+    from PIL import Image
+
+    kind = Image.DecompressionBombWarning
+    # Not catch_warnings, which is not safe with threads.
+    if not any(category is kind for _, _, category, *_ in warnings.filters):
+        warnings.filterwarnings("ignore", category=kind, append=True)
+
+
+def _upright(image: Any) -> Any:
+    """Turn a loaded picture by its EXIF tag; a broken tag is no broken picture."""
+    from PIL import Image
+
+    if image.format == "TIFF":  # Pillow has turned it when it loaded it
+        return image
     try:
         orientation = image.getexif().get(0x0112, 1)
     except Exception:
@@ -148,22 +209,30 @@ def _upright(image: Any) -> Any:
     return image.transpose(turns[orientation]) if orientation in turns else image
 
 
-def _damaged(name: str, error: Exception) -> ImageError:
+def _damaged(name: str, error: Exception | str) -> ImageError:
     return ImageError(f"{name} is damaged or truncated ({error}): get it anew")
 
 
-def _from_pil(image: Any, name: str = "the image") -> np.ndarray:
+def _from_pil(image: Any, name: str = "the image", *, upright: bool = False) -> np.ndarray:
     try:
         image.load()
     except Exception as error:  # Pillow's decoders raise many kinds
         raise _damaged(name, error) from None
+    # Pillow holds 16-bit PGM, and 10.3 also 16-bit PNG, in 32 bits; all else may have any range.
+    wide = image.mode == "I" and image.format not in ("PNG", "PPM")
+    if wide or SIGNED in getattr(image, "tag_v2", {}).get(SAMPLE_FORMAT, ()):
+        raise ImageError(
+            f"{name} holds 32-bit or signed integers, whose range is not known: convert it "
+            "to 8 bits (mode L or RGB), 16 bits without sign (mode I;16) or float in [0, 1]"
+        )
+    if upright:
+        image = _upright(image)
     if image.mode == "P" and isinstance(image.info.get("transparency"), bytes):
         image = image.convert("RGBA")  # Pillow warns when it drops such an alpha at once
-    if image.mode.startswith("I") or image.mode == "F":  # 16 or 32 bits a pixel
-        values = np.asarray(image)
-        if image.mode != "F":
-            values = np.clip(values, 0, 65535).astype(np.uint16)
-        return _from_array(values, name)
+    if image.mode == "I":
+        return _from_array(np.asarray(image).astype(np.uint16), name)
+    if image.mode.startswith("I;16") or image.mode == "F":
+        return _from_array(np.asarray(image), name)
     return np.asarray(image.convert("RGB"))
 
 
