@@ -10,7 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, HeatmapOptions, SelectionOptions, select_keypoints
+from deepdetect import (
+    DeepDetect,
+    HeatmapOptions,
+    SelectionOptions,
+    match_images,
+    select_keypoints,
+)
 from deepdetect.bundled import bundled_weights
 from deepdetect.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
 
@@ -177,12 +183,14 @@ def test_a_constant_image_has_no_keypoint(
 def test_detection_is_selection_from_the_map(
     options: dict[str, Any], detector: DeepDetect, image: np.ndarray
 ) -> None:
-    heatmap = detector.heatmap(image)
+    heatmap, logits = detector.heatmap_and_logits(image)
+    np.testing.assert_array_equal(heatmap, detector.heatmap(image))
     keypoints = detector.detect(image, **options)
-    expected = select_keypoints(heatmap, SelectionOptions(**options))
+    expected = select_keypoints(heatmap, SelectionOptions(**options), logits)
     np.testing.assert_array_equal(keypoints.xy, expected.xy)
+    np.testing.assert_array_equal(keypoints.logits, expected.logits)
     assert keypoints.image_size == (image.shape[1], image.shape[0])
-    x, y = keypoints.xy.astype(int).T
+    x, y = np.rint(keypoints.xy).astype(int).T
     np.testing.assert_array_equal(keypoints.scores, heatmap[y, x])
 
 
@@ -504,3 +512,102 @@ def test_threads_get_their_own_images(backend: str) -> None:
         together = list(pool.map(detector.heatmap, images))
     for expected, found in zip(alone, together, strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+# What a network may answer.
+
+
+def bad_answer(folder: Path, kind: str) -> Path:
+    """Write an ONNX file that fits by its declared shapes, and answers wrongly."""
+    onnx = pytest.importorskip("onnx")
+    helper, element = onnx.helper, onnx.TensorProto.FLOAT
+    mean = helper.make_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1)
+    constant = {
+        name: onnx.numpy_helper.from_array(np.array(value, np.float32), name)
+        for name, value in (("minus", -1.0), ("five", 5.0))
+    }
+    output = "logits" if kind == "logits of nan" else "probability"
+    nodes = {
+        "nan": [
+            helper.make_node("Mul", ["mean", "minus"], ["negative"]),
+            helper.make_node("Sub", ["negative", "five"], ["low"]),
+            helper.make_node("Log", ["low"], [output]),
+        ],
+        "half": [
+            helper.make_node("AveragePool", ["mean"], [output], kernel_shape=[2, 2], strides=[2, 2])
+        ],
+        "five": [helper.make_node("Add", ["mean", "five"], [output])],
+    }
+    nodes["logits of nan"] = nodes["nan"]
+    graph = helper.make_graph(
+        [mean, *nodes[kind]],
+        "bad",
+        [helper.make_tensor_value_info("image", element, FREE_IMAGE)],
+        [helper.make_tensor_value_info(output, element, FREE_MAP)],
+        list(constant.values()),
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    path = folder / "bad.onnx"
+    onnx.save(model, str(path))
+    return path
+
+
+@needs["onnx"]
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("nan", "not finite"),
+        ("logits of nan", "not finite"),
+        ("half", "map of shape (1, 1, 24, 32) for an image that needs (1, 1, 48, 64)"),
+        ("five", "no probabilities"),
+    ],
+)
+def test_a_network_that_answers_wrongly(
+    kind: str, words: str, backend: str, tmp_path: Path, one_line: OneLine
+) -> None:
+    pytest.importorskip(backend)
+    detector = DeepDetect(bad_answer(tmp_path, kind), backend=backend)
+    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    for call in (detector.heatmap, detector.detect):
+        with pytest.raises(WeightsError) as caught:
+            call(image)
+        assert words in one_line(caught.value)
+        assert "bad.onnx" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "heatmap", [np.full((48, 64), np.nan, np.float32), np.zeros((24, 32), np.float32)]
+)
+def test_a_heat_map_of_somebody_s_own_detector(heatmap: np.ndarray, one_line: OneLine) -> None:
+    class Own:
+        def heatmap(self, image: Any) -> np.ndarray:
+            return heatmap
+
+    image = np.zeros((48, 64, 3), np.uint8)
+    with pytest.raises(OptionError) as caught:
+        match_images(image, image, Own())
+    assert "heat map must be" in one_line(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "wrong", "right"),
+    [("detect", "max_keypoint", "max_keypoints"), ("__init__", "weight", "weights")],
+)
+def test_an_unknown_keyword(
+    call: str, wrong: str, right: str, detector: DeepDetect, image: np.ndarray, one_line: OneLine
+) -> None:
+    with pytest.raises(OptionError) as caught:
+        DeepDetect(**{wrong: 5}) if call == "__init__" else detector.detect(image, **{wrong: 5})
+    assert f"unknown option {wrong!r}: did you mean {right!r}?" in one_line(caught.value)
+
+
+@needs["torch"]
+@needs["safetensors"]
+def test_logits_are_the_network_s_own(image: np.ndarray) -> None:
+    for name in ("matching", "geometry"):
+        torch_maps = DeepDetect(bundled_weights(name, ".safetensors")).heatmap_and_logits(image)
+        onnx_maps = DeepDetect(name, backend="onnxruntime").heatmap_and_logits(image)
+        np.testing.assert_allclose(onnx_maps[1], torch_maps[1], atol=2e-3)
+        probability = 1 / (1 + np.exp(-onnx_maps[1].astype(np.float64)))
+        np.testing.assert_allclose(onnx_maps[0], probability, atol=1e-6)

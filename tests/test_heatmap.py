@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect.errors import OptionError
-from deepdetect.heatmap import HeatmapOptions, compute_heatmap
+from deepdetect.heatmap import HeatmapOptions, compute_heatmap, compute_heatmap_and_logits
 
 RGB = np.random.default_rng(11).integers(0, 256, (61, 90, 3), dtype=np.uint8)
 
@@ -20,12 +20,22 @@ class Recorder:
 
     def __call__(self, planes: np.ndarray) -> np.ndarray:
         self.shown.append(planes.copy())
-        return respond(planes)
+        return answer(planes)
 
 
 def respond(planes: np.ndarray) -> np.ndarray:
     red, green, blue = planes[0]
     return (0.6 * red + 0.3 * green + 0.1 * blue**2).astype(np.float32)[None, None]
+
+
+def to_logits(probability: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        wide = probability.astype(np.float64)
+        return (np.log(wide) - np.log1p(-wide)).astype(np.float32)
+
+
+def answer(planes: np.ndarray) -> np.ndarray:
+    return to_logits(respond(planes))
 
 
 def refuse(planes: np.ndarray) -> np.ndarray:
@@ -51,7 +61,11 @@ def test_an_image_of_any_size_is_padded_with_its_border(height: int, width: int)
     np.testing.assert_allclose(planes[0], expected, atol=1e-7)
     assert heatmap.shape == (height, width)
     assert heatmap.dtype == np.float32
-    np.testing.assert_array_equal(heatmap, respond(planes)[0, 0, :height, :width])
+    expected = respond(planes)[0, 0, :height, :width]
+    np.testing.assert_allclose(heatmap, expected, rtol=1e-5, atol=1e-7)
+    again, logits = compute_heatmap_and_logits(rgb, network)
+    np.testing.assert_array_equal(again, heatmap)
+    np.testing.assert_array_equal(logits, to_logits(expected))
 
 
 @pytest.mark.parametrize("side", [16, 48, 104])
@@ -59,17 +73,19 @@ def test_an_image_of_any_size_is_padded_with_its_border(height: int, width: int)
 def test_a_squashed_image(side: int, channels: str) -> None:
     shown = RGB if channels == "rgb" else RGB[:, :, [2, 1, 0]]
     square = cv2.resize(np.ascontiguousarray(shown), (side, side), interpolation=cv2.INTER_CUBIC)
-    answer = respond((square.transpose(2, 0, 1)[None] / 255).astype(np.float32))[0, 0]
-    expected = cv2.resize(answer, (90, 61), interpolation=cv2.INTER_CUBIC).clip(0, 1)
-    heatmap = compute_heatmap(RGB, respond, HeatmapOptions(side, channels))
-    assert heatmap.dtype == np.float32
+    small = respond((square.transpose(2, 0, 1)[None] / 255).astype(np.float32))[0, 0]
+    expected = cv2.resize(small, (90, 61), interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    heatmap, logits = compute_heatmap_and_logits(RGB, answer, HeatmapOptions(side, channels))
+    assert heatmap.dtype == logits.dtype == np.float32
     np.testing.assert_allclose(heatmap, expected, atol=1e-5)
+    expected = cv2.resize(to_logits(small), (90, 61), interpolation=cv2.INTER_CUBIC)
+    np.testing.assert_allclose(logits, expected, atol=1e-4)
 
 
 def test_a_square_of_the_wanted_side_is_not_changed() -> None:
     square = np.ascontiguousarray(RGB[:56, :56])
     np.testing.assert_array_equal(
-        compute_heatmap(square, respond, HeatmapOptions(56)), compute_heatmap(square, respond)
+        compute_heatmap(square, answer, HeatmapOptions(56)), compute_heatmap(square, answer)
     )
 
 
@@ -78,7 +94,7 @@ def test_a_squashed_map_stays_in_range(side: int) -> None:
     def checkers(planes: np.ndarray) -> np.ndarray:
         # Cubic interpolation of this overshoots on both sides.
         rows, columns = np.indices(planes.shape[2:])
-        return ((rows // 2 + columns // 2) % 2).astype(np.float32)[None, None]
+        return to_logits(((rows // 2 + columns // 2) % 2).astype(np.float32)[None, None])
 
     heatmap = compute_heatmap(RGB, checkers, HeatmapOptions(side))
     assert heatmap.min() == 0
@@ -88,11 +104,11 @@ def test_a_squashed_map_stays_in_range(side: int) -> None:
 @pytest.mark.parametrize("resolution", ["native", 40])
 def test_bgr_is_the_swapped_image(resolution: str | int) -> None:
     swapped = np.ascontiguousarray(RGB[:, :, ::-1])
-    ours = compute_heatmap(RGB, respond, HeatmapOptions(resolution, "bgr"))
+    ours = compute_heatmap(RGB, answer, HeatmapOptions(resolution, "bgr"))
     np.testing.assert_array_equal(
-        ours, compute_heatmap(swapped, respond, HeatmapOptions(resolution))
+        ours, compute_heatmap(swapped, answer, HeatmapOptions(resolution))
     )
-    assert np.abs(ours - compute_heatmap(RGB, respond, HeatmapOptions(resolution))).max() > 0.1
+    assert np.abs(ours - compute_heatmap(RGB, answer, HeatmapOptions(resolution))).max() > 0.1
 
 
 @pytest.mark.parametrize("resolution", ["native", 40])
@@ -112,13 +128,13 @@ def test_a_constant_image_is_not_shown_to_the_network(
 def test_one_other_value_makes_an_image_not_constant(place: tuple[int, int, int]) -> None:
     rgb = np.full((16, 20, 3), 100, np.uint8)
     rgb[place] = 101
-    assert compute_heatmap(rgb, respond).any()
+    assert compute_heatmap(rgb, answer).any()
 
 
 def test_the_image_is_left_as_it_was() -> None:
     before = RGB.copy()
     for options in (HeatmapOptions(), HeatmapOptions(40, "bgr")):
-        compute_heatmap(RGB, respond, options)
+        compute_heatmap(RGB, answer, options)
     np.testing.assert_array_equal(RGB, before)
 
 

@@ -127,12 +127,12 @@ def reference(heatmap: np.ndarray, options: SelectionOptions) -> list[tuple[int,
         ],
         heatmap.shape,
     )
-    radius = options.nms_radius
+    radius = options.suppression_radius
     kept: list[tuple[float, int, int]] = []
-    for one in candidates:
+    for position, one in enumerate(candidates):
         near = (
             abs(one[1] - better[1]) <= radius and abs(one[2] - better[2]) <= radius
-            for better in kept
+            for better in candidates[:position]
         )
         if not radius or not any(near):
             kept.append(one)
@@ -156,11 +156,11 @@ def test_equals_plain_loops(data: st.DataObject, shape: tuple[int, int]) -> None
         threshold=data.draw(st.sampled_from([0.0, 0.25, 0.5, 0.6])),
         density=data.draw(st.none() | st.floats(0.01, 1)),
         max_keypoints=data.draw(st.none() | st.integers(1, 20)),
-        nms_radius=data.draw(st.integers(0, 4)),
+        nms_radius=data.draw(st.none() | st.integers(0, 4)),
         ignore=data.draw(st.none() | arrays(bool, shape)),
     )
     keypoints = select_keypoints(heatmap, options)
-    found = [(int(x), int(y)) for x, y in keypoints]
+    found = [(round(float(x)), round(float(y))) for x, y in keypoints]
     assert found == reference(heatmap, options)
     assert keypoints.image_size == (shape[1], shape[0])
     assert keypoints.scores.tolist() == [float(heatmap[y, x]) for x, y in found]
@@ -181,12 +181,12 @@ def test_suppressed_keypoints_keep_their_distance(heatmap: np.ndarray, radius: i
         assert keypoints.scores.max() == heatmap.max()
 
 
-def test_a_ramp_is_thinned_and_not_emptied() -> None:
-    """Its top suppresses the next pixel only, so the one after that is kept again."""
+def test_a_ramp_keeps_its_top() -> None:
+    """Pixels that are suppressed suppress, too: the rest of a slope is no maximum."""
     heatmap = np.zeros((16, 16), np.float32)
     heatmap[4, 2:12] = np.linspace(0.6, 0.9, 10)
     keypoints = select_keypoints(heatmap, SelectionOptions(nms_radius=1))
-    assert keypoints.xy.tolist() == [[3, 4], [5, 4], [7, 4], [9, 4], [11, 4]]
+    assert keypoints.xy.tolist() == [[11, 4]]
 
 
 def test_the_threshold_is_strict() -> None:
@@ -217,7 +217,7 @@ def test_a_density_takes_no_impossible_pixel() -> None:
 @pytest.mark.parametrize("count", [1, 7, 100, 10_000])
 def test_the_most_probable_are_kept(count: int) -> None:
     heatmap = np.random.default_rng(1).random((30, 40)).astype(np.float32)
-    keypoints = select_keypoints(heatmap, SelectionOptions(0.5, max_keypoints=count))
+    keypoints = select_keypoints(heatmap, SelectionOptions(0.5, max_keypoints=count, nms_radius=0))
     best = np.sort(heatmap[heatmap > 0.5])[::-1][:count]
     np.testing.assert_array_equal(np.sort(keypoints.scores)[::-1], best)
 
@@ -262,7 +262,7 @@ def test_a_plateau_leaves_its_first_pixel() -> None:
 def test_suppression_goes_before_the_number() -> None:
     heatmap = np.zeros((16, 16), np.float32)
     heatmap[4, 4], heatmap[4, 5], heatmap[10, 10] = 0.9, 0.8, 0.7
-    options = SelectionOptions(max_keypoints=2, nms_radius=1)
+    options = SelectionOptions(max_keypoints=2, nms_radius=1, subpixel=False)
     assert select_keypoints(heatmap, options).xy.tolist() == [[4, 4], [10, 10]]
 
 
@@ -319,3 +319,81 @@ def test_the_heat_map_is_left_as_it_was() -> None:
     before = heatmap.copy()
     select_keypoints(heatmap, SelectionOptions(0.2, max_keypoints=9, nms_radius=2))
     np.testing.assert_array_equal(heatmap, before)
+
+
+# Ranking by logits, and positions between pixels.
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    return (1 / (1 + np.exp(-logits.astype(np.float64)))).astype(np.float32)
+
+
+def test_logits_rank_what_float32_rounds_to_one() -> None:
+    logits = np.full((24, 24), -5, np.float32)
+    places = [(3, 4), (20, 7), (11, 19), (5, 15)]  # (x, y), from the worst to the best
+    for level, (x, y) in zip((20, 30, 40, 50), places, strict=True):
+        logits[y, x] = level
+    heatmap = sigmoid(logits)
+    assert (heatmap[logits > 0] == 1).all()
+    for count in (1, 2, 3):
+        found = select_keypoints(heatmap, SelectionOptions(max_keypoints=count), logits)
+        assert {tuple(xy) for xy in found.xy.tolist()} == set(places[-count:])
+        assert found.logits is not None
+        assert sorted(found.logits.tolist()) == [20, 30, 40, 50][-count:]
+        assert found.best(1).xy.tolist() == [[5, 15]]
+
+
+def test_the_best_keypoints_of_a_photograph_are_no_lattice(photo: np.ndarray) -> None:
+    """Ranked by probabilities, many of which are 1, they lay on a grid of powers of two."""
+    detector = DeepDetect()
+    keypoints = detector.detect(photo, max_keypoints=100)
+    assert len(keypoints) == 100
+    xy = np.rint(keypoints.xy).astype(int)
+    offsets = np.bincount((xy[:, 1] % 4) * 4 + xy[:, 0] % 4, minlength=16) / len(xy)
+    ours = offsets.max()
+    heatmap, logits = detector.heatmap_and_logits(photo)
+    old = select_keypoints(heatmap, SelectionOptions(max_keypoints=100, nms_radius=0))
+    saturated = (heatmap == 1).sum()
+    assert saturated > 200  # else this photograph shows nothing
+    assert np.sort(logits[heatmap == 1])[-1] > np.sort(logits[heatmap == 1])[0]
+    xy = old.xy.astype(int)
+    offsets = np.bincount((xy[:, 1] % 4) * 4 + xy[:, 0] % 4, minlength=16) / len(xy)
+    # The network itself, which halves the image twice, prefers every other pixel a little.
+    assert ours < 0.4 < offsets.max() - 0.15
+
+
+@pytest.mark.parametrize(("x", "y"), [(12.0, 9.0), (12.3, 9.0), (11.6, 9.45), (12.25, 8.75)])
+def test_the_peak_of_a_paraboloid_is_found(x: float, y: float) -> None:
+    row, column = np.indices((20, 24))
+    heatmap = (0.9 - 0.01 * (column - x) ** 2 - 0.02 * (row - y) ** 2).clip(0).astype(np.float32)
+    found = select_keypoints(heatmap, SelectionOptions(max_keypoints=1))
+    np.testing.assert_allclose(found.xy, [[x, y]], atol=1e-4)
+    whole = select_keypoints(heatmap, SelectionOptions(max_keypoints=1, subpixel=False))
+    np.testing.assert_array_equal(whole.xy, [[round(x), round(y)]])
+    alone = select_keypoints(heatmap, SelectionOptions(nms_radius=30, subpixel=True))
+    np.testing.assert_allclose(alone.xy, [[x, y]], atol=1e-4)
+
+
+@given(heatmap=arrays(np.float32, SHAPES, elements=LEVELS))
+def test_a_refined_keypoint_stays_with_its_pixel(heatmap: np.ndarray) -> None:
+    whole = select_keypoints(heatmap, SelectionOptions(0.1))
+    refined = select_keypoints(heatmap, SelectionOptions(0.1, subpixel=True))
+    np.testing.assert_array_equal(np.rint(refined.xy), whole.xy)
+    height, width = heatmap.shape
+    assert (refined.xy >= 0).all()
+    assert (refined.xy <= (width - 1, height - 1)).all()
+
+
+def test_defaults_of_suppression_and_refinement() -> None:
+    dense, sparse = SelectionOptions(), SelectionOptions(max_keypoints=9)
+    assert (dense.suppression_radius, dense.refines) == (0, False)
+    assert (sparse.suppression_radius, sparse.refines) == (1, True)
+    own = SelectionOptions(max_keypoints=9, nms_radius=0, subpixel=False)
+    assert (own.suppression_radius, own.refines) == (0, False)
+
+
+def test_logits_of_another_size() -> None:
+    with pytest.raises(OptionError, match="must be equal"):
+        select_keypoints(np.zeros((4, 5), np.float32), logits=np.zeros((5, 4), np.float32))
+    with pytest.raises(OptionError, match="as many logits as scores"):
+        Keypoints([[1, 2]], [0.5], (8, 5), [1.0, 2.0])

@@ -494,7 +494,6 @@ def test_the_result_is_the_same_every_time(photo: np.ndarray, detector: Any) -> 
 def test_every_stage_has_its_time(photo: np.ndarray) -> None:
     matches = unguided(photo, photo, Corners(), max_keypoints=50)
     assert list(matches.seconds) == [
-        "heat map",
         "keypoints",
         "descriptors",
         "matching",

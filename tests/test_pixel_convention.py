@@ -15,16 +15,22 @@ from deepdetect.labels import DETECTORS
 from deepdetect.labels.points import keypoints_mask, pixels_mask
 
 
+def to_logits(probability: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        wide = probability.astype(np.float64)
+        return (np.log(wide) - np.log1p(-wide)).astype(np.float32)
+
+
 def brightness(planes: np.ndarray) -> np.ndarray:
     """A network whose probability is the brightness of the pixel."""
-    return planes.mean(1, keepdims=True)
+    return to_logits(planes.mean(1, keepdims=True))
 
 
 def place(planes: np.ndarray) -> np.ndarray:
     """A network whose probability at (x, y) is (3 x + y) / 1000, whatever the image."""
     height, width = planes.shape[2:]
     rows, columns = np.mgrid[:height, :width]
-    return ((3 * columns + rows) / 1000).astype(np.float32)[None, None]
+    return to_logits(((3 * columns + rows) / 1000)[None, None])
 
 
 def dot(x: int, y: int, height: int = 30, width: int = 50) -> np.ndarray:

@@ -90,3 +90,12 @@ def test_files_without_keypoints_are_refused(tmp_path: Path) -> None:
     for name in ("other.npz", "text.npz", "pickle.npz", "missing.npz"):
         with pytest.raises(DeepDetectError):
             load_keypoints(tmp_path / name)
+
+
+def test_logits_survive_the_round_trip(tmp_path: Path) -> None:
+    points = Keypoints([[1, 2], [3.5, 4]], [1, 1], (8, 8), [17.5, 40])
+    save_keypoints(points, tmp_path / "k.npz")
+    found = load_keypoints(tmp_path / "k.npz")
+    assert found.logits is not None
+    assert found.logits.tolist() == [17.5, 40]
+    assert found.best(1).xy.tolist() == [[3.5, 4]]

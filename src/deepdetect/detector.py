@@ -9,9 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 from .bundled import find_weights
-from .heatmap import HeatmapOptions, compute_heatmap
+from .errors import OptionError
+from .heatmap import HeatmapOptions, compute_heatmap_and_logits
 from .image import load_image
 from .keypoints import Keypoints, SelectionOptions, select_keypoints
+from .options import suggest_keywords
 from .runtime import RuntimeOptions, open_network
 
 
@@ -50,6 +52,7 @@ class DeepDetect:
         10
     """
 
+    @suggest_keywords
     def __init__(
         self,
         weights: str | Path = "matching",
@@ -95,8 +98,23 @@ class DeepDetect:
         Raises:
             ImageError: the image cannot be read or is not fit.
         """
-        return compute_heatmap(load_image(image), self._network, self.heatmap_options)
+        return self.heatmap_and_logits(image)[0]
 
+    def heatmap_and_logits(self, image: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the heat map and the logits of its probabilities; argument as of `heatmap`.
+
+        Float32 rounds the highest probabilities to 1. The logits still tell these pixels apart, so
+        keypoints are ranked by them.
+
+        Returns:
+            The heat map and the logits, (H, W) float32 both.
+
+        Raises:
+            ImageError: the image cannot be read or is not fit.
+        """
+        return compute_heatmap_and_logits(load_image(image), self._network, self.heatmap_options)
+
+    @suggest_keywords
     def detect(
         self,
         image: Any,
@@ -104,7 +122,8 @@ class DeepDetect:
         *,
         density: float | None = None,
         max_keypoints: int | None = None,
-        nms_radius: int = 0,
+        nms_radius: int | None = None,
+        subpixel: bool | None = None,
         ignore: np.ndarray | None = None,
     ) -> Keypoints:
         """Detect keypoints.
@@ -112,18 +131,44 @@ class DeepDetect:
         Args:
             image: as for `heatmap`.
             threshold: tau: pixels with a probability above it.
-            density: wanted keypoints a pixel, in (0, 1], instead of the threshold. So many
+            density: wanted keypoints per pixel, in (0, 1], instead of the threshold. This many
                 are returned even where there is little to detect.
-            max_keypoints: keep the most probable so many.
-            nms_radius: keep only the most probable of pixels so close, in pixels.
+            max_keypoints: keep at most this many, the most probable ones, ranked by logits.
+            nms_radius: radius of non-maximum suppression in pixels. None: 1 with `max_keypoints`,
+                else 0.
+            subpixel: refine positions to a fraction of a pixel. None: with `max_keypoints` only.
             ignore: (H, W) array, true where no keypoint is wanted.
 
         Returns:
-            The keypoints, on pixel centres, in the order of rows and columns.
+            The keypoints in the order of rows and columns, on pixel centres unless `subpixel`.
 
         Raises:
             ImageError: the image cannot be read or is not fit.
             OptionError: an option is out of its range.
         """
-        options = SelectionOptions(threshold, density, max_keypoints, nms_radius, ignore)
-        return select_keypoints(self.heatmap(image), options)
+        options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel, ignore)
+        return find_keypoints(self, load_image(image), options)
+
+
+def find_keypoints(detector: Any, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
+    """Choose the keypoints of an image, ranked by logits where the detector gives them.
+
+    Args:
+        detector: a `DeepDetect`, or anything with a method `heatmap`.
+        rgb: (H, W, 3) uint8 RGB.
+        options: what to choose.
+
+    Raises:
+        OptionError: the detector's map has another size than the image, or is not finite.
+    """
+    logits = None
+    if hasattr(detector, "heatmap_and_logits"):
+        heatmap, logits = detector.heatmap_and_logits(rgb)
+    else:
+        heatmap = detector.heatmap(rgb)
+    if np.shape(heatmap) != rgb.shape[:2] or not np.isfinite(heatmap).all():
+        raise OptionError(
+            f"the detector's heat map must be {rgb.shape[:2]} finite probabilities, one per "
+            f"pixel, and has shape {np.shape(heatmap)}: correct its method heatmap"
+        )
+    return select_keypoints(np.asarray(heatmap), options, logits)

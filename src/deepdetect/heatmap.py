@@ -63,16 +63,39 @@ def compute_heatmap(
         (H, W) float32 probability in [0, 1], at the image's own pixels. A constant
         image holds nothing to detect: its map is 0 throughout.
     """
+    return compute_heatmap_and_logits(rgb, network, options)[0]
+
+
+def compute_heatmap_and_logits(
+    rgb: np.ndarray, network: Network, options: HeatmapOptions = HeatmapOptions()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Run the network on an image; arguments as of `compute_heatmap`.
+
+    Returns:
+        The heat map, and the (H, W) float32 logits of its probabilities. Float32 rounds the
+        highest probabilities to 1; logits still tell them apart, so keypoints are ranked by them.
+    """
     height, width = rgb.shape[:2]
     if (rgb == rgb[0, 0]).all():
-        return np.zeros((height, width), np.float32)
+        return np.zeros((height, width), np.float32), np.full((height, width), -np.inf, np.float32)
     shown = rgb if options.channels == "rgb" else rgb[:, :, ::-1]
     if options.resolution == "native":
-        return np.ascontiguousarray(_run(network, _pad(shown))[:height, :width])
+        logits = np.ascontiguousarray(_run(network, _pad(shown))[:height, :width])
+        return _sigmoid(logits), logits
     side = int(options.resolution)
     squashed = cv2.resize(np.ascontiguousarray(shown), (side, side), interpolation=cv2.INTER_CUBIC)
-    heatmap = cv2.resize(_run(network, squashed), (width, height), interpolation=cv2.INTER_CUBIC)
-    return np.clip(heatmap, 0, 1, out=heatmap)
+    logits = _run(network, squashed)
+    heatmap, enlarged = (
+        cv2.resize(map_, (width, height), interpolation=cv2.INTER_CUBIC)
+        for map_ in (_sigmoid(logits), logits)
+    )
+    return np.clip(heatmap, 0, 1, out=heatmap), enlarged
+
+
+def _sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Return the probabilities; the exponent is never positive, so that nothing overflows."""
+    decay = np.exp(-np.abs(logits))
+    return np.where(logits >= 0, np.float32(1), decay) / (1 + decay)
 
 
 def _pad(rgb: np.ndarray) -> np.ndarray:

@@ -11,6 +11,9 @@ import numpy as np
 from .errors import OptionError
 from .even_order import even_order
 
+LARGEST_OFFSET = 0.499
+"""In pixels: a refined keypoint is still nearest to the pixel that it was found at."""
+
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
@@ -19,8 +22,11 @@ class Keypoints:
     Attributes:
         xy: (N, 2) float32 positions, x right and y down in pixels, centre of the
             first pixel (0, 0).
-        scores: (N,) float32 probabilities.
+        scores: (N,) float32 probabilities. Float32 rounds the highest to 1: to rank keypoints,
+            use `best`, or the logits.
         image_size: (width, height) of the image in pixels.
+        logits: (N,) float32 logits of the probabilities, or None where the detector gives
+            probabilities only.
 
     `len`, iteration over (x, y) rows and indexing by slices, masks and index arrays work.
 
@@ -36,6 +42,7 @@ class Keypoints:
     xy: np.ndarray
     scores: np.ndarray
     image_size: tuple[int, int]
+    logits: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         xy = np.asarray(self.xy, np.float32)
@@ -47,6 +54,14 @@ class Keypoints:
                 f"keypoints need (N, 2) positions and (N,) scores, "
                 f"not {xy.shape} and {scores.shape}"
             )
+        if self.logits is not None:
+            logits = np.asarray(self.logits, np.float32)
+            if logits.shape != scores.shape:
+                raise OptionError(
+                    f"keypoints need as many logits as scores, not {logits.shape} and "
+                    f"{scores.shape}"
+                )
+            object.__setattr__(self, "logits", logits)
         object.__setattr__(self, "xy", xy)
         object.__setattr__(self, "scores", scores)
         object.__setattr__(self, "image_size", (int(self.image_size[0]), int(self.image_size[1])))
@@ -62,13 +77,25 @@ class Keypoints:
         width, height = self.image_size
         return len(self) / (width * height)
 
+    def best(self, count: int) -> Keypoints:
+        """Return the keypoints with the highest logits (or scores), in the order they have here.
+
+        Equal ones come in an order that spreads them evenly over the image.
+        """
+        if len(self) <= count:
+            return self
+        ranks = self.scores if self.logits is None else self.logits
+        spread = even_order(self.xy, self.image_size)
+        return self[np.sort(np.lexsort((spread, -ranks))[:count])]
+
     def __len__(self) -> int:
         return len(self.xy)
 
     def __getitem__(self, index: slice | np.ndarray | list[int]) -> Keypoints:
         if isinstance(index, (int, np.integer)):
             index = [int(index)]
-        return Keypoints(self.xy[index], self.scores[index], self.image_size)
+        logits = None if self.logits is None else self.logits[index]
+        return Keypoints(self.xy[index], self.scores[index], self.image_size, logits)
 
     def __iter__(self) -> Iterator[np.ndarray]:
         return iter(self.xy)
@@ -80,11 +107,15 @@ class SelectionOptions:
 
     Attributes:
         threshold: tau: pixels with a probability above it (paper: 0.5).
-        density: wanted number of keypoints a pixel, in (0, 1]; takes the place of the
+        density: wanted number of keypoints per pixel, in (0, 1]; takes the place of the
             threshold: the most probable pixels are taken, as many as that.
-        max_keypoints: the most probable so many are kept.
-        nms_radius: each keypoint, the most probable first, suppresses those at most so
-            far from it in x and in y (0 suppresses none).
+        max_keypoints: at most this many are kept, the most probable ones.
+        nms_radius: non-maximum suppression: only pixels are kept that rank highest among those
+            at most this many pixels away in x and in y (0 suppresses none). None: 1 (a window of
+            3x3) with `max_keypoints`, else 0.
+        subpixel: move each keypoint from its pixel's centre to the maximum of a parabola through
+            the pixel and its two neighbours, in x and in y, less than half a pixel. None: with
+            `max_keypoints` only.
         ignore: (H, W) bool or number array, true where no keypoint is wanted.
 
     Raises:
@@ -94,7 +125,8 @@ class SelectionOptions:
     threshold: float = 0.5
     density: float | None = None
     max_keypoints: int | None = None
-    nms_radius: int = 0
+    nms_radius: int | None = None
+    subpixel: bool | None = None
     ignore: np.ndarray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -104,28 +136,47 @@ class SelectionOptions:
             raise OptionError(f"the density must lie in (0, 1], not {self.density}")
         if self.max_keypoints is not None and self.max_keypoints < 1:
             raise OptionError(f"max_keypoints must be at least 1, not {self.max_keypoints}")
-        if self.nms_radius < 0:
-            raise OptionError(f"nms_radius must be 0 or more pixels, not {self.nms_radius}")
-        if self.nms_radius != int(self.nms_radius):
-            raise OptionError(f"nms_radius must be a whole number of pixels, not {self.nms_radius}")
+        if self.nms_radius is not None:
+            if self.nms_radius < 0:
+                raise OptionError(f"nms_radius must be 0 or more pixels, not {self.nms_radius}")
+            if self.nms_radius != int(self.nms_radius):
+                raise OptionError(
+                    f"nms_radius must be a whole number of pixels, not {self.nms_radius}"
+                )
+
+    @property
+    def suppression_radius(self) -> int:
+        """The radius of suppression in pixels, with the default filled in."""
+        if self.nms_radius is None:
+            return 0 if self.max_keypoints is None else 1
+        return int(self.nms_radius)
+
+    @property
+    def refines(self) -> bool:
+        """Whether positions are refined, with the default filled in."""
+        return self.max_keypoints is not None if self.subpixel is None else self.subpixel
 
 
 def select_keypoints(
-    heatmap: np.ndarray, options: SelectionOptions = SelectionOptions()
+    heatmap: np.ndarray,
+    options: SelectionOptions = SelectionOptions(),
+    logits: np.ndarray | None = None,
 ) -> Keypoints:
     """Choose the keypoints of a heat map.
 
     Args:
         heatmap: (H, W) float32 probability.
         options: what to choose. The order is: ignore mask, threshold, suppression,
-            density or maximum number. Where probabilities are equal, as the many that float32
-            rounds to 1, those come first that spread the keypoints evenly (`even_order`).
+            density or maximum number, sub-pixel positions.
+        logits: (H, W) float32 logits of the map, by which keypoints are ranked; by default the
+            map itself, though float32 rounds its highest probabilities to 1. Equal ones come
+            in an order that spreads the keypoints evenly (`even_order`).
 
     Returns:
-        Keypoints on pixel centres, in the order of rows and columns.
+        Keypoints in the order of rows and columns, on pixel centres unless `subpixel`.
 
     Raises:
-        OptionError: the ignore mask has another size than the map.
+        OptionError: the ignore mask or the logits have another size than the map.
 
     Example:
         >>> heatmap = np.zeros((16, 16), np.float32)
@@ -134,6 +185,12 @@ def select_keypoints(
         [[9.0, 4.0]]
     """
     height, width = heatmap.shape
+    ranking = heatmap if logits is None else logits
+    if ranking.shape != heatmap.shape:
+        raise OptionError(
+            f"the logits have shape {ranking.shape}, the heat map {heatmap.shape}: "
+            "they must be equal"
+        )
     # With a density wanted, all but the impossible pixels may be needed.
     wanted = heatmap > (options.threshold if options.density is None else 0.0)
     if options.ignore is not None:
@@ -145,16 +202,40 @@ def select_keypoints(
             )
         wanted &= ~ignore.astype(bool)
     pixels = np.flatnonzero(wanted)
-    scores = heatmap.ravel()[pixels]
-    if options.nms_radius and len(pixels):
-        kept = _suppress(pixels, scores, heatmap.shape, options.nms_radius)
-        pixels, scores = pixels[kept], scores[kept]
+    ranks = ranking.ravel()
+    if options.suppression_radius and len(pixels):
+        pixels = pixels[_suppress(pixels, ranks[pixels], heatmap.shape, options.suppression_radius)]
     count = _wanted_count(options, heatmap.size)
     if count is not None and len(pixels) > count:
-        kept = np.sort(_ranked(pixels, scores, heatmap.shape)[:count])
-        pixels, scores = pixels[kept], scores[kept]
+        pixels = pixels[np.sort(_ranked(pixels, ranks[pixels], heatmap.shape)[:count])]
     row, column = np.divmod(pixels, width)
-    return Keypoints(np.stack([column, row], 1).astype(np.float32), scores, (width, height))
+    xy = np.stack([column, row], 1).astype(np.float32)
+    if options.refines:
+        xy += np.stack([_peak_offset(ranking, row, column, axis) for axis in (1, 0)], 1)
+    found = None if logits is None else ranks[pixels]
+    return Keypoints(xy, heatmap.ravel()[pixels], (width, height), found)
+
+
+def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
+    """Return where the parabola through pixels and their neighbours along an axis peaks.
+
+    The offset stays under half a pixel, so that the nearest pixel is the keypoint's own. It is 0 on
+    the image's border, and where a pixel is no maximum along the axis.
+    """
+    position, last = (row, column)[axis], ranking.shape[axis] - 1
+    inner = (position > 0) & (position < last)
+    before, after = (
+        ranking[
+            np.clip(row + step * (axis == 0), 0, ranking.shape[0] - 1),
+            np.clip(column + step * (axis == 1), 0, ranking.shape[1] - 1),
+        ].astype(np.float64)
+        for step in (-1, 1)
+    )
+    middle = ranking[row, column].astype(np.float64)
+    bend = 2 * middle - before - after
+    peaked = inner & (middle >= before) & (middle >= after) & (bend > 0)
+    offset = np.where(peaked, (after - before) / np.where(peaked, 2 * bend, 1), 0)
+    return np.clip(offset, -LARGEST_OFFSET, LARGEST_OFFSET).astype(np.float32)
 
 
 def _ranked(pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -176,19 +257,11 @@ def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
 def _suppress(
     pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...], radius: int
 ) -> np.ndarray:
-    """Tell which pixels are kept when each kept one, best first, suppresses those around it.
+    """Tell which pixels rank highest in the window around them.
 
-    The map is nearly flat near 1, so pixels are compared by rank, which has no ties. All
-    pixels that are the best of their window are kept at once, their neighbours fall out,
-    and so on with what is left, until nothing is: the same as going through the list.
+    Pixels are compared by rank, which has no ties: one of a plateau stays.
     """
-    left = np.zeros(shape, np.float64)
-    left.ravel()[pixels[_ranked(pixels, scores, shape)]] = np.arange(len(pixels), 0, -1)
-    kept = np.zeros(shape, np.uint8)
-    window = np.ones((2 * int(radius) + 1,) * 2, np.uint8)  # a box is dilated in linear time
-    while left.any():
-        # Beyond the border is -infinity.
-        best = ((cv2.dilate(left, window) == left) & (left > 0)).astype(np.uint8)
-        kept |= best
-        left[cv2.dilate(best, window) > 0] = 0
-    return kept.ravel()[pixels] > 0
+    rank = np.zeros(shape, np.float32 if len(pixels) < 2**24 else np.float64)
+    rank.ravel()[pixels[_ranked(pixels, scores, shape)]] = np.arange(len(pixels), 0, -1)
+    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # a box is dilated in linear time
+    return (cv2.dilate(rank, window) == rank).ravel()[pixels]  # beyond the border is -infinity

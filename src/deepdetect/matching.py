@@ -11,14 +11,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from .descriptors import get_descriptor
-from .detector import DeepDetect
+from .detector import DeepDetect, find_keypoints
 from .errors import OptionError
 from .geometry import Geometry, GeometryOptions, estimate_geometry
 from .geometry.residuals import transfer_errors
 from .guidance import Guidance, guided_matches
 from .heatmap import HeatmapOptions
 from .image import load_image, luma
-from .keypoints import Keypoints, select_keypoints
+from .keypoints import Keypoints
 from .matchers import DescriptorMatches, get_matcher, match_descriptors, one_to_one
 from .memory import free_memory
 from .options import changed
@@ -124,17 +124,15 @@ def match_images(
     seconds: dict[str, float] = {}
     rgb = load_image(image0), load_image(image1)
     detector = _configured(detector, chosen.heatmap)
-    with _timed(seconds, "heat map"):
-        heatmaps = [detector.heatmap(image) for image in rgb]
     with _timed(seconds, "keypoints"):
-        keypoints = [select_keypoints(heatmap, chosen.selection) for heatmap in heatmaps]
+        keypoints = [find_keypoints(detector, image, chosen.selection) for image in rgb]
     grays = luma(rgb[0]), luma(rgb[1])
     guidance, found = None, None
     if chosen.guidance != "none":
         with _timed(seconds, "guided matching"):
             guidance, found = guided_matches(
                 *grays,
-                *(points.xy for points in keypoints),
+                *(np.rint(points.xy) for points in keypoints),
                 _guiding_model(chosen),
                 chosen.geometry.seed,
             )
@@ -190,7 +188,7 @@ def unguided_matches(
             ratio=chosen.ratio,
             mutual=chosen.mutual,
             seed=chosen.geometry.seed,
-            positions=(points[0], points[1]),
+            positions=(np.rint(points[0]), np.rint(points[1])),
         )
 
 

@@ -3,15 +3,49 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import inspect
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from .errors import unknown_name
 
 Options = TypeVar("Options")
 Entry = TypeVar("Entry")
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Make an unknown keyword of a function an error that names the nearest right one.
+
+    A decorator; the function keeps its signature, so that editors and type checkers see it.
+
+    Raises:
+        OptionError: from the function, called with a keyword that it does not take.
+
+    Example:
+        >>> @suggest_keywords
+        ... def detect(image, *, max_keypoints=None):
+        ...     return max_keypoints
+        >>> detect(None, max_keypoint=5)
+        Traceback (most recent call last):
+        ...
+        deepdetect.errors.OptionError: unknown option 'max_keypoint': did you mean \
+'max_keypoints'? (known: image, max_keypoints)
+    """
+    names = [name for name in inspect.signature(function).parameters if name != "self"]
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        for name in kwargs:
+            if name not in names:
+                raise unknown_name("option", name, names)
+        return function(*args, **kwargs)
+
+    return call
 
 
 def is_path(value: str | Path) -> bool:

@@ -21,7 +21,8 @@ def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
     Args:
         keypoints: the keypoints.
         path: ending in .npz (arrays `keypoints` (N, 2) float32, `scores` (N,) float32,
-            `image_size` (width, height)) or .csv (columns x, y, score).
+            `image_size` (width, height), and `logits` (N,) float32 where there are) or .csv
+            (columns x, y, score).
 
     Raises:
         OptionError: the file's ending is another.
@@ -33,6 +34,7 @@ def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
             keypoints=keypoints.xy,
             scores=keypoints.scores,
             image_size=np.array(keypoints.image_size),
+            **({} if keypoints.logits is None else {"logits": keypoints.logits}),
         )
     else:
         _save_csv(path, "x,y,score", np.column_stack([keypoints.xy, keypoints.scores]))
@@ -46,7 +48,12 @@ def load_keypoints(path: str | Path) -> Keypoints:
     """
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return Keypoints(arrays["keypoints"], arrays["scores"], tuple(arrays["image_size"]))
+            return Keypoints(
+                arrays["keypoints"],
+                arrays["scores"],
+                tuple(arrays["image_size"]),
+                arrays["logits"] if "logits" in arrays else None,
+            )
     except FileNotFoundError:
         raise DeepDetectError(f"there is no file {path}: check the path") from None
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:

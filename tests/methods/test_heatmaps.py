@@ -43,7 +43,7 @@ def test_points_equal_those_of_the_detector(detector: DeepDetect, crop: np.ndarr
     found = method.detect(crop)
     assert len(found) > 50
     np.testing.assert_array_equal(found.xy, expected.xy)
-    np.testing.assert_array_equal(found.scores, expected.scores)
+    np.testing.assert_array_equal(found.scores, expected.logits)
     assert found.image_size == (100, 80)
 
 

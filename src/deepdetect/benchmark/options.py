@@ -106,9 +106,9 @@ class BenchmarkOptions:
         ]
         own = deepdetect_method(
             self._native(),
-            SelectionOptions(nms_radius=1),
+            SelectionOptions(nms_radius=1, subpixel=True),
             name="deepdetect-sparse",
-            title="DeepDetect, native resolution, suppression 3x3",
+            title="DeepDetect, native resolution, suppression 3x3, sub-pixel",
             descriptor=COMMON_DESCRIPTOR,
         )
         dense = common(self.native())

@@ -42,7 +42,8 @@ def detect(
     threshold: float,
     density: float | None,
     max_keypoints: int | None,
-    nms_radius: int,
+    nms_radius: int | None,
+    subpixel: bool | None,
     ignore: Path | None,
     file_format: str,
     pictures: bool,
@@ -66,7 +67,7 @@ def detect(
 
     paths = expand_images(images, output)
     mask = load_mask(ignore) if ignore is not None else None
-    selection = SelectionOptions(threshold, density, max_keypoints, nms_radius, mask)
+    selection = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel, mask)
     detector = make_detector(values)
     results: list[dict[str, Any]] = []
     failures = []
@@ -101,8 +102,8 @@ def _detect_one(
 
     rgb = load_image(path)
     started = time.perf_counter()
-    heatmap = detector.heatmap(rgb)
-    keypoints = select_keypoints(heatmap, selection)
+    heatmap, logits = detector.heatmap_and_logits(rgb)
+    keypoints = select_keypoints(heatmap, selection, logits)
     seconds = time.perf_counter() - started
     file = output / f"{path.stem}.{file_format}"
     save_keypoints(keypoints, file)

@@ -43,7 +43,7 @@ def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: 
     from ..registration import register as register_images
 
     detector = make_detector(values)
-    names = ("threshold", "density", "max_keypoints", "nms_radius")
+    names = ("threshold", "density", "max_keypoints", "nms_radius", "subpixel")
     chosen = {name: values[name] for name in names if values.get(name) is not None}
     found = register_images(image0, image1, detector, **chosen)
     stem = f"{image1.stem}_on_{image0.stem}"

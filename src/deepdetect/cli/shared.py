@@ -94,15 +94,19 @@ selection_options = combined(
     click.option(
         "--density",
         type=float,
-        help="Wanted keypoints a pixel, from 0 to 1, instead of the threshold.",
+        help="Wanted keypoints per pixel, from 0 to 1, instead of the threshold.",
     ),
-    click.option("--max-keypoints", type=int, help="Keep only the most probable so many."),
+    click.option("--max-keypoints", type=int, help="Keep at most this many, the most probable."),
     click.option(
         "--nms-radius",
         type=int,
-        default=0,
-        show_default=True,
-        help="Keep only the most probable of keypoints so close, in pixels.",
+        help="Radius of non-maximum suppression in pixels.  [default: 1 with --max-keypoints, "
+        "else 0]",
+    ),
+    click.option(
+        "--subpixel/--no-subpixel",
+        default=None,
+        help="Refine positions to a fraction of a pixel.  [default: with --max-keypoints only]",
     ),
 )
 

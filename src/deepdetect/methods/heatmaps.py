@@ -12,7 +12,7 @@ import numpy as np
 
 from ..controls import RandomPoints
 from ..descriptors import get_descriptor
-from ..detector import DeepDetect
+from ..detector import DeepDetect, find_keypoints
 from ..even_order import even_order
 from ..image import luma
 from ..keypoints import SelectionOptions, select_keypoints
@@ -63,8 +63,8 @@ def deepdetect_method(
     """
 
     def detect(rgb: np.ndarray) -> Features:
-        points = select_keypoints(detector.heatmap(rgb), selection)
-        return Features(points.xy, points.scores, points.image_size)
+        points = find_keypoints(detector, rgb, selection)
+        return Features(points.xy, points.logits, points.image_size)
 
     digest = hashlib.sha256(detector.weights.read_bytes()).hexdigest()[:16]
     version = f"{digest} {detector.backend} {detector.heatmap_options} {selection} {descriptor}"
@@ -87,7 +87,7 @@ def random_method(like: Method, seed: int = 0, *, name: str = "random") -> Metho
         size = (rgb.shape[1], rgb.shape[0])
         if not count:
             return Features(np.empty((0, 2)), np.empty(0), size)
-        options = SelectionOptions(threshold=0, max_keypoints=count)
+        options = SelectionOptions(threshold=0, max_keypoints=count, nms_radius=0, subpixel=False)
         points = select_keypoints(RandomPoints(seed + own).heatmap(rgb), options)
         return Features(points.xy, points.scores, size)
 

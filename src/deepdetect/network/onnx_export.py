@@ -1,4 +1,4 @@
-"""The network as an ONNX file for any image size: `image` in, `probability` out."""
+"""The network as an ONNX file for any image size: `image` in, `probability` and `logits` out."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from ..atomic import atomic_path
 OPSET = 17
 
 
-class Probability(nn.Module):
-    """The network followed by the sigmoid."""
+class ProbabilityAndLogits(nn.Module):
+    """The network followed by the sigmoid, and its logits, which tell the best pixels apart."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
 
-    def forward(self, image: Tensor) -> Tensor:
-        return torch.sigmoid(self.network(image))
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        logits = self.network(image)
+        return torch.sigmoid(logits), logits
 
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
@@ -32,9 +33,10 @@ def export_onnx(network: nn.Module, path: str | Path) -> None:
         network: maps (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits; H and W
             are multiples of 8.
         path: file ending in .onnx. Its input is `image` (batch, 3, height, width)
-            float32, its output `probability` (batch, 1, height, width) float32.
+            float32, its outputs `probability` and `logits`, both (batch, 1, height, width)
+            float32.
     """
-    module = Probability(network.cpu()).eval()
+    module = ProbabilityAndLogits(network.cpu()).eval()
     example = torch.zeros(2, 3, 64, 96)
     axes = {0: "batch", 2: "height", 3: "width"}
     with atomic_path(path) as temporary, warnings.catch_warnings():
@@ -45,8 +47,8 @@ def export_onnx(network: nn.Module, path: str | Path) -> None:
             (example,),
             str(temporary),
             input_names=["image"],
-            output_names=["probability"],
-            dynamic_axes={"image": axes, "probability": axes},
+            output_names=["probability", "logits"],
+            dynamic_axes={"image": axes, "probability": axes, "logits": axes},
             opset_version=OPSET,
             dynamo=False,
         )

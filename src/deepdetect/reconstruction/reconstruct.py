@@ -10,17 +10,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..detector import DeepDetect
+from ..detector import DeepDetect, find_keypoints
 from ..errors import ReconstructionError
 from ..guidance.sparse import sparse_features
 from ..image import load_image, luma
-from ..keypoints import SelectionOptions, select_keypoints
+from ..keypoints import SelectionOptions
 from ..matchers import get_matcher, match_descriptors
 from ..matching import HeatmapDetector, match_images
 from ..options import changed
@@ -175,7 +175,9 @@ def _from_rows(pair: _Pair) -> Reconstruction:
     images, options, calibration = pair.images, pair.options, pair.calibration
     check_cameras(calibration)
     with pair.stage("keypoints"):
-        keypoints = select_keypoints(pair.detector.heatmap(images[0]), options.selection)
+        # Disparities are those of pixels.
+        selection = replace(options.selection, subpixel=False)
+        keypoints = find_keypoints(pair.detector, images[0], selection)
     check_keypoints(len(keypoints), options.selection)
     with pair.stage("matching"):
         found = match_rows(*pair.grays, keypoints.xy, options.row_matching)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import DeepDetectError, OptionError, WeightsError, unknown_name
-from .shapes import check_network
+from .shapes import as_logits, check_network, output_to_read
 
 if TYPE_CHECKING:
     from .registry import RuntimeOptions
@@ -17,19 +17,22 @@ if TYPE_CHECKING:
 class OnnxRuntimeNetwork:
     """A network run by ONNX Runtime."""
 
-    def __init__(self, session: Any, input_name: str) -> None:
+    def __init__(self, session: Any, input_name: str, output_name: str, path: Path) -> None:
         self._session = session
         self._input_name = input_name
+        self._output_name = output_name
+        self._path = path
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         try:
-            return self._session.run(None, {self._input_name: image})[0]
+            output = self._session.run([self._output_name], {self._input_name: image})[0]
         except Exception as error:  # its exceptions share no base class
             height, width = image.shape[2:]
             raise DeepDetectError(
                 f"the network failed on an image of {width}x{height} pixels "
                 f"({str(error).splitlines()[0]}): use a smaller one, or another provider"
             ) from None
+        return as_logits(output, self._output_name, image.shape, self._path)
 
 
 def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
@@ -80,4 +83,5 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
             for value in [*inputs, *outputs]
         },
     )
-    return OnnxRuntimeNetwork(session, inputs[0].name)
+    output = output_to_read([value.name for value in outputs])
+    return OnnxRuntimeNetwork(session, inputs[0].name, output, path)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import WeightsError
-from .shapes import check_network
+from .shapes import as_logits, check_network, output_to_read
 
 if TYPE_CHECKING:
     from .registry import RuntimeOptions
@@ -18,15 +18,18 @@ if TYPE_CHECKING:
 class OpenVinoNetwork:
     """A network run by OpenVINO on the CPU."""
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, output_name: str, path: Path) -> None:
         self._model = model
+        self._output_name = output_name
+        self._path = path
         self._local = threading.local()
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         # A request holds one image at a time, so each thread gets its own.
         if not hasattr(self._local, "request"):
             self._local.request = self._model.create_infer_request()
-        return self._local.request.infer([image], share_inputs=True)[0]
+        outputs = self._local.request.infer([image], share_inputs=True)
+        return as_logits(outputs[self._output_name], self._output_name, image.shape, self._path)
 
 
 def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
@@ -59,7 +62,8 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         [_shape(value) for value in model.outputs],
         {str(value.get_element_type().to_dtype()) for value in [*model.inputs, *model.outputs]},
     )
-    return OpenVinoNetwork(model)
+    output = output_to_read([value.get_any_name() for value in model.outputs])
+    return OpenVinoNetwork(model, output, path)
 
 
 def _shape(value: object) -> list[int | str]:

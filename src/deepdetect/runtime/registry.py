@@ -24,9 +24,12 @@ class Network(Protocol):
     """A loaded network."""
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Map (1, 3, H, W) float32 in [0, 1] to (1, 1, H, W) float32 probability.
+        """Map (1, 3, H, W) float32 in [0, 1] to (1, 1, H, W) float32 logits, all finite.
 
-        H and W are multiples of 8.
+        H and W are multiples of 8. The logits are those of the probability of a keypoint.
+
+        Raises:
+            WeightsError: the network gives a map of another size, or values that are no number.
         """
 
 

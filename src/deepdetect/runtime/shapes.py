@@ -1,19 +1,24 @@
-"""The check that an ONNX file is a network of ours."""
+"""The checks that an ONNX file is a network of ours, and that it answers like one."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import WeightsError
 
 Shape = Sequence[int | str | None]
+
+LOGITS = "logits"
+"""Name of the output that holds logits; an output of another name holds probabilities."""
 
 
 def check_network(
     path: Path, inputs: Sequence[Shape], outputs: Sequence[Shape], types: set[str]
 ) -> None:
-    """Check that a network maps one RGB image to one map, for any size.
+    """Check that a network maps one RGB image to a map or two, for any size.
 
     Args:
         path: the file, for the message.
@@ -24,9 +29,10 @@ def check_network(
         WeightsError: the shapes or the types do not fit.
     """
     fits = (
-        len(inputs) == len(outputs) == 1
+        len(inputs) == 1
+        and len(outputs) in (1, 2)
         and _like(inputs[0], channels=3)
-        and _like(outputs[0], channels=1)
+        and all(_like(output, channels=1) for output in outputs)
     )
     if not fits:
         raise WeightsError(
@@ -38,6 +44,51 @@ def check_network(
             f"{path} does not fit: it computes with {', '.join(sorted(types))}, "
             "and must take and give float32"
         )
+
+
+def output_to_read(names: Sequence[str]) -> str:
+    """Choose the output to read: the logits, or the first where there are none."""
+    return LOGITS if LOGITS in names else names[0]
+
+
+def as_logits(
+    output: np.ndarray, name: str, image_shape: tuple[int, ...], path: Path
+) -> np.ndarray:
+    """Check what a network returns, and turn probabilities into logits.
+
+    Args:
+        output: what the network returned.
+        name: the output's name; probabilities unless it is "logits".
+        image_shape: (1, 3, H, W) of the image.
+        path: the weights file, for the message.
+
+    Returns:
+        (1, 1, H, W) float32 logits. Probabilities that float32 rounds to 0 or 1 become the
+        logits of the nearest number that it holds.
+
+    Raises:
+        WeightsError: the map has another size, or a value is not finite or no probability.
+    """
+    wanted = (1, 1, *image_shape[2:])
+    if output.shape != wanted:
+        raise WeightsError(
+            f"{path} gives a map of shape {output.shape} for an image that needs {wanted}: "
+            "use other weights"
+        )
+    if not np.isfinite(output).all():
+        raise WeightsError(
+            f"{path} gives values that are not finite: it is damaged, or its training diverged; "
+            "use other weights"
+        )
+    if name == LOGITS:
+        return output
+    if output.min() < 0 or output.max() > 1:
+        raise WeightsError(
+            f"{path} gives values from {output.min():g} to {output.max():g}, which are no "
+            f"probabilities: name the output {LOGITS!r} if it holds logits, or use other weights"
+        )
+    probability = np.clip(output.astype(np.float64), 1e-38, 1 - 2.0**-25)
+    return np.log(probability / (1 - probability)).astype(np.float32)
 
 
 def _like(shape: Shape, channels: int) -> bool:

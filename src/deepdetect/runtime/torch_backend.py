@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .shapes import LOGITS, as_logits
+
 if TYPE_CHECKING:
     from .registry import RuntimeOptions
 
@@ -14,8 +16,9 @@ if TYPE_CHECKING:
 class TorchNetwork:
     """A network run by torch on the CPU."""
 
-    def __init__(self, network: object) -> None:
+    def __init__(self, network: object, path: Path) -> None:
         self._network = network
+        self._path = path
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         import torch
@@ -23,7 +26,8 @@ class TorchNetwork:
         with torch.inference_mode():
             tensor = torch.from_numpy(np.ascontiguousarray(image))
             tensor = tensor.contiguous(memory_format=torch.channels_last)
-            return torch.sigmoid(self._network(tensor)).contiguous().numpy()
+            logits = self._network(tensor).contiguous().numpy()
+        return as_logits(logits, LOGITS, image.shape, self._path)
 
 
 def open_torch(path: Path, options: RuntimeOptions) -> TorchNetwork:
@@ -38,4 +42,4 @@ def open_torch(path: Path, options: RuntimeOptions) -> TorchNetwork:
 
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    return TorchNetwork(load_network(path).to(memory_format=torch.channels_last))
+    return TorchNetwork(load_network(path).to(memory_format=torch.channels_last), path)
