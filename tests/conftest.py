@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,9 @@ from pathlib import Path
 import hypothesis
 import numpy as np
 import pytest
+
+# Some tests import ONNX Runtime by themselves.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 # The same examples on every run, no files left behind, no limit on time.
 hypothesis.settings.register_profile(

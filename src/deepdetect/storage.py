@@ -52,7 +52,7 @@ def load_keypoints(path: str | Path) -> Keypoints:
                 arrays["keypoints"],
                 arrays["scores"],
                 tuple(arrays["image_size"]),
-                arrays["logits"] if "logits" in arrays else None,
+                arrays.get("logits"),
             )
     except FileNotFoundError:
         raise DeepDetectError(f"there is no file {path}: check the path") from None

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ..kernels import compiled
 
 LEAST = 1e-3
 """Of the product of the squared lengths: below it descriptors are the mean, and tell nothing."""
 
 
 # No full fastmath: its approximate division and root do not give 0 for equal descriptors.
-@njit(nogil=True, fastmath={"reassoc", "nsz", "contract"}, cache=True)
+@compiled(nogil=True, fastmath={"reassoc", "nsz", "contract"})
 def compare(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]
     """Write 1 - correlation of the pairs from `start` to before `stop` into `out`."""
     for k in range(start, stop):

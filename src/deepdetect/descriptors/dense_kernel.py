@@ -8,13 +8,14 @@ then along the column into its four rows at the keypoints only.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ..kernels import compiled
 
 TILE_HEIGHT = 48
 TILE_WIDTH = 64
 
 
-@njit(nogil=True, fastmath=True, cache=True)
+@compiled(nogil=True, fastmath=True)
 def describe_tiles(  # type: ignore[no-untyped-def]
     first,
     last,
@@ -83,7 +84,7 @@ def describe_tiles(  # type: ignore[no-untyped-def]
             _normalise(histogram, out[k])
 
 
-@njit(nogil=True, fastmath=True, cache=True, inline="always")
+@compiled(nogil=True, fastmath=True, inline="always")
 def _normalise(histogram, out):  # type: ignore[no-untyped-def]
     """Cut at a fifth of the length, scale to 512 and round, as Lowe and OpenCV do."""
     total = np.float32(0)
@@ -102,7 +103,7 @@ def _normalise(histogram, out):  # type: ignore[no-untyped-def]
             out[32 * b + o] = np.uint8(min(np.float32(255), np.rint(histogram[b, o] * scale)))
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def square_root(first, last, descriptors):  # type: ignore[no-untyped-def]
     """Turn SIFT into RootSIFT, in place: 512 times the root of each one's share of the sum."""
     for k in range(first, last):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ..kernels import compiled
 
 FAR = np.int32(2**31 - 1)
 """The distance of a neighbour that has not been found."""
 
 
-@njit(nogil=True, cache=True, inline="always")
+@compiled(nogil=True, inline="always")
 def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
     """Return the squared Euclidean distance; all in 32 bits, for the sake of the processor."""
     total = np.int32(0)
@@ -19,7 +20,7 @@ def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(nogil=True, cache=True, inline="always")
+@compiled(nogil=True, inline="always")
 def _with(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
     """Return the best two rows and their distances when one more row is considered."""
     if distance < nearer:
@@ -29,7 +30,7 @@ def _with(row, distance, best, second, nearer, farther):  # type: ignore[no-unty
     return best, second, nearer, farther
 
 
-@njit(nogil=True, cache=True, inline="always")
+@compiled(nogil=True, inline="always")
 def _scrambled(number):  # type: ignore[no-untyped-def]
     """Return a number that looks random, the same for the same number (Wellons's lowbias32)."""
     number = np.uint32(number)
@@ -41,7 +42,7 @@ def _scrambled(number):  # type: ignore[no-untyped-def]
     return number
 
 
-@njit(nogil=True, cache=True, inline="always")
+@compiled(nogil=True, inline="always")
 def _line(matrix, x, y):  # type: ignore[no-untyped-def]
     """Return the epipolar line of a pixel, with a normal of length 1."""
     a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]
@@ -51,7 +52,7 @@ def _line(matrix, x, y):  # type: ignore[no-untyped-def]
     return a / length, b / length, c / length
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def start_on_lines(  # type: ignore[no-untyped-def]
     first, last, queries, base, xy0, at1, matrix, tries, seed, rows, distances
 ):
@@ -81,7 +82,7 @@ def start_on_lines(  # type: ignore[no-untyped-def]
         distances[query, 0], distances[query, 1] = nearer, farther
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def start(first, last, queries, base, seed, rows, distances):  # type: ignore[no-untyped-def]
     """Give the queries from `first` to before `last` two random rows of the base."""
     count = len(base)
@@ -101,7 +102,7 @@ def start(first, last, queries, base, seed, rows, distances):  # type: ignore[no
         distances[query, 0], distances[query, 1] = nearer, farther
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def sweep(  # type: ignore[no-untyped-def]
     first, last, bands, queries, base, xy0, xy1, at0, at1, offsets, turn, seed, radii, before, rows,
     distances, matrix, band_width,

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from ..errors import WeightsError
+from ..runtime.without_telemetry import import_onnxruntime
 from .features import Features
 from .heatmaps import COMMON_DESCRIPTOR
 from .method import Method
@@ -63,8 +64,7 @@ def onnx_method(path: str | Path, name: str | None = None) -> Method:
 
 
 def _open(data: bytes, file: Path) -> Any:
-    import onnxruntime
-
+    onnxruntime = import_onnxruntime()
     try:
         return onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions have no common base

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ..kernels import compiled
 
 
-@njit(nogil=True, fastmath=True, cache=True, inline="always")
+@compiled(nogil=True, fastmath=True, inline="always")
 def _cubic(image, x, y):  # type: ignore[no-untyped-def]
     """Read an image between its pixels (Keys's cubic, a = -1/2); 1 to 2 pixels from the border."""
     column, row = np.int64(np.floor(x)), np.int64(np.floor(y))
@@ -29,7 +30,7 @@ def _cubic(image, x, y):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(nogil=True, fastmath=True, cache=True)
+@compiled(nogil=True, fastmath=True)
 def align(  # type: ignore[no-untyped-def]
     first,
     last,

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import DeepDetectError, OptionError, WeightsError, unknown_name
 from .shapes import as_logits, check_network, output_to_read
+from .without_telemetry import import_onnxruntime
 
 if TYPE_CHECKING:
     from .registry import RuntimeOptions
@@ -42,8 +43,7 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
         WeightsError: the file is damaged or is another network.
         OptionError: an execution provider is unknown or not available.
     """
-    import onnxruntime
-
+    onnxruntime = import_onnxruntime()
     providers = list(options.providers) or ["CPUExecutionProvider"]
     for provider in providers:
         if provider not in onnxruntime.get_all_providers():

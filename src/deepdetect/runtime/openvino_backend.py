@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import WeightsError
 from .shapes import as_logits, check_network, output_to_read
+from .without_telemetry import import_openvino
 
 if TYPE_CHECKING:
     from .registry import RuntimeOptions
@@ -38,7 +39,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     Raises:
         WeightsError: the file is damaged or is another network.
     """
-    import openvino
+    openvino = import_openvino()
     from openvino.frontend import FrontEndManager
 
     # Its default on newer CPUs is bfloat16, which moves keypoints.

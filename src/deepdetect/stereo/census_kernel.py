@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ..kernels import compiled
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def census_rows(first, last, gray, out):  # type: ignore[no-untyped-def]
     """Write of each pixel of some rows which of its neighbours are darker, one bit each.
 
@@ -29,7 +30,7 @@ def census_rows(first, last, gray, out):  # type: ignore[no-untyped-def]
                     out[y, x] = (out[y, x] << np.uint64(1)) | np.uint64(darker)
 
 
-@njit(nogil=True, cache=True, inline="always")
+@compiled(nogil=True, inline="always")
 def _count_bits(word):  # type: ignore[no-untyped-def]
     """Count the bits of a 64-bit word; the compiler knows this form as one instruction."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
@@ -40,7 +41,7 @@ def _count_bits(word):  # type: ignore[no-untyped-def]
     return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def _distances(left, right_mirrored, smallest, outside, out):  # type: ignore[no-untyped-def]
     """Write the Hamming distances of one row, (W, D) uint8."""
     width, count = out.shape
@@ -56,7 +57,7 @@ def _distances(left, right_mirrored, smallest, outside, out):  # type: ignore[no
             out[x, d] = np.uint8(_count_bits(word ^ right_mirrored[start + d]))
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def cost_rows(first, last, left, right_mirrored, smallest, outside, cost):  # type: ignore[no-untyped-def]
     """Write the costs of some rows.
 

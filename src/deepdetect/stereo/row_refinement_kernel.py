@@ -8,7 +8,8 @@ so far from any other that it is never on the same surface.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ..kernels import compiled
 
 UNKNOWN = np.float32(1e9)
 
@@ -19,7 +20,7 @@ BLOCK = 128
 """Pixels of a row that are done together: what is in the works stays in the nearest cache."""
 
 
-@njit(nogil=True, cache=True, fastmath=True)
+@compiled(nogil=True, fastmath=True)
 def smooth_rows(first, last, disparity, reach, jump, out):  # type: ignore[no-untyped-def]
     """Write the mean disparity of the same surface around each pixel of some rows.
 
@@ -57,7 +58,7 @@ def smooth_rows(first, last, disparity, reach, jump, out):  # type: ignore[no-un
                 out[y, start + x] = here[x] + total[x] / weight[x]
 
 
-@njit(nogil=True, cache=True, fastmath=True)
+@compiled(nogil=True, fastmath=True)
 def sample_rows(first, last, right, disparity, values, slopes):  # type: ignore[no-untyped-def]
     """Read the right image at x - disparity by cubic interpolation (Catmull-Rom), with slopes.
 
@@ -84,7 +85,7 @@ def sample_rows(first, last, right, disparity, values, slopes):  # type: ignore[
             slopes[y, x] = one + t * (np.float32(2) * two + t * np.float32(3) * three)
 
 
-@njit(nogil=True, cache=True, fastmath=True)
+@compiled(nogil=True, fastmath=True)
 def step_rows(  # type: ignore[no-untyped-def]
     first, last, left, values, slopes, disparity, reach, jump, noise, out
 ):

@@ -7,13 +7,14 @@ at once by the processor's wide registers; sums are kept in 16 bits for the same
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from ..kernels import compiled
 
 END = np.uint16(30000)
 """Cost beyond both ends of a path's disparities: more than any sum, and room to add a step."""
 
 
-@njit(nogil=True, cache=True, inline="always")
+@compiled(nogil=True, inline="always")
 def _step(before, least, cost, total, after, small_step, large_step):  # type: ignore[no-untyped-def]
     """Go one pixel along a path; return the least cost there.
 
@@ -39,7 +40,7 @@ def _step(before, least, cost, total, after, small_step, large_step):  # type: i
     return lowest
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def sum_along_rows(first, last, gray, cost, total, direction, small_step, large_steps):  # type: ignore[no-untyped-def]
     """Add the paths along some rows, to the right (1) or to the left (-1)."""
     width, count = cost.shape[1], cost.shape[2]
@@ -60,7 +61,7 @@ def sum_along_rows(first, last, gray, cost, total, direction, small_step, large_
             )  # fmt: skip
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def sum_along_columns(  # type: ignore[no-untyped-def]
     first, last, gray, cost, total, direction, slant, small_step, large_steps
 ):
@@ -90,7 +91,7 @@ def sum_along_columns(  # type: ignore[no-untyped-def]
             )  # fmt: skip
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True)
 def best_of_rows(first, last, total, smallest, count, disparity, known, unique):  # type: ignore[no-untyped-def]
     """Choose the disparity of least cost for each pixel of some rows, in both views.
 
