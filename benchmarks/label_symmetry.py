@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deepdetect.image import find_images, load_image, luma
+from deepdetect.io.image import find_images, load_image, luma
 from deepdetect.labels import DETECTOR_NAMES, LabelOptions, fuse
 
 CHANGES = {

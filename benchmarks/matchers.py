@@ -16,10 +16,10 @@ import numpy as np
 
 from deepdetect import DeepDetect, HeatmapOptions, SelectionOptions, select_keypoints
 from deepdetect.datasets.oxford import find_scene, load_oxford
-from deepdetect.descriptors import get_descriptor
+from deepdetect.features.descriptors import get_descriptor
+from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.geometry import transform_points
-from deepdetect.image import load_image, luma
-from deepdetect.matchers import get_matcher, match_descriptors
+from deepdetect.io.image import load_image, luma
 
 PAIRS = (("graf", 3), ("wall", 6), ("leuven", 6))
 MATCHERS = ("flann", "faiss", "patchmatch")
@@ -29,7 +29,7 @@ def main() -> None:
     """Print a line for each pair, descriptor and matcher."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("oxford", type=Path)
-    parser.add_argument("--weights", default="matching")
+    parser.add_argument("--weights", default="default")
     parser.add_argument("--repeats", type=int, default=2)
     arguments = parser.parse_args()
     scenes = load_oxford(arguments.oxford)

@@ -15,7 +15,7 @@ import numpy as np
 
 from deepdetect import DeepDetect, match_images
 from deepdetect.datasets.motorcycle import load_motorcycle
-from deepdetect.metrics import stereo_score
+from deepdetect.evaluation.metrics import stereo_score
 
 WAYS: dict[str, dict[str, Any]] = {
     'guidance="auto"': {"guidance": "auto"},
@@ -33,7 +33,7 @@ WAYS: dict[str, dict[str, Any]] = {
 def main() -> None:
     """Print a row of a table for each way."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--weights", default="matching")
+    parser.add_argument("--weights", default="default")
     detector = DeepDetect(parser.parse_args().weights)
     pair = load_motorcycle()
     print("| options | matches, within 1 px | inliers, within 1 px |\n|---|---|---|")

@@ -20,12 +20,12 @@ import numpy as np
 from skimage import data
 
 from deepdetect import DeepDetect, HeatmapOptions, Matches, match_images
-from deepdetect.benchmark.oxford import GUIDED_PAIRS, chosen_pairs
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.datasets.oxford import load_oxford
+from deepdetect.evaluation.metrics import stereo_score
+from deepdetect.evaluation.protocols.oxford import GUIDED_PAIRS, chosen_pairs
 from deepdetect.geometry import transform_points
-from deepdetect.image import load_image
-from deepdetect.metrics import stereo_score
+from deepdetect.io.image import load_image
 
 PHOTOGRAPHS = ("chelsea", "coffee", "rocket", "astronaut", "grass")
 SCENES = ("cones", "teddy", "art")
@@ -36,7 +36,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("oxford", type=Path, nargs="?")
     parser.add_argument("--middlebury", type=Path, help="folder of the stereo scenes")
-    parser.add_argument("--weights", default="matching")
+    parser.add_argument("--weights", default="default")
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--pair", action="append", help="as 'ubc 1-6'; default all nine")
     arguments = parser.parse_args()

@@ -30,12 +30,12 @@ from pathlib import Path
 import numpy as np
 
 from deepdetect import DeepDetect
-from deepdetect.benchmark.stereo_pipelines import sgbm_disparity
-from deepdetect.benchmark.stereo_truth import truths
+from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.motorcycle import load_motorcycle
-from deepdetect.errors import ImageError
-from deepdetect.image import load_image
-from deepdetect.stereo import COMPLETE, RowMatchingOptions, match_rows
+from deepdetect.evaluation.protocols.stereo_pipelines import sgbm_disparity
+from deepdetect.evaluation.protocols.stereo_truth import truths
+from deepdetect.io.image import load_image
+from deepdetect.reconstruction.stereo import COMPLETE, RowMatchingOptions, match_rows
 
 TOLERANCES = (0.5, 1.0, 2.0, 4.0)
 AT_EDGES = RowMatchingOptions(uniqueness=1.0, edge_distance=0)
@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("data", type=Path, help="folder of the scenes")
     parser.add_argument("--repeats", type=int, default=3, help="the fastest counts (default: 3)")
     arguments = parser.parse_args()
-    detector = DeepDetect("geometry")
+    detector = DeepDetect("dense")
     for name, left, right, known in scenes(arguments.data):
         keypoints = detector.detect(left).xy
         for way, compute in ways(left, right, keypoints, search_count(known)).items():

@@ -16,9 +16,9 @@ import numpy as np
 
 from deepdetect import DeepDetect, match_images
 from deepdetect.datasets import load_stereo_pair
-from deepdetect.image import luma
-from deepdetect.reconstruction.calibration import Calibration, Camera
-from deepdetect.reconstruction.relative_pose import estimate_relative_pose, rotation_angle
+from deepdetect.geometry.camera import Calibration, Camera
+from deepdetect.geometry.relative_pose import estimate_relative_pose, rotation_angle
+from deepdetect.io.image import luma
 from deepdetect.reconstruction.subpixel import refine_matches, similarity
 from deepdetect.reconstruction.two_view import TwoViewOptions, reconstruct_two_view
 
@@ -69,7 +69,7 @@ def main() -> None:
     size = pair.left.shape[1::-1]
     left = Camera(size, FOCAL, CENTRE)
     right = Camera(size, FOCAL, (CENTRE[0] + OFFSET, CENTRE[1]))
-    detector = DeepDetect("geometry")
+    detector = DeepDetect("dense")
     print(
         "| turned | matches | positions | used | < 0.25 px | < 0.5 px | < 1 px | rotation | "
         "not refined | direction | points | depth within 1 % | 2 % | 5 % | seconds |\n"

@@ -138,8 +138,8 @@ def run_evaluate(tmp_path: Path) -> Callable[..., str]:
     from click.testing import CliRunner
     from PIL import Image
 
-    from deepdetect.bundled import bundled_weights
     from deepdetect.cli import main
+    from deepdetect.detector.pretrained import bundled_weights
 
     generator = np.random.default_rng(0)
     Image.fromarray(generator.integers(0, 256, (64, 64, 3), np.uint8)).save(

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.heatmap import HeatmapOptions, compute_heatmap
-from deepdetect.keypoints import select_keypoints
+from deepdetect.detector.heatmap import HeatmapOptions, compute_heatmap
+from deepdetect.features.keypoints import select_keypoints
 from deepdetect.labels import DETECTORS
 from deepdetect.labels.points import keypoints_mask, pixels_mask
 

@@ -98,7 +98,7 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
             Image.fromarray(whole[:, start : start + 330]).save(folder / f"{name}.png")
     if "average" in words:
         pytest.importorskip("torch", reason="needs torch to read weights")
-        words[words.index("WEIGHTS") : words.index("WEIGHTS") + 1] = ["matching", "geometry"]
+        words[words.index("WEIGHTS") : words.index("WEIGHTS") + 1] = ["default", "dense"]
     if "shards" in words:
         pytest.importorskip("webdataset", reason="needs webdataset, of the extra data")
         words += ["--detectors", "fast", "--short-side", "32", "--workers", "1"]
@@ -197,11 +197,11 @@ def test_the_wheel_installs_and_detects(folder: Path) -> None:
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    weights = target / "deepdetect" / "weights"
-    for name in ("deepdetect", "geometry"):
+    weights = target / "deepdetect" / "detector" / "weights"
+    for name in ("default", "dense"):
         assert 0 < (weights / f"{name}.onnx").stat().st_size < 2_000_000
         assert 0 < (weights / f"{name}.safetensors").stat().st_size < 2_000_000
-    for name in ("MODEL_CARD.md", "GEOMETRY_CARD.md"):
+    for name in ("MODEL_CARD.md", "DENSE_CARD.md"):
         assert (weights / name).exists()
     code = (
         f"import sys; sys.path.insert(0, {str(target)!r}); import deepdetect;"

@@ -13,8 +13,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .detector import DeepDetect
-    from .errors import (
+    from ._shared.errors import (
         DeepDetectError,
         ImageError,
         MissingExtraError,
@@ -22,50 +21,51 @@ if TYPE_CHECKING:
         ReconstructionError,
         WeightsError,
     )
-    from .exporters import save_point_cloud
+    from .detector.detector import DeepDetect
+    from .detector.heatmap import HeatmapOptions
+    from .features.keypoints import Keypoints, SelectionOptions, select_keypoints
     from .geometry import Geometry, GeometryOptions, estimate_geometry
-    from .heatmap import HeatmapOptions
-    from .image import load_image
-    from .keypoints import Keypoints, SelectionOptions, select_keypoints
+    from .geometry.camera import Calibration, Camera
+    from .geometry.point_cloud import PointCloud
+    from .io.exporters import save_point_cloud
+    from .io.image import load_image
     from .labels import Label, LabelOptions, fuse
-    from .matching import Matches, match_images
-    from .point_cloud import PointCloud
-    from .presets import MatchingOptions
-    from .reconstruction.calibration import Calibration, Camera
-    from .reconstruction.reconstruct import ReconstructionOptions, reconstruct
+    from .matching.options import MatchingOptions
+    from .matching.pipeline import Matches, match_images
+    from .reconstruction.pipeline import ReconstructionOptions, reconstruct
     from .reconstruction.result import Reconstruction
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Calibration": "reconstruction.calibration",
-    "Camera": "reconstruction.calibration",
-    "DeepDetect": "detector",
-    "DeepDetectError": "errors",
+    "Calibration": "geometry.camera",
+    "Camera": "geometry.camera",
+    "DeepDetect": "detector.detector",
+    "DeepDetectError": "_shared.errors",
     "Geometry": "geometry",
     "GeometryOptions": "geometry",
-    "HeatmapOptions": "heatmap",
-    "ImageError": "errors",
-    "Keypoints": "keypoints",
+    "HeatmapOptions": "detector.heatmap",
+    "ImageError": "_shared.errors",
+    "Keypoints": "features.keypoints",
     "Label": "labels",
     "LabelOptions": "labels",
-    "Matches": "matching",
-    "MatchingOptions": "presets",
-    "MissingExtraError": "errors",
-    "OptionError": "errors",
-    "PointCloud": "point_cloud",
+    "Matches": "matching.pipeline",
+    "MatchingOptions": "matching.options",
+    "MissingExtraError": "_shared.errors",
+    "OptionError": "_shared.errors",
+    "PointCloud": "geometry.point_cloud",
     "Reconstruction": "reconstruction.result",
-    "ReconstructionError": "errors",
-    "ReconstructionOptions": "reconstruction.reconstruct",
-    "SelectionOptions": "keypoints",
-    "WeightsError": "errors",
+    "ReconstructionError": "_shared.errors",
+    "ReconstructionOptions": "reconstruction.pipeline",
+    "SelectionOptions": "features.keypoints",
+    "WeightsError": "_shared.errors",
     "estimate_geometry": "geometry",
     "fuse": "labels",
-    "load_image": "image",
-    "match_images": "matching",
-    "reconstruct": "reconstruction.reconstruct",
-    "save_point_cloud": "exporters",
-    "select_keypoints": "keypoints",
+    "load_image": "io.image",
+    "match_images": "matching.pipeline",
+    "reconstruct": "reconstruction.pipeline",
+    "save_point_cloud": "io.exporters",
+    "select_keypoints": "features.keypoints",
 }
 
 __all__ = [

@@ -9,15 +9,20 @@ import pytest
 pytest.importorskip("torch", reason="needs torch, which is for training only")
 
 from deepdetect import DeepDetect
-from deepdetect.bundled import bundled_weights
-from deepdetect.network.weights import load_mean_network, load_network, read_notes, weights_digest
+from deepdetect.detector.network.weights import (
+    load_mean_network,
+    load_network,
+    read_notes,
+    weights_digest,
+)
+from deepdetect.detector.pretrained import bundled_weights
 
 
 def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo) -> None:
-    result = run("average", "matching", "matching", "geometry", "-o", tmp_path, "--json")
+    result = run("average", "default", "default", "dense", "-o", tmp_path, "--json")
     assert result.exit_code == 0, result.output
     files = json.loads(result.output)
-    parts = [bundled_weights(name, ".safetensors") for name in ("matching", "geometry")]
+    parts = [bundled_weights(name, ".safetensors") for name in ("default", "dense")]
     expected = load_mean_network([parts[0], parts[0], parts[1]])
     assert weights_digest(load_network(files["weights"])) == weights_digest(expected)
     told = json.loads(read_notes(files["weights"])["parts"])
@@ -33,12 +38,12 @@ def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo)
 
 
 def test_the_mean_of_equals_is_the_same(run, tmp_path: Path) -> None:
-    assert run("average", "matching", "matching", "-o", tmp_path).exit_code == 0
-    own = load_network(bundled_weights("matching", ".safetensors"))
+    assert run("average", "default", "default", "-o", tmp_path).exit_code == 0
+    own = load_network(bundled_weights("default", ".safetensors"))
     assert weights_digest(load_network(tmp_path / "best.safetensors")) == weights_digest(own)
 
 
-@pytest.mark.parametrize("words", [["matching"], ["matching", "matchin"], ["matching", "no.onnx"]])
+@pytest.mark.parametrize("words", [["default"], ["default", "matchin"], ["default", "no.onnx"]])
 def test_a_mistake_ends_with_exit_code_2_and_leaves_nothing(run, tmp_path: Path, words) -> None:
     result = run("average", *words, "-o", tmp_path / "out")
     assert result.exit_code == 2

@@ -10,9 +10,9 @@ from click.testing import CliRunner
 from PIL import Image
 from skimage import data
 
-from deepdetect.benchmark import BENCHMARKS
 from deepdetect.cli import main
 from deepdetect.cli.benchmark import NAMES
+from deepdetect.evaluation.protocols import BENCHMARKS
 
 FILES = {"index.html", "report.md", "report.json", "tables/foreground.csv"}
 
@@ -122,7 +122,7 @@ def test_no_classical_method_may_be_wanted(made, folder: Path, run) -> None:
         ("foreground --method none.onnx", "none.onnx"),
         ("foreground --method no_such_module:find", "no_such_module"),
         ("foreground --preset publishd", "'published'"),
-        ("foreground --weights geometri", "'geometry'"),
+        ("foreground --weights dens", "'dense'"),
         ("oxford", "img1"),
         ("hpatches", "HPatches"),
         ("middlebury", "stereo"),

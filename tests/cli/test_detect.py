@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect
-from deepdetect.storage import load_keypoints
+from deepdetect.io.tables import load_keypoints
 
 
 def test_writes_keypoints_and_pictures(run, photos: Path) -> None:

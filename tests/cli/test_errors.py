@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError, Keypoints
-from deepdetect.bundled import bundled_weights
-from deepdetect.storage import save_keypoints
+from deepdetect.detector.pretrained import bundled_weights
+from deepdetect.io.tables import save_keypoints
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ CASES = {
     "threshold": "detect {bad}/good.png --threshold 2",
     "density": "detect {bad}/good.png --density 0",
     "resolution": "detect {bad}/good.png --resolution 481",
-    "weights' name": "detect {bad}/good.png --weights geometri",
+    "weights' name": "detect {bad}/good.png --weights dens",
     "label settings' name": "label {bad}/good.png -o {bad}/out --label-settings geometri",
     "start's name": "train {bad} -o {bad}/out --start geometri",
     "stereo without a scene": "evaluate-stereo {bad}/empty",

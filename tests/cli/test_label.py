@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import LabelOptions, fuse, load_image
-from deepdetect.image import luma
+from deepdetect.io.image import luma
 
 
 def test_writes_one_bit_masks(run, photos: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect.exporters import load_depth_png
+from deepdetect.io.exporters import load_depth_png
 
 FOCAL, OFFSET, BASELINE = 994.978, 31.086, 193.001
 """In pixels and mm, of the page of skimage.data.stereo_motorcycle."""
@@ -99,7 +99,7 @@ def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
     assert told["pose"] is None is told["median_reprojection_error_px"]
     assert told["calibration"]["baseline_mm"] == BASELINE
     assert told["calibration"]["source"].endswith("calib.json")
-    assert set(told["seconds"]) >= {"rectified or not", "keypoints", "matching", "files"}
+    assert set(told["seconds"]) >= {"rectified or not", "keypoints", "default", "files"}
 
     points, colors = ply_points(Path("out/m.ply"))
     assert len(points) == told["points"] > 30_000
@@ -185,7 +185,7 @@ def test_selection_options_and_weights_reach_the_detector(run, folder: Path) -> 
     assert told["keypoints"] == 9000
     assert told["rectified_why"] == "as asked for"
     assert Path("deepdetect-output/model.ply").is_file()
-    for given, weights in (([], "geometry"), (["--weights", "matching"], "matching")):
+    for given, weights in (([], "dense"), (["--weights", "default"], "default")):
         told = json.loads(run("reconstruct", *pair, "--threshold", 0.7, *given).stdout)
         expected = DeepDetect(weights).detect(folder / "left.png", threshold=0.7)
         assert told["keypoints"] == len(expected)
@@ -245,7 +245,7 @@ CASES = {
     "an unknown ending": ("left right --focal 995 -o out/m.plyy", "did you mean '.ply'"),
     "no ending": ("left right --focal 995 -o out/m", "unknown ending ''"),
     "a density of nothing": ("left right --focal 995 --density 0", "density"),
-    "weights that are none": ("left right --focal 995 --weights geometri", "geometry"),
+    "weights that are none": ("left right --focal 995 --weights dens", "dense"),
 }
 
 
@@ -315,7 +315,7 @@ def test_exif_gives_the_focal_length(run, folder: Path) -> None:
 
 def test_the_progress_counts_every_stage(monkeypatch: pytest.MonkeyPatch, run, folder) -> None:
     """On a terminal the bar ends full, whichever road was taken."""
-    import deepdetect.progress
+    import deepdetect._shared.progress
 
     bars = []
 
@@ -337,10 +337,10 @@ def test_the_progress_counts_every_stage(monkeypatch: pytest.MonkeyPatch, run, f
         def set_postfix_str(self, text: str) -> None:
             self.stages.append(text)
 
-    monkeypatch.setattr(deepdetect.progress, "progress", Bar)
+    monkeypatch.setattr(deepdetect._shared.progress, "progress", Bar)
     for pair, more in ((("left", "right"), []), (("turned0", "turned1"), ["--not-rectified"])):
         paths = [folder / f"{name}.png" for name in pair]
         assert run("reconstruct", *paths, "--focal", FOCAL, *more, "-o", "m.ply").exit_code == 0
     assert [bar.n == bar.total for bar in bars] == [True, True]
-    assert bars[0].stages[:3] == ["rectified or not", "keypoints", "matching"]
+    assert bars[0].stages[:3] == ["rectified or not", "keypoints", "default"]
     assert bars[1].stages == ["keypoints and matching", "reconstruction", "files"]

@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.geometry.correlation import warp_back
+from deepdetect.evaluation.metrics.homography_accuracy import corner_error
 from deepdetect.geometry.majority_fit import fit_to_majority, robust_homography, share_in_place
 from deepdetect.geometry.residuals import transform_points
-from deepdetect.image import luma
-from deepdetect.metrics.homography_accuracy import corner_error
+from deepdetect.geometry.zncc import warp_back
+from deepdetect.io.image import luma
 
 NEARLY = np.array([[1.004, 0.006, 2.0], [-0.005, 0.997, -1.5], [8e-6, -5e-6, 1.0]])
 """A homography by which points move a few pixels, as what is left to correct."""

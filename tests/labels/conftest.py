@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.image import luma
+from deepdetect.io.image import luma
 from deepdetect.labels import DETECTORS
 
 

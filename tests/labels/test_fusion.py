@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.errors import OptionError
-from deepdetect.image import load_image, luma
+from deepdetect._shared.errors import OptionError
+from deepdetect.io.image import load_image, luma
 from deepdetect.labels import DETECTOR_NAMES, DETECTORS, Label, LabelOptions, fuse
-from deepdetect.labels.files import load_mask
+from deepdetect.labels.batch import load_mask
 
 
 @pytest.fixture(scope="module")

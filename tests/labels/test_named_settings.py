@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deepdetect import LabelOptions, OptionError, fuse
-from deepdetect.image import luma
+from deepdetect.io.image import luma
 from deepdetect.labels import LABEL_SETTINGS, find_label_settings
 
 
@@ -21,7 +21,7 @@ def test_the_paper_s_are_the_default() -> None:
 
 def test_those_for_geometry_mark_more_and_nothing_less(photo: np.ndarray) -> None:
     sparse = fuse(luma(photo), options("paper")).mask
-    dense = fuse(luma(photo), options("geometry")).mask
+    dense = fuse(luma(photo), options("dense")).mask
     assert (dense | sparse).sum() == dense.sum()
     assert dense.mean() > 1.1 * sparse.mean()
     assert dense.mean() < 0.95
@@ -32,6 +32,6 @@ def test_a_file_is_read_and_a_word_is_a_name(tmp_path: Path) -> None:
     path.write_text("[fast]\nnormal = { threshold = 20 }\n")
     (change,) = find_label_settings(path).changes
     assert change.value == 20
-    assert set(LABEL_SETTINGS) == {"paper", "geometry"}
-    with pytest.raises(OptionError, match="did you mean 'geometry'"):
+    assert set(LABEL_SETTINGS) == {"paper", "dense"}
+    with pytest.raises(OptionError, match="did you mean 'dense'"):
         find_label_settings("geometri")

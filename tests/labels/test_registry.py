@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.errors import OptionError
+from deepdetect._shared.errors import OptionError
 from deepdetect.labels.registry import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
 
 NAMES = ("sift", "orb", "brisk", "fast", "agast", "harris", "shi-tomasi", "canny", "sobel")

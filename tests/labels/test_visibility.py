@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image, ImageEnhance
 
-from deepdetect.errors import OptionError
-from deepdetect.image import luma
+from deepdetect._shared.errors import OptionError
+from deepdetect.io.image import luma
 from deepdetect.labels.visibility import LOW_VISIBILITY_RANGE, luma_range, visibility_of
 
 

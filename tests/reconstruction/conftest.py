@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from deepdetect.datasets import load_stereo_pair
-from deepdetect.image import luma
-from deepdetect.reconstruction.calibration import Calibration, Camera
+from deepdetect.geometry.camera import Calibration, Camera
+from deepdetect.io.image import luma
 
 FOCAL, OFFSET, BASELINE = 994.978 / 2, 31.086 / 2, 193.001
 """In pixels and mm, of the page of skimage.data.stereo_motorcycle, at half size."""
@@ -125,7 +125,7 @@ def level() -> Turned:
 def matched(pair: Turned, **changes: Any) -> tuple[np.ndarray, np.ndarray]:
     from deepdetect import DeepDetect, match_images
 
-    found = match_images(pair.left, pair.right, DeepDetect("geometry"), **changes)
+    found = match_images(pair.left, pair.right, DeepDetect("dense"), **changes)
     assert found.guided
     return found.points0, found.points1
 

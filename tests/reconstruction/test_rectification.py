@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.guidance.sparse import sparse_features
-from deepdetect.image import load_image, luma
-from deepdetect.matchers import get_matcher, match_descriptors
+from deepdetect.features.matchers import get_matcher, match_descriptors
+from deepdetect.features.sift_detector import sparse_features
+from deepdetect.io.image import load_image, luma
 from deepdetect.reconstruction.rectification import judge_rectification
 
 SCENES = ("art", "cloth", "cones", "dolls", "moebius", "rocks", "teddy")

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from deepdetect._shared.errors import ReconstructionError
 from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.errors import ReconstructionError
-from deepdetect.image import luma
-from deepdetect.keypoints import SelectionOptions
-from deepdetect.reconstruction.calibration import Calibration, Camera
+from deepdetect.features.keypoints import SelectionOptions
+from deepdetect.geometry.camera import Calibration, Camera
+from deepdetect.io.image import luma
 from deepdetect.reconstruction.row_degeneracy import (
     LEAST_MATCHED,
     LEAST_SURE,
@@ -23,7 +23,7 @@ from deepdetect.reconstruction.row_degeneracy import (
     check_matched,
     check_turn,
 )
-from deepdetect.stereo import COMPLETE, RowMatchingOptions, match_rows
+from deepdetect.reconstruction.stereo import COMPLETE, RowMatchingOptions, match_rows
 
 
 @pytest.mark.parametrize(("sure", "least"), [(True, LEAST_SURE), (False, LEAST_MATCHED)])

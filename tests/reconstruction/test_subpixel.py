@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect import OptionError
-from deepdetect.image import luma
+from deepdetect.io.image import luma
 from deepdetect.reconstruction import subpixel
 from deepdetect.reconstruction.subpixel import (
     SubpixelOptions,

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, OptionError, match_images
-from deepdetect.errors import ReconstructionError
-from deepdetect.reconstruction.calibration import calibration_from_focal
+from deepdetect._shared.errors import ReconstructionError
+from deepdetect.geometry.camera import calibration_from_focal
 from deepdetect.reconstruction.two_view import (
     TwoViewOptions,
     TwoViewReconstruction,
@@ -141,9 +141,9 @@ def test_what_is_wrong_is_said(turned: Any, turned_matches: Any, level: Any, one
 
 
 def test_a_camera_that_only_turned_gives_no_cloud(level: Any, only_turned: np.ndarray) -> None:
-    from deepdetect.image import luma
+    from deepdetect.io.image import luma
 
-    found = match_images(level.left, only_turned, DeepDetect("geometry"))
+    found = match_images(level.left, only_turned, DeepDetect("dense"))
     calibration = replace(level.calibration, camera1=level.calibration.camera0)
     with pytest.raises(ReconstructionError, match="turn of the camera"):
         reconstruct_two_view(

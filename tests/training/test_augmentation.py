@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from deepdetect.image import luma
+from deepdetect.io.image import luma
 from deepdetect.labels import DETECTOR_NAMES, LabelOptions, fuse
 from deepdetect.training.augmentation import flip, transpose, turn_hue, without_color
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect.image import luma
+from deepdetect._shared.options import changed
+from deepdetect.io.image import luma
 from deepdetect.labels import LabelOptions, fuse
-from deepdetect.options import changed
 from deepdetect.training.batches import Batches
 from deepdetect.training.feed import FileFeed
 from deepdetect.training.label_cache import LabelCache

@@ -95,7 +95,7 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 from torch.nn.functional import binary_cross_entropy_with_logits
-from deepdetect.network.espnet import ESPNet
+from deepdetect.detector.network.espnet import ESPNet
 from deepdetect.training.batch_norm import freeze_batch_norm
 from deepdetect.training.device import DeviceOptions, Engine
 

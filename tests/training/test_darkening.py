@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image, ImageEnhance
 
-from deepdetect.errors import OptionError
-from deepdetect.image import load_image, luma
+from deepdetect._shared.errors import OptionError
+from deepdetect.io.image import load_image, luma
 from deepdetect.labels import LOW_VISIBILITY_RANGE, luma_range, visibility_of
 from deepdetect.training.darkening import Darkening, DarkeningRange, darken
 

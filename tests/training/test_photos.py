@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from deepdetect.errors import ImageError
+from deepdetect._shared.errors import ImageError
 from deepdetect.labels import LabelOptions
 from deepdetect.training.label_cache import LabelCache
 from deepdetect.training.photos import Photo, hold_out, list_photos, photos_digest

@@ -27,21 +27,21 @@ def test_the_papers_recipe() -> None:
 
 def test_the_recipe_for_geometry() -> None:
     """Normal light only, and the labels of the name."""
-    geometry = training_preset("geometry")
+    geometry = training_preset("dense")
     assert geometry.dark_fraction == 0
-    assert geometry.label_changes == find_label_settings("geometry").changes
+    assert geometry.label_changes == find_label_settings("dense").changes
     assert Schedule(geometry, 2_705).steps > 1_000
 
 
 def test_a_preset_keeps_its_label_settings_unless_others_are_given(tmp_path: Path) -> None:
-    changes = training_preset("geometry").label_changes
-    assert chosen_recipe("geometry", None, None, {}).label_changes == changes
-    assert chosen_recipe("geometry", "sobel,fast", None, {}).label_changes == changes
-    assert chosen_recipe("geometry", "fast", None, {}).label_changes == ()
-    assert chosen_recipe("geometry", None, "paper", {}).label_changes == ()
-    assert chosen_recipe("paper", None, "geometry", {}).label_changes == changes
+    changes = training_preset("dense").label_changes
+    assert chosen_recipe("dense", None, None, {}).label_changes == changes
+    assert chosen_recipe("dense", "sobel,fast", None, {}).label_changes == changes
+    assert chosen_recipe("dense", "fast", None, {}).label_changes == ()
+    assert chosen_recipe("dense", None, "paper", {}).label_changes == ()
+    assert chosen_recipe("paper", None, "dense", {}).label_changes == changes
     (tmp_path / "mine.toml").write_text("[fast]\nnormal = { threshold = 20 }\n")
-    (change,) = chosen_recipe("geometry", None, str(tmp_path / "mine.toml"), {}).label_changes
+    (change,) = chosen_recipe("dense", None, str(tmp_path / "mine.toml"), {}).label_changes
     assert change.detector == "fast"
 
 

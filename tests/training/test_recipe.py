@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.errors import OptionError
-from deepdetect.options import changed
+from deepdetect._shared.errors import OptionError
+from deepdetect._shared.options import changed
 from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.schedule import Schedule
 

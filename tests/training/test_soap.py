@@ -7,7 +7,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
 from deepdetect import OptionError  # noqa: E402
-from deepdetect.network.espnet import ESPNet  # noqa: E402
+from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
 from deepdetect.training.optimizers import make_optimizers  # noqa: E402
 from deepdetect.training.soap import Soap  # noqa: E402
 

@@ -19,15 +19,15 @@ torch = pytest.importorskip("torch", reason="needs torch, which is for training 
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from deepdetect import DeepDetect, ImageError, OptionError, WeightsError  # noqa: E402
-from deepdetect.bundled import bundled_weights  # noqa: E402
-from deepdetect.network.espnet import ESPNet  # noqa: E402
-from deepdetect.network.weights import (  # noqa: E402
+from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
+from deepdetect.detector.network.weights import (  # noqa: E402
     load_mean_network,
     load_network,
     read_notes,
     save_weights,
     weights_digest,
 )
+from deepdetect.detector.pretrained import bundled_weights  # noqa: E402
 from deepdetect.training.checkpoint import read_checkpoint, restore, save_checkpoint  # noqa: E402
 from deepdetect.training.device import DeviceOptions, Engine  # noqa: E402
 from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
@@ -177,7 +177,7 @@ def test_own_photographs_and_settings_from_the_shipped_weights(
     settings = tmp_path / "labels.toml"
     settings.write_text('detectors = ["fast", "sobel"]\n[fast]\nnormal = { threshold = 30 }\n')
     arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
-    arguments += [str(tmp_path / "run"), "--start", "matching", "--label-settings", str(settings)]
+    arguments += [str(tmp_path / "run"), "--start", "default", "--label-settings", str(settings)]
     arguments += ["--stage", "96x4x12", "--short-side", "96", "--learning-rate", "0.0005"]
     arguments += ["--warm-up", "5", "--dark-fraction", "0"]
     arguments += [
@@ -203,9 +203,9 @@ def test_frozen_batch_norm_keeps_the_statistics_and_trains_the_rest(
     photographs: Path, tmp_path: Path
 ) -> None:
     arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels")]
-    arguments += ["--start", "matching"]
+    arguments += ["--start", "default"]
     subprocess.run(arguments, check=True, capture_output=True)
-    before = load_network(bundled_weights("matching", ".safetensors")).state_dict()
+    before = load_network(bundled_weights("default", ".safetensors")).state_dict()
     after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
     kept = {name for name in before if torch.equal(before[name], after[name])}
     statistics = {name for name in before if name.rpartition(".")[2].startswith(("running", "num"))}
@@ -220,9 +220,9 @@ def test_only_the_decoder_may_be_trained(
     photographs: Path, tmp_path: Path, batch_norm: str
 ) -> None:
     arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels"), batch_norm]
-    arguments += ["--start", "matching", "--layers", "decoder", "--optimizer", "soap"]
+    arguments += ["--start", "default", "--layers", "decoder", "--optimizer", "soap"]
     subprocess.run(arguments, check=True, capture_output=True)
-    before = load_network(bundled_weights("matching", ".safetensors")).state_dict()
+    before = load_network(bundled_weights("default", ".safetensors")).state_dict()
     after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
     kept = {name for name in before if torch.equal(before[name], after[name])}
     encoder = {name for name in before if name.startswith("encoder.")}

@@ -25,7 +25,7 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
     deepdetect average first/best.safetensors second/best.safetensors -o mean
     deepdetect evaluate samples/ --weights mean/deepdetect.onnx
     """
-    from ..errors import MissingExtraError, OptionError
+    from .._shared.errors import MissingExtraError, OptionError
 
     for package in ("torch", "safetensors", "onnx"):
         if importlib.util.find_spec(package) is None:
@@ -33,16 +33,16 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
                 f"averaging weights needs the package {package}, which is not installed: "
                 "run pip install torch safetensors onnx"
             )
-    from ..bundled import find_weights
-    from ..network.onnx_export import export_onnx
-    from ..network.weights import (
+    from .._shared.provenance import provenance
+    from ..detector.network.onnx_export import export_onnx
+    from ..detector.network.weights import (
         load_mean_network,
         load_network,
         read_notes,
         save_weights,
         weights_digest,
     )
-    from ..provenance import provenance
+    from ..detector.pretrained import find_weights
 
     if len(weights) < 2:
         raise OptionError("name two weights at least: the mean of one is itself")

@@ -56,7 +56,7 @@ NAMES = (
 @click.option(
     "--geometry-weights",
     multiple=True,
-    default=("geometry",),
+    default=("dense",),
     help="Weights for stereo pairs, as --weights; may be repeated.  [default: geometry]",
 )
 @detector_options
@@ -88,11 +88,11 @@ def benchmark(
     if name == "refine-oxford":
         _refine_oxford(data, output, as_json)
         return
-    from ..benchmark import BENCHMARKS, PROTOCOLS, BenchmarkOptions, run_benchmarks
-    from ..benchmark.formats import report_values, save_report, table_text
-    from ..errors import OptionError, look_up
-    from ..methods import CLASSICAL, find_method
-    from ..presets import get_preset
+    from .._shared.errors import OptionError, look_up
+    from ..evaluation.baselines import CLASSICAL, find_method
+    from ..evaluation.formats import report_values, save_report, table_text
+    from ..evaluation.protocols import BENCHMARKS, PROTOCOLS, BenchmarkOptions, run_benchmarks
+    from ..matching.options import get_preset
 
     if values["resolution"] != "native":
         raise OptionError(
@@ -128,11 +128,11 @@ def benchmark(
 
 
 def _refine_oxford(data: Path, output: Path, as_json: bool) -> None:
-    from ..benchmark.formats import report_values, save_report, table_text
-    from ..benchmark.refine_oxford import refine_oxford, refinement_table
-    from ..benchmark.report import Report, Section
-    from ..progress import progress
-    from ..provenance import provenance
+    from .._shared.progress import progress
+    from .._shared.provenance import provenance
+    from ..evaluation.formats import report_values, save_report, table_text
+    from ..evaluation.protocols.refine_oxford import refine_oxford, refinement_table
+    from ..evaluation.report import Report, Section
 
     folder = data / "oxford" if (data / "oxford").is_dir() else data
     with progress(40, "refining", "pair", as_json) as bar:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import click
 
-from ..errors import DeepDetectError
+from .._shared.errors import DeepDetectError
 
 
 @contextlib.contextmanager

@@ -60,7 +60,7 @@ def get(name: str, output: Path | None, as_json: bool) -> None:
     deepdetect benchmark oxford --data data -o report
     """
     from ..datasets import find_remote_dataset, get_dataset
-    from ..image import find_images
+    from ..io.image import find_images
 
     dataset = find_remote_dataset(name)
     folder = get_dataset(dataset, output or Path("data") / dataset.name, quiet=as_json)

@@ -36,7 +36,7 @@ def demo(output: Path, as_json: bool, **values: Any) -> None:
     of the same number stand beside ours: a match by chance is not to be mistaken for skill.
     """
     from ..datasets import load_stereo_pair
-    from ..stereo_demo import run_demo
+    from ..evaluation.stereo_demo import run_demo
 
     detector = make_detector(values)
     result = run_demo(load_stereo_pair("motorcycle"), detector, output)

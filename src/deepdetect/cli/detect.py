@@ -60,10 +60,10 @@ def detect(
     deepdetect detect photos/ -o keypoints --max-keypoints 2048 --nms-radius 2
     deepdetect detect photo.jpg --density 0.1 --format csv
     """
-    from ..errors import DeepDetectError
-    from ..keypoints import SelectionOptions
-    from ..labels.files import load_mask
-    from ..progress import progress
+    from .._shared.errors import DeepDetectError
+    from .._shared.progress import progress
+    from ..features.keypoints import SelectionOptions
+    from ..labels.batch import load_mask
 
     paths = expand_images(images, output)
     mask = load_mask(ignore) if ignore is not None else None
@@ -95,10 +95,10 @@ def _detect_one(
     path: Path, detector: Any, selection: Any, output: Path, file_format: str, pictures: bool
 ) -> dict[str, Any]:
     """Detect, save and draw the keypoints of one image; return its numbers."""
-    from ..image import load_image
-    from ..keypoints import select_keypoints
-    from ..pictures import draw_heatmap, draw_keypoints, save_picture, with_caption
-    from ..storage import save_keypoints
+    from ..features.keypoints import select_keypoints
+    from ..io.image import load_image
+    from ..io.tables import save_keypoints
+    from ..viz.draw import draw_heatmap, draw_keypoints, save_picture, with_caption
 
     rgb = load_image(path)
     started = time.perf_counter()

@@ -13,10 +13,10 @@ from .shared import PATH, detector_options, json_option, make_detector, print_js
 
 if TYPE_CHECKING:
     from ..datasets.planar import PlanarScene
-    from ..detector import DeepDetect
-    from ..mask_scores import MaskScore
-    from ..scale_quality import ScaleQuality
-    from ..weights_quality import OxfordQuality
+    from ..detector.detector import DeepDetect
+    from ..evaluation.mask_scores import MaskScore
+    from ..evaluation.scale_quality import ScaleQuality
+    from ..evaluation.weights_quality import OxfordQuality
 
 WIDTH = 12
 
@@ -72,10 +72,10 @@ def evaluate(
     deepdetect evaluate samples/ --weights run/deepdetect.onnx --against other.onnx
     deepdetect evaluate samples/ --scale 0.5 --scale 1 --scale 2
     """
+    from .._shared.errors import OptionError
     from ..datasets.oxford import load_oxford
-    from ..errors import OptionError
-    from ..mask_scores import score_samples
-    from ..scale_quality import check_scales
+    from ..evaluation.mask_scores import score_samples
+    from ..evaluation.scale_quality import check_scales
 
     check_scales(scales)
     if labels and oxford is None:
@@ -117,8 +117,8 @@ def evaluate(
 def _measure_oxford(
     detectors: Sequence[DeepDetect], labels: bool, scenes: list[PlanarScene], quiet: bool
 ) -> list[OxfordQuality]:
-    from ..progress import progress
-    from ..weights_quality import LabelMasks, oxford_quality, oxford_steps
+    from .._shared.progress import progress
+    from ..evaluation.weights_quality import LabelMasks, oxford_quality, oxford_steps
 
     rows = [*detectors, LabelMasks()] if labels else detectors
     with progress(oxford_steps(scenes) * len(rows), "Oxford", "step", quiet) as bar:
@@ -128,9 +128,9 @@ def _measure_oxford(
 def _measure_scales(
     detectors: Sequence[DeepDetect], samples: Path, scales: Sequence[float], quiet: bool
 ) -> list[list[ScaleQuality]]:
-    from ..mask_scores import sample_images
-    from ..progress import progress
-    from ..scale_quality import scale_quality
+    from .._shared.progress import progress
+    from ..evaluation.mask_scores import sample_images
+    from ..evaluation.scale_quality import scale_quality
 
     images = sample_images(samples)
     with progress(len(images) * len(scales), "scales", "image", quiet) as bar:

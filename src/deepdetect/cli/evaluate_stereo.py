@@ -39,15 +39,15 @@ def evaluate_stereo(
     density and every pixel stand beside as controls.
 
     \b
-    deepdetect evaluate-stereo cones/ teddy/ --weights matching --weights geometry
+    deepdetect evaluate-stereo cones/ teddy/ --weights default --weights dense
     deepdetect evaluate-stereo cones/ teddy/ --label-settings paper --label-settings mine.toml
     """
-    from ..bundled import BUNDLED
+    from .._shared.progress import progress
     from ..datasets.middlebury import load_middlebury
-    from ..detector import DeepDetect
+    from ..detector.detector import DeepDetect
+    from ..detector.pretrained import BUNDLED
+    from ..evaluation.stereo_quality import LabelKeypoints, stereo_quality
     from ..labels import LabelOptions, find_label_settings
-    from ..progress import progress
-    from ..stereo_quality import LabelKeypoints, stereo_quality
 
     pairs = [load_middlebury(scene) for scene in scenes]
     sources = {}

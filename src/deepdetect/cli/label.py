@@ -58,9 +58,9 @@ def label(
     deepdetect label photos/ -o masks
     deepdetect label photo.jpg -o masks --detectors fast,sobel --explain
     """
+    from .._shared.progress import progress
     from ..labels import LabelOptions
-    from ..labels.files import LabelTask, check_outputs, label_files, pending
-    from ..progress import progress
+    from ..labels.batch import LabelTask, check_outputs, label_files, pending
 
     settings = chosen_label_settings(detectors, label_settings)
     options = LabelOptions(settings.detectors, visibility, settings.changes)

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ..errors import DeepDetectError
+from .._shared.errors import DeepDetectError
 from .average import average
 from .benchmark import benchmark
 from .datasets import datasets

@@ -101,10 +101,10 @@ def match(
     deepdetect match left.jpg right.jpg --guidance none --ratio 0.9 --mutual
     deepdetect match a.png b.png --preset published --homography H1to2p
     """
-    from ..image import load_image
-    from ..matching import match_images
-    from ..presets import UNGUIDED_ONLY, get_preset
-    from ..storage import save_matches
+    from ..io.image import load_image
+    from ..io.tables import save_matches
+    from ..matching.options import UNGUIDED_ONLY, get_preset
+    from ..matching.pipeline import match_images
 
     rgb0, rgb1 = load_image(image0), load_image(image1)
     detector = make_detector(values)
@@ -184,7 +184,7 @@ def _guidance(matches: Any) -> dict[str, Any] | None:
 
 
 def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
-    from ..pictures import draw_matches, save_picture, with_caption
+    from ..viz.draw import draw_matches, save_picture, with_caption
 
     picture = draw_matches(rgb0, rgb1, matches.points0, matches.points1, matches.inliers)
     caption = (
@@ -201,7 +201,7 @@ def _was_given(context: click.Context, name: str) -> bool:
 def _read_matrix(path: Path) -> Any:
     import numpy as np
 
-    from ..errors import OptionError
+    from .._shared.errors import OptionError
 
     try:
         return np.loadtxt(path, ndmin=2)

@@ -48,7 +48,7 @@ def chosen_recipe(
         detectors, label_settings: as of `chosen_label_settings`.
         values: the others, by name; None and () stand for what is not given.
     """
-    from ..options import changed
+    from .._shared.options import changed
     from ..training.presets import training_preset
 
     given = {name: value for name, value in values.items() if value not in (None, ())}

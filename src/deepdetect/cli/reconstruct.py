@@ -22,7 +22,7 @@ from .shared import (
 )
 
 if TYPE_CHECKING:
-    from ..exporters import DepthPng
+    from ..io.exporters import DepthPng
     from ..reconstruction.result import Reconstruction
 
 STAGES = 5
@@ -53,7 +53,7 @@ STAGES = 5
     help="The model, .ply, .glb or .html; the other files get its name and stand beside it.",
 )
 @selection_options
-@detector_options_with("geometry")
+@detector_options_with("dense")
 @json_option
 def reconstruct(
     left: Path,
@@ -76,9 +76,9 @@ def reconstruct(
     deepdetect reconstruct left.jpg right.jpg --focal 1250 -o model.ply
     deepdetect reconstruct phone1.jpg phone2.jpg
     """
-    from ..exporters import get_exporter
-    from ..progress import progress
-    from ..reconstruction.reconstruct import reconstruct as reconstruct_pair
+    from .._shared.progress import progress
+    from ..io.exporters import get_exporter
+    from ..reconstruction.pipeline import reconstruct as reconstruct_pair
 
     get_exporter(output)
     files = _files(output, [path for path in (left, right, calib) if path is not None])
@@ -112,7 +112,7 @@ def reconstruct(
 
 def _files(model: Path, inputs: list[Path]) -> dict[str, Path]:
     """Name all files, and check that none of them is an input."""
-    from ..exporters import EXPORTERS
+    from ..io.exporters import EXPORTERS
 
     endings = (*EXPORTERS, "_depth.png", "_depth.npz", ".json")
     files = {ending: model.with_name(model.stem + ending) for ending in endings}
@@ -127,8 +127,8 @@ def _write(
     """Write all files, the JSON last; return what it holds."""
     import json
 
-    from ..atomic import atomic_path
-    from ..exporters import EXPORTERS, save_depth_npz, save_depth_png, save_point_cloud
+    from .._shared.atomic import atomic_path
+    from ..io.exporters import EXPORTERS, save_depth_npz, save_depth_png, save_point_cloud
     from ..reconstruction.report import reconstruction_values
 
     started = time.perf_counter()

@@ -38,9 +38,9 @@ def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: 
     """
     import numpy as np
 
-    from ..atomic import atomic_path
-    from ..pictures import save_picture
-    from ..registration import register as register_images
+    from .._shared.atomic import atomic_path
+    from ..matching.registration import register as register_images
+    from ..viz.draw import save_picture
 
     detector = make_detector(values)
     names = ("threshold", "density", "max_keypoints", "nms_radius", "subpixel")

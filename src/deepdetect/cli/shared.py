@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import DeepDetectError, OptionError
+from .._shared.errors import DeepDetectError, OptionError
 
 if TYPE_CHECKING:
-    from ..detector import DeepDetect
+    from ..detector.detector import DeepDetect
     from ..labels import LabelSettings
 
 PATH = click.Path(path_type=Path)
@@ -81,7 +81,7 @@ def detector_options_with(weights: str) -> Decorator:
     )
 
 
-detector_options = detector_options_with("matching")
+detector_options = detector_options_with("default")
 
 selection_options = combined(
     click.option(
@@ -162,7 +162,7 @@ def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelSet
 
 def make_detector(values: dict[str, Any]) -> DeepDetect:
     """Make the detector that `detector_options` describe, taking them out of the values."""
-    from ..detector import DeepDetect
+    from ..detector.detector import DeepDetect
 
     names = ("weights", "resolution", "backend", "providers", "threads")
     return DeepDetect(**{name: values.pop(name) for name in names})
@@ -179,7 +179,7 @@ def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
         ImageError: a folder is empty.
         OptionError: two images have the same name without its ending.
     """
-    from ..image import find_images
+    from ..io.image import find_images
 
     images: list[Path] = []
     for path in paths:

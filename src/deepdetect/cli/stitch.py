@@ -26,8 +26,8 @@ def stitch(images: tuple[Path, ...], output: Path, as_json: bool) -> None:
     \b
     deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
     """
-    from ..pictures import picture_ending, save_picture
-    from ..stitching import stitch as stitch_images
+    from ..matching.stitching import stitch as stitch_images
+    from ..viz.draw import picture_ending, save_picture
 
     # Before the work, which would else be lost.
     picture_ending(output)

@@ -163,7 +163,7 @@ def train(
     deepdetect train photos/ -o run
     deepdetect detect photo.jpg --weights run/deepdetect.onnx
     """
-    from ..errors import MissingExtraError
+    from .._shared.errors import MissingExtraError
 
     for package in ("torch", "lightning_fabric", "safetensors", "onnx"):
         if importlib.util.find_spec(package) is None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..image import IMAGE_SUFFIXES
+from ..io.image import IMAGE_SUFFIXES
 
 
 def content_digest(folder: Path, name: str) -> str | None:

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from ..errors import DeepDetectError
-from ..progress import progress
+from .._shared.errors import DeepDetectError
+from .._shared.progress import progress
 
 CHUNK = 1 << 16  # bytes; so many are lost when a download is broken off
 TIMEOUT = 60  # seconds without a byte

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..errors import ImageError
+from .._shared.errors import ImageError
 
 ENDINGS = (".jpg", ".png")
 

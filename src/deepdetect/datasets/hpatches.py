@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import ImageError
+from .._shared.errors import ImageError
 from .planar import PlanarScene, read_homography
 
 ENDINGS = (".ppm", ".png")

@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ..errors import ImageError
-from ..image import load_image
+from .._shared.errors import ImageError
+from ..io.image import load_image
 from .stereo import StereoPair
 
 

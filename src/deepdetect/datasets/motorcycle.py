@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import MissingExtraError
+from .._shared.errors import MissingExtraError
 from .stereo import StereoPair
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from ..errors import ImageError, OptionError, unknown_name
+from .._shared.errors import ImageError, OptionError, unknown_name
 from .planar import PlanarScene, read_homography
 
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")

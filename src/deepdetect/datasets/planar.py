@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import ImageError
+from .._shared.errors import ImageError
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..errors import DeepDetectError, MissingExtraError
-from ..image import find_images
-from ..progress import progress
+from .._shared.errors import DeepDetectError, MissingExtraError
+from .._shared.progress import progress
+from ..io.image import find_images
 from .contents import content_digest
 from .download import RemoteFile, download, have_pooch, partial_size
 

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..errors import OptionError, unknown_name
-from .model_choice import has_depth
+from .._shared.errors import OptionError, unknown_name
+from .model_selection import has_depth
 from .residuals import epipolar_errors, transfer_errors
 
 ESTIMATORS = ("magsac", "ransac")

@@ -11,9 +11,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from .correlation import warp_back
-from .photometric_refinement import RefinementOptions, tracked_corners
+from .homography_refinement import RefinementOptions, tracked_corners
 from .residuals import transform_points
+from .zncc import warp_back
 
 IN_PLACE = 0.5
 """A pixel is in place when what is around it lies at most so far off, in pixels."""

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..options import is_path, look_up_word
+from .._shared.options import is_path, look_up_word
 from .settings import LabelSettings, SettingChange, read_label_settings
 
 LABEL_SETTINGS: dict[str, LabelSettings] = {
     "paper": LabelSettings(),
     # Denser, for geometry: chosen by true stereo matches (docs/labels.md).
-    "geometry": LabelSettings(
-        changes=(SettingChange("sobel", "normal", "relative_threshold", 0.02),)
-    ),
+    "dense": LabelSettings(changes=(SettingChange("sobel", "normal", "relative_threshold", 0.02),)),
 }
 
 

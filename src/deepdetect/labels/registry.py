@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..errors import OptionError, unknown_name
+from .._shared.errors import OptionError, unknown_name
 from .agast import AgastSettings, agast_mask
 from .brisk import BriskSettings, brisk_mask
 from .canny import CannySettings, canny_mask

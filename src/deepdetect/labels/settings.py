@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..errors import OptionError, unknown_name
+from .._shared.errors import OptionError, unknown_name
 from .registry import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
 from .visibility import Visibility
 
@@ -39,7 +39,7 @@ class SettingChange:
         >>> SettingChange("fast", "normal", "treshold", 20)
         Traceback (most recent call last):
         ...
-        deepdetect.errors.OptionError: unknown setting of fast 'treshold': did you mean \
+        deepdetect.OptionError: unknown setting of fast 'treshold': did you mean \
 'threshold'? (known: threshold, suppression)
     """
 

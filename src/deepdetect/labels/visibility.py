@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..errors import unknown_name
+from .._shared.errors import unknown_name
 
 Visibility = Literal["normal", "low"]
 VisibilityChoice = Literal["auto", "normal", "low"]

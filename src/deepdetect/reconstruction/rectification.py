@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry import GeometryOptions, estimate_geometry
-from ..guidance.trust import LARGEST, false_alarms
-from .degeneracy import PLANE_THRESHOLD, is_flat, one_a_cell, stands_still
+from ..geometry.acontrario import LARGEST, false_alarms
+from .checks import PLANE_THRESHOLD, is_flat, one_a_cell, stands_still
 
 ROWS = 1.0
 """Rows by which a match of a rectified pair may be off."""

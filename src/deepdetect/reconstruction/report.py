@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .calibration import Calibration, Camera
+from ..geometry.camera import Calibration, Camera
 from .result import Reconstruction
 
 PERCENTILES = (0, 5, 25, 50, 75, 95, 100)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ReconstructionError
-from ..point_cloud import PointCloud
-from .calibration import Calibration
+from .._shared.errors import ReconstructionError
+from ..geometry.camera import Calibration
+from ..geometry.point_cloud import PointCloud
+from ..geometry.relative_pose import RelativePose
 from .rectification import Rectification
-from .relative_pose import RelativePose
 
 
 @dataclass(frozen=True, eq=False)

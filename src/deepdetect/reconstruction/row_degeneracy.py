@@ -8,10 +8,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ..errors import ReconstructionError
-from ..keypoints import SelectionOptions
-from .calibration import Calibration
-from .degeneracy import IN_FRONT, one_a_cell, stands_still
+from .._shared.errors import ReconstructionError
+from ..features.keypoints import SelectionOptions
+from ..geometry.camera import Calibration
+from .checks import IN_FRONT, one_a_cell, stands_still
 
 FOCAL_DIFFERENCE = 0.01
 """Share by which the focal lengths of both views may differ. Rectified views have one; lengths
@@ -63,7 +63,7 @@ def check_cameras(calibration: Calibration) -> None:
         >>> check_cameras(Calibration(Camera((640, 480), 500), Camera((640, 480), 600)))
         Traceback (most recent call last):
         ...
-        deepdetect.errors.ReconstructionError: the focal lengths of the left and the right view \
+        deepdetect.ReconstructionError: the focal lengths of the left and the right view \
 are 500 and 600 px, those of a rectified pair are one: mend the calibration (given), or give \
 --not-rectified (rectified=False)
     """
@@ -141,7 +141,7 @@ def check_disparities(disparity: np.ndarray) -> None:
         >>> check_disparities(np.full(100, 7.0))
         Traceback (most recent call last):
         ...
-        deepdetect.errors.ReconstructionError: all disparities are 7 px: one image is the other \
+        deepdetect.ReconstructionError: all disparities are 7 px: one image is the other \
 moved sideways, or both show one plane, and there is no depth
     """
     known = np.asarray(disparity)[np.isfinite(disparity)]

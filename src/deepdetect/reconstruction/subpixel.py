@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..errors import OptionError
-from ..threads import in_threads
+from .._shared.errors import OptionError
+from .._shared.threads import in_threads
 
 AROUND = 15
 """Side in pixels of the window whose matches give a patch its affinity."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..kernels import compiled
+from .._shared.kernels import compiled
 
 
 @compiled(nogil=True, fastmath=True, inline="always")

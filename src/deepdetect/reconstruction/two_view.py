@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import OptionError, ReconstructionError
-from .calibration import Calibration
-from .degeneracy import check_focal, check_images, check_matches, check_pose
-from .outlier_removal import disparity_space, statistical_inliers
-from .relative_pose import RelativePose, estimate_relative_pose
+from .._shared.errors import OptionError, ReconstructionError
+from ..geometry.camera import Calibration
+from ..geometry.relative_pose import RelativePose, estimate_relative_pose
+from ..geometry.triangulation import triangulate
+from .checks import check_focal, check_images, check_matches, check_pose
+from .outliers import disparity_space, statistical_inliers
 from .subpixel import SubpixelOptions, refine_matches
-from .triangulation import triangulate
 
 
 @dataclass(frozen=True)

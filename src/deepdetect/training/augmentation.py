@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 
-from ..image import luma
+from ..io.image import luma
 
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
 

@@ -14,8 +14,8 @@ from safetensors.torch import save_file
 from torch import nn
 from torch.optim import Optimizer
 
-from ..atomic import atomic_path
-from ..errors import WeightsError
+from .._shared.atomic import atomic_path
+from .._shared.errors import WeightsError
 
 
 def save_checkpoint(

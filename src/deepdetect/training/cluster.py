@@ -7,7 +7,7 @@ import itertools
 import os
 from dataclasses import dataclass
 
-from ..errors import OptionError
+from .._shared.errors import OptionError
 
 PATIENCE = datetime.timedelta(hours=24)
 _meetings = itertools.count()  # each has its own name in the store

@@ -6,7 +6,7 @@ import csv
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
-from ..atomic import atomic_path
+from .._shared.atomic import atomic_path
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..errors import OptionError
+from .._shared.errors import OptionError
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import nn
 
-from ..errors import OptionError, unknown_name
-from ..memory import keep_freed_memory
-from ..processes import processor_count
+from .._shared.errors import OptionError, unknown_name
+from .._shared.memory import keep_freed_memory
+from .._shared.processes import processor_count
 from .batch_norm import synchronize_batch_norm
 from .cluster import Place, place_in_cluster
 

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import DeepDetectError
-from ..image import load_image, luma
+from .._shared.errors import DeepDetectError
+from .._shared.processes import map_in_processes
+from .._shared.progress import progress
+from ..io.image import load_image, luma
 from ..labels import LabelOptions, fuse
-from ..labels.files import load_mask, save_mask
+from ..labels.batch import load_mask, save_mask
 from ..labels.registry import select_detectors
 from ..labels.settings import settings_for
 from ..labels.visibility import Visibility
-from ..processes import map_in_processes
-from ..progress import progress
 from .photos import Photo
 from .views import View, render
 

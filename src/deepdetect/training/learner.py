@@ -9,8 +9,8 @@ import torch
 from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from ..errors import OptionError
-from ..image import luma
+from .._shared.errors import OptionError
+from ..io.image import luma
 from ..labels import visibility_of
 from .batch_norm import freeze_batch_norm
 from .device import DeviceOptions, Engine

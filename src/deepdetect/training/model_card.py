@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ..atomic import atomic_path
+from .._shared.atomic import atomic_path
 from .curves import CurvePoint
 
 

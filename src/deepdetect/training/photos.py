@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import ImageError
-from ..image import find_images
+from .._shared.errors import ImageError
+from ..io.image import find_images
 from .recipe import TrainingOptions
 from .views import View, views_of
 

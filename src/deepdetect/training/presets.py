@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..errors import look_up
+from .._shared.errors import look_up
 from ..labels import LABEL_SETTINGS
 from .recipe import Stage, TrainingOptions
 
@@ -25,13 +25,13 @@ PRESETS: dict[str, TrainingOptions] = {
         validations=20,
     ),
     # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser
-    # labels. Meant to go on from trained weights, as --start matching.
-    "geometry": TrainingOptions(
+    # labels. Meant to go on from trained weights, as --start default.
+    "dense": TrainingOptions(
         stages=(Stage(480, 8, 5, (480,)), Stage(480, 8, 1, (720,)), Stage(240, 32, 3, (240,))),
         interleave=True,
         short_sides=(480, 240, 720),
         dark_fraction=0.0,
-        label_changes=LABEL_SETTINGS["geometry"].changes,
+        label_changes=LABEL_SETTINGS["dense"].changes,
         optimizer="soap",
         learning_rate=1.5e-3,
         warm_up=100,

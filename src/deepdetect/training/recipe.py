@@ -7,7 +7,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Literal
 
-from ..errors import OptionError, look_up, unknown_name
+from .._shared.errors import OptionError, look_up, unknown_name
 from ..labels import DETECTOR_NAMES, LabelOptions, SettingChange
 from .darkening import DarkeningRange
 from .optimizers import OPTIMIZERS

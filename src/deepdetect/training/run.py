@@ -10,13 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import OptionError, WeightsError
-from ..mask_scores import MaskScore, mean_score
-from ..network.espnet import ESPNet
-from ..network.onnx_export import export_onnx
-from ..network.weights import load_network, read_notes, save_weights, weights_digest
-from ..progress import progress
-from ..provenance import provenance
+from .._shared.errors import OptionError, WeightsError
+from .._shared.progress import progress
+from .._shared.provenance import provenance
+from ..detector.network.espnet import ESPNet
+from ..detector.network.onnx_export import export_onnx
+from ..detector.network.weights import load_network, read_notes, save_weights, weights_digest
+from ..evaluation.mask_scores import MaskScore, mean_score
 from .batches import Batches
 from .checkpoint import Checkpoint, read_checkpoint, restore, save_checkpoint
 from .curves import CurvePoint, save_curves

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import torch
 
-from ..bundled import find_weights
-from ..errors import OptionError
-from ..network.espnet import ESPNet
-from ..network.weights import load_mean_network
-from ..progress import progress
+from .._shared.errors import OptionError
+from .._shared.progress import progress
+from ..detector.network.espnet import ESPNet
+from ..detector.network.weights import load_mean_network
+from ..detector.pretrained import find_weights
 from .device import DeviceOptions
 from .preparation import Sources, prepare
 from .profile import WARM_UP_STEPS, StageProfile, profile_stages
@@ -45,7 +45,7 @@ def train(
         options: the recipe.
         validation: folder of other photographs; default: some are held out.
         labels: folder for the label cache; default: in `output`.
-        start: weights (.safetensors) to start from, or "matching" or "geometry" for those
+        start: weights (.safetensors) to start from, or "default" or "dense" for those
             inside the package; of several, their mean; default: random ones, by the seed.
         device: how the network is run.
         workers: processes that make labels; default one for each processor.

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from torch.nn.functional import pad
 
-from ..mask_scores import MaskScore, mean_score, score_heatmap
+from ..evaluation.mask_scores import MaskScore, mean_score, score_heatmap
 
 
 def score_network(

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import ImageError
-from ..memory import free_memory
+from .._shared.errors import ImageError
+from .._shared.memory import free_memory
 from .cluster import place_in_cluster
 from .label_cache import LabelCache
 from .photos import Photo

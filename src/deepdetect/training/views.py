@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..image import load_image, scale_short_side
+from ..io.image import load_image, scale_short_side
 from .darkening import Darkening, DarkeningRange, darken
 from .variation import VERSION as VARIATION_VERSION
 from .variation import vary

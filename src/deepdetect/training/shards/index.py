@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...atomic import atomic_path
-from ...errors import ImageError, OptionError
+from ..._shared.atomic import atomic_path
+from ..._shared.errors import ImageError, OptionError
 from ..label_cache import settings_digest
 from ..recipe import TrainingOptions
 

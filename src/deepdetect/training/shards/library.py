@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...errors import MissingExtraError
+from ..._shared.errors import MissingExtraError
 
 
 def webdataset() -> Any:

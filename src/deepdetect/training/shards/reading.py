@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import ImageError
-from ...labels.files import load_mask
+from ..._shared.errors import ImageError
+from ...labels.batch import load_mask
 from ..photos import Photo
 from ..prefetch import prefetched
 from ..recipe import TrainingOptions

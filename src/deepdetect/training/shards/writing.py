@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...atomic import atomic_path
-from ...errors import DeepDetectError, ImageError, OptionError
-from ...image import load_image
+from ..._shared.atomic import atomic_path
+from ..._shared.errors import DeepDetectError, ImageError, OptionError
+from ..._shared.processes import map_in_processes
+from ..._shared.progress import progress
+from ...io.image import load_image
 from ...labels import LabelOptions
-from ...labels.files import encode_mask
-from ...processes import map_in_processes
-from ...progress import progress
+from ...labels.batch import encode_mask
 from ..label_cache import label_of_view, settings_digest
 from ..photos import Photo, hold_out, list_photos
 from ..recipe import TrainingOptions

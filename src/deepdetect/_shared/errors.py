@@ -1,0 +1,90 @@
+"""The errors a user can cause, and the search for the name they meant."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import TypeVar
+
+Entry = TypeVar("Entry")
+
+
+class DeepDetectError(Exception):
+    """A mistake that the user can mend: one sentence saying what is wrong and what to do.
+
+    The command line prints it without a traceback and ends with exit code 2.
+    """
+
+
+class ImageError(DeepDetectError):
+    """An image is missing, unreadable, too small, or has the wrong shape or type."""
+
+
+class OptionError(DeepDetectError):
+    """An option has an unknown name or a value out of its range."""
+
+
+class WeightsError(DeepDetectError):
+    """A weights file is missing, damaged, or does not fit the network."""
+
+
+class ReconstructionError(DeepDetectError):
+    """Two images give no depth: the error says which of the usual reasons it is."""
+
+
+class MissingExtraError(DeepDetectError):
+    """An optional package is needed for what was asked and is not installed."""
+
+
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
+    """Make the error for an unknown name, with the nearest right one.
+
+    Args:
+        kind: what the name stands for, as "detector".
+        name: the name that was given.
+        known: the names that exist.
+
+    Returns:
+        The error, to be raised by the caller.
+
+    Example:
+        >>> print(unknown_name("detector", "siift", ["sift", "orb"]))
+        unknown detector 'siift': did you mean 'sift'? (known: sift, orb)
+    """
+    names = list(known)
+    spelled = {known_name.lower(): known_name for known_name in names}
+    nearest = difflib.get_close_matches(str(name).lower(), spelled, n=1, cutoff=0.5)
+    hint = f"did you mean {spelled[nearest[0]]!r}? " if nearest else ""
+    return OptionError(f"unknown {kind} {name!r}: {hint}(known: {', '.join(names)})")
+
+
+def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
+    """Find an entry of a registry by its name.
+
+    Args:
+        kind: what the entries are, as "matcher".
+        name: the name.
+        registry: the entries by name.
+
+    Raises:
+        OptionError: the name is unknown (the nearest right one is named).
+
+    Example:
+        >>> look_up("answer", "yes", {"yes": True, "no": False})
+        True
+    """
+    if name not in registry:
+        raise unknown_name(kind, name, registry)
+    return registry[name]
+
+
+for _error in (
+    DeepDetectError,
+    ImageError,
+    MissingExtraError,
+    OptionError,
+    ReconstructionError,
+    WeightsError,
+):
+    # Where users import them from: tracebacks and `pickle` say so.
+    _error.__module__ = "deepdetect"

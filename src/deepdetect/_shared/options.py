@@ -1,0 +1,123 @@
+"""Options as frozen dataclasses, in which an unknown name is an error that names the right one."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from .errors import unknown_name
+
+Options = TypeVar("Options")
+Entry = TypeVar("Entry")
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Make an unknown keyword of a function an error that names the nearest right one.
+
+    A decorator; the function keeps its signature, so that editors and type checkers see it.
+
+    Raises:
+        OptionError: from the function, called with a keyword that it does not take.
+
+    Example:
+        >>> @suggest_keywords
+        ... def detect(image, *, max_keypoints=None):
+        ...     return max_keypoints
+        >>> detect(None, max_keypoint=5)
+        Traceback (most recent call last):
+        ...
+        deepdetect.OptionError: unknown option 'max_keypoint': did you mean \
+'max_keypoints'? (known: image, max_keypoints)
+    """
+    names = [name for name in inspect.signature(function).parameters if name != "self"]
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        for name in kwargs:
+            if name not in names:
+                raise unknown_name("option", name, names)
+        return function(*args, **kwargs)
+
+    return call
+
+
+def is_path(value: str | Path) -> bool:
+    """Tell a file's path from a name: it has an ending, or a folder before it.
+
+    Example:
+        >>> [is_path(text) for text in ("dense", "dense.onnx", "./dense")]
+        [False, True, True]
+    """
+    text = str(value)
+    return bool(Path(text).suffix) or any(mark in text for mark in (os.sep, os.altsep) if mark)
+
+
+def look_up_word(kind: str, word: str | Path, registry: Mapping[str, Entry]) -> Entry:
+    """Find an entry of a registry by a word that is no path.
+
+    Raises:
+        OptionError: there is none (the nearest right one is named, and that a file would do).
+    """
+    if str(word) not in registry:
+        raise unknown_name(kind, str(word), (*registry, "or a file with its ending"))
+    return registry[str(word)]
+
+
+def changed(options: Options, **changes: Any) -> Options:
+    """Return options with some values changed, also those of options inside them.
+
+    Args:
+        options: a frozen dataclass, some of whose fields may be such dataclasses.
+        changes: new values by field name.
+
+    Raises:
+        OptionError: a name is unknown (the nearest right one is named), or a dataclass
+            refuses a value.
+
+    Example:
+        >>> from deepdetect.geometry import GeometryOptions
+        >>> changed(GeometryOptions(), estimator="ransac").estimator
+        'ransac'
+        >>> changed(GeometryOptions(), estimater="ransac")
+        Traceback (most recent call last):
+        ...
+        deepdetect.OptionError: unknown option 'estimater': did you mean 'estimator'? \
+(known: model, estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations, \
+seed)
+    """
+    names = option_names(options)
+    for name in changes:
+        if name not in names:
+            raise unknown_name("option", name, names)
+    return _rebuild(options, changes)
+
+
+def option_names(options: Any) -> list[str]:
+    """List the names that `changed` takes for these options, the outer ones first."""
+    fields = [field.name for field in dataclasses.fields(options) if field.init]
+    inner = [getattr(options, name) for name in fields]
+    nested = [option_names(value) for value in inner if dataclasses.is_dataclass(value)]
+    return list(dict.fromkeys(fields + [name for names in nested for name in names]))
+
+
+def _rebuild(options: Any, changes: dict[str, Any]) -> Any:
+    """Apply each change at the outermost place of its name; a new group before its members."""
+    fields = [field.name for field in dataclasses.fields(options) if field.init]
+    values = {name: changes[name] for name in fields if name in changes}
+    left = {name: value for name, value in changes.items() if name not in values}
+    for name in fields:
+        group = values.get(name, getattr(options, name))
+        if dataclasses.is_dataclass(group):
+            own = {key: left.pop(key) for key in option_names(group) if key in left}
+            if own:
+                values[name] = _rebuild(group, own)
+    if left:
+        raise unknown_name("option", next(iter(left)), option_names(options))
+    return dataclasses.replace(options, **values)

@@ -1,0 +1,1 @@
+"""The detector: the network, its heat map and its keypoints."""

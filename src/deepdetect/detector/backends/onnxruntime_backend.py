@@ -1,0 +1,87 @@
+"""ONNX Runtime: the backend that is always installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..._shared.errors import DeepDetectError, OptionError, WeightsError, unknown_name
+from .shapes import as_logits, check_network, output_to_read
+from .without_telemetry import import_onnxruntime
+
+if TYPE_CHECKING:
+    from .registry import RuntimeOptions
+
+
+class OnnxRuntimeNetwork:
+    """A network run by ONNX Runtime."""
+
+    def __init__(self, session: Any, input_name: str, output_name: str, path: Path) -> None:
+        self._session = session
+        self._input_name = input_name
+        self._output_name = output_name
+        self._path = path
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        try:
+            output = self._session.run([self._output_name], {self._input_name: image})[0]
+        except Exception as error:  # its exceptions share no base class
+            height, width = image.shape[2:]
+            raise DeepDetectError(
+                f"the network failed on an image of {width}x{height} pixels "
+                f"({str(error).splitlines()[0]}): use a smaller one, or another provider"
+            ) from None
+        return as_logits(output, self._output_name, image.shape, self._path)
+
+
+def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
+    """Load an ONNX file.
+
+    Raises:
+        WeightsError: the file is damaged or is another network.
+        OptionError: an execution provider is unknown or not available.
+    """
+    onnxruntime = import_onnxruntime()
+    providers = list(options.providers) or ["CPUExecutionProvider"]
+    for provider in providers:
+        if provider not in onnxruntime.get_all_providers():
+            raise unknown_name("provider", provider, onnxruntime.get_all_providers())
+        if provider not in onnxruntime.get_available_providers():
+            raise OptionError(
+                f"the provider {provider} is not in the installed onnxruntime: "
+                f"install the build that has it, or use one of "
+                f"{', '.join(onnxruntime.get_available_providers())}"
+            )
+    settings = onnxruntime.SessionOptions()
+    settings.log_severity_level = 3
+    if options.threads is not None:
+        settings.intra_op_num_threads = options.threads
+    try:
+        session = onnxruntime.InferenceSession(str(path), settings, providers=providers)
+    except Exception as error:  # its exceptions share no base class
+        raise WeightsError(
+            f"{path} is not an ONNX file that can be read ({str(error).splitlines()[0]}): "
+            "get it anew"
+        ) from None
+    # It goes on with the CPU when a provider cannot start, and says so in a log only.
+    session.disable_fallback()
+    if providers[0] not in session.get_providers():
+        raise OptionError(
+            f"the provider {providers[0]} could not start: check its driver and libraries, "
+            "or leave it out"
+        )
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    check_network(
+        path,
+        [value.shape for value in inputs],
+        [value.shape for value in outputs],
+        # It says "tensor(float)" for float32.
+        {
+            "float32" if value.type == "tensor(float)" else value.type
+            for value in [*inputs, *outputs]
+        },
+    )
+    output = output_to_read([value.name for value in outputs])
+    return OnnxRuntimeNetwork(session, inputs[0].name, output, path)

@@ -1,0 +1,103 @@
+"""The checks that an ONNX file is a network of ours, and that it answers like one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..._shared.errors import WeightsError
+
+Shape = Sequence[int | str | None]
+
+LOGITS = "logits"
+"""Name of the output that holds logits; an output of another name holds probabilities."""
+
+
+def check_network(
+    path: Path, inputs: Sequence[Shape], outputs: Sequence[Shape], types: set[str]
+) -> None:
+    """Check that a network maps one RGB image to a map or two, for any size.
+
+    Args:
+        path: the file, for the message.
+        inputs, outputs: their shapes; a free dimension is no number.
+        types: names of all their number types.
+
+    Raises:
+        WeightsError: the shapes or the types do not fit.
+    """
+    fits = (
+        len(inputs) == 1
+        and len(outputs) in (1, 2)
+        and _like(inputs[0], channels=3)
+        and all(_like(output, channels=1) for output in outputs)
+    )
+    if not fits:
+        raise WeightsError(
+            f"{path} does not fit: it maps {_text(inputs)} to {_text(outputs)}, and must map "
+            "one image (1, 3, height, width) to one map (1, 1, height, width) of any size"
+        )
+    if types != {"float32"}:
+        raise WeightsError(
+            f"{path} does not fit: it computes with {', '.join(sorted(types))}, "
+            "and must take and give float32"
+        )
+
+
+def output_to_read(names: Sequence[str]) -> str:
+    """Choose the output to read: the logits, or the first where there are none."""
+    return LOGITS if LOGITS in names else names[0]
+
+
+def as_logits(
+    output: np.ndarray, name: str, image_shape: tuple[int, ...], path: Path
+) -> np.ndarray:
+    """Check what a network returns, and turn probabilities into logits.
+
+    Args:
+        output: what the network returned.
+        name: the output's name; probabilities unless it is "logits".
+        image_shape: (1, 3, H, W) of the image.
+        path: the weights file, for the message.
+
+    Returns:
+        (1, 1, H, W) float32 logits. Probabilities that float32 rounds to 0 or 1 become the
+        logits of the nearest number that it holds.
+
+    Raises:
+        WeightsError: the map has another size, or a value is not finite or no probability.
+    """
+    wanted = (1, 1, *image_shape[2:])
+    if output.shape != wanted:
+        raise WeightsError(
+            f"{path} gives a map of shape {output.shape} for an image that needs {wanted}: "
+            "use other weights"
+        )
+    if not np.isfinite(output).all():
+        raise WeightsError(
+            f"{path} gives values that are not finite: it is damaged, or its training diverged; "
+            "use other weights"
+        )
+    if name == LOGITS:
+        return output
+    if output.min() < 0 or output.max() > 1:
+        raise WeightsError(
+            f"{path} gives values from {output.min():g} to {output.max():g}, which are no "
+            f"probabilities: name the output {LOGITS!r} if it holds logits, or use other weights"
+        )
+    probability = np.clip(output.astype(np.float64), 1e-38, 1 - 2.0**-25)
+    return np.log(probability / (1 - probability)).astype(np.float32)
+
+
+def _like(shape: Shape, channels: int) -> bool:
+    if len(shape) != 4 or (isinstance(shape[0], int) and shape[0] != 1):
+        return False
+    if isinstance(shape[1], int) and shape[1] != channels:
+        return False
+    return not any(isinstance(side, int) for side in shape[2:])
+
+
+def _text(shapes: Sequence[Shape]) -> str:
+    return ", ".join("(" + ", ".join(str(side) for side in shape) + ")" for shape in shapes)

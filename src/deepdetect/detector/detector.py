@@ -1,0 +1,174 @@
+"""The detector: an image in, a heat map or keypoints out."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
+from ..features.keypoints import Keypoints, SelectionOptions, select_keypoints
+from ..io.image import load_image
+from .backends import RuntimeOptions, open_network
+from .heatmap import HeatmapOptions, compute_heatmap_and_logits
+from .pretrained import find_weights
+
+
+class DeepDetect:
+    """The dense keypoint detector of the paper.
+
+    Args:
+        weights: "default" or "dense", the weights inside the package; or an ONNX file, or
+            a safetensors file where torch is installed.
+        resolution: "native" (the image as it is, padded), or a number of pixels: the
+            image is squashed to a square of that side, as the paper does with 480.
+        backend: "auto" (OpenVINO when it is installed, else ONNX Runtime; torch for
+            safetensors), "onnxruntime", "openvino" or "torch".
+        providers: ONNX Runtime's execution providers by name, as
+            ("CUDAExecutionProvider", "CPUExecutionProvider").
+        threads: number of threads; None leaves the backend's choice.
+        channels: "rgb", or "bgr" as the paper's published code feeds them.
+
+    Attributes:
+        backend: name of the backend that runs.
+        heatmap_options: the resolution and the order of the channels.
+
+    Raises:
+        WeightsError: the weights are missing, damaged or do not fit.
+        OptionError: an option is unknown or out of its range.
+        MissingExtraError: the backend is not installed.
+
+    Example:
+        >>> import numpy as np
+        >>> image = np.zeros((48, 64), np.uint8)
+        >>> image[16:32, 16:48] = 255
+        >>> detector = DeepDetect()
+        >>> detector.heatmap(image).shape
+        (48, 64)
+        >>> len(detector.detect(image, max_keypoints=10))
+        10
+    """
+
+    @suggest_keywords
+    def __init__(
+        self,
+        weights: str | Path = "default",
+        *,
+        resolution: Literal["native"] | int = "native",
+        backend: str = "auto",
+        providers: tuple[str, ...] = (),
+        threads: int | None = None,
+        channels: Literal["rgb", "bgr"] = "rgb",
+    ) -> None:
+        self.weights = find_weights(weights)
+        self.heatmap_options = HeatmapOptions(resolution, channels)
+        self._runtime = RuntimeOptions(backend, providers, threads)
+        self._network, self.backend = open_network(self.weights, self._runtime)
+
+    def configured(self, heatmap_options: HeatmapOptions) -> DeepDetect:
+        """Return a detector with the same loaded network and other heat map options."""
+        other = copy.copy(self)
+        other.heatmap_options = heatmap_options
+        return other
+
+    def with_weights(self, weights: str | Path) -> DeepDetect:
+        """Return a detector with other weights, and all other options as they are.
+
+        Raises:
+            WeightsError: the weights are missing, damaged or do not fit.
+        """
+        other = self.configured(self.heatmap_options)
+        other.weights = find_weights(weights)
+        other._network, other.backend = open_network(other.weights, self._runtime)
+        return other
+
+    def heatmap(self, image: Any) -> np.ndarray:
+        """Compute the probability of a keypoint at each pixel.
+
+        Args:
+            image: a path, a PIL image, or an array: uint8, uint16 or float in [0, 1];
+                grey, RGB or RGBA.
+
+        Returns:
+            (H, W) float32 in [0, 1], at the image's own size.
+
+        Raises:
+            ImageError: the image cannot be read or is not fit.
+        """
+        return self.heatmap_and_logits(image)[0]
+
+    def heatmap_and_logits(self, image: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the heat map and the logits of its probabilities; argument as of `heatmap`.
+
+        Float32 rounds the highest probabilities to 1. The logits still tell these pixels apart, so
+        keypoints are ranked by them.
+
+        Returns:
+            The heat map and the logits, (H, W) float32 both.
+
+        Raises:
+            ImageError: the image cannot be read or is not fit.
+        """
+        return compute_heatmap_and_logits(load_image(image), self._network, self.heatmap_options)
+
+    @suggest_keywords
+    def detect(
+        self,
+        image: Any,
+        threshold: float = 0.5,
+        *,
+        density: float | None = None,
+        max_keypoints: int | None = None,
+        nms_radius: int | None = None,
+        subpixel: bool | None = None,
+        ignore: np.ndarray | None = None,
+    ) -> Keypoints:
+        """Detect keypoints.
+
+        Args:
+            image: as for `heatmap`.
+            threshold: tau: pixels with a probability above it.
+            density: wanted keypoints per pixel, in (0, 1], instead of the threshold. This many
+                are returned even where there is little to detect.
+            max_keypoints: keep at most this many, the most probable ones, ranked by logits.
+            nms_radius: radius of non-maximum suppression in pixels. None: 1 with `max_keypoints`,
+                else 0.
+            subpixel: refine positions to a fraction of a pixel. None: with `max_keypoints` only.
+            ignore: (H, W) array, true where no keypoint is wanted.
+
+        Returns:
+            The keypoints in the order of rows and columns, on pixel centres unless `subpixel`.
+
+        Raises:
+            ImageError: the image cannot be read or is not fit.
+            OptionError: an option is out of its range.
+        """
+        options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel, ignore)
+        return find_keypoints(self, load_image(image), options)
+
+
+def find_keypoints(detector: Any, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
+    """Choose the keypoints of an image, ranked by logits where the detector gives them.
+
+    Args:
+        detector: a `DeepDetect`, or anything with a method `heatmap`.
+        rgb: (H, W, 3) uint8 RGB.
+        options: what to choose.
+
+    Raises:
+        OptionError: the detector's map has another size than the image, or is not finite.
+    """
+    logits = None
+    if hasattr(detector, "heatmap_and_logits"):
+        heatmap, logits = detector.heatmap_and_logits(rgb)
+    else:
+        heatmap = detector.heatmap(rgb)
+    if np.shape(heatmap) != rgb.shape[:2] or not np.isfinite(heatmap).all():
+        raise OptionError(
+            f"the detector's heat map must be {rgb.shape[:2]} finite probabilities, one per "
+            f"pixel, and has shape {np.shape(heatmap)}: correct its method heatmap"
+        )
+    return select_keypoints(np.asarray(heatmap), options, logits)

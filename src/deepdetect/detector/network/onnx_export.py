@@ -1,0 +1,54 @@
+"""The network as an ONNX file for any image size: `image` in, `probability` and `logits` out."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from ..._shared.atomic import atomic_path
+
+OPSET = 17
+
+
+class ProbabilityAndLogits(nn.Module):
+    """The network followed by the sigmoid, and its logits, which tell the best pixels apart."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        logits = self.network(image)
+        return torch.sigmoid(logits), logits
+
+
+def export_onnx(network: nn.Module, path: str | Path) -> None:
+    """Write a network as ONNX, whole or not at all.
+
+    Args:
+        network: maps (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits; H and W
+            are multiples of 8.
+        path: file ending in .onnx. Its input is `image` (batch, 3, height, width)
+            float32, its outputs `probability` and `logits`, both (batch, 1, height, width)
+            float32.
+    """
+    module = ProbabilityAndLogits(network.cpu()).eval()
+    example = torch.zeros(2, 3, 64, 96)
+    axes = {0: "batch", 2: "height", 3: "width"}
+    with atomic_path(path) as temporary, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        torch.onnx.export(
+            module,
+            (example,),
+            str(temporary),
+            input_names=["image"],
+            output_names=["probability", "logits"],
+            dynamic_axes={"image": axes, "probability": axes, "logits": axes},
+            opset_version=OPSET,
+            dynamo=False,
+        )

@@ -1,0 +1,97 @@
+"""Weights as safetensors files: a plain state dict, with notes in the header."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+
+from ..._shared.atomic import atomic_path
+from ..._shared.errors import WeightsError
+from .espnet import ESPNet
+
+
+def save_weights(network: nn.Module, path: str | Path, notes: dict[str, str]) -> None:
+    """Write a network's state dict, whole or not at all.
+
+    Args:
+        network: the network.
+        path: file ending in .safetensors.
+        notes: text to be kept in the file's header.
+    """
+    tensors = {
+        name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
+    }
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata=notes)
+
+
+def load_network(path: str | Path) -> ESPNet:
+    """Make the network from a weights file, in evaluation mode.
+
+    Raises:
+        WeightsError: the file is missing, damaged or does not fit the network.
+    """
+    if not Path(path).is_file():
+        raise WeightsError(f"there is no weights file {path}: check the path")
+    network = ESPNet()
+    try:
+        with safe_open(path, framework="pt") as file:
+            names = list(file.keys())
+            network.load_state_dict({name: file.get_tensor(name) for name in names})
+    except (SafetensorError, OSError, RuntimeError, KeyError) as error:
+        # torch names the first wrong tensor on its second line.
+        reason = " ".join(str(error).split("\n\t")[:2]).strip()
+        reason = reason if len(reason) < 160 else reason[:160] + "..."
+        raise WeightsError(
+            f"{path} does not fit the network ({reason}): "
+            "use weights that deepdetect has trained, or the published ones"
+        ) from None
+    return network.eval()
+
+
+def load_mean_network(paths: Sequence[str | Path]) -> ESPNet:
+    """Make the network from the mean of several weights files.
+
+    The mean of runs that went on from one another is often better than each of them
+    (Wortsman et al., "Model soups", 2022). Counts, which have no mean, are the first file's.
+
+    Raises:
+        WeightsError: a file is missing, damaged or does not fit the network.
+    """
+    networks = [load_network(path) for path in paths]
+    states = [network.state_dict() for network in networks]
+    mean = {
+        name: sum(state[name] for state in states) / len(states)
+        if value.is_floating_point()
+        else value
+        for name, value in states[0].items()
+    }
+    networks[0].load_state_dict(mean)
+    return networks[0]
+
+
+def read_notes(path: str | Path) -> dict[str, str]:
+    """Read the notes in a weights file's header.
+
+    Raises:
+        WeightsError: the file is missing or damaged.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            return dict(file.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path} is not a weights file ({error})") from None
+
+
+def weights_digest(network: nn.Module) -> str:
+    """Return the SHA-256 of a network's state, the same whatever file it came from."""
+    digest = hashlib.sha256()
+    for name, value in sorted(network.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,85 @@
+"""Charts and pictures of a report, as PNG."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+
+from .._shared.errors import MissingExtraError
+
+WIDEST = 1600
+"""Pixels; wider pictures are shrunk."""
+
+
+def bar_chart(
+    values: Mapping[str, float],
+    label: str,
+    highlighted: Sequence[str] = (),
+    limit: float | None = None,
+) -> bytes:
+    """Draw horizontal bars, with the value beside each.
+
+    Args:
+        values: by name, from top to bottom.
+        label: of the axis.
+        highlighted: names that are drawn in another colour.
+        limit: end of the axis.
+
+    Returns:
+        The PNG file.
+    """
+    figure = _figure(8, 0.32 * len(values) + 1)
+    axes = figure.subplots()
+    names = list(values)
+    colors = ["C1" if name in highlighted else "C0" for name in names]
+    bars = axes.barh(names, list(values.values()), color=colors)
+    axes.bar_label(bars, fmt="{:.3f}", padding=3)
+    axes.invert_yaxis()
+    axes.set_xlabel(label)
+    axes.set_xlim(0, limit)
+    axes.margins(x=0.12)
+    axes.grid(axis="x", alpha=0.3)
+    return _saved(figure)
+
+
+def line_chart(
+    lines: Mapping[str, tuple[Sequence[float], Sequence[float]]], x_label: str, y_label: str
+) -> bytes:
+    """Draw lines of (x, y) values, with their names in a legend."""
+    figure = _figure(8, 4.5)
+    axes = figure.subplots()
+    for name, (x, y) in lines.items():
+        axes.plot(x, y, marker=".", label=name)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    return _saved(figure)
+
+
+def picture(rgb: np.ndarray) -> bytes:
+    """Encode a (H, W, 3) uint8 RGB picture, shrunk where it is very wide."""
+    if rgb.shape[1] > WIDEST:
+        size = (WIDEST, round(rgb.shape[0] * WIDEST / rgb.shape[1]))
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def _figure(width: float, height: float):  # type: ignore[no-untyped-def]
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise MissingExtraError(
+            "the report's charts need the package matplotlib, which is not installed: "
+            "run pip install 'deepdetect[benchmark]'"
+        ) from None
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _saved(figure) -> bytes:  # type: ignore[no-untyped-def]
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()

@@ -1,0 +1,1 @@
+"""Keypoints and their descriptors, and descriptor matching."""

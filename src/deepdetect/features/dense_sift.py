@@ -1,0 +1,116 @@
+"""SIFT of very many upright keypoints on whole pixels, all at once (paper, Section III-C).
+
+OpenCV sums the gradients around each keypoint anew. Where all keypoints have one size and no
+turn, the sums are a filter: bilinear times Gaussian, along rows and then along columns. The
+numbers are OpenCV's but for rounding.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from .._shared.errors import OptionError
+from .._shared.threads import in_threads
+
+SIZES = (2.0, 8.0)
+"""Smallest and largest keypoint, in pixels."""
+
+SIGMA = 1.6
+CAMERA_SIGMA = 0.5
+"""Blur of SIFT's first image, and the blur that an image is taken to have already."""
+
+BIN_WIDTH = 1.5
+"""Width of a spatial bin in units of the keypoint's size (3 times its radius)."""
+
+
+def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarray:
+    """Compute upright SIFT descriptors, as OpenCV's at angle 0.
+
+    Args:
+        gray: (H, W) uint8 luma.
+        xy: (N, 2) positions on whole pixels within the image.
+        size: diameter of the keypoints in pixels, in [2, 8].
+
+    Returns:
+        (N, 128) uint8: four rows of four columns of eight orientations.
+
+    Raises:
+        OptionError: a position is not on a pixel of the image, or the size is out of its range.
+
+    Example:
+        >>> gray = np.random.default_rng(0).integers(0, 256, (40, 40)).astype(np.uint8)
+        >>> dense_sift(gray, np.array([[20, 20], [21, 20]])).shape
+        (2, 128)
+    """
+    if not SIZES[0] <= size <= SIZES[1]:
+        raise OptionError(f"the keypoint size must lie in [{SIZES[0]:g}, {SIZES[1]:g}], not {size}")
+    if not on_pixels(xy, gray.shape):
+        raise OptionError("dense SIFT takes keypoints on whole pixels within the image only")
+    from .dense_sift_kernel import TILE_HEIGHT, TILE_WIDTH, describe_tiles
+
+    magnitude, orientation = _gradient(gray)
+    taps = _taps(size)
+    spans = np.array([[np.flatnonzero(row)[0], np.flatnonzero(row)[-1] + 1] for row in taps])
+    columns, rows = (np.ascontiguousarray(part, np.int32) for part in np.asarray(xy).T)
+    across, down = -(-gray.shape[1] // TILE_WIDTH), -(-gray.shape[0] // TILE_HEIGHT)
+    tile = rows // TILE_HEIGHT * across + columns // TILE_WIDTH
+    order = np.argsort(tile, kind="stable")
+    starts = np.searchsorted(tile[order], np.arange(across * down + 1))
+    out = np.empty((len(xy), 128), np.uint8)
+
+    def work(first: int, last: int) -> None:
+        describe_tiles(
+            *(first, last, magnitude, orientation, columns, rows, order, starts, across),
+            *(taps, spans, out),
+        )
+
+    in_threads(across * down, work)
+    return out
+
+
+def on_pixels(xy: np.ndarray, shape: tuple[int, ...]) -> bool:
+    """Tell whether all positions are whole pixels of an image of shape (H, W)."""
+    xy = np.asarray(xy)
+    inside = (xy >= 0).all() and (xy < (shape[1], shape[0])).all()
+    return bool(inside and (xy == np.rint(xy)).all())
+
+
+def root(descriptors: np.ndarray, overwrite: bool = False) -> np.ndarray:
+    """Turn SIFT descriptors into RootSIFT (Arandjelovic, 2012).
+
+    Its Euclidean distance is the Hellinger distance of SIFT.
+
+    Args:
+        descriptors: (N, 128) uint8.
+        overwrite: put the result where the descriptors are, which saves the time of a copy.
+
+    Returns:
+        (N, 128) uint8: the square roots of the L1-normalised ones times 512, at most 255.
+    """
+    from .dense_sift_kernel import square_root
+
+    result = descriptors if overwrite else descriptors.copy()
+    in_threads(len(result), lambda first, last: square_root(first, last, result))
+    return result
+
+
+def _gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the strength of the gradient, 0 on the border, and its direction in 45 degrees."""
+    blur = float(np.sqrt(SIGMA**2 - CAMERA_SIGMA**2))
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), blur)
+    across, up = np.zeros_like(smooth), np.zeros_like(smooth)
+    across[:, 1:-1] = smooth[:, 2:] - smooth[:, :-2]
+    up[1:-1] = smooth[:-2] - smooth[2:]
+    magnitude, degrees = cv2.cartToPolar(across, up, angleInDegrees=True)
+    return magnitude, degrees * np.float32(8 / 360)
+
+
+def _taps(size: float) -> np.ndarray:
+    """Return the weights of the pixels around a keypoint for its four bins, (4, T) float32."""
+    width = BIN_WIDTH * size
+    reach = int(np.ceil(2.5 * width)) - 1  # bins overlap: half of one beyond four
+    offsets = np.arange(-reach, reach + 1) / width
+    bins = np.arange(4)[:, None] - 1.5
+    bilinear = np.maximum(0, 1 - np.abs(offsets - bins))
+    return (bilinear * np.exp(-(offsets**2) / 8)).astype(np.float32)

@@ -1,0 +1,116 @@
+"""The compiled part of `dense_sift`. Importing it takes numba; the first call compiles.
+
+The image is done in tiles, so that what is in the works stays in the processor's cache: for each
+pixel of a tile eight soft orientations, summed along its row into the descriptor's four columns,
+then along the column into its four rows at the keypoints only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .._shared.kernels import compiled
+
+TILE_HEIGHT = 48
+TILE_WIDTH = 64
+
+
+@compiled(nogil=True, fastmath=True)
+def describe_tiles(  # type: ignore[no-untyped-def]
+    first,
+    last,
+    magnitude,
+    orientation,
+    columns,
+    rows,
+    order,
+    starts,
+    tiles_across,
+    taps,
+    spans,
+    out,
+):
+    """Describe the keypoints of the tiles from `first` to before `last`.
+
+    Args:
+        first, last: numbers of the tiles, row by row.
+        magnitude, orientation: (H, W) float32 gradient; orientation in units of 45 degrees.
+        columns, rows: (N,) int32 keypoints.
+        order: (N,) keypoints sorted by tile; `starts[k]` is where those of tile k begin.
+        tiles_across: tiles in a row of them.
+        taps: (4, T) float32 weights of the T pixels around a keypoint for each of four bins.
+        spans: (4, 2) first tap and end of the taps of each bin that are not 0.
+        out: (N, 128) uint8, written.
+    """
+    height, width = magnitude.shape
+    reach = taps.shape[1] // 2
+    soft = np.zeros((TILE_WIDTH + 2 * reach, 8), np.float32)
+    summed = np.zeros((TILE_HEIGHT + 2 * reach, TILE_WIDTH, 32), np.float32)
+    histogram = np.zeros((4, 32), np.float32)
+    line = np.zeros(8, np.float32)
+    for tile in range(first, last):
+        if starts[tile] == starts[tile + 1]:
+            continue
+        top = (tile // tiles_across) * TILE_HEIGHT
+        left = (tile % tiles_across) * TILE_WIDTH
+        for j in range(TILE_HEIGHT + 2 * reach):
+            y = top + j - reach
+            if y < 1 or y >= height - 1:
+                summed[j] = 0
+                continue
+            soft[:] = 0
+            for i in range(max(0, reach + 1 - left), min(len(soft), width - 1 + reach - left)):
+                turn = orientation[y, left + i - reach]
+                whole = int(turn)
+                part = turn - np.float32(whole)
+                weight = magnitude[y, left + i - reach]
+                soft[i, whole & 7] = weight * (np.float32(1) - part)
+                soft[i, (whole + 1) & 7] = weight * part
+            for i in range(min(TILE_WIDTH, width - left)):
+                for b in range(4):
+                    line[:] = 0
+                    for t in range(spans[b, 0], spans[b, 1]):
+                        for o in range(8):
+                            line[o] += taps[b, t] * soft[i + t, o]
+                    for o in range(8):
+                        summed[j, i, 8 * b + o] = line[o]
+        for k in order[starts[tile] : starts[tile + 1]]:
+            j, i = rows[k] - top, columns[k] - left
+            for b in range(4):
+                histogram[b] = 0
+                for t in range(spans[b, 0], spans[b, 1]):
+                    for o in range(32):
+                        histogram[b, o] += taps[b, t] * summed[j + t, i, o]
+            _normalise(histogram, out[k])
+
+
+@compiled(nogil=True, fastmath=True, inline="always")
+def _normalise(histogram, out):  # type: ignore[no-untyped-def]
+    """Cut at a fifth of the length, scale to 512 and round, as Lowe and OpenCV do."""
+    total = np.float32(0)
+    for b in range(4):
+        for o in range(32):
+            total += histogram[b, o] * histogram[b, o]
+    most = np.sqrt(total) * np.float32(0.2)
+    total = np.float32(0)
+    for b in range(4):
+        for o in range(32):
+            histogram[b, o] = min(histogram[b, o], most)
+            total += histogram[b, o] * histogram[b, o]
+    scale = np.float32(512) / max(np.sqrt(total), np.float32(1.1920929e-07))
+    for b in range(4):
+        for o in range(32):
+            out[32 * b + o] = np.uint8(min(np.float32(255), np.rint(histogram[b, o] * scale)))
+
+
+@compiled(nogil=True)
+def square_root(first, last, descriptors):  # type: ignore[no-untyped-def]
+    """Turn SIFT into RootSIFT, in place: 512 times the root of each one's share of the sum."""
+    for k in range(first, last):
+        total = 0
+        for d in range(128):
+            total += descriptors[k, d]
+        scale = np.float32(512) / np.sqrt(np.float32(max(total, 1)))
+        for d in range(128):
+            value = np.rint(scale * np.sqrt(np.float32(descriptors[k, d])))
+            descriptors[k, d] = np.uint8(min(np.float32(255), value))

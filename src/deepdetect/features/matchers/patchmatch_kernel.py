@@ -1,0 +1,186 @@
+"""The compiled part of `patchmatch`. Importing it takes numba; the first call compiles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..._shared.kernels import compiled
+
+FAR = np.int32(2**31 - 1)
+"""The distance of a neighbour that has not been found."""
+
+
+@compiled(nogil=True, inline="always")
+def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
+    """Return the squared Euclidean distance; all in 32 bits, for the sake of the processor."""
+    total = np.int32(0)
+    for d in range(queries.shape[1]):
+        gap = np.int32(np.int32(queries[query, d]) - np.int32(base[row, d]))
+        total = np.int32(total + np.int32(gap * gap))
+    return total
+
+
+@compiled(nogil=True, inline="always")
+def _with(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
+    """Return the best two rows and their distances when one more row is considered."""
+    if distance < nearer:
+        return row, best, distance, nearer
+    if distance < farther:
+        return best, row, nearer, distance
+    return best, second, nearer, farther
+
+
+@compiled(nogil=True, inline="always")
+def _scrambled(number):  # type: ignore[no-untyped-def]
+    """Return a number that looks random, the same for the same number (Wellons's lowbias32)."""
+    number = np.uint32(number)
+    number ^= number >> np.uint32(16)
+    number = np.uint32(number * np.uint32(0x7FEB352D))
+    number ^= number >> np.uint32(15)
+    number = np.uint32(number * np.uint32(0x846CA68B))
+    number ^= number >> np.uint32(16)
+    return number
+
+
+@compiled(nogil=True, inline="always")
+def _line(matrix, x, y):  # type: ignore[no-untyped-def]
+    """Return the epipolar line of a pixel, with a normal of length 1."""
+    a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]
+    b = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]
+    c = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
+    length = max(np.sqrt(a * a + b * b), 1e-12)
+    return a / length, b / length, c / length
+
+
+@compiled(nogil=True)
+def start_on_lines(  # type: ignore[no-untyped-def]
+    first, last, queries, base, xy0, at1, matrix, tries, seed, rows, distances
+):
+    """Give the queries from `first` to before `last` the best of some rows near their lines."""
+    height, width = at1.shape
+    for query in range(first, last):
+        a, b, c = _line(matrix, xy0[query, 0], xy0[query, 1])
+        state = _scrambled(np.uint32(query) ^ _scrambled(np.uint32(seed)))
+        best, second, nearer, farther = 0, 1, FAR, FAR
+        for _ in range(tries):
+            state = _scrambled(state + np.uint32(1))
+            if abs(b) > abs(a):
+                x = np.int64(state % np.uint32(width))
+                y = np.int64(np.rint(-(a * x + c) / b))
+            else:
+                y = np.int64(state % np.uint32(height))
+                x = np.int64(np.rint(-(b * y + c) / a))
+            if x < 0 or y < 0 or x >= width or y >= height:
+                continue
+            row = at1[y, x]
+            if row < 0 or row == best or row == second:  # noqa: SIM109
+                continue
+            best, second, nearer, farther = _with(
+                row, _distance(queries, query, base, row), best, second, nearer, farther
+            )
+        rows[query, 0], rows[query, 1] = best, second
+        distances[query, 0], distances[query, 1] = nearer, farther
+
+
+@compiled(nogil=True)
+def start(first, last, queries, base, seed, rows, distances):  # type: ignore[no-untyped-def]
+    """Give the queries from `first` to before `last` two random rows of the base."""
+    count = len(base)
+    for query in range(first, last):
+        state = _scrambled(np.uint32(query) ^ _scrambled(np.uint32(seed)))
+        best = np.int64(state) % count
+        second = np.int64(_scrambled(state)) % count
+        if second == best:
+            second = (best + 1) % count
+        nearer, farther = (
+            _distance(queries, query, base, best),
+            _distance(queries, query, base, second),
+        )
+        if farther < nearer:
+            best, second, nearer, farther = second, best, farther, nearer
+        rows[query, 0], rows[query, 1] = best, second
+        distances[query, 0], distances[query, 1] = nearer, farther
+
+
+@compiled(nogil=True)
+def sweep(  # type: ignore[no-untyped-def]
+    first, last, bands, queries, base, xy0, xy1, at0, at1, offsets, turn, seed, radii, before, rows,
+    distances, matrix, band_width,
+):  # fmt: skip
+    """Improve the queries of the bands from `first` to before `last`, one after the other.
+
+    Args:
+        first, last: numbers of the bands.
+        bands: (B + 1,) query that each band begins with, in the order of reading.
+        queries, base: (N, D), (M, D) uint8 descriptors.
+        xy0, xy1: their pixels.
+        at0, at1: (H, W) int32 row at each pixel, -1 where there is none.
+        offsets: distances in pixels to the queries whose neighbours are tried.
+        turn: number of the sweep; even ones go down, odd ones up.
+        seed: of the random tries.
+        radii: of the random tries around the best, in pixels.
+        before: (N, 2) rows as they were before this sweep, for queries of other bands: so the
+            bands may be done in any order.
+        rows, distances: (N, 2) best and second-best row and squared distances; improved.
+        matrix: (3, 3) fundamental matrix.
+        band_width: neighbours are at most so far from their query's line; infinite: anywhere.
+    """
+    bound = band_width < 1e9
+    height0, width0 = at0.shape
+    height1, width1 = at1.shape
+    direction = 1 - 2 * (turn % 2)
+    for band in range(first, last):
+        begin, end = bands[band], bands[band + 1]
+        for step in range(end - begin):
+            query = begin + step if direction == 1 else end - 1 - step
+            best, second = rows[query, 0], rows[query, 1]
+            nearer, farther = distances[query, 0], distances[query, 1]
+            a, b, c = _line(matrix, xy0[query, 0], xy0[query, 1])
+            for offset in offsets:
+                for axis in range(2):
+                    right = offset * direction * (1 - axis)
+                    down = offset * direction * axis
+                    x, y = xy0[query, 0] - right, xy0[query, 1] - down
+                    if x < 0 or y < 0 or x >= width0 or y >= height0:
+                        continue
+                    other = at0[y, x]
+                    if other < 0:
+                        continue
+                    for rank in range(2):
+                        known = rows if begin <= other < end else before
+                        row = known[other, rank]
+                        x, y = xy1[row, 0] + right, xy1[row, 1] + down
+                        if x < 0 or y < 0 or x >= width1 or y >= height1:
+                            continue
+                        if bound and abs(a * x + b * y + c) > band_width:
+                            continue
+                        row = at1[y, x]
+                        if row < 0 or row == best or row == second:  # noqa: SIM109
+                            continue
+                        best, second, nearer, farther = _with(
+                            row, _distance(queries, query, base, row), best, second, nearer, farther
+                        )
+            state = _scrambled(np.uint32(query) ^ _scrambled(np.uint32(seed + 7919 * (turn + 1))))
+            for radius in radii:
+                state = _scrambled(state + np.uint32(1))
+                step = np.int64(state % np.uint32(2 * radius + 1)) - radius
+                state = _scrambled(state + np.uint32(1))
+                if bound:  # along the line, and a little aside
+                    aside = np.int64(state % np.uint32(3)) - 1
+                    x = xy1[best, 0] + np.int64(np.rint(b * step + a * aside))
+                    y = xy1[best, 1] + np.int64(np.rint(-a * step + b * aside))
+                else:
+                    x = xy1[best, 0] + step
+                    y = xy1[best, 1] + np.int64(state % np.uint32(2 * radius + 1)) - radius
+                if x < 0 or y < 0 or x >= width1 or y >= height1:
+                    continue
+                if bound and abs(a * x + b * y + c) > band_width:
+                    continue
+                row = at1[y, x]
+                if row < 0 or row == best or row == second:  # noqa: SIM109
+                    continue
+                best, second, nearer, farther = _with(
+                    row, _distance(queries, query, base, row), best, second, nearer, farther
+                )
+            rows[query, 0], rows[query, 1] = best, second
+            distances[query, 0], distances[query, 1] = nearer, farther

@@ -1,0 +1,93 @@
+"""The ratio test: a match counts when the second-best one is clearly worse (Lowe, 2004)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .registry import Matcher
+
+
+@dataclass(frozen=True, eq=False)
+class DescriptorMatches:
+    """Matches between two sets of descriptors.
+
+    Attributes:
+        rows0, rows1: (M,) int, matched rows of the first and of the second set.
+        ratios: (M,) float32, distance of the best over that of the second-best.
+    """
+
+    rows0: np.ndarray
+    rows1: np.ndarray
+    ratios: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rows0)
+
+
+def match_descriptors(
+    descriptors0: np.ndarray,
+    descriptors1: np.ndarray,
+    matcher: Matcher,
+    *,
+    ratio: float = 0.99,
+    mutual: bool = False,
+    seed: int = 0,
+    positions: tuple[np.ndarray, np.ndarray] | None = None,
+) -> DescriptorMatches:
+    """Match by nearest neighbour and ratio test.
+
+    Args:
+        descriptors0, descriptors1: (N, D) and (M, D), uint8 or float32.
+        matcher: finds the neighbours.
+        ratio: a match needs a ratio strictly under it (paper's code: 0.99).
+        mutual: keep only pairs that are each other's nearest.
+        seed: of a matcher that is random.
+        positions: (N, 2) and (M, 2) of the keypoints, for a matcher that goes by them.
+
+    Returns:
+        The matches, by ascending row of the first set. None are found when the second
+        set has fewer than two descriptors: there is no second-best then.
+
+    Example:
+        >>> from deepdetect.features.matchers import get_matcher
+        >>> a = np.eye(3, 128, dtype=np.float32)
+        >>> match_descriptors(a, a[::-1].copy(), get_matcher("exact")).rows1.tolist()
+        [2, 1, 0]
+    """
+    if len(descriptors0) == 0 or len(descriptors1) < 2:
+        none = np.empty(0, np.int32)
+        return DescriptorMatches(none, none, np.empty(0, np.float32))
+    rows, distances = matcher(descriptors0, descriptors1, 2, seed, positions)
+    best, second = distances[:, 0], distances[:, 1]
+    # Two neighbours at distance 0 are equally good: their ratio is 1.
+    ratios = np.divide(best, second, out=np.ones_like(best), where=second > 0)
+    ratios[~np.isfinite(second)] = 1  # a second one that the search did not find tells nothing
+    kept = ratios < ratio
+    if mutual:
+        back = None if positions is None else positions[::-1]
+        nearest = matcher(descriptors1, descriptors0, 1, seed, back)[0][:, 0]
+        kept &= nearest[rows[:, 0]] == np.arange(len(rows))
+    rows0 = np.flatnonzero(kept).astype(np.int32)
+    return DescriptorMatches(rows0, rows[rows0, 0].astype(np.int32), ratios[rows0])
+
+
+def one_to_one(found: DescriptorMatches) -> DescriptorMatches:
+    """Keep of the matches that share a row of the second set the one with the smallest ratio.
+
+    Args:
+        found: matches with every row of the first set once; of equal ratios the lowest such row
+            stays.
+
+    Example:
+        >>> rows0, rows1 = np.array([0, 1, 2, 3]), np.array([5, 4, 5, 4])
+        >>> found = DescriptorMatches(rows0, rows1, np.array([0.5, 0.2, 0.4, 0.2], np.float32))
+        >>> kept = one_to_one(found)
+        >>> kept.rows0.tolist(), kept.rows1.tolist()
+        ([1, 2], [4, 5])
+    """
+    best_first = np.lexsort((found.rows0, found.ratios, found.rows1))
+    _, first = np.unique(found.rows1[best_first], return_index=True)
+    kept = np.sort(best_first[first])
+    return DescriptorMatches(found.rows0[kept], found.rows1[kept], found.ratios[kept])

@@ -1,0 +1,286 @@
+"""What is known of the two cameras: focal lengths, principal points, and perhaps the baseline.
+
+A calibration comes from a calib.json, from a focal length in pixels, or from EXIF (`exif`).
+
+The file is one JSON object. Only `focal_px` must be there; all lengths are of the images at the
+size `width` x `height`, pixel convention as everywhere (centre of the first pixel (0, 0))::
+
+    {"focal_px": 1246.7,            one number, or [fx, fy]
+     "cx": 231.0, "cy": 184.5,      principal point; left out: the middle of the image
+     "width": 463, "height": 370,   left out: not checked
+     "baseline_mm": 160.0,          distance of the cameras; left out: lengths are in baselines
+     "disparity_offset_px": 66.7,   cx of the right camera less that of the left; left out: 0
+     "left": {...}, "right": {...}} what differs in one view: focal_px, cx, cy, width, height
+
+Other keys are left alone. The names follow the calib.txt of Middlebury 2014 (Scharstein et al.,
+"High-resolution stereo datasets with subpixel-accurate ground truth"), where the offset is `doffs`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._shared.errors import ReconstructionError
+
+Size = tuple[int, int]
+
+AGREEMENT = 0.5
+"""Pixels by which cx of both views and the disparity offset may contradict each other."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Attributes:
+        size: (width, height) of its image in pixels.
+        focal_px: (fx, fy) in pixels; a single number is taken for both.
+        centre: (cx, cy), the principal point; None is the middle of the image.
+
+    Raises:
+        ReconstructionError: a value is not finite or not positive.
+
+    Example:
+        >>> Camera((640, 480), 500.0)
+        Camera(size=(640, 480), focal_px=(500.0, 500.0), centre=(319.5, 239.5))
+    """
+
+    size: Size
+    focal_px: tuple[float, float]
+    centre: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        size = _pair("the image size", self.size)
+        if min(size) < 1:
+            raise ReconstructionError(f"an image size must be positive, not {self.size}")
+        focal = self.focal_px
+        if np.ndim(focal) == 0:
+            focal = (focal, focal)  # type: ignore[assignment]
+        focal = _pair("the focal length", focal)
+        if min(focal) <= 0:
+            raise ReconstructionError(
+                f"the focal length must be above 0 pixels, not {min(focal):g}: give it in pixels "
+                "of this image"
+            )
+        centre = self.centre
+        if centre is None:
+            centre = ((size[0] - 1) / 2, (size[1] - 1) / 2)
+        object.__setattr__(self, "size", (int(size[0]), int(size[1])))
+        object.__setattr__(self, "focal_px", focal)
+        object.__setattr__(self, "centre", _pair("the principal point", centre))
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The (3, 3) camera matrix."""
+        assert self.centre is not None
+        (fx, fy), (cx, cy) = self.focal_px, self.centre
+        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+    def rays(self, points: np.ndarray) -> np.ndarray:
+        """Return the directions (x, y, 1) in the camera's frame in which pixels look.
+
+        Args:
+            points: (N, 2) positions in its image.
+
+        Returns:
+            (N, 3) float64.
+        """
+        directions = np.ones((len(points), 3))
+        directions[:, :2] = (np.asarray(points, np.float64) - self.centre) / self.focal_px
+        return directions
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Return where points in the camera's frame are seen, (N, 2) float64 in pixels.
+
+        Args:
+            points: (N, 3), x right, y down, z forward.
+        """
+        points = np.asarray(points, np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return points[:, :2] / points[:, 2:] * self.focal_px + self.centre
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Both cameras, and perhaps how far they are apart.
+
+    Attributes:
+        camera0, camera1: of the left (first) and the right (second) image.
+        baseline_mm: distance of their centres, or None: then depths are in baselines.
+        source: where it comes from, as "calib.json", "--focal" or "EXIF".
+
+    Raises:
+        ReconstructionError: the baseline is not above 0.
+
+    Example:
+        >>> left, right = Camera((463, 370), 1246.7), Camera((463, 370), 1246.7, (297.7, 184.5))
+        >>> calibration = Calibration(left, right, baseline_mm=160)
+        >>> round(calibration.disparity_offset_px, 1), calibration.depth_mm(np.array([40])).round()
+        (66.7, array([1869.]))
+    """
+
+    camera0: Camera
+    camera1: Camera
+    baseline_mm: float | None = None
+    source: str = "given"
+
+    def __post_init__(self) -> None:
+        if self.baseline_mm is None:
+            return
+        baseline = _number("the baseline", self.baseline_mm)
+        if baseline <= 0:
+            raise ReconstructionError(
+                f"the baseline must be above 0 mm, not {baseline:g}: two images from one place "
+                "have no depth; give the distance of the cameras, or leave it out"
+            )
+        object.__setattr__(self, "baseline_mm", baseline)
+
+    @property
+    def disparity_offset_px(self) -> float:
+        """What is added to a disparity before it tells the depth: cx of the right less the left."""
+        assert self.camera0.centre is not None
+        assert self.camera1.centre is not None
+        return self.camera1.centre[0] - self.camera0.centre[0]
+
+    def depth_mm(self, disparity_px: np.ndarray) -> np.ndarray:
+        """Return the depth of a rectified pair's disparities.
+
+        depth = focal * baseline / (disparity + offset), in mm; in baselines when that is not
+        known.
+
+        Args:
+            disparity_px: x in the left less x in the right image, any shape.
+
+        Returns:
+            float64 of the same shape; infinite where disparity and offset cancel or are negative.
+        """
+        moved = np.asarray(disparity_px, np.float64) + self.disparity_offset_px
+        baseline = 1.0 if self.baseline_mm is None else self.baseline_mm
+        with np.errstate(divide="ignore"):
+            depth = self.camera0.focal_px[0] * baseline / moved
+        return np.where(moved > 0, depth, np.inf)
+
+    def check_sizes(self, size0: Size, size1: Size) -> None:
+        """Raise `ReconstructionError` unless it is for images of these (width, height)."""
+        for name, camera, size in (("left", self.camera0, size0), ("right", self.camera1, size1)):
+            if camera.size != tuple(size):
+                raise ReconstructionError(
+                    f"the calibration is for images of {_text(camera.size)} pixels, the {name} "
+                    f"image has {_text(size)}: give the calibration of this size"
+                )
+
+
+def calibration_from_focal(
+    focal_px: float | Sequence[float], size0: Size, size1: Size, source: str = "--focal"
+) -> Calibration:
+    """Return the calibration of two images of one camera, its principal point in the middle.
+
+    Args:
+        focal_px: focal length in pixels, or (fx, fy).
+        size0, size1: (width, height) of the images.
+        source: where it comes from.
+
+    Raises:
+        ReconstructionError: the focal length is not a number above 0.
+    """
+    return Calibration(*(Camera(size, focal_px) for size in (size0, size1)), source=source)  # type: ignore[arg-type]
+
+
+def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
+    """Read a calib.json, in the format at the top of this module.
+
+    Args:
+        path: the file.
+        size0, size1: (width, height) of the left and the right image.
+
+    Raises:
+        ReconstructionError: the file is missing, damaged, for images of another size, or says
+            what cannot be.
+    """
+    try:
+        values = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise ReconstructionError(f"{path} cannot be read ({reason}): check the path") from None
+    except ValueError as error:
+        raise ReconstructionError(
+            f"{path} is no JSON file ({_first_line(error)}): mend it, or give the focal length"
+        ) from None
+    try:
+        return _from_values(values, size0, size1, str(path))
+    except ReconstructionError as error:
+        raise ReconstructionError(f"{path}: {error}") from None
+
+
+def _from_values(values: Any, size0: Size, size1: Size, source: str) -> Calibration:
+    if not isinstance(values, dict):
+        raise ReconstructionError('it must hold one object, as {"focal_px": 1000}')
+    views = []
+    for name in ("left", "right"):
+        own = values.get(name, {})
+        if not isinstance(own, dict):
+            raise ReconstructionError(f'"{name}" must be an object, as {{"cx": 320}}')
+        views.append({**values, **own})
+    if any(view.get("focal_px") is None for view in views):
+        raise ReconstructionError('it has no "focal_px": add the focal length in pixels')
+    offset = values.get("disparity_offset_px")
+    offset = None if offset is None else _number("disparity_offset_px", offset)
+    left, right = views
+    camera0 = _camera(left, size0)
+    assert camera0.centre is not None
+    if offset is not None and "cx" not in values.get("right", {}):
+        # The offset is how much further right the right principal point is.
+        right = {**right, "cx": camera0.centre[0] + offset}
+    camera1 = _camera(right, size1)
+    baseline = values.get("baseline_mm")
+    found = Calibration(camera0, camera1, baseline, source)
+    if offset is not None and abs(found.disparity_offset_px - offset) > AGREEMENT:
+        raise ReconstructionError(
+            f"disparity_offset_px is {offset:g}, but cx of the right view less that of the left "
+            f"is {found.disparity_offset_px:g}: leave one of them out"
+        )
+    found.check_sizes(size0, size1)
+    return found
+
+
+def _camera(view: dict[str, Any], size: Size) -> Camera:
+    """Return one view's camera; what the file leaves out is taken from the image."""
+    width, height = (
+        side if view.get(name) is None else _number(name, view[name])
+        for name, side in zip(("width", "height"), size, strict=True)
+    )
+    cx, cy = (
+        (side - 1) / 2 if view.get(name) is None else _number(name, view[name])
+        for name, side in (("cx", width), ("cy", height))
+    )
+    return Camera((width, height), view["focal_px"], (cx, cy))  # type: ignore[arg-type]
+
+
+def _pair(name: str, value: Any) -> tuple[float, float]:
+    try:
+        first, second = value
+    except (TypeError, ValueError):
+        raise ReconstructionError(f"{name} must be one or two numbers, not {value!r}") from None
+    return _number(name, first), _number(name, second)
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+        raise ReconstructionError(f"{name} must be a number, not {value!r}")
+    if not np.isfinite(value):
+        raise ReconstructionError(f"{name} must be finite, not {value}")
+    return float(value)
+
+
+def _text(size: Sequence[float]) -> str:
+    return "x".join(f"{side:g}" for side in size)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]

@@ -1,0 +1,164 @@
+"""Coloured points in space, and the box that most of them lie in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .._shared.errors import OptionError, unknown_name
+
+UNITS = ("mm", "baseline")
+"""Millimetres, or the distance of the two cameras where that is not known."""
+
+TAIL = 1.0
+"""Percent of the points that may lie beyond each side of the robust box."""
+
+SPARSEST = 0.02
+"""No point is drawn wider than this times its depth (1 degree)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Coloured points in the frame of the left camera: x right, y down, z forward.
+
+    Attributes:
+        points: (N, 3) float32 or float64 positions, the left camera's centre at (0, 0, 0).
+        colors: (N, 3) uint8 sRGB.
+        unit: "mm", or "baseline": lengths are multiples of the distance of the two cameras.
+
+    `len` and indexing by slices, masks and index arrays work.
+
+    Raises:
+        OptionError: a shape or type is wrong, a coordinate is not finite (or beyond float32,
+            which files hold), or the unit is unknown.
+
+    Example:
+        >>> cloud = PointCloud([[0.0, 0.0, 900.0], [8.0, 2.0, 950.0]], [[9, 9, 9], [7, 7, 7]], "mm")
+        >>> len(cloud), cloud[cloud.points[:, 2] > 910].colors.tolist()
+        (2, [[7, 7, 7]])
+    """
+
+    points: np.ndarray
+    colors: np.ndarray
+    unit: str
+
+    def __post_init__(self) -> None:
+        if self.unit not in UNITS:
+            raise unknown_name("unit", self.unit, UNITS)
+        points, colors = _array(self.points), _array(self.colors)
+        if points.size == colors.size == 0:
+            points, colors = np.empty((0, 3)), np.empty((0, 3), np.uint8)
+        if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
+            raise OptionError(
+                f"a point cloud needs (N, 3) points and as many (N, 3) colours, "
+                f"not {points.shape} and {colors.shape}"
+            )
+        if points.dtype not in (np.float32, np.float64):
+            raise OptionError(f"points must be float32 or float64, not {points.dtype}")
+        if colors.dtype != np.uint8:
+            if colors.dtype.kind not in "iu" or colors.min() < 0 or colors.max() > 255:
+                raise OptionError(
+                    f"colours must be whole numbers from 0 to 255 (uint8), not {colors.dtype}"
+                )
+            colors = colors.astype(np.uint8)
+        # Written so that NaN fails too.
+        if not (np.abs(points) < np.finfo(np.float32).max).all():
+            raise OptionError("every coordinate of a point cloud must be finite: drop the others")
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "colors", colors)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index: slice | np.ndarray | list[int]) -> PointCloud:
+        if isinstance(index, (int, np.integer)):
+            index = [int(index)]
+        return PointCloud(self.points[index], self.colors[index], self.unit)
+
+
+@dataclass(frozen=True, eq=False)
+class RobustBox:
+    """The box along the axes that holds all but the outermost points.
+
+    Attributes:
+        low, high: (3,) float64 corners, in the cloud's unit.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) float64, the middle."""
+        return (self.low + self.high) / 2
+
+    @property
+    def radius(self) -> float:
+        """Half the diagonal; 1 where the box is a point."""
+        return float(np.linalg.norm(self.high - self.low)) / 2 or 1.0
+
+
+def robust_box(cloud: PointCloud) -> RobustBox:
+    """Find the box from the 1st to the 99th percentile of each coordinate.
+
+    A few points very far away, as wrong matches make, do not change it much.
+
+    Raises:
+        OptionError: the cloud is empty.
+
+    Example:
+        >>> line = np.linspace(0, 100, 101)
+        >>> points = np.column_stack([line, 2 * line, 0 * line])
+        >>> box = robust_box(PointCloud(points, np.zeros((101, 3), np.uint8), "mm"))
+        >>> box.low.tolist(), box.high.tolist(), box.centre.tolist()
+        ([1.0, 2.0, 0.0], [99.0, 198.0, 0.0], [50.0, 100.0, 0.0])
+    """
+    require_points(cloud)
+    low, high = np.percentile(cloud.points.astype(np.float64), (TAIL, 100 - TAIL), axis=0)
+    return RobustBox(low, high)
+
+
+def angular_spacing(cloud: PointCloud) -> float:
+    """Tell how far neighbouring points lie apart as the left camera sees them.
+
+    A point drawn so large covers its share of what the photograph shows, so that the points
+    of a dense cloud close a surface.
+
+    Returns:
+        Width of a point over its depth, at most 0.02, were all points spread evenly.
+
+    Raises:
+        OptionError: the cloud is empty.
+
+    Example:
+        >>> y, x = np.indices((100, 100)).reshape(2, -1)
+        >>> points = np.column_stack([x, y, np.full(10_000, 500.0)])
+        >>> round(angular_spacing(PointCloud(points, np.zeros((10_000, 3), np.uint8), "mm")), 5)
+        0.00198
+    """
+    require_points(cloud)
+    ahead = cloud.points[cloud.points[:, 2] > 0]
+    if not len(ahead):
+        return SPARSEST
+    seen = np.percentile(ahead[:, :2] / ahead[:, 2:], (TAIL, 100 - TAIL), axis=0)
+    width, height = ((seen[1] - seen[0]) / (1 - 2 * TAIL / 100)).tolist()
+    return min(SPARSEST, float(np.sqrt(width * height / len(ahead)))) or SPARSEST
+
+
+def require_points(cloud: PointCloud) -> None:
+    """Refuse an empty cloud.
+
+    Raises:
+        OptionError: it is empty.
+    """
+    if not len(cloud):
+        raise OptionError("the point cloud has no points: there is nothing to show or to write")
+
+
+def _array(values: Any) -> np.ndarray:
+    try:
+        return np.asarray(values)
+    except ValueError:
+        return np.empty(0, object)  # rows of several lengths

@@ -1,5 +1,0 @@
-"""Guidance: a geometry from few points, and the dense matches that it proposes and that hold."""
-
-from .guided import GUIDANCES, Guidance, guided_matches
-
-__all__ = ["GUIDANCES", "Guidance", "guided_matches"]

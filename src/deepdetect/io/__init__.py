@@ -1,0 +1,1 @@
+"""Images, keypoints, matches, depth maps and point clouds in files."""

@@ -1,0 +1,150 @@
+"""Depth maps: 16-bit PNG with its scale written inside, and npz with floats."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, PngImagePlugin
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import ImageError, OptionError, unknown_name
+from ..geometry.point_cloud import UNITS
+
+LARGEST = 65535
+"""Of 16 bits."""
+
+FAR = 4.0
+"""A chosen scale leaves room for all depths up to so many times the 99th percentile."""
+
+
+@dataclass(frozen=True)
+class DepthPng:
+    """What became of a depth map in 16 bits.
+
+    Attributes:
+        unit: "mm" or "baseline".
+        value_per_unit: depth = value / value_per_unit; a value of 0 is unknown.
+        known: pixels with a value.
+        out_of_range: pixels with a depth that 16 bits at this scale cannot hold; they are
+            written as unknown, never as another depth.
+    """
+
+    unit: str
+    value_per_unit: float
+    known: int
+    out_of_range: int
+
+
+def save_depth_png(
+    depth: np.ndarray, path: str | Path, unit: str, value_per_unit: float | None = None
+) -> DepthPng:
+    """Write a depth map as a grey PNG of 16 bits, whole or not at all.
+
+    value = round(depth * value_per_unit), and 0 where the depth is unknown. Unit and scale
+    are also written into the PNG, as text chunks `unit` and `value_per_unit`.
+
+    Args:
+        depth: (H, W) depths; not finite, 0 or less: unknown.
+        path: ending in .png.
+        unit: "mm" or "baseline" (multiples of the distance of the two cameras).
+        value_per_unit: the scale; without one, the finest of 1, 2 or 5 times a power of ten
+            that holds all depths up to 4 times the 99th percentile.
+
+    Returns:
+        The scale, and what did not fit.
+
+    Raises:
+        OptionError: the map is no (H, W) array, the unit is unknown, the scale is not above 0
+            or the ending is another.
+        DeepDetectError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "depth.png"
+        >>> save_depth_png(np.array([[500.25, np.nan, 3000.0]]), path, "mm")
+        DepthPng(unit='mm', value_per_unit=20.0, known=2, out_of_range=0)
+        >>> load_depth_png(path)[0].tolist()
+        [[500.25, nan, 3000.0]]
+    """
+    depth = _checked(depth, unit)
+    if Path(path).suffix.lower() != ".png":
+        raise OptionError(f"{path} must end in .png")
+    if value_per_unit is not None and not 0 < value_per_unit < np.inf:
+        raise OptionError(f"value_per_unit must be above 0, not {value_per_unit}")
+    known = np.isfinite(depth) & (depth > 0)
+    scale = float(value_per_unit or _scale(depth[known]))
+    values = np.rint(np.where(known, depth, 0).astype(np.float64) * scale)
+    fits = known & (values >= 1) & (values <= LARGEST)
+    stored = np.where(fits, values, 0).astype(np.uint16)
+    told = PngImagePlugin.PngInfo()
+    told.add_text("unit", unit)
+    told.add_text("value_per_unit", repr(scale))
+    with atomic_path(path) as temporary:
+        Image.fromarray(stored).save(temporary, format="PNG", pnginfo=told)
+    return DepthPng(unit, scale, int(fits.sum()), int((known & ~fits).sum()))
+
+
+def load_depth_png(path: str | Path) -> tuple[np.ndarray, str]:
+    """Read a depth map that `save_depth_png` wrote.
+
+    Returns:
+        (H, W) float32 depths, NaN where unknown, and their unit.
+
+    Raises:
+        ImageError: the file is missing or is no such file.
+    """
+    try:
+        with Image.open(path) as image:
+            values, told = np.asarray(image), image.info
+        scale, unit = float(told["value_per_unit"]), str(told["unit"])
+    except FileNotFoundError:
+        raise ImageError(f"there is no file {path}: check the path") from None
+    except (OSError, ValueError, KeyError) as error:
+        raise ImageError(f"{path} is no depth map with its scale ({error})") from None
+    return np.where(values == 0, np.nan, values / scale).astype(np.float32), unit
+
+
+def save_depth_npz(depth: np.ndarray, path: str | Path, unit: str, **arrays: np.ndarray) -> None:
+    """Write a depth map as floats, whole or not at all.
+
+    Args:
+        depth: (H, W) depths; not finite, 0 or less: unknown, written as NaN.
+        path: ending in .npz; it gets `depth` (H, W) float32 and `unit`.
+        unit: "mm" or "baseline".
+        **arrays: further arrays, as `disparity`.
+
+    Raises:
+        OptionError: the map is no (H, W) array, the unit is unknown, or the ending is another.
+        DeepDetectError: the file cannot be written.
+    """
+    depth = _checked(depth, unit)
+    if Path(path).suffix.lower() != ".npz":
+        raise OptionError(f"{path} must end in .npz")
+    known = np.isfinite(depth) & (depth > 0)
+    stored = np.where(known, depth, np.nan).astype(np.float32)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, depth=stored, unit=np.array(unit), **arrays)
+
+
+def _checked(depth: Any, unit: str) -> np.ndarray:
+    depth = np.asarray(depth)
+    if depth.ndim != 2 or depth.size == 0 or depth.dtype.kind not in "fiu":
+        raise OptionError(
+            f"a depth map must be an (H, W) array of numbers, not {depth.dtype} of {depth.shape}"
+        )
+    if unit not in UNITS:
+        raise unknown_name("unit", unit, UNITS)
+    return depth
+
+
+def _scale(depths: np.ndarray) -> float:
+    """Choose the finest round scale that holds all depths but those very far away."""
+    if not len(depths):
+        return 1.0
+    furthest = min(float(depths.max()), FAR * float(np.percentile(depths, 99)))
+    finest = LARGEST / furthest
+    power = 10.0 ** np.floor(np.log10(finest))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= finest * (1 + 1e-12)))

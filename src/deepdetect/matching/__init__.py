@@ -1,0 +1,1 @@
+"""Matching two images, and what follows from it: registration, panoramas."""

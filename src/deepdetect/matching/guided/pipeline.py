@@ -1,0 +1,154 @@
+"""Guided matching: a geometry from few points, sharpened, then all keypoints where it points.
+
+Geometry only proposes: a pair stays when both places look alike once the geometry is taken out
+(`agreement_test`). The true geometry is never seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..._shared.errors import unknown_name
+from ...features.matchers import DescriptorMatches
+from ...geometry import GeometryOptions, estimate_geometry
+from ...geometry.homography_refinement import RefinementOptions, refine_homography
+from ...geometry.majority_fit import fit_to_majority
+from ...geometry.rescaling import scaled_homography, shrunk
+from .epipolar import matches_by_epipolar_line
+from .homography import matches_by_homography
+from .initial_geometry import FirstPass, first_pass
+from .prewarp import affinity_between, straightened
+
+GUIDANCES = ("auto", "homography", "fundamental", "none")
+
+LONGEST = 1600
+"""Longer sides are shrunk to so many pixels where the geometry is sharpened."""
+
+SHARPENING = RefinementOptions(rounds=2, windows=(15, 21, 41), inlier_threshold=0.5)
+
+ROUNDS = 2
+LEAST_MORE = 0.01
+"""New fundamental matrices from the dense matches, at the most, and the share of further matches
+that one must give."""
+
+FEWEST = 0.02
+"""With fewer matches than this share of the keypoints, the geometry is not trusted after all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Guidance:
+    """What guided the matching of two images.
+
+    Attributes:
+        kind: "homography", "fundamental", or "none": no geometry could be trusted, and the
+            matches are unguided.
+        matrix: (3, 3) the geometry, sharpened; None without one.
+        sparse_matches: matches of few points that it was first estimated from.
+        sparse_inliers: those that agree with it.
+        log_false_alarms: decimal logarithm of its number of false alarms.
+        simulated_views: number of views from the side that the first pass took.
+    """
+
+    kind: str
+    matrix: np.ndarray | None
+    sparse_matches: int
+    sparse_inliers: int
+    log_false_alarms: float
+    simulated_views: int
+
+
+def guided_matches(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    xy0: np.ndarray,
+    xy1: np.ndarray,
+    model: str = "auto",
+    seed: int = 0,
+) -> tuple[Guidance, DescriptorMatches | None]:
+    """Match the keypoints of two images by their geometry.
+
+    Args:
+        gray0, gray1: (H, W) uint8 luma.
+        xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
+        model: "homography", "fundamental" or "auto".
+        seed: of all random choices.
+
+    Returns:
+        What guided, and the matches; None when nothing could.
+
+    Raises:
+        OptionError: the model is unknown.
+    """
+    if model not in GUIDANCES[:3]:
+        raise unknown_name("guidance", model, GUIDANCES)
+    first = first_pass(gray0, gray1, model, seed)
+    if first.kind == "none" or first.matrix is None:
+        return _guidance(first, None), None
+    if first.kind == "homography":
+        matrix = sharpened(gray0, gray1, first.matrix)
+        rows0, rows1, ratios = matches_by_homography(gray0, gray1, xy0, xy1, matrix, seed)
+    else:
+        matrix, (rows0, rows1, ratios) = _by_lines(gray0, gray1, xy0, xy1, first, seed)
+    if len(rows0) < FEWEST * min(len(xy0), len(xy1)):
+        return _guidance(replace(first, kind="none", points0=first.points0[:0]), None), None
+    return _guidance(first, matrix), DescriptorMatches(rows0, rows1, ratios)
+
+
+def _by_lines(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    xy0: np.ndarray,
+    xy1: np.ndarray,
+    first: FirstPass,
+    seed: int,
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Match by a fundamental matrix; take a new one from the matches while that gives more.
+
+    The second image is turned as the first one stands where it does not stand so already.
+    """
+    affinity = affinity_between(first.points0, first.points1)
+    view = None if affinity is None else straightened(gray0, gray1, xy1, affinity)
+
+    def matched(fundamental: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if view is None:
+            return matches_by_epipolar_line(gray0, gray1, xy0, xy1, fundamental, seed)
+        rows0, rows1, ratios = matches_by_epipolar_line(
+            view.gray0, view.gray1, xy0, view.xy1, view.fundamental(fundamental), seed
+        )
+        return rows0, view.rows1[rows1], ratios
+
+    assert first.matrix is not None
+    best = first.matrix, matched(first.matrix)
+    for _ in range(ROUNDS):
+        rows0, rows1, _ = best[1]
+        options = GeometryOptions(model="fundamental", inlier_threshold=1.0, seed=seed)
+        matrix = estimate_geometry(xy0[rows0], xy1[rows1], options).matrix
+        if matrix is None:
+            break
+        found = matched(matrix)
+        if len(found[0]) <= len(rows0) * (1 + LEAST_MORE):
+            break
+        best = matrix, found
+    return best
+
+
+def sharpened(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Refine a homography by the images, shrunk to what that needs; (3, 3)."""
+    (small0, scale0), (small1, scale1) = (shrunk(gray, LONGEST) for gray in (gray0, gray1))
+    start = scaled_homography(homography, scale0, scale1)
+    found = refine_homography(small0, small1, start, SHARPENING).homography
+    found = fit_to_majority(small0, small1, found)
+    return scaled_homography(found, 1 / scale0, 1 / scale1)
+
+
+def _guidance(first: FirstPass, matrix: np.ndarray | None) -> Guidance:
+    return Guidance(
+        first.kind,
+        matrix,
+        first.matches,
+        len(first.points0),
+        float(first.log_false_alarms),
+        first.simulated,
+    )

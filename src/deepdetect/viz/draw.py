@@ -1,0 +1,195 @@
+"""Pictures of heat maps, keypoints, matches and labels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import DeepDetectError, OptionError
+from ..features.keypoints import Keypoints
+from ..labels import Label
+
+SPARSE = 5000
+"""Up to so many keypoints are drawn as circles, more as single pixels."""
+
+ENDINGS = (".png", ".jpg", ".jpeg")
+JPEG_SIDE = 65_500
+"""Pixels of width and height that libjpeg writes at most."""
+
+CAPTION_HEIGHT = 28
+GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
+
+
+def save_picture(rgb: np.ndarray, path: str | Path) -> None:
+    """Write a (H, W, 3) uint8 RGB picture, whole or not at all.
+
+    Args:
+        rgb: the picture.
+        path: ending in .png, .jpg or .jpeg.
+
+    Raises:
+        OptionError: the ending is another.
+        DeepDetectError: the file cannot be written, or its format holds no picture of this size.
+    """
+    ending = picture_ending(path)
+    data = _encoded(rgb, ending)
+    if data is None:
+        size = f"{rgb.shape[1]}x{rgb.shape[0]}"
+        advice = "make it smaller" if ending == ".png" else "give it a name that ends in .png"
+        raise DeepDetectError(f"{path} cannot hold a picture of {size} pixels: {advice}")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def picture_ending(path: str | Path) -> str:
+    """Return the ending of a picture's file, in small letters, before any work is done for it.
+
+    Raises:
+        OptionError: `save_picture` does not write such files.
+
+    Example:
+        >>> picture_ending("panorama.JPG")
+        '.jpg'
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in ENDINGS:
+        raise OptionError(f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
+    return ending
+
+
+def _encoded(rgb: np.ndarray, ending: str) -> bytes | None:
+    """Return the file's content, or None where the format does not hold such a picture."""
+    # Asked before OpenCV is, which would also log it.
+    if ending != ".png" and max(rgb.shape[:2]) > JPEG_SIDE:
+        return None
+    try:
+        done, data = cv2.imencode(ending, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+    except cv2.error:
+        return None
+    return data.tobytes() if done else None
+
+
+def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
+    """Colour a (H, W) probability map: dark blue is 0, yellow is 1.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+    """
+    levels = np.rint(np.clip(heatmap, 0, 1) * 255).astype(np.uint8)
+    return cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
+
+
+def draw_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
+    """Draw keypoints over a dimmed image: circles when they are few, else pixels.
+
+    Args:
+        rgb: (H, W, 3) uint8 RGB.
+        keypoints: its keypoints.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+    """
+    canvas = rgb // 2
+    pixels = np.rint(keypoints.xy).astype(int)
+    if len(keypoints) <= SPARSE:
+        for x, y in pixels.tolist():
+            cv2.circle(canvas, (x, y), 3, GREEN, 1, cv2.LINE_AA)
+        return canvas
+    # Half transparent, so that the image shows through the dense points.
+    columns, rows = pixels.T
+    canvas[rows, columns] = canvas[rows, columns] // 2 + np.array(GREEN, np.uint8) // 2
+    return canvas
+
+
+def draw_matches(
+    rgb0: np.ndarray,
+    rgb1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    good: np.ndarray,
+    lines: int = 150,
+) -> np.ndarray:
+    """Draw the two images side by side, with lines between a sample of the matches.
+
+    Args:
+        rgb0, rgb1: the images, (H, W, 3) uint8 RGB.
+        points0, points1: (M, 2) matched positions.
+        good: (M,) bool: green lines, the others red.
+        lines: number of lines; the sample is random with a fixed seed, so the shares
+            of green and red are those of all matches.
+
+    Returns:
+        (H, W0 + W1, 3) uint8 RGB, H of the higher image.
+    """
+    height = max(rgb0.shape[0], rgb1.shape[0])
+    canvas = np.zeros((height, rgb0.shape[1] + rgb1.shape[1], 3), np.uint8)
+    canvas[: rgb0.shape[0], : rgb0.shape[1]] = cv2.convertScaleAbs(rgb0, alpha=0.7)
+    canvas[: rgb1.shape[0], rgb0.shape[1] :] = cv2.convertScaleAbs(rgb1, alpha=0.7)
+    chosen = np.random.default_rng(0).permutation(len(points0))[:lines]
+    for k in sorted(chosen, key=lambda k: bool(good[k])):  # the good ones on top
+        start = tuple(int(v) for v in np.rint(points0[k]))
+        end = tuple(int(v) for v in np.rint(points1[k] + [rgb0.shape[1], 0]))
+        colour = GREEN if good[k] else RED
+        cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
+        cv2.circle(canvas, start, 2, colour, -1, cv2.LINE_AA)
+        cv2.circle(canvas, end, 2, colour, -1, cv2.LINE_AA)
+    return canvas
+
+
+def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
+    """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
+
+    Args:
+        rgb: (H, W, 3) uint8 RGB.
+        label: its label.
+
+    Returns:
+        Four panels in a row, each with a caption that tells its density.
+    """
+    panels = [with_caption(rgb, f"image ({label.visibility} visibility settings)")]
+    for title, mask in (
+        ("keypoints", label.keypoints),
+        ("edges", label.edges),
+        ("combined", label.mask),
+    ):
+        picture = np.repeat((mask * np.uint8(255))[:, :, None], 3, 2)
+        panels.append(with_caption(picture, f"{title}: {mask.mean():.1%} of pixels"))
+    return side_by_side(panels)
+
+
+def with_caption(rgb: np.ndarray, text: str) -> np.ndarray:
+    """Put a line of text under a picture, shrunk to its width where needed."""
+    strip = np.zeros((CAPTION_HEIGHT, rgb.shape[1], 3), np.uint8)
+    scale = 0.5
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    scale *= min(1.0, (rgb.shape[1] - 12) / max(width, 1))
+    cv2.putText(strip, text, (6, 19), cv2.FONT_HERSHEY_SIMPLEX, scale, WHITE, 1, cv2.LINE_AA)
+    return np.concatenate([rgb, strip])
+
+
+def side_by_side(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
+    """Join pictures of one height in a row, with a white gap."""
+    height = max(panel.shape[0] for panel in panels)
+    joined = []
+    for panel in panels:
+        if joined:
+            joined.append(np.full((height, gap, 3), 255, np.uint8))
+        below = height - panel.shape[0]
+        joined.append(np.pad(panel, ((0, below), (0, 0), (0, 0))))
+    return np.concatenate(joined, axis=1)
+
+
+def stacked(rows: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
+    """Join pictures from top to bottom, with a white gap, and white beside narrower ones."""
+    width = max(row.shape[1] for row in rows)
+    joined = []
+    for row in rows:
+        if joined:
+            joined.append(np.full((gap, width, 3), 255, np.uint8))
+        beside = width - row.shape[1]
+        joined.append(np.pad(row, ((0, 0), (0, beside), (0, 0)), constant_values=255))
+    return np.concatenate(joined)

@@ -1,0 +1,186 @@
+"""Pictures of point clouds from any side, drawn without a screen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .._shared.errors import OptionError
+from ..geometry.point_cloud import TAIL, PointCloud, angular_spacing, require_points, robust_box
+
+SUPERSAMPLING = 2
+"""A pixel is the mean of so many by so many: edges are smooth."""
+
+FILLED = 0.95
+"""Share of the picture's width or height that the cloud takes."""
+
+OVERLAP = 1.4
+"""Points are drawn so much wider than they lie apart: gaps close, also seen from the side."""
+
+WIDEST = 5
+"""Pixels: no point is drawn wider by itself, so that few points look like few."""
+
+EMPTY = np.iinfo(np.uint64).max
+
+
+@dataclass(frozen=True, eq=False)
+class ViewCamera:
+    """A perspective camera that looks at a cloud.
+
+    Attributes:
+        position: (3,) float64 centre, in the cloud's frame.
+        axes: (3, 3) float64, whose rows are its right, down and forward.
+        focal: in pixels.
+        middle: (2,) float64, the pixel position of its axis.
+        size: (width, height) of the picture in pixels.
+    """
+
+    position: np.ndarray
+    axes: np.ndarray
+    focal: float
+    middle: np.ndarray
+    size: tuple[int, int]
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Project points.
+
+        Args:
+            points: (N, 3).
+
+        Returns:
+            (N, 2) float64 pixel positions, and (N,) float64 depths along the axis; the positions
+            of points whose depth is not above 0 mean nothing.
+        """
+        seen = (points - self.position) @ self.axes.T
+        depth = seen[:, 2]
+        scale = self.focal / np.where(depth > 0, depth, np.inf)
+        return seen[:, :2] * scale[:, None] + self.middle, depth
+
+
+def camera_around(
+    cloud: PointCloud,
+    azimuth: float = 12.0,
+    elevation: float = 8.0,
+    size: tuple[int, int] = (800, 600),
+) -> ViewCamera:
+    """Place a camera that looks at the robust centre of a cloud, which fills its picture.
+
+    It stands as far from the centre as the left camera does, so that the picture looks as the
+    photograph does when the angles are small.
+
+    Args:
+        cloud: the cloud.
+        azimuth: degrees, from the left camera's direction (0) to the right of the scene.
+        elevation: degrees, from there up; 90 looks down.
+        size: (width, height) of the picture in pixels.
+
+    Returns:
+        The camera; 98 % of the points lie between its left and right border, and as many
+        between its upper and lower one.
+
+    Raises:
+        OptionError: the cloud is empty, or a value is out of its range.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> cloud = PointCloud(rng.normal((0, 0, 9), 1, (500, 3)), np.zeros((500, 3), int), "mm")
+        >>> camera = camera_around(cloud, azimuth=90, elevation=0)
+        >>> camera.axes[2].round(6).tolist()  # it stands on the right and looks to the left
+        [-1.0, 0.0, 0.0]
+    """
+    if not -90 <= elevation <= 90:
+        raise OptionError(f"the elevation must lie in [-90, 90] degrees, not {elevation}")
+    if min(size) < 1:
+        raise OptionError(f"a picture must have at least one pixel, not {size}")
+    a, e = np.deg2rad([azimuth, elevation])
+    right = [np.cos(a), 0, np.sin(a)]
+    down = [np.sin(e) * np.sin(a), np.cos(e), -np.sin(e) * np.cos(a)]
+    forward = [-np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)]
+    axes = np.array([right, down, forward])
+    box = robust_box(cloud)
+    distance = max(float(np.linalg.norm(box.centre)), box.radius)
+    position = box.centre - distance * axes[2]
+    # With a focal length of 1 and the axis at 0, to see what the cloud covers.
+    plain = ViewCamera(position, axes, 1.0, np.zeros(2), size)
+    xy, depth = plain.project(cloud.points)
+    low, high = np.percentile(xy[depth > 0], (TAIL, 100 - TAIL), axis=0)
+    wanted = FILLED * np.array(size) / np.maximum(high - low, 1e-6)
+    focal = float(wanted.min())
+    middle = (np.array(size) - 1) / 2 - focal * (low + high) / 2
+    return ViewCamera(position, axes, focal, middle, size)
+
+
+def render(cloud: PointCloud, camera: ViewCamera, point_width: float | None = None) -> np.ndarray:
+    """Draw a cloud as squares that hide what lies behind them, on white.
+
+    Args:
+        cloud: the cloud.
+        camera: the viewer.
+        point_width: of a point in pixels; without one, as wide as the points of this cloud
+            must be for a closed surface, which differs from point to point.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+
+    Raises:
+        OptionError: the cloud is empty, or the width is not above 0.
+
+    Example:
+        >>> cloud = PointCloud([[0.0, 0.0, 5.0]], [[200, 0, 0]], "mm")
+        >>> camera = ViewCamera(np.zeros(3), np.eye(3), 10.0, np.ones(2), (3, 3))
+        >>> render(cloud, camera, point_width=1)[..., 1].tolist()
+        [[255, 255, 255], [255, 0, 255], [255, 255, 255]]
+    """
+    require_points(cloud)
+    if point_width is not None and not point_width > 0:
+        raise OptionError(f"the width of a point must be above 0 pixels, not {point_width}")
+    nearest = _nearest_points(cloud, _finer(camera), point_width)
+    # The last colour is that of pixels which show no point.
+    colors = np.append(cloud.colors, np.full((1, 3), 255, np.uint8), axis=0)
+    fine = colors[nearest].astype(np.uint16)
+    steps = range(SUPERSAMPLING)
+    total = sum(
+        fine[row::SUPERSAMPLING, column::SUPERSAMPLING] for row in steps for column in steps
+    )
+    return np.rint(total / SUPERSAMPLING**2).astype(np.uint8)
+
+
+def _finer(camera: ViewCamera) -> ViewCamera:
+    times = SUPERSAMPLING
+    # The centre of the first fine pixel lies before that of the first pixel.
+    middle = camera.middle * times + (times - 1) / 2
+    size = (camera.size[0] * times, camera.size[1] * times)
+    return replace(camera, focal=camera.focal * times, middle=middle, size=size)
+
+
+def _nearest_points(cloud: PointCloud, camera: ViewCamera, point_width: float | None) -> np.ndarray:
+    """Find which point each pixel shows: (H, W) int64 index, -1 for none."""
+    width, height = camera.size
+    xy, depth = camera.project(cloud.points)
+    if point_width is None:
+        spread = camera.focal * OVERLAP * angular_spacing(cloud)
+        sides = spread * np.maximum(cloud.points[:, 2], 0) / np.where(depth > 0, depth, np.inf)
+        sides = np.minimum(sides, WIDEST * SUPERSAMPLING)
+    else:
+        sides = np.full(len(cloud), point_width * SUPERSAMPLING)
+    sides = np.maximum(np.rint(sides), 1).astype(np.int64)
+    corners = np.rint(xy - (sides[:, None] - 1) / 2)
+    shown = (depth > 0) & (corners > -sides[:, None]).all(1) & (corners < camera.size).all(1)
+    # Nearer is smaller: the bits of a float above 0 are in its order. The index decides ties.
+    index = np.flatnonzero(shown)
+    index = index[np.argsort(-sides[index], kind="stable")]  # the widest first
+    keys = depth[index].astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
+    keys |= index.astype(np.uint64)
+    x, y = corners[index].astype(np.int64).T
+    sides = sides[index]
+    buffer = np.full(width * height, EMPTY)
+    for across in range(int(sides.max(initial=0))):
+        for down in range(int(sides.max(initial=0))):
+            count = int(np.searchsorted(-sides, -max(across, down), side="left"))
+            column, row = x[:count] + across, y[:count] + down
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            place = row[inside] * width + column[inside]
+            np.minimum.at(buffer, place, keys[:count][inside])
+    buffer = buffer.reshape(height, width)
+    return np.where(buffer == EMPTY, -1, (buffer & np.uint64(0xFFFFFFFF)).astype(np.int64))

@@ -1,0 +1,140 @@
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from deepdetect._shared.atomic import atomic_path
+from deepdetect._shared.errors import DeepDetectError
+
+
+class BlockFailed(Exception):
+    pass
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def write_and_fail(target: Path, error: type[BaseException] | BaseException) -> None:
+    with atomic_path(target) as temporary:
+        temporary.write_text("half")
+        raise error
+
+
+@pytest.mark.parametrize("as_text", [True, False])
+def test_a_whole_file_appears(as_text: bool, tmp_path: Path) -> None:
+    target = tmp_path / "new" / "folders" / "out.txt"
+    with atomic_path(str(target) if as_text else target) as temporary:
+        assert temporary.parent == target.parent
+        temporary.write_text("whole")
+        assert not target.exists()
+    assert target.read_text() == "whole"
+    assert names(target.parent) == ["out.txt"]
+
+
+@pytest.mark.parametrize("name", ["out.png", "out.tar.gz", "out", ".hidden", "out.safetensors"])
+def test_the_temporary_name_keeps_the_suffix(name: str, tmp_path: Path) -> None:
+    with atomic_path(tmp_path / name) as temporary:
+        assert temporary.suffix in (Path(name).suffix, ".part")
+        assert temporary.name.endswith(Path(name).suffix)
+        assert temporary.name.startswith(".")
+        assert temporary.name != name
+    assert names(tmp_path) == [name]
+
+
+@pytest.mark.parametrize("error", [BlockFailed, ValueError, KeyboardInterrupt])
+def test_nothing_appears_when_the_block_fails(error: type[BaseException], tmp_path: Path) -> None:
+    with pytest.raises(error):
+        write_and_fail(tmp_path / "out.txt", error)
+    assert names(tmp_path) == []
+
+
+def test_a_full_disk_is_an_error_of_ours(tmp_path: Path) -> None:
+    with pytest.raises(DeepDetectError, match="No space left on device") as caught:
+        write_and_fail(tmp_path / "out.txt", OSError(errno.ENOSPC, "No space left on device"))
+    assert str(tmp_path / "out.txt") in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert names(tmp_path) == []
+
+
+def test_an_old_file_survives_a_failure(tmp_path: Path) -> None:
+    target = tmp_path / "out.txt"
+    target.write_text("old")
+    with pytest.raises(BlockFailed):
+        write_and_fail(target, BlockFailed)
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["out.txt"]
+
+
+def test_an_old_file_is_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "out.txt"
+    target.write_text("old")
+    with atomic_path(target) as temporary:
+        temporary.write_text("new")
+        assert target.read_text() == "old"
+    assert target.read_text() == "new"
+    assert names(tmp_path) == ["out.txt"]
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
+    target = tmp_path / "out.txt"
+    with atomic_path(target) as first, atomic_path(target) as second:
+        assert first != second
+        first.write_text("first")
+        second.write_text("second")
+    assert target.read_text() == "first"  # the outer block ends last
+    assert names(tmp_path) == ["out.txt"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX file modes")
+def test_the_mode_is_that_of_any_new_file(tmp_path: Path) -> None:
+    (tmp_path / "plain").touch()
+    with atomic_path(tmp_path / "out") as temporary:
+        temporary.write_text("whole")
+    assert (tmp_path / "out").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def check_refusal(target: Path) -> None:
+    with pytest.raises(DeepDetectError, match="cannot write") as caught, atomic_path(target) as t:
+        t.write_text("whole")
+    assert str(target) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_that_is_a_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("old")
+    check_refusal(tmp_path / "file" / "out.txt")
+    assert (tmp_path / "file").read_text() == "old"
+    assert names(tmp_path) == ["file"]
+
+
+def test_a_target_that_is_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    check_refusal(tmp_path / "folder")
+    assert names(tmp_path) == ["folder"]
+    assert names(tmp_path / "folder") == []
+
+
+def test_an_unwritable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> tuple[int, str]:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(tempfile, "mkstemp", refuse)
+    check_refusal(tmp_path / "out.txt")
+
+
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write everywhere"
+)
+def test_a_read_only_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    folder.chmod(0o500)
+    try:
+        check_refusal(folder / "out.txt")
+    finally:
+        folder.chmod(0o700)

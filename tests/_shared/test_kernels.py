@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+
+import deepdetect
+from deepdetect._shared.kernels import compiled
+
+PACKAGE = Path(deepdetect.__file__).parent
+MODULE = """
+from deepdetect._shared.kernels import compiled
+
+@compiled(nogil=True)
+def add(a, b):
+    return a + b
+"""
+ADD = """
+import numba
+before = numba.config.CACHE_DIR
+from kernel_of_test import add
+assert numba.config.CACHE_DIR == before
+assert add(1, 2) == 3
+assert add.targetoptions["nogil"] and add.signatures
+print(add.stats.cache_path, len(add.stats.cache_hits))
+"""
+MATCH = """
+import numpy as np
+from deepdetect import match_images
+image = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+print(len(match_images(image, image).points0))
+"""
+needs_users = pytest.mark.skipif(
+    not hasattr(os, "getuid"), reason="the temporary directory is not shared by users here"
+)
+
+
+@pytest.fixture
+def sealed(tmp_path: Path) -> Path:
+    """A folder in which numba can neither write beside a module nor in the home folder.
+
+    Files in the places of the folders, so that they cannot be made by the superuser either.
+    """
+    folder = tmp_path / "sealed"
+    folder.mkdir()
+    (folder / "kernel_of_test.py").write_text(MODULE)
+    (folder / "__pycache__").touch()
+    (tmp_path / "home").touch()
+    (tmp_path / "temporary").mkdir()
+    return folder
+
+
+def run(code: str, sealed: Path, source: Path = PACKAGE.parent, **variables: object) -> str:
+    """Run Python in a fresh process without a home, and return its output."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name != "XDG_CACHE_HOME" and not name.startswith("NUMBA_")
+    }
+    home = str(sealed.parent / "home")
+    own = {
+        **dict.fromkeys(("HOME", "USERPROFILE", "LOCALAPPDATA"), home),
+        "TMPDIR": sealed.parent / "temporary",
+        "PYTHONPATH": f"{source}{os.pathsep}{sealed}",
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=kept | {name: str(value) for name, value in (own | variables).items()},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def temporary_folder(sealed: Path) -> Path:
+    return sealed.parent / "temporary" / f"deepdetect-numba-{os.getuid()}"
+
+
+def test_matching_where_nothing_can_be_written_beside_the_package(sealed: Path) -> None:
+    source = sealed.parent / "source"
+    shutil.copytree(PACKAGE, source / "deepdetect", ignore=shutil.ignore_patterns("__pycache__"))
+    for folder in [source, *(entry for entry in source.rglob("*") if entry.is_dir())]:
+        (folder / "__pycache__").touch()
+    assert int(run(MATCH, sealed, source)) > 0
+    if hasattr(os, "getuid"):
+        assert list(temporary_folder(sealed).rglob("*.nbi"))
+
+
+@needs_users
+def test_the_cache_in_the_temporary_directory(sealed: Path) -> None:
+    folder = temporary_folder(sealed)
+    for hits in "01":
+        path, seen = run(ADD, sealed).split()
+        assert seen == hits
+        assert Path(path).parent == folder
+        assert len(list(folder.rglob("*.nbc"))) == 1
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+@needs_users
+@pytest.mark.parametrize("kind", ["file", "link", "open to others"])
+def test_a_folder_that_another_user_may_have_made_is_not_taken(kind: str, sealed: Path) -> None:
+    folder, other = temporary_folder(sealed), sealed.parent / "other"
+    other.mkdir(mode=0o700)
+    if kind == "file":
+        folder.touch()
+    elif kind == "link":
+        folder.symlink_to(other)
+    else:
+        folder.mkdir()
+        folder.chmod(0o770)
+    assert run(ADD, sealed) == "None 0"
+    assert list(other.iterdir()) == []
+    assert kind == "file" or list(folder.iterdir()) == []
+
+
+@needs_users
+def test_a_folder_of_another_user_is_not_taken(sealed: Path) -> None:
+    if os.getuid() != 0:
+        pytest.skip("only the superuser can give a folder to another user")
+    folder = temporary_folder(sealed)
+    folder.mkdir(mode=0o700)
+    os.chown(folder, 65534, 65534)
+    assert run(ADD, sealed) == "None 0"
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.skipif(
+    not hasattr(numba.config, "CACHE_LOCATOR_CLASSES"), reason="needs a later numba"
+)
+def test_where_numba_is_told_to_look_nowhere_else(sealed: Path) -> None:
+    assert run(ADD, sealed, NUMBA_CACHE_LOCATOR_CLASSES="InTreeCacheLocator") == "None 0"
+
+
+def test_the_folder_that_the_user_names(sealed: Path, tmp_path: Path) -> None:
+    path, _ = run(ADD, sealed, NUMBA_CACHE_DIR=tmp_path / "named").split()
+    assert Path(path).parent == tmp_path / "named"
+    assert list((tmp_path / "named").rglob("*.nbi"))
+    assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def test_the_cache_beside_the_module(sealed: Path) -> None:
+    (sealed / "__pycache__").unlink()
+    path, _ = run(ADD, sealed).split()
+    assert Path(path) == sealed / "__pycache__"
+    assert list(Path(path).glob("*.nbi"))
+
+
+def test_the_flags_reach_numba() -> None:
+    @compiled(nogil=True, fastmath={"reassoc"}, inline="always")
+    def double(value):  # type: ignore[no-untyped-def]
+        return 2 * value
+
+    assert double.targetoptions["fastmath"] == {"reassoc"}
+    assert double.targetoptions["inline"] == "always"
+    assert double.targetoptions["nogil"] is True
+    assert double(4) == 8

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import deepdetect
+
+# What would leave the process or be written into the home folder is printed, and forbidden.
+WATCH = """
+import os, sys
+home, started = os.environ["HOME"], {"os.fork", "os.exec", "os.system", "os.posix_spawn"}
+started |= {"subprocess.Popen", "os.startfile", "socket.connect", "socket.getaddrinfo"}
+def watch(event, arguments):
+    written = event == "os.mkdir" or event == "open" and (arguments[2] or 0) & 3
+    if written and isinstance(arguments[0], int):
+        return
+    if event in started or written and os.fsdecode(arguments[0]).startswith(home):
+        print("forbidden:", event, arguments, flush=True)
+        raise OSError("forbidden")
+sys.addaudithook(watch)
+"""
+HEATMAP = """
+import os, sys
+import numpy as np
+from deepdetect import DeepDetect
+before = dict(os.environ)
+DeepDetect(backend=%r).heatmap(np.zeros((40, 48, 3), np.uint8))
+assert dict(os.environ) == before
+assert sys.modules.get("openvino_telemetry", before) is not None
+"""
+ONNX_METHOD = """
+from deepdetect.detector.pretrained import bundled_weights
+from deepdetect._shared.errors import WeightsError
+from deepdetect.evaluation.baselines.onnx_file import onnx_method
+try:
+    onnx_method(bundled_weights())
+except WeightsError as error:
+    assert "outputs keypoints and scores" in str(error), error
+"""
+
+needs_openvino = pytest.mark.skipif(
+    importlib.util.find_spec("openvino") is None, reason="needs openvino, which is not installed"
+)
+needs_openvino_telemetry = pytest.mark.skipif(
+    importlib.util.find_spec("openvino_telemetry") is None,
+    reason="needs openvino_telemetry, which is not installed",
+)
+
+
+def run(code: str, home: Path, **variables: str) -> list[str]:
+    """Run Python in a fresh process that is not told to send nothing; return what it forbade."""
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("CI", "ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")
+    }
+    source = str(Path(deepdetect.__file__).parents[1])
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", code],
+        env=kept | {"HOME": str(home), "USERPROFILE": str(home), "PYTHONPATH": source} | variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    return re.findall("forbidden: (.*)", done.stdout)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        pytest.param(HEATMAP % "onnxruntime", id="onnxruntime"),
+        pytest.param(HEATMAP % "openvino", id="openvino", marks=needs_openvino),
+        pytest.param(ONNX_METHOD, id="another network"),
+    ],
+)
+def test_nothing_is_sent_or_left_in_the_home_folder(code: str, tmp_path: Path) -> None:
+    assert run(WATCH + code, tmp_path) == []
+    assert list(tmp_path.rglob("*")) == []
+
+
+def test_the_watch_sees_files_processes_and_connections(tmp_path: Path) -> None:
+    code = WATCH + (
+        "import socket, subprocess\n"
+        f"for act in (lambda: open({str(tmp_path / 'file')!r}, 'w'),\n"
+        f"            lambda: os.mkdir({str(tmp_path / 'folder')!r}),\n"
+        "            lambda: subprocess.run([sys.executable, '-V']),\n"
+        "            lambda: socket.create_connection(('127.0.0.1', 9))):\n"
+        "    try:\n"
+        "        act()\n"
+        "    except OSError as error:\n"
+        "        assert str(error) == 'forbidden', error\n"
+    )
+    events = [line.split()[0] for line in run(code, tmp_path)]
+    assert events == ["open", "os.mkdir", "subprocess.Popen", "socket.getaddrinfo"]
+    assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_user_s_own_setting_of_onnxruntime_stays(tmp_path: Path) -> None:
+    code = (
+        "import os, sys\n"
+        "from deepdetect.detector.backends.without_telemetry import import_onnxruntime\n"
+        "seen = []\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'onnxruntime':\n"
+        "            seen.append(os.environ['ORT_DISABLE_TELEMETRY'])\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "import_onnxruntime()\n"
+        "assert seen == [os.environ['ORT_DISABLE_TELEMETRY']] == ['true']\n"
+    )
+    assert run(code, tmp_path, ORT_DISABLE_TELEMETRY="true") == []
+
+
+@needs_openvino
+@needs_openvino_telemetry
+def test_the_user_s_openvino_stays(tmp_path: Path) -> None:
+    code = (
+        "import sys, openvino, openvino_telemetry as before\n"
+        "from deepdetect.detector.backends.without_telemetry import import_openvino\n"
+        "assert import_openvino() is openvino\n"
+        "assert sys.modules['openvino_telemetry'] is before\n"
+        "assert openvino.tools.ovc.telemetry_utils.tm is before\n"
+    )
+    assert run(code, tmp_path, CI="true") == []
+
+
+@needs_openvino
+@needs_openvino_telemetry
+def test_openvino_telemetry_can_be_imported_afterwards(tmp_path: Path) -> None:
+    code = (
+        "from deepdetect.detector.backends.without_telemetry import import_openvino\n"
+        "openvino = import_openvino()\n"
+        "from openvino.frontend import FrontEndManager\n"
+        "from openvino_telemetry import Telemetry\n"
+        "assert openvino.tools.ovc.telemetry_utils.tm.Telemetry is not Telemetry\n"
+        "assert callable(openvino.convert_model)\n"
+    )
+    assert run(code, tmp_path) == []

@@ -1,0 +1,613 @@
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import (
+    DeepDetect,
+    HeatmapOptions,
+    SelectionOptions,
+    match_images,
+    select_keypoints,
+)
+from deepdetect._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
+from deepdetect.detector.pretrained import bundled_weights
+
+# The bundled weights change, so nothing here depends on the values that they give.
+
+OneLine = Callable[[BaseException], str]
+INSTALLED = {
+    name: importlib.util.find_spec(name) is not None
+    for name in ("onnx", "onnxruntime", "openvino", "safetensors", "torch")
+}
+needs = {
+    name: pytest.mark.skipif(not there, reason=f"needs {name}, which is not installed")
+    for name, there in INSTALLED.items()
+}
+TORCH_WEIGHTS = bundled_weights().with_suffix(".safetensors")
+
+
+@pytest.fixture(scope="module")
+def detector() -> DeepDetect:
+    return DeepDetect(backend="onnxruntime")
+
+
+@pytest.fixture
+def torch_threads() -> Iterator[None]:
+    """Give torch its number of threads back, which a detector sets for the whole process."""
+    if not INSTALLED["torch"]:
+        yield
+        return
+    import torch
+
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def image(photo: np.ndarray) -> np.ndarray:
+    """A piece of the photograph whose sides are no multiples of 8."""
+    return np.ascontiguousarray(photo[20:121, 60:197])
+
+
+def run_by_hand(rgb: np.ndarray) -> np.ndarray:
+    """The bundled network on an image whose sides are multiples of 8, without the package."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(
+        str(bundled_weights()), providers=["CPUExecutionProvider"]
+    )
+    planes = (rgb.transpose(2, 0, 1)[None] / 255).astype(np.float32)
+    return session.run(None, {session.get_inputs()[0].name: planes})[0][0, 0]
+
+
+# The heat map.
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (17, 23), (24, 40), (31, 16), (33, 57), (101, 64)])
+def test_any_size_is_padded_with_its_border(
+    shape: tuple[int, int], detector: DeepDetect, image: np.ndarray
+) -> None:
+    rgb = image[: shape[0], : shape[1]]
+    heatmap = detector.heatmap(rgb)
+    assert heatmap.shape == shape
+    assert heatmap.dtype == np.float32
+    assert 0 <= heatmap.min() < heatmap.max() <= 1
+    below, right = -shape[0] % 8, -shape[1] % 8
+    padded = cv2.copyMakeBorder(rgb, 0, below, 0, right, cv2.BORDER_REPLICATE)
+    np.testing.assert_allclose(heatmap, run_by_hand(padded)[: shape[0], : shape[1]], atol=1e-5)
+
+
+@pytest.mark.parametrize("side", [48, 104])
+def test_squashing_as_the_paper_does(side: int, image: np.ndarray) -> None:
+    detector = DeepDetect(backend="onnxruntime", resolution=side)
+    square = cv2.resize(image, (side, side), interpolation=cv2.INTER_CUBIC)
+    height, width = image.shape[:2]
+    expected = cv2.resize(run_by_hand(square), (width, height), interpolation=cv2.INTER_CUBIC)
+    np.testing.assert_allclose(detector.heatmap(image), expected.clip(0, 1), atol=1e-5)
+
+
+@pytest.mark.parametrize("resolution", ["native", 64])
+def test_bgr_is_the_swapped_image(
+    resolution: str | int, detector: DeepDetect, image: np.ndarray
+) -> None:
+    rgb = detector.configured(HeatmapOptions(resolution))
+    bgr = DeepDetect(backend="onnxruntime", resolution=resolution, channels="bgr")
+    np.testing.assert_array_equal(bgr.heatmap(image), rgb.heatmap(image[:, :, ::-1]))
+    assert np.abs(bgr.heatmap(image) - rgb.heatmap(image)).max() > 1e-3
+
+
+def test_other_options_share_the_network(detector: DeepDetect, image: np.ndarray) -> None:
+    options = HeatmapOptions(64, "bgr")
+    other = detector.configured(options)
+    fresh = DeepDetect(backend="onnxruntime", resolution=64, channels="bgr")
+    assert detector.heatmap_options == HeatmapOptions()
+    assert other.heatmap_options == options
+    assert other.backend == detector.backend
+    np.testing.assert_array_equal(other.heatmap(image), fresh.heatmap(image))
+
+
+KINDS = {
+    "path": lambda rgb, path: path,
+    "text path": lambda rgb, path: str(path),
+    "uint16": lambda rgb, path: rgb.astype(np.uint16) * 257,
+    "float64": lambda rgb, path: rgb / 255,
+    "float32": lambda rgb, path: (rgb / 255).astype(np.float32),
+    "rgba": lambda rgb, path: np.dstack([rgb, rgb[:, :, :1]]),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_inputs_of_every_kind_give_the_same_map(
+    kind: str, detector: DeepDetect, photo: np.ndarray, photo_path: Path
+) -> None:
+    np.testing.assert_array_equal(
+        detector.heatmap(KINDS[kind](photo, photo_path)), detector.heatmap(photo)
+    )
+
+
+def test_deeper_inputs_give_nearly_the_same_map(detector: DeepDetect, image: np.ndarray) -> None:
+    noise = np.random.default_rng(0).integers(-100, 101, image.shape)
+    deep = np.clip(image.astype(np.int64) * 257 + noise, 0, 65535).astype(np.uint16)
+    expected = detector.heatmap(image)
+    for given in (deep, deep / 65535, (deep / 65535).astype(np.float32)):
+        assert np.abs(detector.heatmap(given) - expected).max() < 1e-3
+
+
+def test_grey_is_grey_rgb(detector: DeepDetect, image: np.ndarray) -> None:
+    grey = image[:, :, 1]
+    np.testing.assert_array_equal(
+        detector.heatmap(grey), detector.heatmap(np.dstack([grey, grey, grey]))
+    )
+
+
+@pytest.mark.parametrize("resolution", ["native", 64])
+@pytest.mark.parametrize("level", [0, 1, 60, 128, 254, 255])
+def test_a_constant_image_has_no_keypoint(
+    level: int, resolution: str | int, detector: DeepDetect
+) -> None:
+    flat = detector.configured(HeatmapOptions(resolution))
+    for given in (
+        np.full((48, 61), level, np.uint8),
+        np.full((17, 23, 3), level, np.uint8),
+        np.full((48, 61), level / 255),
+    ):
+        assert not flat.heatmap(given).any()
+        assert len(flat.detect(given, 0.0)) == 0
+        assert len(flat.detect(given, density=0.5)) == 0
+        assert len(flat.detect(given, density=1.0, nms_radius=2)) == 0
+
+
+# The keypoints.
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"threshold": 0.3},
+        {"max_keypoints": 50},
+        {"density": 0.1},
+        {"density": 0.3, "nms_radius": 2},
+        {"threshold": 0.1, "nms_radius": 3, "max_keypoints": 20},
+    ],
+)
+def test_detection_is_selection_from_the_map(
+    options: dict[str, Any], detector: DeepDetect, image: np.ndarray
+) -> None:
+    heatmap, logits = detector.heatmap_and_logits(image)
+    np.testing.assert_array_equal(heatmap, detector.heatmap(image))
+    keypoints = detector.detect(image, **options)
+    expected = select_keypoints(heatmap, SelectionOptions(**options), logits)
+    np.testing.assert_array_equal(keypoints.xy, expected.xy)
+    np.testing.assert_array_equal(keypoints.logits, expected.logits)
+    assert keypoints.image_size == (image.shape[1], image.shape[0])
+    x, y = np.rint(keypoints.xy).astype(int).T
+    np.testing.assert_array_equal(keypoints.scores, heatmap[y, x])
+
+
+def test_density_and_number(detector: DeepDetect, image: np.ndarray) -> None:
+    pixels = image.shape[0] * image.shape[1]
+    assert len(detector.detect(image, density=0.1)) == round(0.1 * pixels)
+    assert len(detector.detect(image, density=0.1, max_keypoints=77)) == 77
+
+
+def test_ignored_pixels(detector: DeepDetect, image: np.ndarray) -> None:
+    ignore = np.zeros(image.shape[:2], np.uint8)
+    ignore[:, :70] = 255
+    keypoints = detector.detect(image, density=0.3, ignore=ignore)
+    assert keypoints.xy[:, 0].min() >= 70
+    with pytest.raises(OptionError, match="ignore mask"):
+        detector.detect(image, ignore=ignore.T)
+
+
+# Backends.
+
+
+def open_backends() -> list[Any]:
+    weights = {"onnxruntime": bundled_weights(), "openvino": bundled_weights()}
+    weights["torch"] = TORCH_WEIGHTS
+    return [pytest.param(name, path, id=name, marks=needs[name]) for name, path in weights.items()]
+
+
+@pytest.mark.usefixtures("torch_threads")
+@pytest.mark.parametrize(("backend", "weights"), open_backends())
+def test_backends_agree(
+    backend: str, weights: Path, detector: DeepDetect, image: np.ndarray
+) -> None:
+    other = DeepDetect(weights, backend=backend, threads=1)
+    assert other.backend == backend
+    for given in (image, image[:17, :23]):
+        heatmap = other.heatmap(given)
+        assert heatmap.dtype == np.float32
+        assert np.abs(heatmap - detector.heatmap(given)).max() < 1e-3
+
+
+@pytest.mark.usefixtures("torch_threads")
+@pytest.mark.parametrize(("backend", "weights"), open_backends())
+def test_a_map_is_not_overwritten_by_the_next(
+    backend: str, weights: Path, photo: np.ndarray
+) -> None:
+    detector = DeepDetect(weights, backend=backend, threads=1)
+    first = detector.heatmap(photo[:64, :64])
+    before = first.copy()
+    detector.heatmap(photo[64:128, 64:128])
+    np.testing.assert_array_equal(first, before)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize(
+    "backend", ["onnxruntime", pytest.param("openvino", marks=needs["openvino"])]
+)
+def test_the_number_of_threads_does_not_matter(
+    threads: int, backend: str, detector: DeepDetect, image: np.ndarray
+) -> None:
+    other = DeepDetect(backend=backend, threads=threads)
+    assert np.abs(other.heatmap(image) - detector.heatmap(image)).max() < 1e-3
+
+
+def hide(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
+    """Make packages look as if they were not installed."""
+    find = importlib.util.find_spec
+
+    def find_others(name: str, package: str | None = None) -> object:
+        return None if name.partition(".")[0] in packages else find(name, package)
+
+    monkeypatch.setattr(importlib.util, "find_spec", find_others)
+    for package in packages:
+        monkeypatch.setitem(sys.modules, package, None)
+        for name in [name for name in sys.modules if name.startswith(f"{package}.")]:
+            monkeypatch.setitem(sys.modules, name, None)
+
+
+def test_the_automatic_backend(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert DeepDetect().backend == ("openvino" if INSTALLED["openvino"] else "onnxruntime")
+    assert DeepDetect(providers=["CPUExecutionProvider"]).backend == "onnxruntime"
+    hide(monkeypatch, "openvino")
+    assert DeepDetect().backend == "onnxruntime"
+
+
+@needs["torch"]
+@needs["safetensors"]
+def test_the_automatic_backend_of_safetensors() -> None:
+    assert DeepDetect(TORCH_WEIGHTS).backend == "torch"
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments", "command"),
+    [
+        ("openvino", {"backend": "openvino"}, "pip install openvino"),
+        ("torch", {"weights": TORCH_WEIGHTS}, "pip install torch"),
+        (
+            "torch",
+            {"weights": TORCH_WEIGHTS, "backend": "torch"},
+            "pip install torch",
+        ),
+    ],
+)
+def test_a_backend_that_is_not_installed(
+    package: str,
+    arguments: dict[str, Any],
+    command: str,
+    monkeypatch: pytest.MonkeyPatch,
+    one_line: OneLine,
+) -> None:
+    hide(monkeypatch, package)
+    with pytest.raises(MissingExtraError) as caught:
+        DeepDetect(**arguments)
+    message = one_line(caught.value)
+    assert command in message
+    assert package in message
+
+
+@needs["torch"]
+def test_torch_without_safetensors(monkeypatch: pytest.MonkeyPatch, one_line: OneLine) -> None:
+    hide(monkeypatch, "safetensors")
+    monkeypatch.delitem(sys.modules, "deepdetect.detector.network.weights", raising=False)
+    with pytest.raises(MissingExtraError) as caught:
+        DeepDetect(TORCH_WEIGHTS)
+    assert "pip install safetensors" in one_line(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"backend": "onnx"}, "unknown backend 'onnx': did you mean 'onnxruntime'?"),
+        ({"backend": "open-vino"}, "did you mean 'openvino'?"),
+        ({"backend": "Torch"}, "did you mean 'torch'?"),
+        ({"backend": "torch"}, "torch reads .safetensors files, not default.onnx"),
+        (
+            {"backend": "onnxruntime", "weights": TORCH_WEIGHTS},
+            "onnxruntime reads .onnx files, not default.safetensors",
+        ),
+        ({"threads": 0}, "threads must be at least 1, not 0"),
+        ({"threads": -2}, "threads must be at least 1, not -2"),
+        (
+            {"providers": ("CUDAExecutionProvidr",)},
+            "unknown provider 'CUDAExecutionProvidr': did you mean 'CUDAExecutionProvider'?",
+        ),
+        (
+            {"providers": ("CPUExecutionProvider",), "backend": "openvino"},
+            "providers belong to onnxruntime, not to openvino",
+        ),
+        # Providers cannot be obeyed by torch, which alone reads these weights.
+        (
+            {"providers": ("CPUExecutionProvider",), "weights": TORCH_WEIGHTS},
+            "providers belong to onnxruntime",
+        ),
+        ({"resolution": "nativ"}, "did you mean 'native'?"),
+        ({"resolution": 100}, "multiple of 8"),
+        ({"channels": "grb"}, "unknown channel order 'grb'"),
+    ],
+)
+def test_wrong_options(arguments: dict[str, Any], words: str, one_line: OneLine) -> None:
+    with pytest.raises(OptionError) as caught:
+        DeepDetect(**arguments)
+    assert words in one_line(caught.value)
+
+
+def test_a_provider_that_is_not_in_this_build(one_line: OneLine) -> None:
+    import onnxruntime
+
+    absent = set(onnxruntime.get_all_providers()) - set(onnxruntime.get_available_providers())
+    name = sorted(absent)[0]
+    with pytest.raises(OptionError) as caught:
+        DeepDetect(providers=(name,))
+    message = one_line(caught.value)
+    assert name in message
+    assert "CPUExecutionProvider" in message
+
+
+# Weights that are wrong.
+
+
+def text(name: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / name).write_text("These are words.\nAnd more of them.\n")
+        return folder / name
+
+    return make
+
+
+def half(suffix: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        content = bundled_weights().with_suffix(suffix).read_bytes()
+        (folder / f"half{suffix}").write_bytes(content[: len(content) // 2])
+        return folder / f"half{suffix}"
+
+    return make
+
+
+def folder_named_onnx(folder: Path) -> Path:
+    (folder / "folder.onnx").mkdir()
+    return folder / "folder.onnx"
+
+
+def other_tensors(folder: Path) -> Path:
+    numpy = pytest.importorskip("safetensors.numpy")
+    numpy.save_file({"layer": np.zeros(3, np.float32)}, folder / "other.safetensors")
+    return folder / "other.safetensors"
+
+
+def wrong_shape(folder: Path) -> Path:
+    """The bundled tensors, one of them one channel too wide."""
+    numpy = pytest.importorskip("safetensors.numpy")
+    tensors = numpy.load_file(TORCH_WEIGHTS)
+    name = sorted(name for name, value in tensors.items() if value.ndim == 4)[0]
+    tensors[name] = np.concatenate([tensors[name], tensors[name][:1]])
+    numpy.save_file(tensors, folder / "wide.safetensors")
+    return folder / "wide.safetensors"
+
+
+def onnx_file(
+    given: Sequence[int | str], result: Sequence[int | str], kind: str = "FLOAT"
+) -> Callable[[Path], Path]:
+    """Make an ONNX file of a mean over the channels, or of nothing where the shapes are equal."""
+
+    def make(folder: Path) -> Path:
+        onnx = pytest.importorskip("onnx")
+        helper = onnx.helper
+        element = getattr(onnx.TensorProto, kind)
+        if given == result:
+            node = helper.make_node("Identity", ["image"], ["map"])
+        else:
+            node = helper.make_node("ReduceMean", ["image"], ["map"], axes=[1], keepdims=1)
+        graph = helper.make_graph(
+            [node],
+            "graph",
+            [helper.make_tensor_value_info("image", element, given)],
+            [helper.make_tensor_value_info("map", element, result)],
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+        model.ir_version = 8
+        onnx.save(model, str(folder / "made.onnx"))
+        return folder / "made.onnx"
+
+    return make
+
+
+FREE_IMAGE, FREE_MAP = ("n", 3, "h", "w"), ("n", 1, "h", "w")
+BAD_ONNX = {
+    "missing": (lambda folder: folder / "none.onnx", "there is no weights file"),
+    "a folder": (folder_named_onnx, "there is no weights file"),
+    "text": (text("words.onnx"), "is not an ONNX file that can be read"),
+    "half": (half(".onnx"), "is not an ONNX file that can be read"),
+    "one channel": (onnx_file(FREE_MAP, FREE_MAP), "does not fit"),
+    "three maps": (onnx_file(FREE_IMAGE, FREE_IMAGE), "does not fit"),
+    "one size only": (onnx_file((1, 3, 64, 64), (1, 1, 64, 64)), "does not fit"),
+    "no image": (onnx_file(("n", 3), ("n", 3)), "does not fit"),
+    "two images at once": (onnx_file((2, 3, "h", "w"), (2, 1, "h", "w")), "does not fit"),
+    "double precision": (onnx_file(FREE_IMAGE, FREE_MAP, "DOUBLE"), "does not fit"),
+}
+BAD_SAFETENSORS = {
+    "missing": (lambda folder: folder / "none.safetensors", "there is no weights file"),
+    "text": (text("words.safetensors"), "does not fit the network"),
+    "half": (half(".safetensors"), "does not fit the network"),
+    "other tensors": (other_tensors, "does not fit the network"),
+    "wrong shape": (wrong_shape, "does not fit the network"),
+}
+BAD_WEIGHTS = [
+    *(
+        pytest.param(*case, backend, id=f"{backend}: {name}", marks=needs[backend])
+        for name, case in BAD_ONNX.items()
+        for backend in ("onnxruntime", "openvino")
+    ),
+    *(
+        pytest.param(
+            *case, "torch", id=f"torch: {name}", marks=[needs["torch"], needs["safetensors"]]
+        )
+        for name, case in BAD_SAFETENSORS.items()
+    ),
+    *(
+        pytest.param(text(name), "must end in .onnx or .safetensors", "auto", id=f"auto: {name}")
+        for name in ("weights.pth", "weights.pt", "weights")
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "words", "backend"), BAD_WEIGHTS)
+def test_wrong_weights(
+    make: Callable[[Path], Path], words: str, backend: str, tmp_path: Path, one_line: OneLine
+) -> None:
+    path = make(tmp_path)
+    with pytest.raises(WeightsError) as caught:
+        DeepDetect(path, backend=backend)
+    message = one_line(caught.value)
+    assert words in message
+    assert str(path) in message
+
+
+@needs["onnx"]
+def test_an_onnx_file_that_fits(tmp_path: Path, image: np.ndarray) -> None:
+    path = onnx_file(FREE_IMAGE, FREE_MAP)(tmp_path)
+    heatmap = DeepDetect(str(path), backend="onnxruntime").heatmap(image)
+    np.testing.assert_allclose(heatmap, image.mean(2) / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino", "torch"])
+def test_a_pth_file_with_a_backend(backend: str, tmp_path: Path, one_line: OneLine) -> None:
+    with pytest.raises(DeepDetectError) as caught:
+        DeepDetect(text("weights.pth")(tmp_path), backend=backend)
+    assert "weights.pth" in one_line(caught.value)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+def test_threads_get_their_own_images(backend: str) -> None:
+    pytest.importorskip(backend, reason=f"needs {backend}")
+    from concurrent.futures import ThreadPoolExecutor
+
+    detector = DeepDetect(backend=backend, threads=1)
+    rng = np.random.default_rng(0)
+    images = [rng.integers(0, 256, (48 + 8 * k, 64, 3), np.uint8) for k in range(4)] * 4
+    alone = [detector.heatmap(image) for image in images]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(detector.heatmap, images))
+    for expected, found in zip(alone, together, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+# What a network may answer.
+
+
+def bad_answer(folder: Path, kind: str) -> Path:
+    """Write an ONNX file that fits by its declared shapes, and answers wrongly."""
+    onnx = pytest.importorskip("onnx")
+    helper, element = onnx.helper, onnx.TensorProto.FLOAT
+    mean = helper.make_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1)
+    constant = {
+        name: onnx.numpy_helper.from_array(np.array(value, np.float32), name)
+        for name, value in (("minus", -1.0), ("five", 5.0))
+    }
+    output = "logits" if kind == "logits of nan" else "probability"
+    nodes = {
+        "nan": [
+            helper.make_node("Mul", ["mean", "minus"], ["negative"]),
+            helper.make_node("Sub", ["negative", "five"], ["low"]),
+            helper.make_node("Log", ["low"], [output]),
+        ],
+        "half": [
+            helper.make_node("AveragePool", ["mean"], [output], kernel_shape=[2, 2], strides=[2, 2])
+        ],
+        "five": [helper.make_node("Add", ["mean", "five"], [output])],
+    }
+    nodes["logits of nan"] = nodes["nan"]
+    graph = helper.make_graph(
+        [mean, *nodes[kind]],
+        "bad",
+        [helper.make_tensor_value_info("image", element, FREE_IMAGE)],
+        [helper.make_tensor_value_info(output, element, FREE_MAP)],
+        list(constant.values()),
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    path = folder / "bad.onnx"
+    onnx.save(model, str(path))
+    return path
+
+
+@needs["onnx"]
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("nan", "not finite"),
+        ("logits of nan", "not finite"),
+        ("half", "map of shape (1, 1, 24, 32) for an image that needs (1, 1, 48, 64)"),
+        ("five", "no probabilities"),
+    ],
+)
+def test_a_network_that_answers_wrongly(
+    kind: str, words: str, backend: str, tmp_path: Path, one_line: OneLine
+) -> None:
+    pytest.importorskip(backend)
+    detector = DeepDetect(bad_answer(tmp_path, kind), backend=backend)
+    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    for call in (detector.heatmap, detector.detect):
+        with pytest.raises(WeightsError) as caught:
+            call(image)
+        assert words in one_line(caught.value)
+        assert "bad.onnx" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "heatmap", [np.full((48, 64), np.nan, np.float32), np.zeros((24, 32), np.float32)]
+)
+def test_a_heat_map_of_somebody_s_own_detector(heatmap: np.ndarray, one_line: OneLine) -> None:
+    class Own:
+        def heatmap(self, image: Any) -> np.ndarray:
+            return heatmap
+
+    image = np.zeros((48, 64, 3), np.uint8)
+    with pytest.raises(OptionError) as caught:
+        match_images(image, image, Own())
+    assert "heat map must be" in one_line(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "wrong", "right"),
+    [("detect", "max_keypoint", "max_keypoints"), ("__init__", "weight", "weights")],
+)
+def test_an_unknown_keyword(
+    call: str, wrong: str, right: str, detector: DeepDetect, image: np.ndarray, one_line: OneLine
+) -> None:
+    with pytest.raises(OptionError) as caught:
+        DeepDetect(**{wrong: 5}) if call == "__init__" else detector.detect(image, **{wrong: 5})
+    assert f"unknown option {wrong!r}: did you mean {right!r}?" in one_line(caught.value)
+
+
+@needs["torch"]
+@needs["safetensors"]
+def test_logits_are_the_network_s_own(image: np.ndarray) -> None:
+    for name in ("default", "dense"):
+        torch_maps = DeepDetect(bundled_weights(name, ".safetensors")).heatmap_and_logits(image)
+        onnx_maps = DeepDetect(name, backend="onnxruntime").heatmap_and_logits(image)
+        np.testing.assert_allclose(onnx_maps[1], torch_maps[1], atol=2e-3)
+        probability = 1 / (1 + np.exp(-onnx_maps[1].astype(np.float64)))
+        np.testing.assert_allclose(onnx_maps[0], probability, atol=1e-6)

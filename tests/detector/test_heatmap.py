@@ -1,0 +1,162 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepdetect._shared.errors import OptionError
+from deepdetect.detector.heatmap import HeatmapOptions, compute_heatmap, compute_heatmap_and_logits
+
+RGB = np.random.default_rng(11).integers(0, 256, (61, 90, 3), dtype=np.uint8)
+
+
+class Recorder:
+    """A network that keeps what it was shown; its answer tells the channels apart."""
+
+    def __init__(self) -> None:
+        self.shown: list[np.ndarray] = []
+
+    def __call__(self, planes: np.ndarray) -> np.ndarray:
+        self.shown.append(planes.copy())
+        return answer(planes)
+
+
+def respond(planes: np.ndarray) -> np.ndarray:
+    red, green, blue = planes[0]
+    return (0.6 * red + 0.3 * green + 0.1 * blue**2).astype(np.float32)[None, None]
+
+
+def to_logits(probability: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        wide = probability.astype(np.float64)
+        return (np.log(wide) - np.log1p(-wide)).astype(np.float32)
+
+
+def answer(planes: np.ndarray) -> np.ndarray:
+    return to_logits(respond(planes))
+
+
+def refuse(planes: np.ndarray) -> np.ndarray:
+    raise AssertionError("the network was run")
+
+
+@given(height=st.integers(16, 41), width=st.integers(16, 41))
+def test_an_image_of_any_size_is_padded_with_its_border(height: int, width: int) -> None:
+    rgb = RGB[:height, :width]
+    network = Recorder()
+    heatmap = compute_heatmap(rgb, network)
+    (planes,) = network.shown
+    assert planes.dtype == np.float32
+    assert planes.shape[:2] == (1, 3)
+    full_height, full_width = planes.shape[2:]
+    assert full_height % 8 == 0
+    assert full_width % 8 == 0
+    assert 0 <= full_height - height < 8
+    assert 0 <= full_width - width < 8
+    rows = np.minimum(np.arange(full_height), height - 1)
+    columns = np.minimum(np.arange(full_width), width - 1)
+    expected = (rgb[rows][:, columns] / 255).transpose(2, 0, 1)
+    np.testing.assert_allclose(planes[0], expected, atol=1e-7)
+    assert heatmap.shape == (height, width)
+    assert heatmap.dtype == np.float32
+    expected = respond(planes)[0, 0, :height, :width]
+    np.testing.assert_allclose(heatmap, expected, rtol=1e-5, atol=1e-7)
+    again, logits = compute_heatmap_and_logits(rgb, network)
+    np.testing.assert_array_equal(again, heatmap)
+    np.testing.assert_array_equal(logits, to_logits(expected))
+
+
+@pytest.mark.parametrize("side", [16, 48, 104])
+@pytest.mark.parametrize("channels", ["rgb", "bgr"])
+def test_a_squashed_image(side: int, channels: str) -> None:
+    shown = RGB if channels == "rgb" else RGB[:, :, [2, 1, 0]]
+    square = cv2.resize(np.ascontiguousarray(shown), (side, side), interpolation=cv2.INTER_CUBIC)
+    small = respond((square.transpose(2, 0, 1)[None] / 255).astype(np.float32))[0, 0]
+    expected = cv2.resize(small, (90, 61), interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    heatmap, logits = compute_heatmap_and_logits(RGB, answer, HeatmapOptions(side, channels))
+    assert heatmap.dtype == logits.dtype == np.float32
+    np.testing.assert_allclose(heatmap, expected, atol=1e-5)
+    expected = cv2.resize(to_logits(small), (90, 61), interpolation=cv2.INTER_CUBIC)
+    np.testing.assert_allclose(logits, expected, atol=1e-4)
+
+
+def test_a_square_of_the_wanted_side_is_not_changed() -> None:
+    square = np.ascontiguousarray(RGB[:56, :56])
+    np.testing.assert_array_equal(
+        compute_heatmap(square, answer, HeatmapOptions(56)), compute_heatmap(square, answer)
+    )
+
+
+@pytest.mark.parametrize("side", [16, 32, 128])
+def test_a_squashed_map_stays_in_range(side: int) -> None:
+    def checkers(planes: np.ndarray) -> np.ndarray:
+        # Cubic interpolation of this overshoots on both sides.
+        rows, columns = np.indices(planes.shape[2:])
+        return to_logits(((rows // 2 + columns // 2) % 2).astype(np.float32)[None, None])
+
+    heatmap = compute_heatmap(RGB, checkers, HeatmapOptions(side))
+    assert heatmap.min() == 0
+    assert heatmap.max() == 1
+
+
+@pytest.mark.parametrize("resolution", ["native", 40])
+def test_bgr_is_the_swapped_image(resolution: str | int) -> None:
+    swapped = np.ascontiguousarray(RGB[:, :, ::-1])
+    ours = compute_heatmap(RGB, answer, HeatmapOptions(resolution, "bgr"))
+    np.testing.assert_array_equal(
+        ours, compute_heatmap(swapped, answer, HeatmapOptions(resolution))
+    )
+    assert np.abs(ours - compute_heatmap(RGB, answer, HeatmapOptions(resolution))).max() > 0.1
+
+
+@pytest.mark.parametrize("resolution", ["native", 40])
+@pytest.mark.parametrize("colour", [(0, 0, 0), (9, 9, 9), (255, 255, 255), (12, 200, 77)])
+@pytest.mark.parametrize("shape", [(16, 16), (17, 23), (64, 48)])
+def test_a_constant_image_is_not_shown_to_the_network(
+    shape: tuple[int, int], colour: tuple[int, int, int], resolution: str | int
+) -> None:
+    rgb = np.broadcast_to(np.array(colour, np.uint8), (*shape, 3))
+    heatmap = compute_heatmap(rgb, refuse, HeatmapOptions(resolution))
+    assert heatmap.shape == shape
+    assert heatmap.dtype == np.float32
+    assert not heatmap.any()
+
+
+@pytest.mark.parametrize("place", [(0, 0, 0), (15, 19, 2), (7, 3, 1)])
+def test_one_other_value_makes_an_image_not_constant(place: tuple[int, int, int]) -> None:
+    rgb = np.full((16, 20, 3), 100, np.uint8)
+    rgb[place] = 101
+    assert compute_heatmap(rgb, answer).any()
+
+
+def test_the_image_is_left_as_it_was() -> None:
+    before = RGB.copy()
+    for options in (HeatmapOptions(), HeatmapOptions(40, "bgr")):
+        compute_heatmap(RGB, answer, options)
+    np.testing.assert_array_equal(RGB, before)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"resolution": "nativ"}, "unknown resolution 'nativ': did you mean 'native'?"),
+        ({"resolution": "full"}, "unknown resolution 'full'"),
+        ({"resolution": 8}, "a multiple of 8 from 16 on, not 8"),
+        ({"resolution": 0}, "a multiple of 8 from 16 on, not 0"),
+        ({"resolution": -480}, "a multiple of 8 from 16 on, not -480"),
+        ({"resolution": 100}, "a multiple of 8 from 16 on, not 100"),
+        ({"channels": "brg"}, "unknown channel order 'brg': did you mean"),
+        ({"channels": "gray"}, "(known: rgb, bgr)"),
+    ],
+)
+def test_wrong_options(options: dict[str, object], words: str) -> None:
+    with pytest.raises(OptionError) as caught:
+        HeatmapOptions(**options)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("resolution", ["native", 16, 480, np.int64(640)])
+def test_right_resolutions(resolution: str | int) -> None:
+    assert HeatmapOptions(resolution).resolution == resolution

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from deepdetect import DeepDetect, SelectionOptions
+from deepdetect.detector.heatmap import HeatmapOptions
+from deepdetect.detector.pretrained import bundled_weights
+from deepdetect.evaluation.baselines import (
+    CLASSICAL,
+    Features,
+    Method,
+    PointDescriptor,
+    deepdetect_method,
+    every_pixel_method,
+    random_method,
+)
+from deepdetect.evaluation.metrics.spread import coverage
+from deepdetect.features.sift import root_sift_descriptors, sift_descriptors
+from deepdetect.io.image import luma
+
+
+@pytest.fixture(scope="module")
+def crop(photo: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(photo[60:140, 100:200])
+
+
+@pytest.fixture(scope="module")
+def detector() -> DeepDetect:
+    return DeepDetect(backend="onnxruntime", threads=1)
+
+
+def blank(width: int, height: int) -> np.ndarray:
+    return np.zeros((height, width, 3), np.uint8)
+
+
+def test_points_equal_those_of_the_detector(detector: DeepDetect, crop: np.ndarray) -> None:
+    method = deepdetect_method(detector, SelectionOptions(0.4, max_keypoints=300, nms_radius=1))
+    expected = detector.detect(crop, 0.4, max_keypoints=300, nms_radius=1)
+    found = method.detect(crop)
+    assert len(found) > 50
+    np.testing.assert_array_equal(found.xy, expected.xy)
+    np.testing.assert_array_equal(found.scores, expected.logits)
+    assert found.image_size == (100, 80)
+
+
+def test_descriptors_are_sift_of_size_3_with_the_angle_unset(
+    detector: DeepDetect, crop: np.ndarray
+) -> None:
+    method = deepdetect_method(detector)
+    found = method.detect(crop).best(100)
+    expected = sift_descriptors(luma(crop), found.xy, 3.0, -1.0)
+    np.testing.assert_array_equal(method.describe(crop, found), expected)
+    other = deepdetect_method(detector, descriptor=PointDescriptor("rootsift", 4.0, 0.0))
+    expected = root_sift_descriptors(luma(crop), found.xy, 4.0, 0.0)
+    np.testing.assert_array_equal(other.describe(crop, found), expected)
+
+
+def test_the_version_follows_all_that_the_points_depend_on(
+    detector: DeepDetect, tmp_path: Path
+) -> None:
+    changed = tmp_path / "other.onnx"
+    changed.write_bytes(bundled_weights("dense").read_bytes())
+    methods = [
+        deepdetect_method(detector),
+        deepdetect_method(detector, SelectionOptions(0.7)),
+        deepdetect_method(detector, SelectionOptions(nms_radius=1)),
+        deepdetect_method(detector.configured(HeatmapOptions(480))),
+        deepdetect_method(detector.configured(HeatmapOptions("native", "bgr"))),
+        deepdetect_method(DeepDetect(changed, backend="onnxruntime", threads=1)),
+        deepdetect_method(detector, descriptor=PointDescriptor(size=4.0)),
+    ]
+    assert len({method.version for method in methods}) == len(methods)
+    again = deepdetect_method(DeepDetect(backend="onnxruntime", threads=1))
+    assert again.version == methods[0].version
+
+
+@pytest.mark.parametrize("name", ["fast", "sift", "harris-low"])
+def test_random_points_are_as_many_as_those_of_the_method(crop: np.ndarray, name: str) -> None:
+    control = random_method(CLASSICAL[name])
+    for image in (crop, crop[::-1].copy(), crop[:, ::-1].copy()):
+        found = control.detect(image)
+        assert len(found) == len(CLASSICAL[name].detect(image)) > 0
+        # They are distinct pixels of the image.
+        assert len(np.unique(found.xy, axis=0)) == len(found)
+        assert (found.xy == np.rint(found.xy)).all()
+        assert ((found.xy >= 0) & (found.xy < (100, 80))).all()
+
+
+def test_random_points_are_the_same_again_and_others_in_another_image(crop: np.ndarray) -> None:
+    control = random_method(CLASSICAL["harris"])
+    first = control.detect(crop)
+    np.testing.assert_array_equal(first.xy, random_method(CLASSICAL["harris"]).detect(crop).xy)
+    darker = crop.copy()
+    darker[0, 0] //= 2  # a pixel is enough
+    second = control.detect(darker)
+    share = len(first) / (100 * 80)
+    common = len({tuple(p) for p in first.xy} & {tuple(p) for p in second.xy}) / len(first)
+    assert common < share + 0.1
+    other_seed = random_method(CLASSICAL["harris"], seed=1).detect(crop)
+    assert not np.array_equal(first.xy, other_seed.xy)
+
+
+def test_random_points_are_spread_like_dice(crop: np.ndarray) -> None:
+    """Counts by quarter of the image are within five standard deviations."""
+    found = random_method(CLASSICAL["fast-low"]).detect(crop)
+    quarters = np.bincount((found.xy[:, 0] >= 50) * 2 + (found.xy[:, 1] >= 40).astype(int))
+    expected = len(found) / 4
+    assert np.abs(quarters - expected).max() < 5 * np.sqrt(expected)
+
+
+def test_random_points_of_nothing_are_nothing() -> None:
+    found = random_method(CLASSICAL["fast"]).detect(blank(40, 30))
+    assert (len(found), found.image_size) == (0, (40, 30))
+
+
+def test_random_points_follow_the_version_of_their_method() -> None:
+    def nothing(rgb: np.ndarray) -> Features:
+        return Features(np.empty((0, 2)), np.empty(0), (1, 1))
+
+    def made(version: str, seed: int) -> str:
+        like = Method("like", "Like", nothing, lambda rgb, features: rgb, version=version)
+        return random_method(like, seed).detection
+
+    assert len({made("1", 0), made("2", 0), made("1", 1)}) == 3
+
+
+@pytest.mark.parametrize(("width", "height"), [(17, 16), (100, 80), (128, 128), (150, 131)])
+def test_every_pixel_is_there_once(width: int, height: int) -> None:
+    found = every_pixel_method().detect(blank(width, height))
+    assert len(found) == width * height
+    assert found.density == 1
+    assert len(np.unique(found.xy, axis=0)) == len(found)
+    np.testing.assert_array_equal(found.xy.max(0), (width - 1, height - 1))
+
+
+@pytest.mark.parametrize("count", [100, 256, 300, 512, 1000, 2048, 3000])
+def test_the_best_of_every_pixel_are_spread_evenly(count: int) -> None:
+    """No two are nearer than 0.65 of a square grid's step; random points come together."""
+    width, height = 250, 190
+    found = every_pixel_method().detect(blank(width, height)).best(count)
+    assert len(found) == count
+    step = np.sqrt(width * height / count)
+    nearest = KDTree(found.xy).query(found.xy, 2)[0][:, 1]
+    assert nearest.min() > 0.65 * step
+    assert nearest.mean() > 0.7 * step  # of random points 0.5
+    generator = np.random.default_rng(0)
+    chance = generator.permutation(every_pixel_method().detect(blank(width, height)).xy)[:count]
+    assert KDTree(chance).query(chance, 2)[0][:, 1].min() < 0.5 * nearest.min()
+    # The grid's own order shows: halves of the image hold like numbers.
+    for axis, side in ((0, width), (1, height)):
+        share = (found.xy[:, axis] < (side - 1) / 2).mean()
+        assert abs(share - 0.5) < 0.12
+    if count >= 100:
+        assert coverage(found.xy, (width, height)) == 1
+
+
+@pytest.mark.parametrize(("size", "count"), [((640, 480), 12), ((700, 300), 9)])
+def test_few_of_the_pixels_of_a_large_image_reach_all_of_its_parts(
+    size: tuple[int, int], count: int
+) -> None:
+    """A 3x2 grid is coarse enough to be filled by nine even points."""
+    found = every_pixel_method().detect(blank(*size)).best(count)
+    cell = np.floor(found.xy * (3, 2) / size).astype(int)
+    assert len(np.unique(cell, axis=0)) == 6
+
+
+def test_controls_get_the_papers_descriptor(crop: np.ndarray) -> None:
+    for method in (every_pixel_method(), random_method(CLASSICAL["fast"])):
+        found = method.detect(crop).best(50)
+        expected = sift_descriptors(luma(crop), found.xy, 3.0, -1.0)
+        np.testing.assert_array_equal(method.describe(crop, found), expected)

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepdetect.evaluation.metrics.homography_accuracy import (
+    area_under_curve,
+    corner_error,
+    share_within,
+)
+
+ERRORS = st.lists(st.floats(0, 20) | st.just(math.inf), min_size=1, max_size=30)
+
+
+def test_the_truth_has_no_error_and_nothing_has_an_infinite_one() -> None:
+    assert corner_error(np.eye(3), np.eye(3), (640, 480)) == 0
+    assert corner_error(-3 * np.eye(3), np.eye(3), (640, 480)) == 0  # the scale is free
+    assert corner_error(None, np.eye(3), (640, 480)) == math.inf
+
+
+def test_the_corners_are_the_centres_of_the_corner_pixels() -> None:
+    stretch = np.diag([2.0, 1, 1])
+    # Two corners stay, two move by width - 1.
+    assert corner_error(stretch, np.eye(3), (11, 7)) == 5
+
+
+def test_agrees_with_opencv() -> None:
+    homography = np.array([[1.1, 0.05, -7], [-0.03, 0.95, 4], [1e-4, -2e-4, 1]])
+    corners = np.array([[0, 0], [639, 0], [639, 479], [0, 479]], np.float64)
+    moved = cv2.perspectiveTransform(corners[None], homography)[0]
+    expected = np.linalg.norm(moved - corners, axis=1).mean()
+    assert corner_error(homography, np.eye(3), (640, 480)) == pytest.approx(expected)
+
+
+def test_a_corner_at_infinity_is_infinitely_far() -> None:
+    homography = np.array([[1.0, 0, 0], [0, 1, 0], [-0.1, 0, 1]])  # x = 10 goes to infinity
+    assert corner_error(homography, np.eye(3), (11, 5)) == math.inf
+
+
+def test_shares_and_areas_of_known_errors() -> None:
+    errors = [0.5, 1.0, 2.0, math.inf]
+    assert share_within(errors, 1) == 0.5
+    assert area_under_curve(errors, 1) == pytest.approx(0.5 / 4)
+    assert area_under_curve(errors, 4) == pytest.approx((3.5 + 3 + 2) / 16)
+    assert share_within([], 1) == area_under_curve([], 1) == 0
+
+
+@given(errors=ERRORS, threshold=st.floats(0.5, 10))
+def test_the_area_is_the_mean_of_the_shares_up_to_the_threshold(
+    errors: list[float], threshold: float
+) -> None:
+    steps = (np.arange(4000) + 0.5) / 4000 * threshold
+    mean = np.mean([share_within(errors, step) for step in steps])
+    assert area_under_curve(errors, threshold) == pytest.approx(mean, abs=1e-3)
+
+
+HOMOGRAPHIES = st.builds(
+    lambda angle, scale, shift, tilt: np.array(
+        [
+            [scale * math.cos(angle), -scale * math.sin(angle), shift[0]],
+            [scale * math.sin(angle), scale * math.cos(angle), shift[1]],
+            [tilt[0], tilt[1], 1],
+        ]
+    ),
+    st.floats(-3, 3),
+    st.floats(0.5, 2),
+    st.tuples(st.floats(-50, 50), st.floats(-50, 50)),
+    st.tuples(st.floats(-5e-4, 5e-4), st.floats(-5e-4, 5e-4)),
+)
+
+
+@given(homography=HOMOGRAPHIES, factor=st.floats(0.1, 10), sign=st.sampled_from([-1, 1]))
+def test_the_scale_and_sign_of_a_homography_do_not_matter(
+    homography: np.ndarray, factor: float, sign: int
+) -> None:
+    other = sign * factor * homography
+    assert corner_error(other, homography, (200, 150)) == pytest.approx(0, abs=1e-6)
+    shift = np.array([[1.0, 0, 3], [0, 1, -4], [0, 0, 1]])
+    assert corner_error(shift @ other, homography, (200, 150)) == pytest.approx(5)

@@ -1,0 +1,175 @@
+"""Unguided and guided counts beside each other, on pairs whose truth is known."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, match_images
+from deepdetect.datasets.planar import PlanarPair
+from deepdetect.evaluation.cache import StageCache
+from deepdetect.evaluation.protocols import BenchmarkOptions, run_benchmarks
+from deepdetect.evaluation.protocols.guided import (
+    SEEDS,
+    FoundGuided,
+    _guided_cells,
+    find_guided,
+    guided_section,
+    guided_steps,
+)
+from deepdetect.evaluation.workspace import Workspace
+
+MOVE = np.array([[1.0, 0.02, -6], [-0.01, 1, 4], [0, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, write_scene) -> Path:
+    root = tmp_path_factory.mktemp("guided")
+    write_scene(root, (240, 200), MOVE, count=2)
+    return root
+
+
+@pytest.fixture(scope="module")
+def pair(folder: Path) -> PlanarPair:
+    return PlanarPair("scene", 2, folder / "img1.png", folder / "img2.png", MOVE)
+
+
+@pytest.fixture(scope="module")
+def options(edge_detector: DeepDetect) -> BenchmarkOptions:
+    return BenchmarkOptions(edge_detector, ("guided",), ())
+
+
+@pytest.fixture(scope="module")
+def section(options: BenchmarkOptions, pair: PlanarPair):
+    done: list[int] = []
+    workspace = Workspace(pair.first.parent, done=lambda steps, text: done.append(steps))
+    elsewhere = MOVE + [[0, 0, 40], [0, 0, 0], [0, 0, 0]]
+    wrong = dataclasses.replace(pair, homography=elsewhere)
+    truths = {"true": [pair], "wrong": [wrong]}
+    found = guided_section(workspace, options, truths, "key", "Scenes")
+    assert sum(done) == guided_steps(options, [pair]) == 3
+    assert not workspace.left_out
+    return found
+
+
+def rows(section, key: str) -> dict[str, dict[str, object]]:
+    (table,) = [table for table in section.tables if table.key == key]
+    titles = [column.title for column in table.columns]
+    return {str(row[1]): dict(zip(titles, row, strict=True)) for row in table.rows}
+
+
+def test_both_ways_and_both_controls_have_counts_and_precision(section) -> None:
+    found = rows(section, "key_true")
+    assert len(found) == 3
+    assert sum(name.startswith("control") for name in found) == 2
+    for row in found.values():
+        assert row["guided by"] == "homography"
+        for way in ("unguided", "guided"):
+            assert row[f"{way}: correct"] > 0
+            assert 0 < row[f"{way}: precision"] <= 1
+        assert row["guided: one to one"] <= row["guided: correct"] <= row["could be matched"]
+        assert row["guided: of what could be"] == row["guided: correct"] / row["could be matched"]
+        assert 0 < row["least"] <= row["guided: of what could be"]
+        assert row["guided: corners off, px"] < 0.5
+
+
+def test_the_counts_are_those_of_match_images(
+    section, options: BenchmarkOptions, pair: PlanarPair
+) -> None:
+    row = rows(section, "key_true")["DeepDetect, threshold 0.5"]
+    counts = []
+    for seed in range(SEEDS):
+        found = match_images(pair.first, pair.second, options.detector, seed=seed)
+        mapped = np.c_[found.points0, np.ones(len(found))] @ MOVE.T
+        gaps = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - found.points1, axis=1)
+        counts.append(int((gaps < 1).sum()))
+    assert row["guided: correct"] == sorted(counts)[SEEDS // 2]
+    assert row["least"] == min(counts) / row["could be matched"]
+
+
+def test_a_wrong_truth_finds_nothing_right(section) -> None:
+    """The truth judges only: the matches are the same, and none of them is right."""
+    true, wrong = rows(section, "key_true"), rows(section, "key_wrong")
+    for name, row in wrong.items():
+        assert row["guided: precision"] < 0.01
+        assert row["guided: corners off, px"] == pytest.approx(40, abs=1)
+        assert row["guided: seconds"] == true[name]["guided: seconds"]
+
+
+def test_a_second_run_reads_what_the_first_has_kept(
+    options: BenchmarkOptions, pair: PlanarPair, tmp_path: Path
+) -> None:
+    cache = StageCache(tmp_path)
+    workspace = Workspace(pair.first.parent, cache)
+    first = find_guided(workspace, options.own(), pair, 0)
+    made = cache.made
+    again = find_guided(workspace, options.own(), pair, 0)
+    assert cache.made == made
+    np.testing.assert_array_equal(first.points1, again.points1)
+    np.testing.assert_array_equal(first.matrix, again.matrix)
+    find_guided(workspace, options.own(), pair, 1)
+    assert cache.made == made + 1
+
+
+def test_strangers_are_said_to_be_unguided(
+    options: BenchmarkOptions, tmp_path: Path, write_scene
+) -> None:
+    write_scene(tmp_path, (100, 80), np.eye(3), count=2)
+    noise = np.random.default_rng(0).integers(0, 256, (80, 100, 3), np.uint8)
+    from PIL import Image
+
+    Image.fromarray(noise).save(tmp_path / "img2.png")
+    pair = PlanarPair("none", 2, tmp_path / "img1.png", tmp_path / "img2.png", np.eye(3))
+    found = guided_section(Workspace(tmp_path), options, {"true": [pair]}, "key", "None")
+    for row in rows(found, "key_true").values():
+        assert row["guided by"] == "none"
+        assert row["guided: corners off, px"] is None
+        assert row["guided: seconds"] > 0
+        assert row["unguided: correct"] is not None
+    workspace = Workspace(tmp_path)
+    for seed in range(2):
+        counted = find_guided(workspace, options.own(), pair, seed)
+        given = match_images(pair.first, pair.second, options.detector, seed=seed)
+        assert not given.guided
+        assert len(given) > 0
+        np.testing.assert_array_equal(counted.points0, given.points0)
+        np.testing.assert_array_equal(counted.points1, given.points1)
+
+
+@pytest.mark.parametrize(
+    ("found", "said", "middle", "least"),
+    [
+        ((("homography", 8), ("none", 3), ("homography", 9)), "homography, 2 of 3", 8, 3),
+        ((("none", 2), ("none", 3), ("homography", 9)), "homography, 1 of 3", 3, 2),
+        ((("homography", 8), ("fundamental", 5)), "homography or fundamental", 5, 5),
+        ((("none", 4), ("none", 3), ("none", 9)), "none", 4, 3),
+    ],
+)
+def test_seeds_that_fall_back_count(
+    pair: PlanarPair, found: tuple, said: str, middle: int, least: int
+) -> None:
+    """Of ten matches each so many are right."""
+    still = dataclasses.replace(pair, homography=np.eye(3))
+    points0 = np.arange(20.0).reshape(10, 2)
+    seeds = []
+    for kind, right in found:
+        points1 = points0 + np.where(np.arange(10) < right, 0, 5)[:, None]
+        matrix = np.eye(3) if kind == "homography" else None
+        seeds.append(FoundGuided(kind, matrix, points0, points1, 1.0, 0))
+    cells = _guided_cells(seeds, still, 20, (240, 200))
+    assert cells[0] == (f"{said} seeds guided" if "of" in said.split() else said)
+    assert cells[1] == middle
+    assert cells[2] == pytest.approx(np.std([right for _, right in found], ddof=1))
+    assert cells[3:6] == (middle / 10, middle / 20, least / 20)
+
+
+def test_the_low_visibility_report_has_the_table(
+    low_visibility_folder: Path, options: BenchmarkOptions
+) -> None:
+    report = run_benchmarks(["low-visibility"], low_visibility_folder, options)
+    assert [table.key for table in report.tables()] == ["low_visibility_guided_published"]
+    (table,) = report.tables()
+    assert [row[0] for row in table.rows] == ["dusty 1-2"] * 3 + ["smoky 1-2"] * 3

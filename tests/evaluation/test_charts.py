@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import io
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import MissingExtraError
+from deepdetect.evaluation.charts import WIDEST, bar_chart, line_chart, picture
+
+pytest.importorskip("matplotlib", reason="needs matplotlib, which draws the charts")
+
+
+def decoded(png: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+
+def test_a_picture_is_kept_to_the_pixel(photo: np.ndarray) -> None:
+    np.testing.assert_array_equal(decoded(picture(photo)), photo)
+
+
+def test_a_wide_picture_is_shrunk_in_proportion(photo: np.ndarray) -> None:
+    wide = np.repeat(photo, 8, axis=1)
+    assert decoded(picture(wide)).shape == (200, WIDEST, 3)
+    exact = np.zeros((20, WIDEST, 3), np.uint8)
+    assert decoded(picture(exact)).shape == exact.shape
+
+
+def test_more_bars_make_a_higher_chart_and_longer_ones_more_ink() -> None:
+    few = decoded(bar_chart({"a": 0.2, "b": 0.1}, "share"))
+    many = decoded(bar_chart({str(k): 0.5 for k in range(12)}, "share"))
+    assert many.shape[0] > 2 * few.shape[0]
+    assert many.shape[1] == few.shape[1]
+    blue = (31, 119, 180)
+    short, long = (
+        (decoded(bar_chart({"a": value}, "share", limit=1)) == blue).all(2).sum()
+        for value in (0.25, 0.75)
+    )
+    assert long == pytest.approx(3 * short, rel=0.05)
+
+
+def test_the_best_bars_have_another_colour() -> None:
+    orange = (255, 127, 14)
+    assert not (decoded(bar_chart({"a": 0.5, "b": 0.5}, "share")) == orange).all(2).any()
+    assert (decoded(bar_chart({"a": 0.5, "b": 0.5}, "share", ["b"])) == orange).all(2).any()
+
+
+def test_names_of_any_kind_are_drawn() -> None:
+    assert len(bar_chart({"$a_b$ & <c> 100 %": 0.5, "_hidden": 0.0}, "x")) > 1000
+    assert len(line_chart({"$1 & $2": ([1, 2], [0.5, float("nan")])}, "x", "y")) > 1000
+
+
+def test_the_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(MissingExtraError, match="matplotlib") as caught:
+        bar_chart({"a": 1}, "x")
+    assert "pip install" in one_line(caught.value)

@@ -1,0 +1,161 @@
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.spatial.distance import cdist
+
+from deepdetect.features.matchers import exact
+from deepdetect.features.matchers.exact import exact_neighbours
+
+
+def naive_neighbours(
+    queries: np.ndarray, base: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """All distances in double precision; the lower row first among equals."""
+    distances = cdist(queries.astype(np.float64), base.astype(np.float64))
+    rows = np.argsort(distances, axis=1, kind="stable")[:, :count]
+    return rows, np.take_along_axis(distances, rows, 1)
+
+
+def assert_exact(queries: np.ndarray, base: np.ndarray, count: int, atol: float = 1e-5) -> None:
+    rows, distances = exact_neighbours(queries, base, count, 0)
+    expected_rows, expected_distances = naive_neighbours(queries, base, count)
+    np.testing.assert_array_equal(rows, expected_rows)
+    np.testing.assert_allclose(distances, expected_distances, rtol=1e-5, atol=atol)
+
+
+def sift_like(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.integers(0, 256, (count, 128)).astype(np.float32)
+
+
+def on_sphere(rng: np.random.Generator, count: int) -> np.ndarray:
+    values = rng.random((count, 128))
+    return (values / np.linalg.norm(values, axis=1, keepdims=True)).astype(np.float32)
+
+
+@pytest.mark.parametrize("make", [sift_like, on_sphere])
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_equals_a_naive_search(make, count: int) -> None:
+    rng = np.random.default_rng(count)
+    assert_exact(make(rng, 70), make(rng, 90), count)
+
+
+@pytest.mark.parametrize("block", [1, 90, 91, 700, 6_299, 6_300])
+def test_blocks_do_not_change_the_result(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    queries, base = sift_like(rng, 70), sift_like(rng, 90)
+    expected = exact_neighbours(queries, base, 2, 0)
+    monkeypatch.setattr(exact, "BLOCK", block)
+    rows, distances = exact_neighbours(queries, base, 2, 0)
+    np.testing.assert_array_equal(rows, expected[0])
+    np.testing.assert_array_equal(distances, expected[1])
+
+
+def small_integers(rows: st.SearchStrategy[int]) -> st.SearchStrategy[np.ndarray]:
+    """Few values in few dimensions: many equal distances and duplicates."""
+    return rows.flatmap(
+        lambda n: hnp.arrays(np.float32, (n, 3), elements=st.integers(0, 3).map(float))
+    )
+
+
+@given(
+    queries=small_integers(st.integers(1, 12)),
+    base=small_integers(st.integers(2, 40)),
+    count=st.integers(1, 2),
+)
+def test_equals_a_naive_search_among_ties(
+    queries: np.ndarray, base: np.ndarray, count: int
+) -> None:
+    assert_exact(queries, base, count)
+
+
+@pytest.mark.parametrize("size", [5, 50, 700])
+def test_the_lower_row_comes_first_among_many_equals(size: int) -> None:
+    rng = np.random.default_rng(size)
+    base = rng.integers(0, 2, (size, 3)).astype(np.float32)
+    queries = rng.integers(0, 2, (40, 3)).astype(np.float32)
+    assert_exact(queries, base, 2)
+
+
+def test_duplicates_are_at_distance_zero() -> None:
+    base = sift_like(np.random.default_rng(0), 30)
+    doubled = np.concatenate([base, base])
+    rows, distances = exact_neighbours(base, doubled, 2, 0)
+    np.testing.assert_array_equal(rows, np.stack([np.arange(30), np.arange(30, 60)], 1))
+    np.testing.assert_array_equal(distances, 0)
+
+
+@pytest.mark.parametrize(("size", "count"), [(1, 1), (2, 1), (2, 2), (3, 3)])
+def test_the_base_may_hold_no_more_than_asked(size: int, count: int) -> None:
+    rng = np.random.default_rng(size)
+    assert_exact(sift_like(rng, 4), sift_like(rng, size), count)
+
+
+def test_shapes_and_types() -> None:
+    rng = np.random.default_rng(0)
+    rows, distances = exact_neighbours(sift_like(rng, 7), sift_like(rng, 9), 2, 0)
+    assert (rows.shape, rows.dtype) == ((7, 2), np.int32)
+    assert (distances.shape, distances.dtype) == ((7, 2), np.float32)
+
+
+def test_no_queries_give_empty_arrays() -> None:
+    rows, distances = exact_neighbours(
+        np.empty((0, 8), np.float32), np.ones((3, 8), np.float32), 2, 0
+    )
+    assert rows.shape == distances.shape == (0, 2)
+
+
+def test_the_seed_plays_no_part() -> None:
+    rng = np.random.default_rng(0)
+    queries, base = sift_like(rng, 20), sift_like(rng, 30)
+    for one, other in zip(
+        exact_neighbours(queries, base, 2, 0), exact_neighbours(queries, base, 2, 7), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("offset", [1.0, 30.0, 1000.0])
+def test_neighbours_stay_true_far_from_the_origin(offset: float) -> None:
+    """|b|^2 - 2 q.b in single precision drowns small distances in a common offset."""
+    rng = np.random.default_rng(0)
+    # Multiples of 1/64, so that adding the offset is exact.
+    queries = (rng.integers(0, 64, (60, 16)) / 64 + offset).astype(np.float32)
+    base = (rng.integers(0, 64, (80, 16)) / 64 + offset).astype(np.float32)
+    assert_exact(queries, base, 2)
+
+
+@pytest.mark.parametrize("gap", [1e-2, 1e-3, 1e-4])
+def test_neighbours_stay_true_among_near_duplicates(gap: float) -> None:
+    """Three copies of each unit vector, at about 1, 2 and 3 gaps from the query."""
+    rng = np.random.default_rng(0)
+    queries = on_sphere(rng, 50).astype(np.float64)
+    direction = rng.normal(size=queries.shape)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    base = np.concatenate([queries + k * gap * direction for k in (3, 1, 2)]).astype(np.float32)
+    rows, distances = exact_neighbours(queries.astype(np.float32), base, 2, 0)
+    np.testing.assert_array_equal(rows, np.arange(50)[:, None] + [50, 100])
+    np.testing.assert_allclose(distances, np.tile([gap, 2 * gap], (50, 1)), rtol=0.01)
+
+
+@pytest.mark.parametrize(("queries", "base"), [(1000, 1000), (30_000, 2), (10_000, 40)])
+def test_memory_is_bounded_by_the_block(
+    queries: int, base: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Working memory is a few times BLOCK numbers, however few descriptors the base holds."""
+    monkeypatch.setattr(exact, "BLOCK", 200_000)
+    rng = np.random.default_rng(0)
+    first = rng.random((queries, 128), np.float32)
+    second = rng.random((base, 128), np.float32)
+    tracemalloc.start()
+    try:
+        results = exact_neighbours(first, second, 2, 0)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    working = peak - sum(result.nbytes for result in results)
+    assert working < 8 * 4 * 200_000

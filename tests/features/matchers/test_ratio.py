@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepdetect.features.matchers import MATCHERS, DescriptorMatches, get_matcher, match_descriptors
+
+
+def told(
+    rows: list[list[int]], distances: list[list[float]]
+) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+    """A matcher that answers what it was told."""
+
+    def matcher(
+        queries, base, count: int, seed: int, positions=None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return np.array(rows, np.int32)[:, :count], np.array(distances, np.float32)[:, :count]
+
+    return matcher
+
+
+def points(*rows: tuple[float, float]) -> np.ndarray:
+    """Descriptors of two numbers, so that distances can be seen by eye."""
+    return np.array(rows, np.float32).reshape(-1, 2)
+
+
+def random_descriptors(seed: int, count: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(count, 8)).astype(np.float32)
+
+
+def pairs(matches: DescriptorMatches) -> set[tuple[int, int]]:
+    return set(zip(matches.rows0.tolist(), matches.rows1.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("best", "second", "ratio", "kept"),
+    [
+        (1.0, 2.0, 0.5, False),  # equal to the ratio: not strictly under it
+        (1.0, 2.0, 0.5001, True),
+        (1.0, 2.0, 0.4999, False),
+        (3.0, 3.0, 1.0, False),  # equally good
+        (2.999, 3.0, 1.0, True),
+        (0.0, 3.0, 1e-6, True),
+        (0.0, 0.0, 1.0, False),  # two at distance 0 are equally good: ratio 1
+        (1.0, 4.0, 0.99, True),
+    ],
+)
+def test_the_ratio_is_strict(best: float, second: float, ratio: float, kept: bool) -> None:
+    one = points((0, 0))
+    two = points((0, 0), (1, 1))
+    matches = match_descriptors(one, two, told([[1, 0]], [[best, second]]), ratio=ratio)
+    assert pairs(matches) == ({(0, 1)} if kept else set())
+    if kept:
+        np.testing.assert_allclose(matches.ratios, [best / second if second else 1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["flann", "exact"])
+def test_known_answer(name: str) -> None:
+    first = points((0, 0), (10, 0), (0, 10), (5, 5))
+    second = points((10, 1), (0, 0), (0, 12), (100, 100))
+    matches = match_descriptors(first, second, get_matcher(name), ratio=0.99)
+    # (5, 5) is at sqrt(41) from (10, 1) and at sqrt(50) from (0, 0).
+    assert matches.rows0.tolist() == [0, 1, 2, 3]
+    assert matches.rows1.tolist() == [1, 0, 2, 0]
+    expected = [0, 1 / 10, 2 / 10, np.sqrt(41 / 50)]
+    np.testing.assert_allclose(matches.ratios, expected, rtol=1e-6)
+    strict = match_descriptors(first, second, get_matcher(name), ratio=0.5)
+    assert strict.rows0.tolist() == [0, 1, 2]
+    both = match_descriptors(first, second, get_matcher(name), ratio=0.99, mutual=True)
+    # (10, 1) is nearer to (10, 0) than to (5, 5).
+    assert pairs(both) == {(0, 1), (1, 0), (2, 2)}
+
+
+@pytest.mark.parametrize("name", ["flann", "exact"])
+def test_two_copies_of_the_nearest_are_no_match(name: str) -> None:
+    first = points((1, 2), (8, 8))
+    second = points((1, 2), (1, 2), (8, 8))
+    matches = match_descriptors(first, second, get_matcher(name), ratio=1.0)
+    assert pairs(matches) == {(1, 2)}
+
+
+@pytest.mark.parametrize("name", ["flann", "exact"])
+@pytest.mark.parametrize("mutual", [False, True])
+@pytest.mark.parametrize(("count0", "count1"), [(0, 0), (0, 5), (5, 0), (5, 1), (1, 1), (0, 1)])
+def test_without_a_second_best_nothing_matches(
+    name: str, mutual: bool, count0: int, count1: int
+) -> None:
+    matches = match_descriptors(
+        random_descriptors(0, count0),
+        random_descriptors(1, count1),
+        get_matcher(name),
+        ratio=1.0,
+        mutual=mutual,
+    )
+    assert len(matches) == 0
+    assert matches.rows0.shape == matches.rows1.shape == matches.ratios.shape == (0,)
+    assert np.issubdtype(matches.rows0.dtype, np.integer)
+    assert np.issubdtype(matches.rows1.dtype, np.integer)
+    assert matches.ratios.dtype == np.float32
+
+
+@pytest.mark.parametrize("name", ["flann", "exact"])
+@pytest.mark.parametrize("mutual", [False, True])
+def test_one_descriptor_matches_into_a_larger_set(name: str, mutual: bool) -> None:
+    """There is a second-best in the second set, whatever the size of the first."""
+    second = points((9, 9), (0, 1), (5, 5))
+    matches = match_descriptors(points((0, 0)), second, get_matcher(name), mutual=mutual)
+    assert pairs(matches) == {(0, 1)}
+
+
+def test_mutual_asks_the_matcher_the_other_way_with_the_same_seed() -> None:
+    calls: list[tuple[int, int, int, int]] = []
+
+    def spy(queries, base, count: int, seed: int, positions=None) -> tuple[np.ndarray, np.ndarray]:
+        calls.append((len(queries), len(base), count, seed))
+        return MATCHERS["exact"](queries, base, count, seed)
+
+    match_descriptors(random_descriptors(0, 5), random_descriptors(1, 7), spy, seed=3, mutual=True)
+    assert calls == [(5, 7, 2, 3), (7, 5, 1, 3)]
+
+
+def test_shapes_and_types() -> None:
+    matches = match_descriptors(
+        random_descriptors(0, 30), random_descriptors(1, 40), get_matcher("exact"), ratio=1.0
+    )
+    assert len(matches) == 30
+    assert matches.rows0.shape == matches.rows1.shape == matches.ratios.shape == (30,)
+    assert np.issubdtype(matches.rows0.dtype, np.integer)
+    assert np.issubdtype(matches.rows1.dtype, np.integer)
+    assert matches.ratios.dtype == np.float32
+    assert (np.diff(matches.rows0) > 0).all()
+
+
+seeds = st.integers(0, 10_000)
+counts = st.integers(2, 40)
+ratios = st.floats(0.05, 1.0)
+
+
+@given(seed=seeds, count0=counts, count1=counts, low=ratios, high=ratios, mutual=st.booleans())
+def test_a_lower_ratio_only_removes_matches(
+    seed: int, count0: int, count1: int, low: float, high: float, mutual: bool
+) -> None:
+    low, high = sorted((low, high))
+    first, second = random_descriptors(seed, count0), random_descriptors(seed + 1, count1)
+    found = {
+        ratio: match_descriptors(first, second, get_matcher("exact"), ratio=ratio, mutual=mutual)
+        for ratio in (low, high)
+    }
+    assert pairs(found[low]) <= pairs(found[high])
+    kept = found[high].ratios < low
+    np.testing.assert_array_equal(found[low].rows0, found[high].rows0[kept])
+
+
+@given(seed=seeds, count0=counts, count1=counts)
+def test_mutual_matches_are_the_same_both_ways(seed: int, count0: int, count1: int) -> None:
+    first, second = random_descriptors(seed, count0), random_descriptors(seed + 1, count1)
+    there = match_descriptors(first, second, get_matcher("exact"), ratio=1.0, mutual=True)
+    back = match_descriptors(second, first, get_matcher("exact"), ratio=1.0, mutual=True)
+    assert pairs(there) == {(row0, row1) for row1, row0 in pairs(back)}
+    # The two nearest of all are always each other's nearest.
+    assert len(there) > 0
+
+
+@given(seed=seeds, count0=counts, count1=counts, ratio=ratios)
+def test_mutual_only_removes_matches_and_leaves_one_to_one(
+    seed: int, count0: int, count1: int, ratio: float
+) -> None:
+    first, second = random_descriptors(seed, count0), random_descriptors(seed + 1, count1)
+    every = match_descriptors(first, second, get_matcher("exact"), ratio=ratio)
+    mutual = match_descriptors(first, second, get_matcher("exact"), ratio=ratio, mutual=True)
+    assert pairs(mutual) <= pairs(every)
+    assert len(set(mutual.rows1.tolist())) == len(mutual)

@@ -1,0 +1,107 @@
+"""Dense SIFT beside OpenCV's, which it must equal."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deepdetect import OptionError, threads
+from deepdetect.features.dense_sift import dense_sift, root
+from deepdetect.features.sift import opencv_sift_descriptors
+from deepdetect.io.image import luma
+
+
+def every_pixel(gray: np.ndarray) -> np.ndarray:
+    row, column = np.indices(gray.shape)
+    return np.column_stack([column.ravel(), row.ravel()])
+
+
+@pytest.mark.parametrize("size", [2.0, 2.5, 3.0, 4.0, 5.3, 6.4, 8.0])
+def test_equals_opencv_on_every_pixel_of_a_photograph(photo: np.ndarray, size: float) -> None:
+    gray = luma(photo)[:150, :220]
+    xy = every_pixel(gray)
+    found = dense_sift(gray, xy, size)
+    difference = np.abs(found.astype(int) - opencv_sift_descriptors(gray, xy, size))
+    assert found.dtype == np.uint8
+    assert (difference == 0).mean() >= 0.999
+    assert difference.max() <= 1
+
+
+@given(
+    width=st.integers(4, 150),
+    height=st.integers(4, 120),
+    size=st.floats(2, 8),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=25)
+def test_equals_opencv_on_noise_of_any_shape(
+    width: int, height: int, size: float, seed: int
+) -> None:
+    generator = np.random.default_rng(seed)
+    gray = generator.integers(0, 256, (height, width)).astype(np.uint8)
+    xy = generator.integers(0, [width, height], (30, 2))
+    difference = np.abs(
+        dense_sift(gray, xy, size).astype(int) - opencv_sift_descriptors(gray, xy, size)
+    )
+    assert difference.max() <= 1
+    assert (difference == 0).mean() >= 0.99
+
+
+def test_follows_the_order_and_repetition_of_the_points(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    xy = every_pixel(gray)
+    chosen = np.random.default_rng(0).integers(0, len(xy), 5000)
+    np.testing.assert_array_equal(dense_sift(gray, xy[chosen]), dense_sift(gray, xy)[chosen])
+
+
+def test_does_not_depend_on_the_number_of_threads(
+    photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gray = luma(photo)
+    xy = every_pixel(gray)
+    found = []
+    for count in (1, 2, 7):
+        monkeypatch.setattr(threads, "processor_count", lambda count=count: count)
+        found.append(root(dense_sift(gray, xy)))
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
+
+
+def test_a_flat_image_has_no_gradient(photo: np.ndarray) -> None:
+    flat = np.full((60, 60), 90, np.uint8)
+    assert not dense_sift(flat, every_pixel(flat)).any()
+    assert not root(dense_sift(flat, every_pixel(flat))).any()
+
+
+def test_no_keypoints_give_no_descriptors() -> None:
+    assert dense_sift(np.zeros((9, 9), np.uint8), np.empty((0, 2))).shape == (0, 128)
+
+
+@pytest.mark.parametrize(
+    ("xy", "size"),
+    [([[3.5, 2]], 3), ([[-1, 2]], 3), ([[2, 9]], 3), ([[2, 2]], 1.9), ([[2, 2]], 8.1)],
+)
+def test_what_it_cannot_describe_is_refused(xy: list, size: float) -> None:
+    with pytest.raises(OptionError):
+        dense_sift(np.zeros((9, 9), np.uint8), np.array(xy), size)
+
+
+def test_root_in_place_is_the_same(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    sift = dense_sift(gray, every_pixel(gray)[:500])
+    kept = sift.copy()
+    expected = root(sift)
+    np.testing.assert_array_equal(sift, kept)
+    assert root(sift, overwrite=True) is sift
+    np.testing.assert_array_equal(sift, expected)
+
+
+def test_root_is_the_root_of_each_share(photo: np.ndarray) -> None:
+    gray = luma(photo)[:60, :60]
+    sift = dense_sift(gray, every_pixel(gray))
+    shares = sift / np.maximum(sift.sum(1, keepdims=True), 1)
+    np.testing.assert_allclose(root(sift), np.minimum(512 * np.sqrt(shares), 255), atol=0.501)
+    assert cv2.norm(root(sift)[1000].astype(np.float32)) == pytest.approx(512, rel=0.005)

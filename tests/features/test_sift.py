@@ -1,0 +1,180 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect.features.dense_sift import dense_sift
+from deepdetect.features.sift import (
+    opencv_sift_descriptors,
+    root_sift_descriptors,
+    sift_descriptors,
+)
+
+
+def make_gray(seed: int = 0, width: int = 90, height: int = 70) -> np.ndarray:
+    """A smooth random image: neighbouring pixels are alike, as in a photo."""
+    noise = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2)
+    return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def make_points(
+    seed: int = 1, count: int = 40, width: int = 90, height: int = 70, margin: int = 0
+) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    x = rng.integers(margin, width - margin, count)
+    y = rng.integers(margin, height - margin, count)
+    return np.stack([x, y], 1).astype(np.float32)
+
+
+def opencv_sift(gray: np.ndarray, xy: np.ndarray, size: float, angle: float) -> np.ndarray:
+    """One keypoint at a time, each made by hand: no order can be lost."""
+    rows = []
+    for x, y in xy:
+        keypoint = cv2.KeyPoint(float(x), float(y), size, angle, 0.0, 0)
+        rows.append(cv2.SIFT_create().compute(gray, [keypoint])[1][0])
+    return np.array(rows)
+
+
+@pytest.mark.parametrize(
+    ("size", "angle"),
+    [(3.0, 0.0), (3.0, -1.0), (3.0, 90.0), (4.5, 0.0), (4.5, 359.0), (12.0, 45.0), (0.5, 0.0)],
+)
+def test_sift_equals_opencv_with_handmade_keypoints(size: float, angle: float) -> None:
+    gray, xy = make_gray(), make_points()
+    expected = opencv_sift(gray, xy, size, angle)
+    np.testing.assert_array_equal(sift_descriptors(gray, xy, size, angle), expected)
+
+
+def test_sift_defaults_are_size_3_and_upright() -> None:
+    gray, xy = make_gray(), make_points()
+    np.testing.assert_array_equal(sift_descriptors(gray, xy), opencv_sift(gray, xy, 3.0, 0.0))
+
+
+def test_sift_follows_the_order_and_repetition_of_the_points() -> None:
+    gray, xy = make_gray(), make_points(count=60)
+    order = np.random.default_rng(2).integers(0, len(xy), 100)  # shuffled, with repeats
+    whole = sift_descriptors(gray, xy)
+    np.testing.assert_array_equal(sift_descriptors(gray, xy[order]), whole[order])
+
+
+@pytest.mark.parametrize("describe", [sift_descriptors, root_sift_descriptors])
+def test_every_point_of_the_image_gets_a_row(describe) -> None:
+    gray = make_gray(width=24, height=20)
+    xy = np.stack(np.meshgrid(np.arange(24), np.arange(20)), -1).reshape(-1, 2)
+    descriptors = describe(gray, xy)
+    assert descriptors.shape == (480, 128)
+    assert np.isfinite(descriptors).all()
+
+
+def test_sift_holds_whole_numbers_of_a_byte() -> None:
+    descriptors = sift_descriptors(make_gray(), make_points())
+    assert descriptors.dtype == np.uint8
+    # Not a trivial 0: OpenCV scales the length to about 512.
+    assert (np.linalg.norm(descriptors.astype(int), axis=1) > 400).all()
+
+
+@pytest.mark.parametrize("describe", [sift_descriptors, root_sift_descriptors])
+@pytest.mark.parametrize("xy", [np.empty((0, 2), np.float32), np.empty((0, 2)), []])
+def test_no_points_give_an_empty_array(describe, xy) -> None:
+    descriptors = describe(make_gray(), xy)
+    assert descriptors.shape == (0, 128)
+    assert descriptors.dtype == np.uint8
+
+
+@pytest.mark.parametrize("kind", [int, np.int32, np.float32, np.float64])
+def test_positions_may_have_any_number_type(kind: type) -> None:
+    gray, xy = make_gray(), make_points()
+    np.testing.assert_array_equal(
+        sift_descriptors(gray, xy.astype(kind)), sift_descriptors(gray, xy)
+    )
+
+
+def test_the_unset_angle_is_a_turn_of_one_degree() -> None:
+    gray, xy = make_gray(), make_points()
+    unset = sift_descriptors(gray, xy, angle=-1).astype(int)
+    upright = sift_descriptors(gray, xy, angle=0).astype(int)
+    assert not np.array_equal(unset, upright)
+    # -1 and 359 are the same direction, up to the rounding of cosine and sine.
+    turned = sift_descriptors(gray, xy, angle=359)
+    assert np.abs(unset - turned).max() <= 1
+    # One degree is little: far nearer to upright than a quarter turn is.
+    near = np.linalg.norm(unset - upright, axis=1)
+    far = np.linalg.norm(sift_descriptors(gray, xy, angle=90) - upright, axis=1)
+    assert near.max() < 100
+    assert (near < far).all()
+
+
+@pytest.mark.parametrize("describe", [sift_descriptors, root_sift_descriptors])
+@pytest.mark.parametrize("shift", [(1, 0), (0, 1), (7, 4), (13, 9)])
+def test_a_shifted_image_has_the_same_descriptors_at_shifted_points(describe, shift) -> None:
+    dx, dy = shift
+    whole = make_gray(width=140, height=120)
+    xy = make_points(width=100, height=90, margin=25)
+    here = describe(np.ascontiguousarray(whole[dy : dy + 90, dx : dx + 100]), xy)
+    np.testing.assert_array_equal(describe(whole, xy + np.float32([dx, dy])), here)
+
+
+def test_pixel_centres_are_whole_numbers() -> None:
+    """Turned by half, the pixel (x, y) of an image is (W - 1 - x, H - 1 - y).
+
+    A convention with the centre of the first pixel at (0.5, 0.5) would be off by one.
+    """
+    gray = make_gray()
+    height, width = gray.shape
+    xy = make_points(margin=20)
+    turned = np.ascontiguousarray(gray[::-1, ::-1])
+    upright = sift_descriptors(gray, xy).astype(int)
+    right = sift_descriptors(turned, np.float32([width - 1, height - 1]) - xy, angle=180)
+    wrong = sift_descriptors(turned, np.float32([width, height]) - xy, angle=180)
+    assert np.abs(upright - right).max() <= 2
+    assert np.linalg.norm(upright - wrong, axis=1).mean() > 20
+
+
+def test_root_sift_has_a_length_of_512() -> None:
+    descriptors = root_sift_descriptors(make_gray(), make_points())
+    assert descriptors.dtype == np.uint8
+    lengths = np.linalg.norm(descriptors.astype(int), axis=1)
+    np.testing.assert_allclose(lengths, 512, rtol=0.005)
+
+
+def test_root_sift_is_zero_where_sift_is() -> None:
+    flat = np.full((40, 40), 128, np.uint8)
+    xy = np.array([[20, 20], [10, 30]])
+    assert not sift_descriptors(flat, xy).any()
+    assert not root_sift_descriptors(flat, xy).any()
+
+
+def test_root_sift_distances_are_hellinger_distances_of_sift() -> None:
+    """|sqrt(p) - sqrt(q)|^2 = 2 - 2 * sum(sqrt(p * q)) for distributions p and q."""
+    gray, xy = make_gray(), make_points()
+    sift = sift_descriptors(gray, xy).astype(np.float64)
+    distribution = sift / sift.sum(1, keepdims=True)
+    affinity = np.sqrt(distribution[:, None] * distribution[None]).sum(2)
+    root = root_sift_descriptors(gray, xy) / 512
+    squared = ((root[:, None] - root[None]) ** 2).sum(2)
+    np.testing.assert_allclose(squared, 2 - 2 * affinity, atol=0.01)
+
+
+def test_root_sift_follows_size_and_angle() -> None:
+    gray, xy = make_gray(), make_points()
+    sift = sift_descriptors(gray, xy, 5.0, 30.0).astype(float)
+    root = root_sift_descriptors(gray, xy, 5.0, 30.0)
+    expected = 512 * np.sqrt(sift / sift.sum(1, keepdims=True))
+    np.testing.assert_allclose(root, np.minimum(expected, 255), atol=0.51)
+
+
+def test_many_keypoints_are_done_at_once_and_few_by_opencv() -> None:
+    gray = make_gray()
+    everywhere = np.stack(np.meshgrid(np.arange(90), np.arange(70)), -1).reshape(-1, 2)
+    np.testing.assert_array_equal(sift_descriptors(gray, everywhere), dense_sift(gray, everywhere))
+    expected = opencv_sift_descriptors(gray, everywhere).astype(int)
+    assert np.abs(sift_descriptors(gray, everywhere) - expected).max() <= 1
+    for xy, angle in ((everywhere, 30.0), (everywhere + 0.25, 0.0), (everywhere[:9], 0.0)):
+        np.testing.assert_array_equal(
+            sift_descriptors(gray, xy, 3.0, angle), opencv_sift_descriptors(gray, xy, 3.0, angle)
+        )
+    np.testing.assert_array_equal(
+        sift_descriptors(gray, everywhere, 9.0), opencv_sift_descriptors(gray, everywhere, 9.0)
+    )

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deepdetect._shared.errors import ReconstructionError
+from deepdetect.geometry.camera import (
+    Calibration,
+    Camera,
+    calibration_from_focal,
+    read_calibration,
+)
+
+SIZE = (640, 480)
+
+
+def written(tmp_path: Path, values: Any) -> Path:
+    path = tmp_path / "calib.json"
+    path.write_text(values if isinstance(values, str) else json.dumps(values))
+    return path
+
+
+def test_the_shared_scenes_are_read(shared: Path) -> None:
+    from deepdetect.io.image import load_image
+
+    seen = 0
+    for path in sorted((shared / "data" / "middlebury").glob("*/calib.json")):
+        height, width = load_image(path.parent / "left.png").shape[:2]
+        values = json.loads(path.read_text())
+        found = read_calibration(path, (width, height), (width, height))
+        assert found.camera0.focal_px == (values["focal_px"],) * 2
+        assert found.camera0.centre == ((width - 1) / 2, (height - 1) / 2)
+        assert found.baseline_mm == values.get("baseline_mm")
+        offset = values.get("disparity_offset_px", 0)
+        assert found.disparity_offset_px == pytest.approx(offset)
+        if found.baseline_mm:
+            depth = values["focal_px"] * values["baseline_mm"] / (30 + offset)
+            assert found.depth_mm(30) == pytest.approx(depth)
+        seen += 1
+    assert seen == 7
+
+
+def test_the_offset_is_the_distance_of_the_principal_points(tmp_path: Path) -> None:
+    """A point of depth z is seen at disparity focal * baseline / z - offset."""
+    values = {"focal_px": 900, "baseline_mm": 120, "disparity_offset_px": 31}
+    found = read_calibration(written(tmp_path, values), SIZE, SIZE)
+    point = np.array([[50.0, -20.0, 3000.0]])
+    left = found.camera0.project(point)
+    right = found.camera1.project(point - [120, 0, 0])
+    disparity = (left - right)[0]
+    assert disparity[1] == 0
+    assert found.depth_mm(disparity[0]) == pytest.approx(3000)
+    assert disparity[0] == pytest.approx(900 * 120 / 3000 - 31)
+
+
+def test_views_may_differ(tmp_path: Path) -> None:
+    values = {
+        "focal_px": [900, 905],
+        "cx": 300,
+        "cy": 250,
+        "left": {"cx": 310},
+        "right": {"focal_px": 800, "cx": 340, "width": 600, "height": 400},
+    }
+    found = read_calibration(written(tmp_path, values), SIZE, (600, 400))
+    assert found.camera0 == Camera(SIZE, (900, 905), (310, 250))
+    assert found.camera1 == Camera((600, 400), (800, 800), (340, 250))
+    moved = read_calibration(
+        written(tmp_path, {"focal_px": 900, "cx": 300, "disparity_offset_px": 25}), SIZE, SIZE
+    )
+    assert (moved.camera0.centre, moved.camera1.centre) == ((300, 239.5), (325, 239.5))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ("{", "no JSON file"),
+        ("\ufeff nonsense \n more", "no JSON file"),
+        ("[1]", "must hold one object"),
+        ({}, 'no "focal_px"'),
+        ({"focal_px": None}, 'no "focal_px"'),
+        ({"focal_px": 0}, "focal length must be above 0"),
+        ({"focal_px": -3}, "focal length must be above 0"),
+        ({"focal_px": [900, 0]}, "focal length must be above 0"),
+        ({"focal_px": "900"}, "focal length must be a number"),
+        ({"focal_px": True}, "must be a number"),
+        ({"focal_px": [1, 2, 3]}, "must be one or two numbers"),
+        ('{"focal_px": NaN}', "must be finite"),
+        ({"focal_px": 900, "baseline_mm": 0}, "baseline must be above 0 mm, not 0"),
+        ({"focal_px": 900, "baseline_mm": -5}, "baseline must be above 0 mm"),
+        ({"focal_px": 900, "baseline_mm": "far"}, "the baseline must be a number"),
+        ({"focal_px": 900, "cx": []}, "cx must be a number"),
+        ({"focal_px": 900, "right": 3}, '"right" must be an object'),
+        ({"focal_px": 900, "width": 320, "height": 240}, "for images of 320x240 pixels, the left"),
+        ({"focal_px": 900, "right": {"width": 320}}, "for images of 320x480 pixels, the right"),
+        (
+            {"focal_px": 900, "cx": 300, "right": {"cx": 340}, "disparity_offset_px": 10},
+            "leave one of them out",
+        ),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, one_line, values: Any, message: str) -> None:
+    path = written(tmp_path, values)
+    with pytest.raises(ReconstructionError, match=message) as error:
+        read_calibration(path, SIZE, SIZE)
+    assert str(path) in one_line(error.value)
+
+
+def test_a_missing_file_is_said(tmp_path: Path, one_line) -> None:
+    for path in (tmp_path / "no.json", tmp_path):
+        with pytest.raises(ReconstructionError, match="cannot be read") as error:
+            read_calibration(path, SIZE, SIZE)
+        one_line(error.value)
+
+
+def test_a_focal_length_is_enough() -> None:
+    found = calibration_from_focal(700, SIZE, (320, 240))
+    np.testing.assert_array_equal(
+        found.camera0.matrix, [[700, 0, 319.5], [0, 700, 239.5], [0, 0, 1]]
+    )
+    assert found.camera1.centre == (159.5, 119.5)
+    for focal in (0, -1, float("nan"), float("inf")):
+        with pytest.raises(ReconstructionError, match="focal length"):
+            calibration_from_focal(focal, SIZE, SIZE)
+
+
+def test_rays_and_projection_undo_each_other() -> None:
+    camera = Camera(SIZE, (700, 720), (300, 250))
+    pixels = np.random.default_rng(0).uniform(0, SIZE, (50, 2))
+    np.testing.assert_allclose(camera.project(camera.rays(pixels) * 3), pixels)
+
+
+def test_without_a_baseline_depths_are_in_baselines() -> None:
+    camera = Camera(SIZE, 700)
+    calibration = Calibration(camera, camera)
+    np.testing.assert_allclose(calibration.depth_mm([70, 7, 0, -3]), [10, 100, np.inf, np.inf])
+
+
+def test_the_size_of_the_images_is_checked() -> None:
+    calibration = calibration_from_focal(700, SIZE, SIZE)
+    calibration.check_sizes(SIZE, SIZE)
+    with pytest.raises(ReconstructionError, match="right image has 320x240"):
+        calibration.check_sizes(SIZE, (320, 240))

@@ -1,0 +1,205 @@
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect.geometry.point_cloud import PointCloud
+from deepdetect.io.exporters import save_point_cloud
+from deepdetect.io.html_viewer import page_points
+
+
+class Page(HTMLParser):
+    """The texts of a page's scripts, its tags, and the addresses in their attributes."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.scripts: dict[str, str] = {}
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.texts: list[str] = []
+        self._inside: str | None = None
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        values = dict(attributes)
+        self.tags.append(tag)
+        self.addresses += [values[name] for name in ("src", "href", "action") if name in values]
+        self._inside = (values.get("id") or "code") if tag == "script" else None
+
+    def handle_data(self, data: str) -> None:
+        if self._inside:
+            self.scripts[self._inside] = self.scripts.get(self._inside, "") + data
+        elif data.strip():
+            self.texts.append(data.strip())
+
+    def handle_endtag(self, tag: str) -> None:
+        self._inside = None
+
+
+def saved(cloud: PointCloud, path: Path, notes: dict | None = None) -> Page:
+    save_point_cloud(cloud, path, notes)
+    return Page(path.read_text("utf-8"))
+
+
+def stored_points(page: Page) -> tuple[np.ndarray, np.ndarray, dict]:
+    told = json.loads(page.scripts["cloud"])
+    levels = np.frombuffer(base64.b64decode(page.scripts["positions"]), "<u2").reshape(-1, 3)
+    colors = np.frombuffer(base64.b64decode(page.scripts["colors"]), np.uint8).reshape(-1, 3)
+    return levels * np.array(told["step"]) + told["offset"], colors, told
+
+
+def test_the_page_holds_the_points_to_half_a_step(cones: PointCloud, tmp_path: Path) -> None:
+    page = saved(cones, tmp_path / "cones.html")
+    points, colors, told = stored_points(page)
+    left_out = len(cones) - told["count"]
+    assert len(points) == len(colors) == told["count"]
+    assert 0 < left_out < 0.001 * len(cones)
+    # The points are in their order, without those that are far away.
+    box = np.percentile(cones.points, [1, 99], axis=0)
+    margin = box[1] - box[0]
+    near = ((cones.points >= box[0] - margin) & (cones.points <= box[1] + margin)).all(1)
+    assert near.sum() == told["count"]
+    error = np.abs(points - cones.points[near])
+    assert (error <= np.array(told["step"]) * 0.5001).all()
+    np.testing.assert_array_equal(colors, cones.colors[near])
+    assert f"{told['count']:,}" in page.texts
+    assert f"{left_out:,}" in page.texts
+    assert (tmp_path / "cones.html").stat().st_size < 12.1 * len(cones) + 20_000
+
+
+def test_points_very_far_away_change_neither_view_nor_step(small: PointCloud) -> None:
+    wild = PointCloud(
+        np.concatenate([small.points, [[0, 0, 1e7], [-1e7, 0, 5]]]),
+        np.concatenate([small.colors, np.zeros((2, 3), np.uint8)]),
+        "mm",
+    )
+    plain, stored = page_points(small), page_points(wild)
+    assert (plain.left_out, stored.left_out) == (0, 2)
+    np.testing.assert_allclose(stored.step, plain.step, rtol=1e-6)
+
+
+def test_nothing_is_fetched(small: PointCloud, tmp_path: Path) -> None:
+    page = saved(small, tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text("utf-8")
+    assert not [address for address in page.addresses if not address.startswith("data:")]
+    assert "default-src 'none'" in text  # the browser refuses what we may have missed
+    assert not re.findall(r"https?://|//cdn|@import|url\(|fetch\(|XMLHttp|import\(", text)
+
+
+def test_notes_are_shown_and_escaped(small: PointCloud, tmp_path: Path) -> None:
+    evil = "</script><script>alert(1)</script>"
+    notes = {"title": f"a & b {evil}", "scene": evil, "<b>": "{{positions}}", "points": 49979}
+    page = saved(small, tmp_path / "page.html", notes)
+    plain = saved(small, tmp_path / "plain.html")
+    assert page.tags.count("script") == plain.tags.count("script") == 4
+    assert "b" not in page.tags
+    assert evil in page.texts
+    assert "{{positions}}" in page.texts
+    assert "49,979" in page.texts
+    assert f"a & b {evil}" in page.texts
+
+
+def test_unit_and_step_are_told(small: PointCloud, tmp_path: Path) -> None:
+    page = saved(small, tmp_path / "page.html")
+    step = page_points(small).step.max() / 2
+    assert f"{step:.2g} mm (16 bits an axis)" in page.texts
+    scaleless = PointCloud(small.points, small.colors, "baseline")
+    texts = saved(scaleless, tmp_path / "page.html").texts
+    assert any("no scale" in text for text in texts)
+
+
+def run_node(page: Page, code: str) -> dict:
+    """Run code after the page's own script, with the browser's parts that it names at start."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("needs node, to run the page's script")
+    script = (
+        "const requestAnimationFrame = () => {};\n"
+        + page.scripts["code"]
+        + "\nconst cloud = JSON.parse(process.argv[1]);\nconsole.log(JSON.stringify((() => {"
+        + code
+        + "})()));"
+    )
+    done = subprocess.run(
+        [node, "-e", script, page.scripts["cloud"]], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_the_script_decodes_what_was_encoded(small: PointCloud, tmp_path: Path) -> None:
+    page = saved(small, tmp_path / "page.html")
+    read = run_node(page, f"return [...fromBase64('{page.scripts['positions']}', Uint16Array)];")
+    np.testing.assert_array_equal(np.reshape(read, (-1, 3)), page_points(small).levels)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 2.0])
+def test_the_first_view_shows_the_cloud_upright(
+    cones: PointCloud, aspect: float, tmp_path: Path
+) -> None:
+    page = saved(cones, tmp_path / "cones.html")
+    matrix = run_node(page, f"return [...clipMatrix(cloud, firstView(cloud), {aspect})];")
+    stored = page_points(cones)
+    homogeneous = np.column_stack([stored.levels, np.ones(len(stored.levels))])
+    clip = homogeneous @ np.reshape(matrix, (4, 4))  # column by column
+    screen = clip[:, :3] / clip[:, 3:]
+    inside = (np.abs(screen) < 1).all(1)
+    assert inside.mean() > 0.9
+    # What is up in the photograph is up on the screen, and right is right.
+    picture = cones.points[:, :2] / cones.points[:, 2:]
+    near = (cones.points[:, 2] <= cones.points[:, 2].max()) & _kept(cones)
+    assert np.corrcoef(picture[near, 0], screen[:, 0])[0, 1] > 0.8
+    assert np.corrcoef(picture[near, 1], screen[:, 1])[0, 1] < -0.8
+
+
+def test_windows_of_any_shape_show_round_things_round(small: PointCloud, tmp_path: Path) -> None:
+    page = saved(small, tmp_path / "page.html")
+    square, wide, high = (
+        np.reshape(run_node(page, f"return [...clipMatrix(cloud, firstView(cloud), {a})];"), (4, 4))
+        for a in (1, 2, 0.5)
+    )
+    # The shorter side keeps its angle.
+    np.testing.assert_allclose(wide, square * [0.5, 1, 1, 1], rtol=1e-6)
+    np.testing.assert_allclose(high, square * [1, 0.5, 1, 1], rtol=1e-6)
+
+
+def _kept(cloud: PointCloud) -> np.ndarray:
+    stored = page_points(cloud)
+    high = stored.offset + 65535 * stored.step
+    slack = stored.step / 2
+    return ((cloud.points >= stored.offset - slack) & (cloud.points <= high + slack)).all(1)
+
+
+def test_the_matrix_is_that_of_a_camera_around_the_target(
+    small: PointCloud, tmp_path: Path
+) -> None:
+    """Checked against the axes of `rendering.camera_around`, which turns in the same way."""
+    from deepdetect.viz.render import camera_around
+
+    page = saved(small, tmp_path / "page.html")
+    view = "{ azimuth: 0.4, elevation: 0.7, distance: 500, target: [5, 6, 800] }"
+    matrix = np.reshape(run_node(page, f"return [...clipMatrix(cloud, {view}, 1)];"), (4, 4))
+    told = json.loads(page.scripts["cloud"])
+    axes = camera_around(small, np.rad2deg(0.4), np.rad2deg(0.7)).axes
+    seen = (np.array([30.0, -40.0, 900.0]) - [5, 6, 800]) @ axes.T + [0, 0, 500]
+    level = (np.array([30.0, -40.0, 900.0]) - told["offset"]) / told["step"]
+    clip = [*level, 1] @ matrix
+    zoom = 1 / np.tan(0.35)
+    np.testing.assert_allclose(clip[3], seen[2], rtol=1e-4)
+    np.testing.assert_allclose(
+        clip[:2] / clip[3], seen[:2] / seen[2] * [zoom, -zoom], rtol=1e-3, atol=1e-4
+    )
+
+
+def test_the_template_is_part_of_the_package() -> None:
+    from importlib.resources import files
+
+    assert files("deepdetect.io.exporters").joinpath("viewer.html").is_file()

@@ -1,0 +1,482 @@
+from __future__ import annotations
+
+import io
+import os
+import struct
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import EpsImagePlugin, Image, ImageOps
+from PIL.PngImagePlugin import PngInfo
+
+from deepdetect._shared.errors import ImageError
+from deepdetect.io.image import IMAGE_SUFFIXES, MINIMUM_SIDE, find_images, load_image, luma
+
+OneLine = Callable[[BaseException], str]
+
+RNG = np.random.default_rng(7)
+RGB = RNG.integers(0, 256, (18, 25, 3), dtype=np.uint8)
+GREY = RGB[:, :, 0]
+ALPHA = RNG.integers(0, 256, (18, 25, 1), dtype=np.uint8)
+DEEP = RNG.integers(0, 65536, (18, 25), dtype=np.uint16)
+DEEP_RGB = RNG.integers(0, 65536, (18, 25, 3), dtype=np.uint16)
+
+
+def triple(grey: np.ndarray) -> np.ndarray:
+    return np.stack([grey] * 3, axis=2)
+
+
+def shallow(deep: np.ndarray) -> np.ndarray:
+    """The 8-bit level nearest to a 16-bit one, in exact decimal arithmetic."""
+    return np.floor(deep.astype(np.float64) * 255 / 65535 + 0.5).astype(np.uint8)
+
+
+ARRAYS = {
+    "rgb": (RGB, RGB),
+    "grey": (GREY, triple(GREY)),
+    "one channel": (GREY[:, :, None], triple(GREY)),
+    "rgba": (np.dstack([RGB, ALPHA]), RGB),
+    "strided": (RGB[:, ::-1], RGB[:, ::-1]),
+    "fortran order": (np.asfortranarray(RGB), RGB),
+    "uint16 grey": (DEEP, triple(shallow(DEEP))),
+    "uint16 rgb": (DEEP_RGB, shallow(DEEP_RGB)),
+    "uint16 of the other byte order": (
+        DEEP.astype(DEEP.dtype.newbyteorder()),
+        triple(shallow(DEEP)),
+    ),
+    "uint16 full range": (
+        np.repeat(np.array([[0, 65535]], np.uint16), 16, 0).repeat(8, 1),
+        triple(np.repeat(np.array([[0, 255]], np.uint8), 16, 0).repeat(8, 1)),
+    ),
+    "float32 grey": ((GREY / 255).astype(np.float32), triple(GREY)),
+    "float64 rgb": (RGB / 255, RGB),
+    "float16 rgba": ((np.dstack([RGB, ALPHA]) / 255).astype(np.float16), RGB),
+    "float a little below a level": ((GREY - 0.4).clip(0) / 255, triple(GREY)),
+    "float a little above a level": ((GREY + 0.4).clip(0, 255) / 255, triple(GREY)),
+    "float of the other byte order": ((RGB / 255).astype(">f4"), RGB),
+    "bool grey": (GREY > 99, triple(np.where(GREY > 99, 255, 0))),
+    "bool rgb": (RGB > 99, np.where(RGB > 99, 255, 0)),
+    "nested lists": ((GREY / 255).tolist(), triple(GREY)),
+}
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+def test_arrays(kind: str) -> None:
+    given, expected = ARRAYS[kind]
+    before = np.array(given)
+    loaded = load_image(given)
+    np.testing.assert_array_equal(given, before)
+    assert loaded.dtype == np.uint8
+    assert loaded.flags.c_contiguous
+    np.testing.assert_array_equal(loaded, expected)
+
+
+DEEP_GREY = triple(shallow(DEEP))
+PALETTE = Image.fromarray(RGB).quantize(16)
+PIL_IMAGES = {
+    "RGB": (Image.fromarray(RGB), RGB),
+    "L": (Image.fromarray(GREY), triple(GREY)),
+    "RGBA": (Image.fromarray(np.dstack([RGB, ALPHA])), RGB),
+    "LA": (Image.fromarray(np.dstack([GREY, ALPHA])), triple(GREY)),
+    "P": (PALETTE, np.array(PALETTE.getpalette(), np.uint8).reshape(-1, 3)[np.asarray(PALETTE)]),
+    "1": (Image.fromarray(GREY > 99), triple(np.where(GREY > 99, 255, 0))),
+    "I;16": (Image.fromarray(DEEP), DEEP_GREY),
+    "I;16B": (Image.frombytes("I;16B", (25, 18), DEEP.astype(">u2").tobytes()), DEEP_GREY),
+    "F": (Image.fromarray((GREY / 255).astype(np.float32)), triple(GREY)),
+}
+
+
+@pytest.mark.parametrize("mode", PIL_IMAGES)
+def test_pil_images(mode: str) -> None:
+    given, expected = PIL_IMAGES[mode]
+    assert given.mode == mode
+    loaded = load_image(given)
+    assert loaded.dtype == np.uint8
+    np.testing.assert_array_equal(loaded, expected)
+
+
+@pytest.mark.parametrize("mode", [mode for mode in PIL_IMAGES if mode not in ("I;16B", "F")])
+@pytest.mark.parametrize("as_text", [True, False])
+def test_files(mode: str, as_text: bool, tmp_path: Path) -> None:
+    given, expected = PIL_IMAGES[mode]
+    path = tmp_path / "image.png"
+    given.save(path)
+    np.testing.assert_array_equal(load_image(str(path) if as_text else path), expected)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "exact"),
+    [(".bmp", True), (".ppm", True), (".tif", True), (".jpg", False), (".webp", False)],
+)
+def test_file_formats(suffix: str, exact: bool, photo: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / f"image{suffix}"
+    Image.fromarray(photo).save(path)
+    loaded = load_image(path)
+    difference = np.abs(loaded.astype(int) - photo)
+    assert loaded.shape == photo.shape
+    assert difference.max() == 0 if exact else difference.mean() < 6
+
+
+def test_palette_with_transparency_loads_in_silence(tmp_path: Path) -> None:
+    # Pillow warns about such files, which are common; a warning is an error in these tests.
+    path = tmp_path / "palette.png"
+    PALETTE.save(path, transparency=bytes(range(16)))
+    np.testing.assert_array_equal(load_image(path), PIL_IMAGES["P"][1])
+
+
+UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: np.rot90(a, -1),
+    7: lambda a: a.swapaxes(0, 1)[::-1, ::-1],
+    8: lambda a: np.rot90(a),
+}
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+@pytest.mark.parametrize("kind", ["RGB", "L", "I;16"])
+def test_exif_orientation(orientation: int, kind: str, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = tmp_path / "turned.png"
+    image, expected = PIL_IMAGES[kind]
+    image.save(path, exif=exif)
+    np.testing.assert_array_equal(load_image(path), UPRIGHT[orientation](expected))
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+@pytest.mark.parametrize("kind", ["RGB", "L", "I;16", "I;16B", "F"])
+@pytest.mark.parametrize("compression", [None, "tiff_lzw"])
+def test_tiff_orientation(
+    orientation: int, kind: str, compression: str | None, tmp_path: Path
+) -> None:
+    # Pillow turns TIFF itself, and scrambles what it maps into memory; once must be enough.
+    path = tmp_path / "turned.tif"
+    image, expected = PIL_IMAGES[kind]
+    image.save(path, tiffinfo={0x0112: orientation}, compression=compression)
+    upright = UPRIGHT[orientation](expected)
+    np.testing.assert_array_equal(load_image(path), upright)
+    np.testing.assert_array_equal(load_image(path.read_bytes()), upright)
+
+
+@pytest.mark.parametrize("orientation", UPRIGHT)
+def test_tiff_whose_xmp_repeats_the_orientation(orientation: int, tmp_path: Path) -> None:
+    xmp = f'<rdf:Description tiff:Orientation="{orientation}"/>'.encode()
+    path = tmp_path / "turned.tif"
+    Image.fromarray(RGB).save(path, tiffinfo={0x0112: orientation, 700: xmp})
+    np.testing.assert_array_equal(load_image(path), UPRIGHT[orientation](RGB))
+
+
+def tiff(array: np.ndarray) -> bytes:
+    """Return an uncompressed TIFF file of one band of integers."""
+    height, width = array.shape
+    bits, sample_format = 8 * array.dtype.itemsize, 2 if array.dtype.kind == "i" else 1
+    tags = {256: width, 257: height, 258: bits, 259: 1, 262: 1, 273: 8, 277: 1, 278: height}
+    tags |= {279: array.nbytes, 339: sample_format}
+    directory = b"".join(struct.pack("<HHIHxx", tag, 3, 1, tags[tag]) for tag in tags)
+    header = b"II*\0" + struct.pack("<I", 8 + array.nbytes)
+    return header + array.tobytes() + struct.pack("<H", len(tags)) + directory + bytes(4)
+
+
+@pytest.mark.parametrize("kind", ["u1", "<u2", "i1", "<i2", "<i4", "<u4"])
+def test_integer_tiff_has_the_types_of_arrays(kind: str, one_line: OneLine) -> None:
+    values = {"u1": GREY, "<u2": DEEP}.get(kind, GREY // 2).astype(kind)
+    if kind in ("u1", "<u2"):
+        np.testing.assert_array_equal(load_image(tiff(values)), load_image(values))
+        return
+    with pytest.raises(ImageError) as caught:
+        load_image(tiff(values))
+    assert "16 bits without sign" in one_line(caught.value)
+
+
+BAD_PIL_IMAGES = {
+    "of 8 bits": Image.fromarray(GREY).convert("I"),
+    "of 16 bits": Image.fromarray(DEEP.astype(np.int32)),
+    "with negative values": Image.fromarray(DEEP.astype(np.int32) - 9),
+    "of 32 bits": Image.fromarray(DEEP.astype(np.int32) * 2**15),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_PIL_IMAGES)
+def test_pil_images_of_32_bit_integers(kind: str, one_line: OneLine) -> None:
+    with pytest.raises(ImageError) as caught:
+        load_image(BAD_PIL_IMAGES[kind])
+    message = one_line(caught.value)
+    assert "8 bits (mode L or RGB), 16 bits without sign (mode I;16)" in message
+
+
+@pytest.mark.parametrize("kind", ["PNG", "PPM"])
+@pytest.mark.parametrize("opened", [True, False])
+def test_16_bit_grey_that_pillow_may_hold_in_32_bits(kind: str, opened: bool) -> None:
+    file = io.BytesIO(b"P5 25 18 65535\n" + DEEP.astype(">u2").tobytes())
+    if kind == "PNG":
+        file = io.BytesIO()
+        Image.fromarray(DEEP).save(file, kind)
+    given = Image.open(file) if opened else file.getvalue()
+    np.testing.assert_array_equal(load_image(given), DEEP_GREY)
+
+
+def encoded(rgb: np.ndarray, kind: str) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(buffer, kind)
+    return buffer.getvalue()
+
+
+PNG = encoded(RGB, "PNG")
+JPEG = encoded(RNG.integers(0, 256, (64, 80, 3), dtype=np.uint8), "JPEG")
+
+
+def write(name: str, content: bytes) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / name).write_bytes(content)
+        return folder / name
+
+    return make
+
+
+BAD_FILES = {
+    "missing": (lambda folder: folder / "none.png", "there is no file"),
+    "folder": (lambda folder: folder, "is a folder"),
+    "text": (write("text.png", b"These are words.\n" * 9), "is not an image that can be read"),
+    "empty": (write("empty.png", b""), "is not an image that can be read"),
+    "half a PNG": (write("half.png", PNG[: len(PNG) // 2]), "damaged or truncated"),
+    "half a JPEG": (write("half.jpg", JPEG[: len(JPEG) // 2]), "damaged or truncated"),
+    "broken PNG": (write("broken.png", PNG.replace(b"IDAT", b"IDAX")), "damaged or truncated"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_FILES)
+def test_bad_files(kind: str, tmp_path: Path, one_line: OneLine) -> None:
+    make, words = BAD_FILES[kind]
+    path = make(tmp_path)
+    with pytest.raises(ImageError) as caught:
+        load_image(path)
+    message = one_line(caught.value)
+    assert words in message
+    assert str(path) in message
+
+
+def test_a_name_too_long_for_a_file(one_line: OneLine) -> None:
+    with pytest.raises(ImageError) as caught:
+        load_image("a" * 300 + ".png")
+    one_line(caught.value)
+
+
+@given(kept=st.floats(0, 0.999))
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_a_cut_file_is_an_error_or_whole(
+    suffix: str, kept: float, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    content = PNG if suffix == ".png" else JPEG
+    path = tmp_path_factory.getbasetemp() / f"cut{suffix}"
+    path.write_bytes(content[: int(kept * len(content))])
+    try:
+        loaded = load_image(path)
+    except ImageError:
+        return
+    # What Pillow takes for whole lacks no pixel.
+    with Image.open(io.BytesIO(content)) as whole:
+        np.testing.assert_array_equal(loaded, np.asarray(whole))
+
+
+def test_one_flipped_bit_of_a_png_is_an_error(one_line: OneLine) -> None:
+    text = PngInfo()
+    text.add_text("before", "the pixels")
+    text.add(b"ruNe", b"after the pixels", after_idat=True)  # a chunk that nobody knows
+    file = io.BytesIO()
+    Image.fromarray(RGB).save(file, "PNG", pnginfo=text)
+    content = file.getvalue()
+    assert content.index(b"before") < content.index(b"IDAT") < content.index(b"after")
+    np.testing.assert_array_equal(load_image(content), RGB)
+    signature = 8
+    for place in range(signature, len(content)):
+        flipped = bytearray(content)
+        flipped[place] ^= 1 << place % 8
+        with pytest.raises(ImageError) as caught:
+            load_image(bytes(flipped))
+        assert "damaged or truncated" in one_line(caught.value)
+
+
+def test_a_png_without_its_last_bytes_is_an_error() -> None:
+    for cut in range(1, 20):
+        with pytest.raises(ImageError, match="damaged or truncated"):
+            load_image(PNG[:-cut])
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the program is a shell script")
+def test_a_file_starts_no_program(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_line: OneLine
+) -> None:
+    # Pillow has Ghostscript (gs) draw PostScript, whatever the name of the file.
+    program, started = tmp_path / "gs", tmp_path / "started"
+    program.write_text(f"#!/bin/sh\ntouch '{started}'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)  # found by an earlier test
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(
+        b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 20 20\n%%EndComments\nshowpage\n"
+    )
+    with Image.open(path) as opened:
+        assert opened.format == "EPS"
+    with pytest.raises(ImageError) as caught:
+        load_image(path)
+    assert "is not an image that can be read" in one_line(caught.value)
+    assert not started.exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_named_pipe_is_not_waited_for(tmp_path: Path, one_line: OneLine) -> None:
+    path = tmp_path / "photo.png"
+    os.mkfifo(path)
+    with pytest.raises(ImageError) as caught:
+        load_image(path)
+    assert f"{path} is a pipe or a device" in one_line(caught.value)
+
+
+def test_large_images_load_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 300)  # RGB has 450; an error comes at 600
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.resetwarnings()
+        np.testing.assert_array_equal(load_image(PNG), RGB)
+    assert caught == []
+    with pytest.raises(ImageError, match="decompression bomb"):  # warnings are errors in tests
+        load_image(PNG)
+
+
+def test_a_pil_image_of_a_cut_file() -> None:
+    with (
+        Image.open(io.BytesIO(JPEG[: len(JPEG) // 2])) as opened,
+        pytest.raises(ImageError, match="truncated"),
+    ):
+        load_image(opened)
+
+
+def with_value(value: float) -> np.ndarray:
+    array = np.full((20, 20), 0.5)
+    array[3, 4] = value
+    return array
+
+
+BAD_ARRAYS = {
+    "too narrow": (np.zeros((16, 15), np.uint8), "15x16 pixels"),
+    "too low": (np.zeros((15, 16, 3), np.uint8), "16x15 pixels"),
+    "no pixel": (np.zeros((0, 0)), "0x0 pixels"),
+    "NaN": (with_value(np.nan), "NaN"),
+    "infinite": (with_value(np.inf), "infinite"),
+    "minus infinite": (with_value(-np.inf), "infinite"),
+    "above 1": (with_value(1.01), "[0.5, 1.01]"),
+    "below 0": (with_value(-0.01), "[-0.01, 0.5]"),
+    "float 0..255": (RGB.astype(np.float32), "[0, 1]"),
+    "1-D": (np.zeros(400, np.uint8), "(400,)"),
+    "4-D": (np.zeros((1, 20, 20, 3), np.uint8), "(1, 20, 20, 3)"),
+    "2 channels": (np.zeros((20, 20, 2), np.uint8), "1, 3 or 4 channels"),
+    "5 channels": (np.zeros((20, 20, 5), np.uint8), "1, 3 or 4 channels"),
+    "channels first": (np.zeros((3, 20, 20), np.uint8), "1, 3 or 4 channels"),
+    "int64": (np.zeros((20, 20), np.int64), "int64"),
+    "int8": (np.zeros((20, 20), np.int8), "int8"),
+    "complex": (np.zeros((20, 20), complex), "complex"),
+    "words": (np.full((20, 20), "a"), "not understood"),
+    "nothing": (None, "shape ()"),
+    "a number": (5, "shape ()"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_ARRAYS)
+def test_bad_arrays(kind: str, one_line: OneLine) -> None:
+    given, words = BAD_ARRAYS[kind]
+    with pytest.raises(ImageError) as caught:
+        load_image(given)
+    assert words in one_line(caught.value)
+
+
+def test_the_smallest_image() -> None:
+    assert MINIMUM_SIDE == 16
+    assert load_image(np.zeros((16, 16), np.uint8)).shape == (16, 16, 3)
+
+
+def test_a_small_file_is_named(tmp_path: Path, one_line: OneLine) -> None:
+    path = tmp_path / "small.png"
+    Image.fromarray(RGB[:10]).save(path)
+    with pytest.raises(ImageError) as caught:
+        load_image(path)
+    message = one_line(caught.value)
+    assert str(path) in message
+    assert "25x10 pixels" in message
+
+
+def test_luma_is_bt601(photo: np.ndarray) -> None:
+    exact = photo @ np.array([0.299, 0.587, 0.114])
+    grey = luma(photo)
+    assert grey.shape == photo.shape[:2]
+    assert grey.dtype == np.uint8
+    assert np.abs(grey - exact).max() < 0.51
+
+
+@pytest.mark.parametrize("level", [0, 1, 127, 254, 255])
+def test_luma_of_grey_is_the_grey(level: int) -> None:
+    assert (luma(np.full((16, 16, 3), level, np.uint8)) == level).all()
+
+
+def test_find_images(tmp_path: Path) -> None:
+    wanted = [f"a{suffix}" for suffix in IMAGE_SUFFIXES]
+    wanted += ["b/UPPER.PNG", "b/c/deep.jpg", "z.jpg"]
+    others = ["notes.txt", "no_suffix", ".hidden.png", ".cache/thumb.png", "b/.c/thumb.jpg"]
+    for name in wanted + others:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "folder.png").mkdir()
+    found = find_images(str(tmp_path))
+    assert found == sorted(tmp_path / name for name in wanted)
+
+
+def test_find_images_below_a_hidden_folder(tmp_path: Path) -> None:
+    # Only what lies below the folder that was asked for decides.
+    (tmp_path / ".data").mkdir()
+    (tmp_path / ".data" / "a.png").touch()
+    assert find_images(tmp_path / ".data") == [tmp_path / ".data" / "a.png"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("none", "there is no folder"), ("file.png", "there is no folder"), ("void", "no image in")],
+)
+def test_find_images_errors(name: str, words: str, tmp_path: Path, one_line: OneLine) -> None:
+    (tmp_path / "file.png").touch()
+    (tmp_path / "void").mkdir()
+    with pytest.raises(ImageError) as caught:
+        find_images(tmp_path / name)
+    message = one_line(caught.value)
+    assert words in message
+    assert str(tmp_path / name) in message
+
+
+def test_broken_exif_is_no_broken_picture(tmp_path: Path) -> None:
+    """A signed resolution cannot be rewritten by Pillow; the picture can be read all the same."""
+    entries = struct.pack("<HHIHxx", 0x0112, 3, 1, 6) + struct.pack("<HHII", 0x011A, 10, 1, 38)
+    exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 2) + entries + struct.pack("<Iii", 0, -1, 0)
+    path = tmp_path / "photo.jpg"
+    Image.new("RGB", (30, 20)).save(path, exif=exif)
+    with Image.open(path) as opened, pytest.raises((struct.error, ZeroDivisionError)):
+        ImageOps.exif_transpose(opened)
+    assert load_image(path).shape == (30, 20, 3)
+
+
+def test_every_exif_orientation_is_that_of_pillow(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
+    for orientation in range(1, 9):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        path = tmp_path / f"{orientation}.png"
+        Image.fromarray(pixels).save(path, exif=exif)
+        with Image.open(path) as opened:
+            expected = np.asarray(ImageOps.exif_transpose(opened))
+        np.testing.assert_array_equal(load_image(path), expected)

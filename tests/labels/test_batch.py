@@ -1,0 +1,87 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from PIL import Image
+
+from deepdetect._shared.errors import ImageError
+from deepdetect.labels.batch import load_mask, save_mask
+
+MASK = np.random.default_rng(3).random((19, 26)) > 0.6
+
+
+@given(arrays(bool, st.tuples(st.integers(1, 20), st.integers(1, 20))))
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, mask: np.ndarray) -> None:
+    path = tmp_path_factory.getbasetemp() / "round_trip.png"
+    save_mask(mask, path)
+    with Image.open(path) as opened:
+        assert opened.mode == "1"
+        assert opened.format == "PNG"
+        assert opened.size == mask.shape[::-1]
+    loaded = load_mask(path)
+    assert loaded.dtype == bool
+    np.testing.assert_array_equal(loaded, mask)
+    # Another reader sees 0 and 255.
+    np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), mask * 255)
+
+
+@pytest.mark.parametrize("view", [MASK.T, MASK[::-1], MASK[:, ::2], np.asfortranarray(MASK)])
+def test_any_layout_in_memory(view: np.ndarray, tmp_path: Path) -> None:
+    save_mask(view, str(tmp_path / "new" / "mask.png"))
+    np.testing.assert_array_equal(load_mask(str(tmp_path / "new" / "mask.png")), view)
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["mask.png"]
+
+
+DEPTHS = {
+    "8 bits": (np.array([[0, 1, 127, 128, 254, 255]], np.uint8), [0, 0, 0, 1, 1, 1]),
+    "16 bits": (np.array([[0, 255, 300, 32767, 32768, 65535]], np.uint16), [0, 0, 0, 0, 1, 1]),
+    "bool": (np.array([[False, True]]), [0, 1]),
+    "rgb": (np.array([[[0] * 3, [255] * 3, [100] * 3]], np.uint8), [0, 1, 0]),
+}
+
+
+@pytest.mark.parametrize("depth", DEPTHS)
+def test_brighter_than_half_at_any_bit_depth(depth: str, tmp_path: Path) -> None:
+    values, expected = DEPTHS[depth]
+    Image.fromarray(values).save(tmp_path / "mask.png")
+    assert load_mask(tmp_path / "mask.png").astype(int).tolist() == [expected]
+
+
+def test_a_palette_of_two_colours(tmp_path: Path) -> None:
+    image = Image.fromarray(MASK.astype(np.uint8)).convert("P")
+    image.putpalette([255, 255, 255, 0, 0, 0])  # 0 is white
+    image.save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(load_mask(tmp_path / "mask.png"), ~MASK)
+
+
+def cut(folder: Path) -> Path:
+    save_mask(MASK, folder / "cut.png")
+    content = (folder / "cut.png").read_bytes()
+    (folder / "cut.png").write_bytes(content[: len(content) // 2])
+    return folder / "cut.png"
+
+
+def text(folder: Path) -> Path:
+    (folder / "text.png").write_text("words")
+    return folder / "text.png"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [lambda folder: folder / "none.png", lambda folder: folder, text, cut],
+    ids=["missing", "folder", "text", "cut"],
+)
+def test_bad_files(
+    make: Callable[[Path], Path], tmp_path: Path, one_line: Callable[[BaseException], str]
+) -> None:
+    path = make(tmp_path)
+    with pytest.raises(ImageError) as caught:
+        load_mask(path)
+    assert str(path) in one_line(caught.value)

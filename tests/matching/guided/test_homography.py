@@ -1,0 +1,198 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import KDTree
+
+from deepdetect.geometry import transfer_errors
+from deepdetect.io.image import luma
+from deepdetect.matching.guided.homography import REACH, matches_by_homography, nearest_pixel
+
+SHIFT = np.array([[1.0, 0, 9], [0, 1, -6], [0, 0, 1]])
+MILD = np.array([[0.95, -0.06, 15.0], [0.08, 0.97, -5.0], [1e-4, -1e-4, 1.0]])
+
+
+def every_pixel(gray: np.ndarray) -> np.ndarray:
+    row, column = np.indices(gray.shape)
+    return np.column_stack([column.ravel(), row.ravel()]).astype(np.float32)
+
+
+def warped(gray: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    size = (gray.shape[1], gray.shape[0])
+    return cv2.warpPerspective(gray, homography, size, flags=cv2.INTER_CUBIC)
+
+
+@given(
+    width=st.integers(1, 12),
+    height=st.integers(1, 12),
+    count=st.integers(0, 40),
+    places=st.integers(0, 30),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_the_nearest_pixel_is_that_of_a_tree(
+    width: int, height: int, count: int, places: int, seed: int
+) -> None:
+    generator = np.random.default_rng(seed)
+    order = generator.permutation(width * height)[:count]
+    xy = np.column_stack([order % width, order // width]).astype(np.float32)
+    where = generator.uniform(-4, [width + 4, height + 4], (places, 2))
+    where[::5] = np.rint(where[::5] * 2) / 2  # also halfway, where several are as near
+    rows, distances = nearest_pixel(where, xy, (width, height))
+    assert rows.shape == distances.shape == (places,)
+    found = rows >= 0
+    np.testing.assert_array_equal(found, np.isfinite(distances))
+    own = np.linalg.norm(where - xy[rows], axis=1) if count else distances
+    np.testing.assert_allclose(distances[found], own[found], atol=1e-9)
+    if count and places:
+        nearest = KDTree(xy).query(where)[0]
+        near = nearest < 1.5  # of those in the 3x3 pixels around it, these are all there are
+        inner = near & (np.abs(where - np.rint(where)) < 0.5).all(1) & (nearest < 1)
+        np.testing.assert_allclose(distances[inner], nearest[inner], atol=1e-9)
+        assert (distances >= nearest - 1e-9).all()
+        assert not np.isfinite(distances[nearest > np.hypot(1.5, 1.5)]).any()
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_all_within_reach_are_found_wherever_they_lie(seed: int) -> None:
+    """Also from places half a pixel off, and from outside the image."""
+    generator = np.random.default_rng(seed)
+    order = generator.permutation(70)[:25]
+    xy = np.column_stack([order % 10, order // 10])
+    where = np.rint(generator.uniform(-2, [12, 9], (60, 2)) * 4) / 4
+    nearest = KDTree(xy).query(where)[0]
+    distances = nearest_pixel(where, xy, (10, 7))[1]
+    within = nearest < REACH
+    np.testing.assert_allclose(distances[within], nearest[within], atol=1e-9)
+    assert (distances[~within] >= REACH).all()
+
+
+def test_places_that_are_nowhere_have_no_nearest_pixel() -> None:
+    where = np.array([[np.nan, 2], [np.inf, 2], [2, -np.inf], [1e300, 2], [-1e18, 2], [2, 1e10]])
+    rows, distances = nearest_pixel(where, np.array([[2, 2]]), (5, 5))
+    assert (rows == -1).all()
+    assert np.isinf(distances).all()
+
+
+def test_the_corners_of_the_image_are_reached_from_outside() -> None:
+    xy = np.array([[0, 0], [9, 6]])
+    where = np.array([[-0.5, -0.5], [9.6, 6.6], [-0.9, 0], [9, 6.9]])
+    rows, distances = nearest_pixel(where, xy, (10, 7))
+    assert rows.tolist() == [0, 1, 0, 1]
+    np.testing.assert_allclose(distances, [0.5**0.5, 0.72**0.5, 0.9, 0.9])
+
+
+def test_a_shift_by_whole_pixels_matches_each_pixel_with_its_own(photo: np.ndarray) -> None:
+    gray = luma(photo)[:120, :160]
+    xy = every_pixel(gray)
+    rows0, rows1, _ = matches_by_homography(gray, warped(gray, SHIFT), xy, xy, SHIFT)
+    np.testing.assert_array_equal(xy[rows1], xy[rows0] + [9, -6])
+    assert len(rows0) > 0.85 * (160 - 9) * (120 - 6)
+    assert len(np.unique(rows0)) == len(rows0)
+
+
+def test_matches_lie_within_reach_of_where_the_homography_takes_them(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    generator = np.random.default_rng(0)
+    xy0, xy1 = (
+        every_pixel(gray)[np.sort(generator.permutation(gray.size)[:20_000])] for _ in range(2)
+    )
+    rows0, rows1, _ = matches_by_homography(gray, warped(gray, MILD), xy0, xy1, MILD)
+    errors = transfer_errors(xy0[rows0], xy1[rows1], MILD)
+    assert errors.max() < REACH
+    assert len(np.unique(rows0)) == len(rows0)
+    # Nearly all that have a partner within reach and are seen.
+    there = cv2.perspectiveTransform(xy0[None].astype(float), MILD)[0]
+    inside = ((there > 2) & (there < 253)).all(1)
+    partner = KDTree(xy1).query(there)[0] < REACH
+    assert len(rows0) > 0.9 * np.count_nonzero(inside & partner)
+
+
+def test_scores_are_under_one_and_smaller_where_both_look_more_alike(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    xy = every_pixel(gray)
+    second = warped(gray, MILD)
+    blurred = cv2.GaussianBlur(second, (0, 0), 1.5)
+    sharp, dull = (matches_by_homography(gray, one, xy, xy, MILD) for one in (second, blurred))
+    for rows0, rows1, scores in (sharp, dull):
+        assert len(rows0) == len(rows1) == len(scores)
+        assert (scores >= 0).all()
+        assert (scores < 1).all()
+    assert np.median(sharp[2]) < np.median(dull[2])
+
+
+def test_several_may_share_a_partner(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
+    small = cv2.resize(gray, (128, 128), interpolation=cv2.INTER_AREA)
+    rows0, rows1, _ = matches_by_homography(
+        gray, small, every_pixel(gray), every_pixel(small), half
+    )
+    counts = np.bincount(rows1)
+    assert counts.max() == 4
+    assert len(rows0) > 0.9 * gray.size
+
+
+def test_what_is_covered_in_the_second_image_is_not_matched(photo: np.ndarray) -> None:
+    camera = pytest.importorskip("skimage.data", reason="needs its photographs").camera()
+    gray = luma(photo)
+    second = warped(gray, MILD)
+    second[:, 128:] = cv2.resize(camera, (128, 256), interpolation=cv2.INTER_AREA)
+    xy = every_pixel(gray)
+    _, rows1, _ = matches_by_homography(gray, second, xy, xy, MILD)
+    column = xy[rows1, 0]
+    assert np.count_nonzero(column > 145) < 0.05 * np.count_nonzero(column < 111)
+
+
+def test_a_wrong_homography_matches_next_to_nothing(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    xy = every_pixel(gray)
+    wrong = SHIFT @ np.array([[0.0, -1, 255], [1, 0, 0], [0, 0, 1]])
+    second = warped(gray, SHIFT)
+    right = matches_by_homography(gray, second, xy, xy, SHIFT)[0]
+    assert len(matches_by_homography(gray, second, xy, xy, wrong)[0]) < 0.05 * len(right)
+
+
+@pytest.mark.parametrize(
+    "homography",
+    [
+        np.array([[1.0, 0, 5000], [0, 1, 0], [0, 0, 1]]),  # nothing in common
+        np.array([[1.0, 0, 0], [0, 1, 0], [-0.02, 0, 1]]),  # the horizon at x = 50
+        np.diag([1.0, 1.0, 0.0]),
+        np.zeros((3, 3)),
+    ],
+)
+def test_a_homography_to_nowhere_is_taken(photo: np.ndarray, homography: np.ndarray) -> None:
+    gray = luma(photo)[:100, :100]
+    xy = every_pixel(gray)
+    rows0, rows1, _ = matches_by_homography(gray, gray, xy, xy, homography)
+    assert len(rows0) == len(rows1) < 0.5 * len(xy)
+    assert (transfer_errors(xy[rows0], xy[rows1], homography) < REACH).all()
+
+
+def test_without_keypoints_nothing_matches(photo: np.ndarray) -> None:
+    gray = luma(photo)[:60, :80]
+    xy, none = every_pixel(gray), np.empty((0, 2), np.float32)
+    for first, second in ((none, xy), (xy, none), (none, none)):
+        rows0, rows1, _ = matches_by_homography(gray, gray, first, second, np.eye(3))
+        assert rows0.shape == rows1.shape == (0,)
+        assert np.issubdtype(rows0.dtype, np.integer)
+
+
+def test_one_keypoint_matches_itself(photo: np.ndarray) -> None:
+    gray = luma(photo)[:60, :80]
+    one = np.array([[40, 30]], np.float32)
+    rows0, rows1, _ = matches_by_homography(gray, gray, one, one, np.eye(3))
+    assert rows0.tolist() == rows1.tolist() == [0]
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (5, 5), (40, 50)])
+def test_flat_and_tiny_images_are_taken(shape: tuple[int, int]) -> None:
+    flat = np.full(shape, 90, np.uint8)
+    noise = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    xy = every_pixel(flat)
+    assert len(matches_by_homography(flat, flat, xy, xy, np.eye(3))[0]) == 0
+    rows0, rows1, _ = matches_by_homography(noise, noise, xy, xy, np.eye(3))
+    np.testing.assert_array_equal(rows0, rows1)

@@ -1,0 +1,321 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect.geometry import epipolar_errors, transfer_errors, transform_points
+from deepdetect.geometry.acontrario import LARGEST
+from deepdetect.geometry.model_selection import has_depth
+from deepdetect.io.image import load_image, luma
+from deepdetect.matching.guided.initial_geometry import LONGEST, THRESHOLDS, FirstPass, first_pass
+
+MILD = np.array([[0.9, -0.12, 25.0], [0.15, 0.95, -8.0], [2e-4, -1e-4, 1.0]])
+ODD = [
+    np.full((64, 80), 90, np.uint8),
+    np.full((5, 5), 90, np.uint8),
+    np.zeros((1, 1), np.uint8),
+    np.random.default_rng(0).integers(0, 256, (5, 5)).astype(np.uint8),
+    np.random.default_rng(1).integers(0, 256, (1, 70)).astype(np.uint8),
+]
+
+
+@pytest.fixture(scope="module")
+def picture() -> Callable[..., np.ndarray]:
+    """One of scikit-image's photographs by its name, as luma of a given width and height."""
+    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+
+    def read(name: str, size: tuple[int, int]) -> np.ndarray:
+        gray = luma(load_image(getattr(data, name)()))
+        return cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+
+    return read
+
+
+@pytest.fixture(scope="module")
+def art(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A rectified pair of a scene with depth, and true matches of pixels seen from the left."""
+    folder = shared / "data" / "middlebury" / "art"
+    left, right = (luma(load_image(folder / f"{side}.png")) for side in ("left", "right"))
+    disparity = cv2.imread(str(folder / "disparity.png"), cv2.IMREAD_UNCHANGED) / 3.0
+    row, column = np.nonzero(disparity)
+    points0 = np.column_stack([column, row])[::50].astype(float)
+    points1 = points0 - np.column_stack([disparity[row, column], np.zeros(len(row))])[::50]
+    return left, right, points0, points1
+
+
+def corners(gray: np.ndarray) -> np.ndarray:
+    height, width = gray.shape
+    last = np.array([width - 1, height - 1])
+    return np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * last.astype(float)
+
+
+def warped(gray: np.ndarray, homography: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return cv2.warpPerspective(gray, homography, size, flags=cv2.INTER_CUBIC)
+
+
+def resized(gray: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """An image in another size, and the map to it: pixel centres are whole numbers."""
+    across, down = width / gray.shape[1], height / gray.shape[0]
+    way = cv2.INTER_AREA if across < 1 else cv2.INTER_CUBIC
+    shift = 0.5 * across - 0.5, 0.5 * down - 0.5
+    matrix = np.array([[across, 0, shift[0]], [0, down, shift[1]], [0, 0, 1]])
+    return cv2.resize(gray, (width, height), interpolation=way), matrix
+
+
+def from_the_side(gray: np.ndarray, tilt: int, turn: float) -> tuple[np.ndarray, np.ndarray]:
+    """An image turned and then made so many times narrower, each pixel the mean of its own."""
+    height, width = gray.shape
+    rotation = np.eye(3)
+    rotation[:2] = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn, 1)
+    view, narrow = resized(warped(gray, rotation, (width, height)), width // tilt, height)
+    return view, narrow @ rotation
+
+
+def assert_nothing(found: FirstPass) -> None:
+    assert found.kind == "none"
+    assert found.matrix is None
+    assert found.points0.shape == found.points1.shape == (0, 2)
+    assert found.log_false_alarms >= LARGEST
+
+
+def check_agreeing(found: FirstPass) -> None:
+    """Its points agree with the matrix."""
+    assert 0 < len(found.points0) == len(found.points1) <= found.matches
+    measure = transfer_errors if found.kind == "homography" else epipolar_errors
+    errors = measure(found.points0, found.points1, found.matrix)
+    assert errors.max() < THRESHOLDS[found.kind]
+    assert found.log_false_alarms < LARGEST
+
+
+@pytest.mark.parametrize(
+    "homography",
+    [
+        np.eye(3),
+        MILD,
+        np.linalg.inv(MILD),
+        np.array([[0.0, -1, 255], [1, 0, 0], [0, 0, 1]]),  # a quarter turn
+        np.array([[0.6, 0, 20], [0, 0.6, 30], [0, 0, 1]]),
+        np.array([[1.0, 0.3, -40], [0, 1.1, 10], [-4e-4, 3e-4, 1]]),
+    ],
+)
+@pytest.mark.parametrize("model", ["auto", "homography"])
+def test_a_plane_is_found_within_a_pixel_at_its_corners(
+    photo: np.ndarray, homography: np.ndarray, model: str
+) -> None:
+    gray = luma(photo)
+    second = warped(gray, homography, (256, 256))
+    second = np.clip(second * 0.7 + 20, 0, 255).astype(np.uint8)  # in other light
+    found = first_pass(gray, second, model)
+    assert found.kind == "homography"
+    assert found.matrix[2, 2] == pytest.approx(1)
+    assert (
+        transfer_errors(
+            corners(gray), transform_points(corners(gray), homography), found.matrix
+        ).max()
+        < 1
+    )
+    assert found.simulated == 0
+    check_agreeing(found)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_the_centre_of_the_first_pixel_is_the_origin(
+    picture: Callable[..., np.ndarray], factor: int
+) -> None:
+    """Pixels that are the mean of several lie in their middle, not on their first."""
+    gray = picture("astronaut", (512, 512))
+    small, to_small = resized(gray, 512 // factor, 512 // factor)
+    found = first_pass(gray, small)
+    column, row = np.meshgrid(np.arange(64, 512, 64), np.arange(64, 512, 64))
+    places = np.column_stack([column.ravel(), row.ravel()])
+    gaps = transform_points(places, found.matrix) - transform_points(places, to_small)
+    assert np.abs(gaps.mean(0)).max() < 0.08
+
+
+def test_points_are_the_matches_and_lie_in_the_images(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    found = first_pass(gray, warped(gray, MILD, (300, 240)))
+    for points, size in ((found.points0, (256, 256)), (found.points1, (300, 240))):
+        assert (points >= 0).all()
+        assert (points < size).all()
+    errors = transfer_errors(found.points0, found.points1, MILD)
+    assert np.median(errors) < 0.5
+
+
+@pytest.mark.parametrize("turn", [0.0, 35.0])
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_strong_tilt_needs_simulated_views(
+    picture: Callable[..., np.ndarray], turn: float, swapped: bool
+) -> None:
+    gray = picture("astronaut", (360, 360))
+    side, true = from_the_side(gray, 4, turn)
+    # The first look counts in pixels of the second image, so the truth is asked for there.
+    pair = (side, gray) if swapped else (gray, side)
+    true = np.linalg.inv(true) if swapped else true
+    found = first_pass(*pair)
+    assert found.kind == "homography"
+    assert found.simulated > 0
+    assert len(found.points0) >= 20
+    check_agreeing(found)
+    tilt = 4 if swapped else 1  # pixels of the long side for one of the short
+    errors = transfer_errors(found.points0, found.points1, true)
+    assert np.median(errors) < 2 * tilt
+    assert np.quantile(errors, 0.9) < 4 * tilt
+
+
+def test_a_pair_that_needs_none_has_no_simulated_views(
+    photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise AssertionError("a view was simulated")
+
+    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.tilted_views", refused)
+    gray = luma(photo)
+    assert first_pass(gray, warped(gray, MILD, (256, 256))).simulated == 0
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("camera", "rocket"),
+        ("rocket", "coins"),
+    ],
+)
+def test_two_images_of_different_things_have_no_geometry(
+    picture: Callable[..., np.ndarray], first: str, second: str
+) -> None:
+    found = first_pass(picture(first, (200, 150)), picture(second, (200, 150)))
+    assert_nothing(found)
+    assert found.simulated > 20  # all were tried
+
+
+def test_noise_has_no_geometry() -> None:
+    generator = np.random.default_rng(0)
+    first, second = (generator.integers(0, 256, (90, 120)).astype(np.uint8) for _ in range(2))
+    assert_nothing(first_pass(first, second))
+
+
+def test_a_scene_with_depth_has_a_fundamental_matrix(art: tuple) -> None:
+    left, right, points0, points1 = art
+    found = first_pass(left, right)
+    assert found.kind == "fundamental"
+    assert found.simulated == 0
+    check_agreeing(found)
+    errors = epipolar_errors(points0, points1, found.matrix)
+    assert np.quantile(errors, 0.95) < 1
+    # In the rows of the rectified pair, whatever the matrix.
+    assert np.median(np.abs(found.points0[:, 1] - found.points1[:, 1])) < 0.5
+
+
+def test_the_homography_of_a_scene_with_depth_is_given_when_asked_for(art: tuple) -> None:
+    found = first_pass(*art[:2], "homography")
+    assert found.kind == "homography"
+    check_agreeing(found)
+    assert len(found.points0) < len(first_pass(*art[:2], "fundamental").points0)
+
+
+def test_the_fundamental_matrix_of_a_plane_is_given_when_asked_for(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    found = first_pass(gray, warped(gray, MILD, (256, 256)), "fundamental")
+    assert found.kind == "fundamental"
+    check_agreeing(found)
+
+
+def test_a_large_image_is_shrunk_and_its_matrix_comes_back_at_its_own_size(
+    picture: Callable[..., np.ndarray],
+) -> None:
+    gray = picture("astronaut", (420, 336))
+    second = warped(gray, MILD, (420, 336))
+    (large0, up0), (large1, up1) = resized(gray, 2000, 1600), resized(second, 1500, 1200)
+    assert min(large0.shape[1], large1.shape[1]) > LONGEST
+    own, found = first_pass(gray, second), first_pass(large0, large1)
+    assert own.kind == found.kind == "homography"
+    expected = up1 @ MILD @ np.linalg.inv(up0)
+    for matrix in (up1 @ own.matrix @ np.linalg.inv(up0), found.matrix):
+        true = transform_points(corners(large0), expected)
+        gap = transfer_errors(corners(large0), true, matrix)
+        assert gap.max() < 1500 / 420  # a pixel of the small images
+    assert found.matrix[2, 2] == pytest.approx(1)
+    assert found.points0.max() > LONGEST
+    errors = transfer_errors(found.points0, found.points1, found.matrix)
+    assert errors.max() < THRESHOLDS["homography"] * 1500 / LONGEST + 1e-6
+
+
+def test_the_fundamental_matrix_of_large_images_comes_back_at_their_own_size(art: tuple) -> None:
+    left, right, points0, points1 = art
+    (large, up), (other, also_up) = resized(left, 1389, 1110), resized(right, 926, 740)
+    found = first_pass(large, other)
+    assert found.kind == "fundamental"
+    errors = epipolar_errors(
+        transform_points(points0, up), transform_points(points1, also_up), found.matrix
+    )
+    assert np.quantile(errors, 0.95) < 2
+    errors = epipolar_errors(found.points0, found.points1, found.matrix)
+    assert errors.max() < THRESHOLDS["fundamental"] * 1389 / LONGEST + 1e-6
+
+
+def test_is_the_same_on_repetition_and_leaves_its_input_alone(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    second = warped(gray, MILD, (256, 256))
+    before = gray.copy(), second.copy()
+    first, again = (first_pass(gray, second, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(first.matrix, again.matrix)
+    np.testing.assert_array_equal(first.points1, again.points1)
+    np.testing.assert_array_equal(before[0], gray)
+    np.testing.assert_array_equal(before[1], second)
+
+
+@pytest.mark.parametrize("model", ["auto", "fundamental"])
+def test_images_without_keypoints_have_no_geometry(model: str, photo: np.ndarray) -> None:
+    small = luma(photo)[60:140, 60:140]
+    for odd in ODD:
+        assert_nothing(first_pass(odd, odd, model))
+        assert_nothing(first_pass(odd, small, model))
+        assert_nothing(first_pass(small, odd, model))
+
+
+def test_one_keypoint_makes_no_geometry() -> None:
+    row, column = np.indices((60, 70))
+    spot = np.exp(-((column - 30) ** 2 + (row - 28) ** 2) / 18)
+    gray = np.rint(40 + 180 * spot).astype(np.uint8)
+    assert_nothing(first_pass(gray, gray))
+
+
+def test_few_matches_on_a_line_make_no_geometry() -> None:
+    row, column = np.indices((60, 160))
+    spots = sum(np.exp(-((column - x) ** 2 + (row - 30) ** 2) / 18) for x in (20, 55, 90, 140))
+    gray = np.rint(40 + 180 * spots).astype(np.uint8)
+    assert_nothing(first_pass(gray, gray))
+
+
+@pytest.mark.parametrize(
+    ("homography", "rest", "neither", "expected"),
+    [
+        (60, 0, 40, False),  # a plane: the fundamental matrix explains no more
+        (60, 19, 21, False),  # less than half of the rest
+        (60, 20, 20, True),
+        (60, 35, 5, True),
+        (950, 50, 0, False),  # all of the rest, but less than a tenth of all
+        (900, 100, 0, True),
+        (100, 0, 0, False),
+        (0, 30, 10, True),
+        (0, 0, 0, False),
+        (0, 0, 10, False),
+    ],
+)
+def test_a_scene_has_depth_by_what_the_homography_leaves(
+    homography: int, rest: int, neither: int, expected: bool
+) -> None:
+    by_homography = np.repeat([True, False, False], [homography, rest, neither])
+    by_fundamental = np.repeat([True, True, False], [homography, rest, neither])
+    assert has_depth(by_homography, by_fundamental) is expected
+
+
+def test_matches_that_the_homography_alone_explains_are_no_depth() -> None:
+    by_homography = np.repeat([True, True, False], [50, 30, 20])
+    by_fundamental = np.repeat([True, False, False], [50, 30, 20])
+    assert has_depth(by_homography, by_fundamental) is False

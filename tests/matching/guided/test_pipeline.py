@@ -1,0 +1,214 @@
+"""Guided matching as a whole: what it finds, and that it says so where it finds nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from deepdetect import DeepDetect, OptionError, match_images
+from deepdetect.cli import main
+from deepdetect.datasets.middlebury import load_middlebury
+from deepdetect.evaluation.metrics import stereo_score
+from deepdetect.geometry import transform_points
+from deepdetect.io.image import luma
+from deepdetect.matching.guided import guided_matches
+
+WARP = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 18.0], [2e-4, 1e-4, 1.0]])
+
+
+class Everywhere:
+    """A detector that marks two pixels of three."""
+
+    def heatmap(self, image: Any) -> np.ndarray:
+        height, width = np.asarray(image).shape[:2]
+        row, column = np.indices((height, width))
+        return ((row + 2 * column) % 3 > 0).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def second(photo: np.ndarray) -> np.ndarray:
+    moved = cv2.warpPerspective(photo, WARP, (256, 256), flags=cv2.INTER_CUBIC)
+    return np.clip(moved * 0.8 + 10, 0, 255).astype(np.uint8)
+
+
+def test_nearly_all_points_of_a_plane_are_matched_right(
+    photo: np.ndarray, second: np.ndarray
+) -> None:
+    matches = match_images(photo, second, Everywhere())
+    assert (matches.kind, matches.guided, matches.guidance.kind) == ("homography", True) + (
+        "homography",
+    )
+    errors = np.linalg.norm(transform_points(matches.points0, WARP) - matches.points1, axis=1)
+    assert (errors < 1).mean() > 0.99
+    places = transform_points(matches.keypoints0.xy, WARP)
+    seen = ((places > 0) & (places < 255)).all(1)
+    assert len(matches) > 0.85 * seen.sum()
+    assert ((matches.ratios >= 0) & (matches.ratios < 1)).all()
+    assert matches.inliers.all()
+    assert len(np.unique(matches.points0, axis=0)) == len(matches)
+
+
+def test_unguided_gives_fewer(photo: np.ndarray, second: np.ndarray) -> None:
+    guided, unguided = (
+        match_images(photo, second, Everywhere(), guidance=guidance, model="homography")
+        for guidance in ("auto", "none")
+    )
+    assert unguided.guidance is None
+    assert not unguided.guided
+    assert guided.inliers.sum() > unguided.inliers.sum()
+
+
+def test_what_cannot_be_trusted_is_unguided_and_says_so(photo: np.ndarray) -> None:
+    data = pytest.importorskip("skimage.data")
+    other = np.ascontiguousarray(data.coffee()[:256, :256])
+    matches = match_images(photo, other, Everywhere(), ratio=0.9)
+    assert matches.guidance.kind == "none"
+    assert matches.guidance.matrix is None
+    assert not matches.guided
+    plain = match_images(photo, other, Everywhere(), ratio=0.9, guidance="none")
+    np.testing.assert_array_equal(matches.points0, plain.points0)
+    np.testing.assert_array_equal(matches.points1, plain.points1)
+
+
+def test_the_command_says_what_guided(
+    photo: np.ndarray, second: np.ndarray, tmp_path: Path
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
+    for name, image in (("a", photo), ("b", second), ("c", noise)):
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+    words = ["-o", str(tmp_path / "out"), "--no-pictures"]
+    good = CliRunner().invoke(
+        main, ["match", str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--json", *words]
+    )
+    report = json.loads(good.stdout)
+    assert report["guided"] is True
+    assert report["guidance"]["kind"] == report["kind"] == "homography"
+    assert report["guidance"]["sparse_inliers"] >= 10
+    bad = CliRunner().invoke(
+        main, ["match", str(tmp_path / "a.png"), str(tmp_path / "c.png"), *words]
+    )
+    assert bad.exit_code == 0
+    assert "no geometry could be trusted: these matches are unguided" in bad.stderr
+
+
+def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> None:
+    pair = load_middlebury(shared / "data" / "middlebury" / "cones")
+    detector = DeepDetect("dense")
+    guided, unguided = (
+        match_images(pair.left, pair.right, detector, guidance=guidance)
+        for guidance in ("auto", "none")
+    )
+    assert guided.guided
+    assert guided.kind == guided.guidance.kind == "fundamental"
+    # The lines are estimated: near a corner they may be some rows off.
+    assert (np.abs(guided.points0[:, 1] - guided.points1[:, 1]) <= 2).mean() > 0.98
+    score = stereo_score(guided.points0, guided.points1, pair.disparity)
+    plain = stereo_score(
+        unguided.points0[unguided.inliers], unguided.points1[unguided.inliers], pair.disparity
+    )
+    assert score.right > plain.right
+    assert score.share > plain.share + 0.03
+
+
+@pytest.mark.parametrize("name", ["art", "cones"])
+def test_a_plane_that_is_asked_for_guides(shared: Path, name: str) -> None:
+    """In scenes with depth, where nothing else would choose a plane."""
+    pair = load_middlebury(shared / "data" / "middlebury" / name)
+    for asked in ({"guidance": "homography"}, {"model": "homography"}):
+        matches = match_images(pair.left, pair.right, Everywhere(), **asked)
+        assert matches.guidance.kind == "homography"
+        assert matches.kind == "homography"
+    assert match_images(pair.left, pair.right, Everywhere()).guidance.kind == "fundamental"
+
+
+@pytest.mark.parametrize("model", ["fundamental", "essential"])
+def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
+    """A homography explains nine tenths of the matches, and would drop what stands before."""
+    pair = facade(0.07)
+    camera = pair.camera
+    detector = DeepDetect("dense")
+    images = pair.left, pair.right, detector
+    assert match_images(*images).guidance.kind == "homography"
+    found = match_images(*images, model=model, camera0=camera, camera1=camera)
+    assert found.guidance.kind == "fundamental"
+    assert found.kind == model
+    x, y = found.points0.astype(int).T
+    near = pair.near[y, x]
+    assert near.sum() > 1000
+    errors = np.linalg.norm(found.points1 - pair.match(found.points0), axis=1)
+    for part in (near, ~near):
+        assert (errors[part] < 2).mean() > 0.9
+    plane = match_images(
+        *images, model=model, camera0=camera, camera1=camera, guidance="homography"
+    )
+    assert plane.guidance.kind == "homography"
+
+
+def test_mutual_matches_are_one_to_one(photo: np.ndarray, second: np.ndarray) -> None:
+    plain, mutual = (
+        match_images(photo, second, Everywhere(), mutual=mutual) for mutual in (False, True)
+    )
+    assert plain.guided
+    assert mutual.guided
+    rows: dict[tuple[float, ...], list[int]] = {}
+    for row, place in enumerate(map(tuple, plain.points1.tolist())):
+        rows.setdefault(place, []).append(row)
+    assert len(rows) < 0.95 * len(plain)
+    # The smallest ratio, then the first; in the order of the first image.
+    expected = sorted(min(of, key=lambda row: (plain.ratios[row], row)) for of in rows.values())
+    for name in ("points0", "points1", "ratios", "inliers"):
+        np.testing.assert_array_equal(getattr(mutual, name), getattr(plain, name)[expected])
+
+
+def test_the_command_says_which_options_have_no_say(
+    photo: np.ndarray, second: np.ndarray, tmp_path: Path
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
+    for name, image in (("a", photo), ("b", second), ("c", noise)):
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+
+    def said(other: str, *options: str) -> list[str]:
+        words = ["match", str(tmp_path / "a.png"), str(tmp_path / f"{other}.png"), "--json"]
+        words += ["--max-keypoints", "3000", "--no-pictures", "-o", str(tmp_path / "out")]
+        result = CliRunner().invoke(main, [*words, *options])
+        assert result.exit_code == 0, result.output
+        assert json.loads(result.stdout)["guided"] == (other == "b" and "none" not in options)
+        return result.stderr.splitlines()
+
+    assert said("b", "--ratio", "0.9") == [
+        "--ratio has a say only in unguided matching: add --guidance none"
+    ]
+    several = ("--matcher", "exact", "--descriptor", "rootsift", "--keypoint-size", "4")
+    assert said("b", *several, "--mutual") == [
+        "--descriptor and --keypoint-size and --matcher have a say only in unguided matching: add "
+        "--guidance none"
+    ]
+    for quiet in (("b",), ("b", "--mutual"), ("b", "--ratio", "0.9", "--guidance", "none")):
+        assert said(*quiet) == []
+    assert said("c", "--ratio", "0.9") == []  # unguided after all
+
+
+def test_is_the_same_on_repetition(photo: np.ndarray, second: np.ndarray) -> None:
+    one, other = (match_images(photo, second, Everywhere()) for _ in range(2))
+    np.testing.assert_array_equal(one.points1, other.points1)
+    np.testing.assert_array_equal(one.ratios, other.ratios)
+    np.testing.assert_array_equal(one.model, other.model)
+
+
+def test_an_unknown_guidance_brings_the_nearest(photo: np.ndarray) -> None:
+    with pytest.raises(OptionError, match="did you mean 'homography'"):
+        match_images(photo, photo, Everywhere(), guidance="homografy")
+    with pytest.raises(OptionError, match="guidance"):
+        guided_matches(luma(photo), luma(photo), np.zeros((1, 2)), np.zeros((1, 2)), "none")
+
+
+def test_the_published_preset_is_unguided(photo: np.ndarray) -> None:
+    matches = match_images(photo, photo, preset="published")
+    assert matches.guidance is None

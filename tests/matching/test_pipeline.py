@@ -1,0 +1,521 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import (
+    DeepDetect,
+    HeatmapOptions,
+    ImageError,
+    Matches,
+    MatchingOptions,
+    OptionError,
+    SelectionOptions,
+    match_images,
+    select_keypoints,
+)
+from deepdetect.features.sift import sift_descriptors
+from deepdetect.geometry import transfer_errors
+from deepdetect.matching.options import PRESETS
+
+WARP = np.array([[0.99, 0.06, 4.0], [-0.05, 0.97, 12.0], [6e-5, -4e-5, 1.0]])
+
+
+class Corners:
+    """A stand-in for the network, with nothing but `heatmap`: how much of a corner a pixel is."""
+
+    def __init__(self) -> None:
+        self.seen: list[np.ndarray] = []
+
+    def heatmap(self, image: Any) -> np.ndarray:
+        self.seen.append(image)
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        strength = cv2.cornerMinEigenVal(gray, 3)
+        return strength / (strength + np.float32(1e-3))
+
+
+def warped(image: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    return cv2.warpPerspective(image, homography, (width, height), flags=cv2.INTER_CUBIC)
+
+
+def share_correct(matches: Matches, homography: np.ndarray, pixels: float) -> float:
+    errors = transfer_errors(matches.points0, matches.points1, homography)
+    return float((errors < pixels).mean())
+
+
+def assert_well_formed(matches: Matches) -> None:
+    count = len(matches)
+    for points, keypoints in (
+        (matches.points0, matches.keypoints0),
+        (matches.points1, matches.keypoints1),
+    ):
+        assert (points.shape, points.dtype) == ((count, 2), np.float32)
+        assert set(map(tuple, points.tolist())) <= set(map(tuple, keypoints.xy.tolist()))
+    assert (matches.ratios.shape, matches.ratios.dtype) == ((count,), np.float32)
+    assert (matches.inliers.shape, matches.inliers.dtype) == ((count,), np.bool_)
+    assert matches.kind in ("homography", "fundamental", "essential", "none")
+    if matches.model is not None:
+        assert (matches.model.shape, matches.model.dtype) == ((3, 3), np.float64)
+
+
+def unguided(*images: Any, **changes: Any) -> Matches:
+    """Match by descriptors alone, whatever the options are otherwise."""
+    return match_images(*images, **{**changes, "guidance": "none"})
+
+
+def assert_same(one: Matches, other: Matches) -> None:
+    for name in ("points0", "points1", "ratios", "inliers"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    if one.model is None or other.model is None:
+        assert one.model is other.model
+    else:
+        np.testing.assert_array_equal(one.model, other.model)
+    assert one.kind == other.kind
+
+
+@pytest.fixture(scope="module")
+def network() -> DeepDetect:
+    return DeepDetect()
+
+
+@pytest.fixture(params=["stand-in", "network"])
+def detector(request: pytest.FixtureRequest) -> Any:
+    return Corners() if request.param == "stand-in" else request.getfixturevalue("network")
+
+
+# Known geometry
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (9, 5), (3, 0)])
+def test_a_shifted_photo_matches_itself(photo: np.ndarray, detector: Any, shift) -> None:
+    dx, dy = shift
+    height, width = photo.shape[:2]
+    first = photo[: height - dy, : width - dx]
+    second = photo[dy:, dx:]
+    matches = unguided(
+        first, second, detector, density=0.1, ratio=0.8, mutual=True, model="homography"
+    )
+    truth = np.array([[1, 0, -dx], [0, 1, -dy], [0, 0, 1]])
+    assert_well_formed(matches)
+    assert len(matches) > 500
+    assert share_correct(matches, truth, 0.1) > 0.9
+    np.testing.assert_allclose(matches.model, truth, atol=0.05)
+    np.testing.assert_array_equal(
+        matches.inliers, transfer_errors(matches.points0, matches.points1, matches.model) < 1
+    )
+
+
+@pytest.mark.parametrize("descriptor", ["sift", "rootsift"])
+@pytest.mark.parametrize("matcher", ["flann", "exact"])
+def test_a_warped_photo_matches_itself(
+    photo: np.ndarray, detector: Any, descriptor: str, matcher: str
+) -> None:
+    second = warped(photo, WARP)
+    matches = match_images(
+        photo,
+        second,
+        detector,
+        density=0.1,
+        descriptor=descriptor,
+        matcher=matcher,
+        ratio=0.85,
+        mutual=True,
+        model="homography",
+        inlier_threshold=2.0,
+    )
+    assert_well_formed(matches)
+    assert len(matches) > 300
+    assert share_correct(matches, WARP, 2) > 0.7
+    # The model agrees with the truth all over the image, which moves by 20 pixels.
+    points = photo.shape[0] * np.random.default_rng(0).random((500, 2))
+    assert np.median(transfer_errors(points, warp_points(points), matches.model)) < 1
+    # Its inliers are the correct matches, but for those near the threshold.
+    correct = transfer_errors(matches.points0, matches.points1, WARP) < 2
+    assert (matches.inliers == correct).mean() > 0.85
+
+
+def warp_points(points: np.ndarray) -> np.ndarray:
+    return cv2.perspectiveTransform(points[None].astype(np.float64), WARP)[0]
+
+
+def test_a_given_homography_judges_the_matches(photo: np.ndarray) -> None:
+    second = warped(photo, WARP)
+    matches = unguided(
+        photo, second, Corners(), density=0.05, homography=WARP, inlier_threshold=1.5
+    )
+    assert matches.kind == "homography"
+    np.testing.assert_array_equal(matches.model, WARP)
+    errors = np.linalg.norm(warp_points(matches.points0) - matches.points1, axis=1)
+    np.testing.assert_array_equal(matches.inliers, errors < 1.5)
+    assert 0 < matches.inliers.sum() < len(matches)
+
+
+def test_images_of_two_sizes(photo: np.ndarray, detector: Any) -> None:
+    matches = unguided(photo, photo[20:200, 30:150], detector, density=0.1, ratio=0.8, mutual=True)
+    assert_well_formed(matches)
+    assert matches.keypoints0.image_size == (photo.shape[1], photo.shape[0])
+    assert matches.keypoints1.image_size == (120, 180)
+    assert len(matches) > 300
+    assert share_correct(matches, np.array([[1, 0, -30], [0, 1, -20], [0, 0, 1]]), 0.1) > 0.9
+
+
+# The road of the data, against a pipeline of OpenCV's own
+
+
+def opencv_pipeline(
+    maps: list[np.ndarray],
+    images: list[np.ndarray],
+    selection: SelectionOptions,
+    options: MatchingOptions,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Keypoint objects, cv2.SIFT, a FLANN or brute-force matcher and a loop over its matches."""
+    keypoints, descriptors = [], []
+    for heatmap, image in zip(maps, images, strict=True):
+        made = [
+            cv2.KeyPoint(float(x), float(y), options.keypoint_size, options.angle)
+            for x, y in select_keypoints(heatmap, selection).xy
+        ]
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        made, described = cv2.SIFT_create().compute(gray, made)
+        keypoints.append(made)
+        descriptors.append(described)
+    cv2.setRNGSeed(options.geometry.seed)
+    if options.matcher == "flann":
+        matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 5}, {"checks": 50})
+    else:
+        matcher = cv2.BFMatcher(cv2.NORM_L2)
+    found = matcher.knnMatch(*descriptors, k=2)
+    kept = [
+        (best, best.distance / second.distance)
+        for best, second in found
+        if best.distance < options.ratio * second.distance
+    ]
+    points0 = [keypoints[0][match.queryIdx].pt for match, _ in kept]
+    points1 = [keypoints[1][match.trainIdx].pt for match, _ in kept]
+    return np.array(points0), np.array(points1), np.array([ratio for _, ratio in kept])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        MatchingOptions(selection=SelectionOptions(density=0.02), descriptor="sift-opencv"),
+        MatchingOptions(selection=SelectionOptions(threshold=0.8), ratio=0.9, angle=-1.0),
+        MatchingOptions(
+            selection=SelectionOptions(max_keypoints=300), matcher="exact", keypoint_size=5.0
+        ),
+        MatchingOptions(
+            selection=SelectionOptions(nms_radius=2), ratio=0.7, angle=30.0, matcher="exact"
+        ),
+    ],
+)
+def test_equals_a_pipeline_of_opencv(photo: np.ndarray, options: MatchingOptions) -> None:
+    images = [photo, warped(photo, WARP)]
+    corners = Corners()
+    matches = unguided(*images, corners, options=options)
+    maps = [corners.heatmap(image) for image in images]
+    points0, points1, ratios = opencv_pipeline(maps, images, options.selection, options)
+    assert len(matches) > 20
+    np.testing.assert_array_equal(matches.points0, points0)
+    np.testing.assert_array_equal(matches.points1, points1)
+    np.testing.assert_allclose(matches.ratios, ratios, rtol=1e-5)
+
+
+def test_the_published_preset_equals_the_published_pipeline(
+    photo: np.ndarray, network: DeepDetect
+) -> None:
+    images = [photo, warped(photo, WARP)]
+    matches = match_images(*images, network, preset="published", homography=WARP)
+    squashing = network.configured(HeatmapOptions(480, "bgr"))
+    maps = [squashing.heatmap(image) for image in images]
+    points0, points1, _ = opencv_pipeline(
+        maps, images, SelectionOptions(threshold=0.5), MatchingOptions(angle=-1.0)
+    )
+    np.testing.assert_array_equal(matches.points0, points0)
+    np.testing.assert_array_equal(matches.points1, points1)
+    # A point counts when the homography takes it to less than a pixel of its match.
+    errors = np.linalg.norm(warp_points(points0) - points1, axis=1)
+    np.testing.assert_array_equal(matches.inliers, errors < 1)
+    assert matches.inliers.any()
+
+
+def test_ratios_belong_to_their_rows(photo: np.ndarray) -> None:
+    second = warped(photo, WARP)
+    matches = unguided(photo, second, Corners(), max_keypoints=400, matcher="exact")
+    gray0, gray1 = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (photo, second))
+    base = sift_descriptors(gray1, matches.keypoints1.xy).astype(float)
+    for index in range(0, len(matches), 10):
+        query = sift_descriptors(gray0, matches.points0[index : index + 1])
+        distances = np.linalg.norm(base - query, axis=1)
+        best, next_best = np.sort(distances)[:2]
+        np.testing.assert_array_equal(
+            matches.keypoints1.xy[distances.argmin()], matches.points1[index]
+        )
+        np.testing.assert_allclose(matches.ratios[index], best / next_best, rtol=1e-5)
+
+
+# Options
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.8, 0.99])
+def test_all_ratios_are_under_the_wanted(photo: np.ndarray, ratio: float) -> None:
+    matches = unguided(photo, warped(photo, WARP), Corners(), density=0.02, ratio=ratio)
+    assert len(matches) > 0
+    assert (matches.ratios < ratio).all()
+
+
+def test_selection_options_reach_both_images(photo: np.ndarray) -> None:
+    ignore = np.zeros(photo.shape[:2], bool)
+    ignore[:, :100] = True
+    matches = match_images(photo, photo, Corners(), max_keypoints=50, ignore=ignore)
+    for keypoints in (matches.keypoints0, matches.keypoints1):
+        assert len(keypoints) == 50
+        assert (keypoints.xy[:, 0] >= 100).all()
+
+
+def test_mutual_leaves_one_to_one(photo: np.ndarray) -> None:
+    second = warped(photo, WARP)
+    every = unguided(photo, second, Corners(), density=0.02, matcher="exact")
+    mutual = unguided(photo, second, Corners(), density=0.02, matcher="exact", mutual=True)
+    assert 0 < len(mutual) < len(every)
+    assert len(np.unique(mutual.points1, axis=0)) == len(mutual)
+    assert len(np.unique(every.points1, axis=0)) < len(every)
+
+
+@pytest.mark.parametrize("model", ["homography", "fundamental", "none"])
+@pytest.mark.parametrize("estimator", ["magsac", "ransac"])
+def test_the_model_is_the_wanted_one(photo: np.ndarray, model: str, estimator: str) -> None:
+    matches = match_images(
+        photo,
+        warped(photo, WARP),
+        Corners(),
+        density=0.02,
+        ratio=0.8,
+        model=model,
+        estimator=estimator,
+    )
+    assert_well_formed(matches)
+    assert matches.kind == model
+    assert (matches.model is None) == (model == "none")
+    assert matches.inliers.mean() > 0.5
+
+
+def test_the_seed_reaches_the_matcher(photo: np.ndarray) -> None:
+    second = warped(photo, WARP)
+    found = [
+        unguided(photo, second, Corners(), density=0.1, model="none", seed=seed) for seed in (0, 1)
+    ]
+    assert found[0].points1.shape != found[1].points1.shape or not np.array_equal(
+        found[0].points1, found[1].points1
+    )
+
+
+def test_options_and_changes_add_up(photo: np.ndarray) -> None:
+    options = MatchingOptions(
+        selection=SelectionOptions(max_keypoints=200), ratio=0.7, matcher="exact"
+    )
+    given = match_images(photo, photo, Corners(), options=options, max_keypoints=100)
+    single = match_images(photo, photo, Corners(), max_keypoints=100, ratio=0.7, matcher="exact")
+    assert len(given.keypoints0) == 100
+    assert_same(given, single)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"ratoi": 0.9}, "unknown option 'ratoi': did you mean 'ratio'?"),
+        ({"treshold": 0.9}, "unknown option 'treshold': did you mean 'threshold'?"),
+        ({"preset": "publishd"}, "unknown preset 'publishd': did you mean 'published'?"),
+        ({"matcher": "exakt"}, "unknown matcher 'exakt': did you mean 'exact'?"),
+        ({"descriptor": "root"}, "unknown descriptor 'root'"),
+        ({"model": "homografy"}, "unknown model 'homografy': did you mean 'homography'?"),
+        ({"model": "essential"}, "needs both cameras"),
+        ({"ratio": 2}, "ratio must be above 0 and at most 1, not 2"),
+        ({"homography": np.eye(2)}, "homography must be a (3, 3) matrix"),
+        ({"ignore": np.zeros((3, 3))}, "the ignore mask has shape (3, 3)"),
+    ],
+)
+def test_wrong_options(photo: np.ndarray, values: dict[str, Any], message: str) -> None:
+    with pytest.raises(OptionError) as caught:
+        match_images(photo, photo, Corners(), **values)
+    assert message in str(caught.value)
+
+
+def test_wrong_options_are_found_before_any_work(tmp_path: Path) -> None:
+    corners = Corners()
+    with pytest.raises(OptionError, match="did you mean 'ratio'"):
+        match_images(tmp_path / "no.png", tmp_path / "no.png", corners, ratoi=1)
+    assert corners.seen == []
+
+
+# Detectors
+
+
+def test_a_stand_in_sees_8_bit_rgb(photo: np.ndarray, photo_path: Path) -> None:
+    corners = Corners()
+    gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
+    match_images(photo_path, gray, corners, max_keypoints=10)
+    np.testing.assert_array_equal(corners.seen[0], photo)
+    np.testing.assert_array_equal(corners.seen[1], np.dstack([gray] * 3))
+    assert all(image.dtype == np.uint8 for image in corners.seen)
+
+
+def test_options_for_the_network_need_the_network(photo: np.ndarray) -> None:
+    for values in (
+        {"preset": "published"},
+        {"options": PRESETS["published"]},
+        {"heatmap": HeatmapOptions(64)},
+    ):
+        with pytest.raises(OptionError, match="only a DeepDetect detector can follow"):
+            match_images(photo, photo, Corners(), **values)
+
+
+def test_a_preset_without_its_heatmap_options_takes_a_stand_in(photo: np.ndarray) -> None:
+    matches = match_images(photo, photo, Corners(), preset="published", heatmap=None, threshold=0.9)
+    assert_well_formed(matches)
+    assert len(matches) > 0
+
+
+def test_a_detector_keeps_its_own_resolution(photo: np.ndarray) -> None:
+    squashing = DeepDetect(resolution=64, channels="bgr")
+    matches = match_images(photo, photo, squashing, max_keypoints=100)
+    np.testing.assert_array_equal(
+        matches.keypoints0.xy, squashing.detect(photo, max_keypoints=100).xy
+    )
+
+
+def test_heatmap_options_reach_the_network_and_leave_the_detector(
+    photo: np.ndarray, network: DeepDetect
+) -> None:
+    before = network.heatmap_options
+    matches = match_images(
+        photo, photo, network, heatmap=HeatmapOptions(64, "bgr"), max_keypoints=100
+    )
+    assert network.heatmap_options == before
+    expected = DeepDetect(resolution=64, channels="bgr").detect(photo, max_keypoints=100)
+    np.testing.assert_array_equal(matches.keypoints0.xy, expected.xy)
+    native = network.detect(photo, max_keypoints=100)
+    assert not np.array_equal(matches.keypoints0.xy, native.xy)
+
+
+def test_without_a_detector_the_bundled_weights_are_used(
+    photo: np.ndarray, network: DeepDetect
+) -> None:
+    second = warped(photo, WARP)
+    assert_same(
+        match_images(photo, second, max_keypoints=500),
+        match_images(photo, second, network, max_keypoints=500),
+    )
+
+
+# Images
+
+
+def test_the_same_images_in_other_clothes(photo: np.ndarray, photo_path: Path) -> None:
+    from PIL import Image
+
+    expected = match_images(photo, photo, Corners(), max_keypoints=200)
+    clothes = [
+        photo_path,
+        str(photo_path),
+        Image.fromarray(photo),
+        photo.astype(np.float64) / 255,
+        photo.astype(np.uint16) * 257,
+    ]
+    for image in clothes:
+        assert_same(match_images(image, photo, Corners(), max_keypoints=200), expected)
+        assert_same(match_images(photo, image, Corners(), max_keypoints=200), expected)
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_missing_image_is_an_image_error(photo: np.ndarray, tmp_path: Path, place: int) -> None:
+    images: list[Any] = [photo, photo]
+    images[place] = tmp_path / "no.png"
+    with pytest.raises(ImageError, match=r"no\.png"):
+        match_images(*images, Corners())
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("constant", [(True, True), (True, False), (False, True)])
+def test_a_constant_image_has_no_matches(
+    photo: np.ndarray, network: DeepDetect, preset: str, constant: tuple[bool, bool]
+) -> None:
+    flat = np.full((48, 64, 3), 200, np.uint8)
+    images = [flat if is_flat else photo[:64, :64] for is_flat in constant]
+    matches = match_images(*images, network, preset=preset)
+    assert_well_formed(matches)
+    assert len(matches) == 0
+    assert matches.model is None
+    for keypoints, is_flat in zip((matches.keypoints0, matches.keypoints1), constant, strict=True):
+        assert not is_flat or len(keypoints) == 0
+
+
+@pytest.mark.parametrize("mutual", [False, True])
+@pytest.mark.parametrize("matcher", ["flann", "exact"])
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_very_few_keypoints(photo: np.ndarray, matcher: str, mutual: bool, count: int) -> None:
+    matches = unguided(photo, photo, Corners(), max_keypoints=count, matcher=matcher, mutual=mutual)
+    assert_well_formed(matches)
+    assert len(matches) == (0 if count == 1 else count)
+    np.testing.assert_array_equal(matches.points0, matches.points1)
+
+
+def test_a_flat_stand_in_image_is_described_by_zeros_that_match_nothing() -> None:
+    """Every descriptor is 0: all neighbours are at distance 0, and no ratio is under 1."""
+
+    class Everywhere:
+        def heatmap(self, image: Any) -> np.ndarray:
+            return np.ones(image.shape[:2], np.float32)
+
+    flat = np.full((20, 24), 90, np.uint8)
+    for matcher in ("flann", "exact"):
+        for descriptor in ("sift", "rootsift"):
+            matches = match_images(
+                flat, flat, Everywhere(), matcher=matcher, descriptor=descriptor, ratio=1
+            )
+            assert len(matches.keypoints0) == 480
+            assert len(matches) == 0
+
+
+# The result
+
+
+def test_the_result_is_the_same_every_time(photo: np.ndarray, detector: Any) -> None:
+    second = warped(photo, WARP)
+    first = match_images(photo, second, detector, density=0.05)
+    cv2.setRNGSeed(777)  # whatever ran before
+    assert_same(match_images(photo, second, detector, density=0.05), first)
+
+
+def test_every_stage_has_its_time(photo: np.ndarray) -> None:
+    matches = unguided(photo, photo, Corners(), max_keypoints=50)
+    assert list(matches.seconds) == [
+        "keypoints",
+        "descriptors",
+        "matching",
+        "geometry",
+    ]
+    assert all(seconds >= 0 for seconds in matches.seconds.values())
+
+
+# The published numbers
+
+
+@pytest.mark.parametrize(("scene", "correct"), [("leuven", 58_946), ("ubc", 39_891)])
+def test_the_published_system_is_reproduced(shared: Path, scene: str, correct: int) -> None:
+    """Correct matches of images 1 and 6 as measured with the authors' own code."""
+    pytest.importorskip("torch")
+    folder = shared / "data" / "oxford" / scene
+    matches = match_images(
+        folder / "img1.png",
+        folder / "img6.png",
+        DeepDetect(shared / "reference" / "published_matching.safetensors"),
+        preset="published",
+        homography=np.loadtxt(folder / "H1to6p"),
+    )
+    assert matches.kind == "homography"
+    assert matches.inliers.sum() == pytest.approx(correct, rel=0.03)

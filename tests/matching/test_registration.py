@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from deepdetect import DeepDetectError, OptionError
+from deepdetect.cli import main
+from deepdetect.evaluation.metrics.homography_accuracy import corner_error
+from deepdetect.matching.registration import register
+
+WARP = np.array([[0.92, -0.1, 25.0], [0.08, 0.97, -6.0], [1e-4, 2e-4, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def second(photo: np.ndarray) -> np.ndarray:
+    return cv2.warpPerspective(photo, WARP, (256, 256), flags=cv2.INTER_CUBIC)
+
+
+def test_the_second_image_comes_to_lie_on_the_first(photo: np.ndarray, second: np.ndarray) -> None:
+    found = register(photo, second)
+    assert corner_error(found.homography, WARP, (256, 256)) < 0.5
+    inside = cv2.erode(found.seen.astype(np.uint8), np.ones((9, 9)), borderValue=0) > 0
+    assert 0.5 < inside.mean() < 1
+    assert np.abs(found.warped.astype(int) - photo)[inside].mean() < 4
+    assert found.difference()[inside].mean() < 4
+    assert not found.difference()[~found.seen].any()
+    assert found.agreement > 0.95
+    assert found.matches > 5000
+
+
+def test_the_checkerboard_has_both(photo: np.ndarray) -> None:
+    dark = photo // 2
+    found = register(photo, dark)
+    board = found.checkerboard()
+    side = 256 // 8
+    np.testing.assert_array_equal(board[:side, :side], photo[:side, :side])
+    brightness = board[:side, side : 2 * side].mean() / photo[:side, side : 2 * side].mean()
+    assert brightness == pytest.approx(0.5, abs=0.05)
+
+
+def test_images_of_different_things_are_refused(photo: np.ndarray) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
+    with pytest.raises(DeepDetectError, match="no homography can be trusted"):
+        register(photo, noise)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"model": "homography"}, {"guidance": "none"}, {"homography": np.eye(3)}, {"estimator": "x"}],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_options_that_are_fixed_are_refused(photo: np.ndarray, changes: dict, one_line) -> None:
+    with pytest.raises(OptionError, match="a registration is by a homography") as error:
+        register(photo, photo, **changes)
+    assert f"the option {next(iter(changes))}:" in one_line(error.value)
+
+
+def test_other_options_are_taken(photo: np.ndarray, second: np.ndarray) -> None:
+    few = register(photo, second, max_keypoints=2000, seed=3, mutual=True)
+    assert 0 < few.matches <= 2000
+    with pytest.raises(OptionError, match="did you mean 'mutual'"):
+        register(photo, second, mutal=True)
+
+
+def test_the_command_writes_pictures_and_the_homography(
+    photo: np.ndarray, second: np.ndarray, tmp_path: Path
+) -> None:
+    for name, image in (("a", photo), ("b", second)):
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+    words = ["register", str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--json"]
+    result = CliRunner().invoke(main, [*words, "-o", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    report = json.loads(result.stdout)
+    for name in ("", "_checkerboard", "_difference"):
+        picture = np.asarray(Image.open(tmp_path / "out" / f"b_on_a{name}.png"))
+        assert picture.shape == (256, 256, 3)
+    homography = np.loadtxt(tmp_path / "out" / "b_on_a_homography.txt")
+    np.testing.assert_allclose(homography, report["homography"])
+    assert corner_error(homography, WARP, (256, 256)) < 0.5
+
+
+def test_the_command_refuses_in_one_sentence(photo: np.ndarray, tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
+    for name, image in (("a", photo), ("b", noise)):
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+    words = ["register", str(tmp_path / "a.png"), str(tmp_path / "b.png")]
+    result = CliRunner().invoke(main, [*words, "-o", str(tmp_path / "out")])
+    assert result.exit_code == 2
+    assert result.stderr.startswith("deepdetect: no homography can be trusted")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,269 @@
+"""Every kind of hopeless input gets its own sentence, and good pairs get none."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetect, match_images
+from deepdetect._shared.errors import DeepDetectError, ReconstructionError
+from deepdetect.features.matchers import get_matcher, match_descriptors
+from deepdetect.features.sift_detector import sparse_features
+from deepdetect.geometry.camera import Calibration, Camera, calibration_from_focal
+from deepdetect.geometry.relative_pose import RelativePose, estimate_relative_pose
+from deepdetect.io.image import load_image, luma
+from deepdetect.reconstruction.checks import (
+    check_focal,
+    check_images,
+    check_matches,
+    check_pose,
+    one_a_cell,
+)
+from deepdetect.reconstruction.subpixel import refine_matches
+
+SIZE = (370, 250)
+
+
+@pytest.fixture(scope="module")
+def detector() -> DeepDetect:
+    return DeepDetect("dense")
+
+
+def sparse(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    described = [sparse_features(luma(image), 2000) for image in (first, second)]
+    found = match_descriptors(
+        *(features.descriptors for features in described),
+        get_matcher("exact"),
+        ratio=0.85,
+        mutual=True,
+    )
+    return described[0].xy[found.rows0], described[1].xy[found.rows1]
+
+
+def refusal(points: tuple[np.ndarray, ...], one_line: Any, **known: Any) -> str:
+    with pytest.raises(ReconstructionError) as error:
+        check_matches(*points, SIZE, **known)
+    assert isinstance(error.value, DeepDetectError)
+    return one_line(error.value)
+
+
+def scaled(calibration: Calibration, factor: float) -> Calibration:
+    cameras = {
+        name: replace(camera, focal_px=tuple(factor * focal for focal in camera.focal_px))
+        for name, camera in (("camera0", calibration.camera0), ("camera1", calibration.camera1))
+    }
+    return replace(calibration, **cameras)
+
+
+@pytest.fixture(scope="module")
+def refined(turned: Any, turned_matches: Any) -> tuple[np.ndarray, np.ndarray]:
+    found = refine_matches(*turned.grays, *turned_matches)
+    return turned_matches[0][found.converged].astype(float), found.points1[found.converged]
+
+
+def test_one_picture_twice(photo: np.ndarray, level: Any, one_line) -> None:
+    again = io.BytesIO()
+    Image.fromarray(photo).save(again, "JPEG", quality=100)
+    for other in (photo, load_image(again.getvalue())):
+        with pytest.raises(ReconstructionError, match="the same picture") as error:
+            check_images(luma(photo), luma(other))
+        one_line(error.value)
+    check_images(*level.grays)
+    check_images(luma(photo), luma(photo)[:-1])
+    for grey in (0, 200):
+        with pytest.raises(ReconstructionError, match="the same picture"):
+            check_images(*np.full((2, 40, 40), grey, np.uint8))
+
+
+@pytest.mark.parametrize("mean", [0.5, 1, 3, 10])
+def test_dark_pairs_are_two_pictures(level: Any, photo: np.ndarray, mean: float, one_line) -> None:
+    factor = mean / level.left.mean()
+    dark = [luma(np.rint(view * factor).astype(np.uint8)) for view in (level.left, level.right)]
+    check_images(*dark)
+    with pytest.raises(ReconstructionError, match="the same picture"):
+        check_images(dark[0], dark[0])
+
+
+def test_a_dark_picture_stored_anew_is_the_same(level: Any) -> None:
+    dark = np.rint(level.left * (6 / level.left.mean())).astype(np.uint8)
+    again = io.BytesIO()
+    Image.fromarray(dark).save(again, "JPEG", quality=100)
+    with pytest.raises(ReconstructionError, match="the same picture"):
+        check_images(luma(dark), luma(load_image(again.getvalue())))
+
+
+def test_what_moves_in_a_small_part_makes_two_pictures(photo: np.ndarray) -> None:
+    """A textured thing over a hundredth of a dark frame, and before a far textured view."""
+    for behind in (np.full((256, 256), 8, np.uint8), luma(photo)):
+        left, right = behind.copy(), behind.copy()
+        left[100:126, 100:126] = right[100:126, 88:114] = luma(photo)[60:86, 120:146]
+        assert cv2.absdiff(left, right).mean() < 2
+        check_images(left, right)
+    small_left, small_right = np.full((2, 480, 640), 8, np.uint8)
+    small_left[100:126, 100:126] = small_right[100:126, 88:114] = luma(photo)[60:86, 120:146]
+    assert cv2.absdiff(small_left, small_right).mean() < 0.5
+    check_images(small_left, small_right)
+
+
+def test_one_view_stored_badly(level: Any, detector: DeepDetect, one_line) -> None:
+    file = io.BytesIO()
+    Image.fromarray(level.left).save(file, "JPEG", quality=30)
+    found = match_images(level.left, load_image(file.getvalue()), detector)
+    message = refusal((found.points0, found.points1), one_line)
+    assert "nothing moves between the images" in message
+
+
+@pytest.mark.parametrize("guidance", ["auto", "fundamental"])
+def test_a_camera_that_only_turned(
+    level: Any, only_turned: np.ndarray, detector: DeepDetect, guidance: str, one_line
+) -> None:
+    found = match_images(level.left, only_turned, detector, guidance=guidance)
+    points = found.points0, found.points1
+    camera = level.calibration.camera0
+    assert "a turn of the camera explains all" in refusal(
+        points, one_line, calibration=Calibration(camera, camera)
+    )
+    assert "a plane, or the camera only turned" in refusal(points, one_line)
+
+
+def test_a_plane(photo: np.ndarray, one_line) -> None:
+    warp = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 18.0], [4e-4, 1e-4, 1.0]])
+    seen = cv2.warpPerspective(photo, warp, (256, 256), flags=cv2.INTER_CUBIC)
+    calibration = calibration_from_focal(300, (256, 256), (256, 256))
+    message = refusal(sparse(photo, seen), one_line, calibration=calibration)
+    assert "one homography explains all the matches" in message
+
+
+@pytest.mark.parametrize("other", [2, 4])
+@pytest.mark.parametrize("name", ["bark", "bikes", "leuven", "wall"])
+def test_planar_photographs(shared: Path, name: str, other: int, one_line) -> None:
+    images = [
+        load_image(shared / "data" / "oxford" / name / f"img{number}.png") for number in (1, other)
+    ]
+    assert "one homography explains all" in refusal(sparse(*images), one_line)
+
+
+@pytest.mark.parametrize("unguided", [False, True])
+def test_unrelated_photographs(detector: DeepDetect, unguided: bool, one_line) -> None:
+    data = pytest.importorskip("skimage.data")
+    first, second = (
+        np.ascontiguousarray(image[:250, :370]) for image in (data.astronaut(), data.coffee())
+    )
+    if unguided:
+        found = match_images(first, second, detector, guidance="none", model="none", density=0.1)
+        points = found.points0, found.points1
+        assert len(points[0]) > 1000
+    else:
+        points = sparse(first, second)
+    assert "do not overlap" in refusal(points, one_line)
+
+
+def test_no_overlap(level: Any, one_line) -> None:
+    """Opposite quarters of one scene."""
+    points = sparse(level.left[:125, :185], level.right[125:, 185:])
+    assert "do not overlap" in refusal(points, one_line)
+    message = refusal(tuple(np.empty((2, 0, 2))), one_line)
+    assert "there are no matches" in message
+    assert "lower it, or give a density" in message
+
+
+@pytest.mark.parametrize("name", ["art", "cones", "dolls", "moebius", "rocks", "cloth", "teddy"])
+def test_scenes_with_depth_pass(shared: Path, name: str) -> None:
+    folder = shared / "data" / "middlebury" / name
+    points = sparse(*(load_image(folder / f"{side}.png") for side in ("left", "right")))
+    evidence = check_matches(*points, SIZE)
+    assert evidence.explained.mean() > 0.8
+    assert evidence.by_homography < 0.6
+    assert evidence.log_false_alarms < -50
+
+
+def test_a_good_pair_passes_with_its_pose_and_focal_length(turned: Any, refined: Any) -> None:
+    for factor in (0.9, 1, 1.1):
+        check_all(refined, scaled(turned.calibration, factor))
+
+
+def check_all(points: Any, calibration: Calibration) -> None:
+    evidence = check_matches(*points, SIZE, calibration)
+    pose = estimate_relative_pose(*points, calibration)
+    check_pose(pose, evidence, calibration)
+    check_focal(*points, pose, evidence, calibration)
+
+
+@pytest.mark.parametrize("factor", [0.2, 0.3, 0.5])
+def test_a_wrong_focal_length(turned: Any, refined: Any, factor: float, one_line) -> None:
+    calibration = scaled(turned.calibration, factor)
+    with pytest.raises(ReconstructionError, match="focal length") as error:
+        check_all(refined, calibration)
+    message = one_line(error.value)
+    assert f"{calibration.camera0.focal_px[0]:.0f} px (calib.json) is probably wrong" in message
+
+
+@pytest.mark.parametrize("factor", [0.4, 1.0, 2.0, 3.0])
+def test_too_long_a_focal_length_is_seen_where_the_camera_turned_more(
+    far_turned: Any, factor: float
+) -> None:
+    pixels = np.indices(SIZE).reshape(2, -1).T[::5].astype(np.float64)
+    there = far_turned.match(pixels)
+    there += np.random.default_rng(0).normal(0, 0.15, there.shape)
+    known = np.isfinite(there).all(1)
+    points, calibration = (pixels[known], there[known]), scaled(far_turned.calibration, factor)
+    if factor == 1:
+        check_all(points, calibration)
+        return
+    with pytest.raises(ReconstructionError, match="focal length"):
+        check_all(points, calibration)
+
+
+def test_the_right_focal_length_is_named(turned: Any, refined: Any) -> None:
+    calibration = scaled(turned.calibration, 0.5)
+    evidence = check_matches(*refined, SIZE, calibration)
+    pose = estimate_relative_pose(*refined, calibration)
+    with pytest.raises(ReconstructionError, match=r"one of about (4[5-9]\d|5[0-4]\d) px"):
+        check_focal(*refined, pose, evidence, calibration)
+
+
+def test_lenses_that_bend_a_little_pass(turned: Any, refined: Any) -> None:
+    def bent(points: np.ndarray, camera: Camera) -> np.ndarray:
+        rays = camera.rays(points)
+        rays[:, :2] *= 1 - 0.1 * (rays[:, :2] ** 2).sum(1, keepdims=True)
+        return camera.project(rays)
+
+    calibration = turned.calibration
+    points = bent(refined[0], calibration.camera0), bent(refined[1], calibration.camera1)
+    check_all(points, calibration)
+
+
+def test_no_pose_and_points_behind(turned: Any, refined: Any, one_line) -> None:
+    calibration = turned.calibration
+    evidence = check_matches(*refined, SIZE, calibration)
+    pose = estimate_relative_pose(*refined, calibration)
+    behind = replace(pose, in_front=0.4)
+    for one, message in (
+        (None, "no pose of the cameras fits"),
+        (behind, "only 40% of the points would lie before both cameras"),
+        (_worse(pose), "matches fit one pose of the cameras"),
+    ):
+        with pytest.raises(ReconstructionError, match=message) as error:
+            check_pose(one, evidence, calibration)
+        one_line(error.value)
+
+
+def _worse(pose: RelativePose) -> RelativePose:
+    return replace(pose, errors=pose.errors + 2)
+
+
+def test_one_match_of_each_cell() -> None:
+    points = np.random.default_rng(0).uniform(0, 100, (5000, 2))
+    rows = one_a_cell(points, cell=10)
+    assert len(rows) == 100
+    assert len(np.unique(points[rows] // 10, axis=0)) == 100
+    assert (np.diff(rows) > 0).all()
+    np.testing.assert_array_equal(rows, one_a_cell(points, cell=10))
+    assert (rows != one_a_cell(points, seed=1, cell=10)).any()

@@ -1,0 +1,481 @@
+"""Both roads from two photographs to points, judged by what is true."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetect, OptionError, ReconstructionError, threads
+from deepdetect._shared.errors import ImageError
+from deepdetect.datasets.middlebury import load_middlebury
+from deepdetect.evaluation.controls import EveryPixel
+from deepdetect.geometry.camera import Calibration, Camera
+from deepdetect.geometry.point_cloud import PointCloud
+from deepdetect.reconstruction.pipeline import ReconstructionOptions, reconstruct
+from deepdetect.reconstruction.report import reconstruction_values
+from deepdetect.reconstruction.result import Reconstruction
+from deepdetect.reconstruction.stereo import COMPLETE, RowMatchingOptions
+
+CONES_POINTS = 49_979
+"""The paper's count."""
+
+
+@pytest.fixture(scope="module")
+def detector() -> DeepDetect:
+    return DeepDetect("dense")
+
+
+@pytest.fixture(scope="module")
+def cones(shared: Path) -> Any:
+    return load_middlebury(shared / "data" / "middlebury" / "cones")
+
+
+@pytest.fixture(scope="module")
+def found(cones: Any, detector: DeepDetect) -> Reconstruction:
+    return reconstruct(cones.left, cones.right, detector, focal_px=500)
+
+
+@pytest.fixture(scope="module")
+def posed(turned: Any, detector: DeepDetect) -> Reconstruction:
+    return reconstruct(turned.left, turned.right, detector, calibration=turned.calibration)
+
+
+def shares(found: Reconstruction, pair: Any, *limits: float) -> list[float]:
+    """Return the shares of the points whose true disparity is known that are within limits."""
+    column, row = found.pixels.astype(int).T
+    error = np.abs(found.disparity - pair.disparity[row, column])
+    return [float((error[np.isfinite(error)] <= limit).mean()) for limit in limits]
+
+
+def test_cones_have_more_points_than_the_papers_and_they_are_true(found: Any, cones: Any) -> None:
+    assert found.rectified
+    assert found.rectification.rectified
+    assert len(found) >= CONES_POINTS
+    within1, within2 = shares(found, cones, 1, 2)
+    assert within1 >= 0.95
+    assert within2 >= 0.985
+    assert found.matched.all()
+
+
+def test_every_pixel_is_as_complete_and_true_as_opencv(cones: Any, detector: DeepDetect) -> None:
+    """The figures are those of OpenCV's semi-global matching on this scene."""
+    complete = reconstruct(cones.left, cones.right, detector, focal_px=500, density=1)
+    error = np.abs(complete.disparity_map() - cones.disparity)
+    true = np.isfinite(cones.disparity)
+    assert np.count_nonzero(error[true] <= 1) / np.count_nonzero(true) >= 0.862
+    assert shares(complete, cones, 1)[0] >= 0.921
+    assert not complete.matched.all()
+    assert np.count_nonzero(complete.matched_map()) == np.count_nonzero(complete.matched)
+    assert complete.keypoints == cones.left.shape[0] * cones.left.shape[1]
+
+
+def test_disparities_are_below_the_pixel_without_terraces(found: Any) -> None:
+    tenths, _ = np.histogram(found.disparity % 1, 10, (0, 1))
+    assert tenths.max() < 1.5 * tenths.min()
+
+
+def test_points_are_the_disparities_by_the_calibration(found: Any) -> None:
+    """z = f b / d, and x and y where the pixel looks: x right, y down, z forward."""
+    expected = 500 / found.disparity
+    np.testing.assert_allclose(found.points[:, 2], expected, rtol=1e-5)
+    seen = found.calibration.camera0.project(found.points)
+    np.testing.assert_allclose(seen, found.pixels, atol=1e-3)
+    there = found.calibration.camera1.project(found.points - found.right_centre)
+    np.testing.assert_allclose(there[:, 0], found.pixels[:, 0] - found.disparity, atol=1e-3)
+    np.testing.assert_allclose(there[:, 1], found.pixels[:, 1], atol=1e-3)
+    top = found.points[found.pixels[:, 1] < 100]
+    assert (top[:, 1] < 0).all()
+
+
+@pytest.mark.parametrize("road", ["found", "posed"])
+def test_arrays_belong_together(
+    road: str, request: pytest.FixtureRequest, cones: Any, turned: Any
+) -> None:
+    made: Reconstruction = request.getfixturevalue(road)
+    image = cones.left if road == "found" else turned.left
+    count = len(made)
+    assert made.points.shape == (count, 3)
+    assert made.points.dtype == np.float32
+    assert made.colors.dtype == np.uint8
+    assert made.pixels.shape == (count, 2)
+    assert (made.disparity is None) == (road == "posed")
+    assert np.isfinite(made.points).all()
+    assert (made.points[:, 2] > 0).all()
+    column, row = made.pixels.astype(int).T
+    np.testing.assert_array_equal(image[row, column], made.colors)
+    assert len(np.unique(made.pixels, axis=0)) == count
+    assert count + sum(made.dropped.values()) == made.matches <= made.keypoints
+    depth = made.depth_map()
+    assert depth.shape == image.shape[:2]
+    np.testing.assert_array_equal(depth[row, column], made.points[:, 2])
+    assert np.isfinite(depth).sum() == count
+    assert isinstance(made.cloud, PointCloud)
+    assert len(made.cloud) == count
+    assert all(value >= 0 for value in made.seconds.values())
+
+
+def test_a_pair_that_is_not_rectified_has_true_depths(posed: Any, turned: Any) -> None:
+    assert not posed.rectified
+    assert not posed.rectification.rectified
+    assert posed.unit == "baseline"
+    assert len(posed) > 25_000
+    true = turned.points(posed.pixels)
+    known = np.isfinite(true[:, 2])
+    off = np.abs(posed.points[known, 2] / true[known, 2] - 1)
+    assert np.median(off) < 0.015
+    assert (off < 0.05).mean() > 0.9
+    assert turned.rotation_error(posed.pose.rotation) < 0.1
+    np.testing.assert_allclose(np.linalg.norm(posed.right_centre), 1)
+    assert len(posed.reprojection_errors) == len(posed)
+    with pytest.raises(ReconstructionError, match="take the depth map"):
+        posed.disparity_map()
+
+
+def test_a_post_before_a_wall_is_not_left_out(
+    facade: Any, detector: DeepDetect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A homography explains nine tenths of the pair, and must not choose the matches."""
+    pair = facade(0.07)
+    given: list[np.ndarray] = []
+
+    def stop(points0: np.ndarray, points1: np.ndarray, *rest: Any) -> None:
+        given.extend([points0, points1])
+        raise ReconstructionError("seen enough")
+
+    monkeypatch.setattr("deepdetect.reconstruction.pipeline.reconstruct_two_view", stop)
+    with pytest.raises(ReconstructionError, match="seen enough"):
+        reconstruct(pair.left, pair.right, detector, focal_px=400)
+    column, row = given[0].astype(int).T
+    near = pair.near[row, column]
+    errors = np.linalg.norm(given[1] - pair.match(given[0]), axis=1)
+    for part, fewest in ((near, 1000), (~near, 20_000)):
+        assert np.count_nonzero(errors[part] < 2) > fewest
+        assert (errors[part] < 2).mean() > 0.9
+
+
+def test_a_post_before_a_wall_has_points_of_both_depths(facade: Any, detector: DeepDetect) -> None:
+    pair = facade(0.07)
+    camera = Camera((400, 300), 400.0)
+    made = reconstruct(pair.left, pair.right, detector, calibration=Calibration(camera, camera))
+    assert not made.rectified
+    column, row = made.pixels.astype(int).T
+    near = pair.near[row, column]
+    baseline = np.linalg.norm([1.0, 0.06, 0.1])
+    for part, depth, fewest in ((near, 5, 1000), (~near, 10, 20_000)):
+        assert np.count_nonzero(part) > fewest
+        off = np.abs(made.points[part, 2] * baseline / depth - 1)
+        assert np.median(off) < 0.02
+        assert (off < 0.1).mean() > 0.9
+
+
+def test_a_wall_alone_gives_no_depth(facade: Any, detector: DeepDetect, one_line: Any) -> None:
+    pair = facade(0)
+    with pytest.raises(ReconstructionError, match="one homography explains all") as error:
+        reconstruct(pair.left, pair.right, detector, focal_px=400)
+    one_line(error.value)
+
+
+def test_the_right_camera_is_where_it_is_seen_from(posed: Any, turned: Any) -> None:
+    """Points seen from there lie on their true matches, and the parallax is the rays' angle."""
+    there = (posed.points - posed.right_centre) @ posed.pose.rotation.T
+    seen = turned.calibration.camera1.project(there)
+    gap = np.linalg.norm(seen - turned.match(posed.pixels), axis=1)
+    assert np.nanmedian(gap) < 0.5
+    rays = posed.points / np.linalg.norm(posed.points, axis=1, keepdims=True)
+    others = posed.points - posed.right_centre
+    others /= np.linalg.norm(others, axis=1, keepdims=True)
+    angle = np.degrees(2 * np.arcsin(np.linalg.norm(rays - others, axis=1) / 2))
+    np.testing.assert_allclose(posed.parallax(), angle, rtol=1e-3)
+
+
+def test_a_baseline_gives_millimetres_and_the_same_points(turned: Any, level: Any) -> None:
+    detector = DeepDetect("dense")
+    for pair in (level, turned):
+        calibration = replace(pair.calibration, baseline_mm=193.0)
+        metric, plain = (
+            reconstruct(pair.left, pair.right, detector, calibration=each, max_keypoints=20_000)
+            for each in (calibration, pair.calibration)
+        )
+        assert (metric.unit, plain.unit) == ("mm", "baseline")
+        np.testing.assert_allclose(metric.points, plain.points * 193, rtol=1e-4)
+        np.testing.assert_allclose(metric.parallax(), plain.parallax(), rtol=1e-3)
+
+
+def test_both_roads_agree_on_a_rectified_pair(level: Any, detector: DeepDetect) -> None:
+    """Forced each way the depths are the same; found out it is the rectified one."""
+    ways = [
+        reconstruct(level.left, level.right, detector, calibration=level.calibration, rectified=way)
+        for way in (True, False, None)
+    ]
+    assert [way.rectified for way in ways] == [True, False, True]
+    assert [way.rectification is None for way in ways] == [True, True, False]
+    np.testing.assert_array_equal(ways[0].points, ways[2].points)
+    ratio = ways[0].depth_map() / ways[1].depth_map()
+    ratio = ratio[np.isfinite(ratio)]
+    assert len(ratio) > 20_000
+    assert abs(np.median(ratio) - 1) < 0.02
+
+
+def test_a_disparity_offset_is_taken_into_account(level: Any, detector: DeepDetect) -> None:
+    """Columns cut off the left of one view change disparity and offset, and no depth."""
+    cut = 10
+    right = level.calibration.camera1
+    moved = Camera((360, 250), right.focal_px, (right.centre[0] - cut, right.centre[1]))
+    left = Camera((360, 250), right.focal_px, level.calibration.camera0.centre)
+    options = {"rectified": True, "density": 1}
+    whole = reconstruct(
+        level.left, level.right, detector, calibration=level.calibration, **options
+    ).depth_map()[:, :360]
+    other = reconstruct(
+        np.ascontiguousarray(level.left[:, :360]),
+        np.ascontiguousarray(level.right[:, cut:]),
+        detector,
+        calibration=Calibration(left, moved),
+        **options,
+    ).depth_map()
+    ratio = (whole / other)[:, 40:300]
+    assert abs(np.nanmedian(ratio) - 1) < 1e-3
+    assert (np.abs(ratio[np.isfinite(ratio)] - 1) < 0.02).mean() > 0.95
+
+
+def test_is_the_same_on_repetition(found: Any, posed: Any, cones: Any, turned: Any) -> None:
+    detector = DeepDetect("dense")
+    again = reconstruct(cones.left, cones.right, detector, focal_px=500)
+    np.testing.assert_array_equal(again.points, found.points)
+    again = reconstruct(turned.left, turned.right, detector, calibration=turned.calibration)
+    np.testing.assert_array_equal(again.points, posed.points)
+
+
+def test_is_the_same_for_any_number_of_threads(
+    turned: Any, level: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = []
+    before = cv2.getNumThreads()
+    try:
+        for count in (1, 3):
+            monkeypatch.setattr(threads, "processor_count", lambda count=count: count)
+            cv2.setNumThreads(count)
+            results.append(
+                [
+                    reconstruct(
+                        *(pair.left, pair.right, EveryPixel()),
+                        calibration=pair.calibration,
+                        max_keypoints=15_000,
+                    ).points
+                    for pair in (level, turned)
+                ]
+            )
+    finally:
+        cv2.setNumThreads(before)
+    for one, three in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, three)
+
+
+def test_options_reach_their_stages(level: Any, detector: DeepDetect) -> None:
+    pair = level.left, level.right, detector
+    known = {"calibration": level.calibration}
+    plain = reconstruct(*pair, **known)
+    assert reconstruct(*pair, **known, max_keypoints=3000).keypoints == 3000
+    all_kept = reconstruct(*pair, **known, neighbours=0)
+    assert "alone" not in all_kept.dropped
+    assert len(all_kept) == len(plain) + plain.dropped["alone"]
+    stricter = reconstruct(*pair, **known, factor=0.5)
+    assert stricter.dropped["alone"] > plain.dropped["alone"]
+    at_edges = reconstruct(*pair, **known, rows=RowMatchingOptions(edge_distance=0))
+    assert len(at_edges) > len(plain)
+    near = reconstruct(*pair, **known, least_parallax_px=20, neighbours=0)
+    offset = near.calibration.disparity_offset_px
+    assert near.disparity.min() + offset == pytest.approx(20, abs=0.5)
+    assert len(near) == np.count_nonzero(all_kept.disparity + offset >= 20) < len(all_kept)
+    options = ReconstructionOptions(rectified=True)
+    asked = reconstruct(*pair, **known, options=options)
+    assert asked.rectification is None
+    np.testing.assert_array_equal(asked.points, plain.points)
+
+
+def test_what_the_right_image_does_not_show_is_filled_only_when_asked_for() -> None:
+    assert ReconstructionOptions().row_matching == RowMatchingOptions()
+    every = ReconstructionOptions(
+        selection=dataclasses.replace(ReconstructionOptions().selection, density=1)
+    )
+    assert every.row_matching == COMPLETE
+    own = RowMatchingOptions(uniqueness=1.2)
+    assert replace(every, rows=own).row_matching is own
+
+
+def test_stages_are_told_as_they_end(level: Any, turned: Any, detector: DeepDetect) -> None:
+    for pair, expected in (
+        (level, ["rectified or not", "keypoints", "matching", "triangulation", "outlier removal"]),
+        (turned, ["rectified or not", "keypoints and matching", "reconstruction"]),
+    ):
+        told: list[str] = []
+        made = reconstruct(
+            pair.left,
+            pair.right,
+            detector,
+            calibration=pair.calibration,
+            max_keypoints=20_000,
+            done=told.append,
+        )
+        assert told == expected
+        assert set(made.seconds) >= set(told) - {"reconstruction"}
+
+
+def test_options_and_results_are_frozen(found: Any) -> None:
+    for value in (ReconstructionOptions(), found):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            value.rectified = True
+
+
+@pytest.mark.parametrize(
+    ("options", "nearest"),
+    [
+        ({"densty": 1}, "density"),
+        ({"rectifed": True}, "rectified"),
+        ({"neighbors": 3}, "neighbours"),
+    ],
+)
+def test_an_unknown_option_names_the_nearest(
+    level: Any, options: dict[str, Any], nearest: str, one_line: Any
+) -> None:
+    with pytest.raises(OptionError, match=f"did you mean '{nearest}'") as error:
+        reconstruct(level.left, level.right, EveryPixel(), focal_px=500, **options)
+    one_line(error.value)
+
+
+def refusal(one_line: Any, *pair: Any, **options: Any) -> str:
+    with pytest.raises(ReconstructionError) as error:
+        reconstruct(*pair, EveryPixel(), **{"focal_px": 497.5, **options})
+    return one_line(error.value)
+
+
+@pytest.mark.parametrize("density", [None, 1])
+def test_pairs_only_said_to_be_rectified_give_no_cloud(
+    density: int | None, level: Any, turned: Any, only_turned: Any, photo: Any, one_line: Any
+) -> None:
+    options = {"rectified": True, "density": density}
+    other = cv2.resize(photo, (370, 250))
+    for pair in ((turned.left, turned.right), (level.left, only_turned), (level.left, other)):
+        assert "have a match on their row" in refusal(one_line, *pair, **options)
+    noise = np.random.default_rng(0).normal(0, 6, level.left.shape)
+    noisy = np.clip(level.left + noise, 0, 255).astype(np.uint8)
+    assert "without a baseline" in refusal(one_line, level.left, noisy, **options)
+    exchanged = level.right, level.left
+    assert "left and right are exchanged" in refusal(one_line, *exchanged, **options)
+    shifted = np.ascontiguousarray(level.left[:, 9:]), np.ascontiguousarray(level.left[:, :-9])
+    assert "all disparities are -9 px" in refusal(one_line, *shifted, **options)
+
+
+@pytest.mark.parametrize("rectified", [None, True, False])
+@pytest.mark.parametrize("quality", [80, 95])
+def test_a_copy_as_jpeg_gives_no_depth(
+    level: Any, detector: DeepDetect, quality: int, rectified: bool | None, one_line: Any
+) -> None:
+    file = io.BytesIO()
+    Image.fromarray(level.left).save(file, "JPEG", quality=quality)
+    with pytest.raises(ReconstructionError) as error:
+        reconstruct(level.left, file.getvalue(), detector, focal_px=497.5, rectified=rectified)
+    assert ("without a baseline" if rectified else "nothing moves") in one_line(error.value)
+
+
+def test_a_pair_taken_in_the_dark_has_depth(level: Any) -> None:
+    """Of a mean of 6 grey levels."""
+    factor = 6 / level.left.mean()
+    dark = [np.rint(view * factor).astype(np.uint8) for view in (level.left, level.right)]
+    found = reconstruct(*dark, EveryPixel(), calibration=level.calibration, rectified=True)
+    column, row = found.pixels.astype(int).T
+    off = np.abs(found.disparity - level.disparity[row, column])
+    assert len(found) > 10_000
+    assert np.nanmedian(off) < 0.5
+
+
+def test_no_keypoint_is_said(level: Any, detector: DeepDetect, one_line: Any) -> None:
+    class Sure:
+        """Nowhere is a keypoint."""
+
+        def heatmap(self, image: Any) -> np.ndarray:
+            return np.full(level.left.shape[:2], 0.25, np.float32)
+
+    for rectified, message in (
+        (True, "no pixel of the left image is above the threshold of 0.5: lower it"),
+        (None, "no pixel of the left image is above the threshold of 0.5: lower it"),
+        (False, "or no pixel of one is above the threshold"),
+    ):
+        with pytest.raises(ReconstructionError) as error:
+            reconstruct(level.left, level.right, Sure(), focal_px=497.5, rectified=rectified)
+        assert message in one_line(error.value)
+    blank = np.full_like(level.left, 128)
+    with pytest.raises(ReconstructionError, match="above the threshold"):
+        reconstruct(blank, level.right, detector, focal_px=497.5, rectified=True)
+
+
+def test_cameras_that_contradict_rectified_rows_are_refused(level: Any, one_line: Any) -> None:
+    calibration = level.calibration
+    right = calibration.camera1
+    assert right.centre is not None
+    pair = level.left, level.right
+    for other in (
+        replace(right, focal_px=1.2 * right.focal_px[0]),
+        replace(right, centre=(right.centre[0], right.centre[1] + 20)),
+    ):
+        wrong = replace(calibration, camera1=other)
+        for rectified in (True, None):
+            message = refusal(
+                one_line, *pair, focal_px=None, calibration=wrong, rectified=rectified
+            )
+            assert "mend the calibration (calib.json), or give --not-rectified" in message
+
+
+@pytest.mark.parametrize("density", [None, 1])
+def test_a_small_turn_said_to_be_rectified_gives_no_cloud(
+    density: int | None, level: Any, one_line: Any
+) -> None:
+    camera = level.calibration.camera0
+    known = {"focal_px": None, "calibration": Calibration(camera, camera), "rectified": True}
+    for degrees in (-1.0, 1.0):
+        rotation = cv2.Rodrigues(np.radians([0, degrees, 0]))[0]
+        warp = camera.matrix @ rotation @ np.linalg.inv(camera.matrix)
+        other = cv2.warpPerspective(level.left, warp, camera.size, flags=cv2.INTER_CUBIC)
+        message = refusal(one_line, level.left, other, density=density, **known)
+        assert "a turn of the camera explains most disparities" in message
+
+
+def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> None:
+    pair = level.left, level.right
+    assert "the same picture" in refusal(one_line, level.left, level.left)
+    assert "left and right exchanged" in refusal(one_line, level.right, level.left)
+    assert "no focal length (EXIF)" in refusal(one_line, *pair, focal_px=None)
+    assert "not both" in refusal(one_line, *pair, calibration=level.calibration)
+    assert "must be above 0" in refusal(one_line, *pair, focal_px=-3)
+    path = tmp_path / "calib.json"
+    path.write_text(json.dumps({"focal_px": 500, "baseline_mm": 0}))
+    assert "baseline must be above 0" in refusal(one_line, *pair, focal_px=None, calibration=path)
+    assert "too far away" in refusal(one_line, *pair, least_parallax_px=1e4)
+    narrow = np.ascontiguousarray(level.right[:, :-4])
+    assert "images of 370x250" in refusal(
+        one_line, level.left, narrow, focal_px=None, calibration=level.calibration
+    )
+    with pytest.raises(ImageError, match="must have one size"):
+        reconstruct(level.left, narrow, EveryPixel(), focal_px=500, rectified=True)
+
+
+def test_the_values_are_plain_and_complete(found: Any, posed: Any) -> None:
+    for made in (found, posed):
+        values = reconstruction_values(made)
+        assert json.loads(json.dumps(values, allow_nan=False)) == values
+        assert values["points"] == len(made)
+        assert values["depth"]["50%"] == pytest.approx(np.median(made.points[:, 2]), rel=1e-4)
+        assert values["median_parallax_degrees"] == pytest.approx(
+            np.median(made.parallax()), abs=1e-3
+        )
+        assert "true scale is not known" in values["scale"]
+    assert values["pose"]["rotation"] == posed.pose.rotation.tolist()

@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect._shared.errors import OptionError
+from deepdetect.geometry.point_cloud import PointCloud
+from deepdetect.viz.render import ViewCamera, camera_around, render
+
+PLAIN = ViewCamera(np.zeros(3), np.eye(3), 50.0, np.array([39.5, 29.5]), (80, 60))
+
+
+@pytest.fixture(scope="module")
+def cloud(photo: np.ndarray) -> PointCloud:
+    """A photograph on a slanted plane."""
+    y, x = np.indices(photo.shape[:2]).reshape(2, -1)
+    depth = 800 + 0.5 * x
+    ray = np.column_stack([(x - 127.5) / 300, (y - 127.5) / 300, np.ones(x.size)])
+    return PointCloud(ray * depth[:, None], photo.reshape(-1, 3), "mm")
+
+
+def test_projection_is_opencv_s(cloud: PointCloud) -> None:
+    camera = camera_around(cloud, 30, -20, (320, 240))
+    xy, depth = camera.project(cloud.points)
+    matrix = np.array(
+        [[camera.focal, 0, camera.middle[0]], [0, camera.focal, camera.middle[1]], [0, 0, 1]]
+    )
+    turn = cv2.Rodrigues(camera.axes)[0]
+    expected = cv2.projectPoints(cloud.points, turn, -camera.axes @ camera.position, matrix, None)[
+        0
+    ]
+    np.testing.assert_allclose(xy, expected[:, 0], atol=1e-6)
+    assert (depth > 0).all()
+    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(camera.axes) == pytest.approx(1)
+
+
+def test_from_the_left_camera_the_photograph_comes_back(
+    cloud: PointCloud, photo: np.ndarray
+) -> None:
+    camera = ViewCamera(np.zeros(3), np.eye(3), 300.0, np.array([127.5, 127.5]), (256, 256))
+    np.testing.assert_array_equal(render(cloud, camera, point_width=1), photo)
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (25, 10), (-60, 40), (180, -90)])
+@pytest.mark.parametrize("size", [(200, 150), (90, 200)])
+def test_the_cloud_fills_the_picture(
+    cloud: PointCloud, azimuth: float, elevation: float, size: tuple[int, int]
+) -> None:
+    camera = camera_around(cloud, azimuth, elevation, size)
+    xy, _ = camera.project(cloud.points)
+    inside = ((xy > -0.5) & (xy < np.array(size) - 0.5)).all(1)
+    assert inside.mean() > 0.96
+    spread = np.percentile(xy, 99, axis=0) - np.percentile(xy, 1, axis=0)
+    assert (spread / size).max() == pytest.approx(0.95, abs=0.01)
+
+
+def test_angles_turn_the_viewer_to_the_right_and_up(cloud: PointCloud) -> None:
+    # x right, y down: the viewer on the right has a larger x, the one above a smaller y.
+    front = camera_around(cloud, 0, 0).position
+    assert camera_around(cloud, 30, 0).position[0] > front[0] + 100
+    assert camera_around(cloud, 0, 30).position[1] < front[1] - 100
+    np.testing.assert_allclose(front, 0, atol=80)  # near the left camera
+
+
+def test_wild_points_do_not_change_the_view(cloud: PointCloud) -> None:
+    wild = PointCloud(
+        np.concatenate([cloud.points, np.full((20, 3), 1e9)]),
+        np.concatenate([cloud.colors, np.zeros((20, 3), np.uint8)]),
+        "mm",
+    )
+    plain, other = camera_around(cloud), camera_around(wild)
+    np.testing.assert_allclose(
+        other.project(cloud.points)[0], plain.project(cloud.points)[0], atol=3
+    )
+
+
+def test_the_nearest_point_is_seen_whatever_the_order() -> None:
+    points = np.array([[0.0, 0, 10], [0, 0, 5], [0, 0, 20], [0, 0, -5]])
+    colors = np.array([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]], np.uint8)
+    for order in ([0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]):
+        picture = render(PointCloud(points[order], colors[order], "mm"), PLAIN, point_width=6)
+        assert picture[30, 40].tolist() == [2, 0, 0]
+
+
+def test_a_near_narrow_point_hides_a_wide_far_one() -> None:
+    """Points differ in width when the width is left open: nearness alone decides."""
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-3, 3, (500, 2)), rng.uniform(5, 20, 500)])
+    cloud = PointCloud(points, rng.integers(0, 250, (500, 3)).astype(np.uint8), "mm")
+    picture = render(cloud, PLAIN)
+    xy, depth = PLAIN.project(points)
+    nearest = np.argmin(depth)
+    x, y = np.rint(xy[nearest]).astype(int)
+    assert picture[y, x].tolist() == cloud.colors[nearest].tolist()
+
+
+def test_the_width_is_in_pixels_and_centred() -> None:
+    cloud = PointCloud([[0.0, 0, 10]], [[0, 0, 0]], "mm")
+    for width in (1, 2, 4, 20):
+        picture = render(cloud, PLAIN, point_width=width)
+        rows, columns = np.nonzero(picture[..., 0] < 255)
+        ink = (255 - picture[..., 0].astype(float)).sum() / 255
+        assert ink == pytest.approx(width**2, rel=0.01)
+        assert abs(rows.mean() - 29.5) <= 0.5
+        assert abs(columns.mean() - 39.5) <= 0.5
+
+
+def test_points_become_wider_as_the_viewer_comes_nearer() -> None:
+    cloud = PointCloud([[0.5, 0, 5], [-2.0, 0, 10]], np.zeros((2, 3), np.uint8), "mm")
+    near = dataclasses.replace(PLAIN, position=np.array([0.0, 0, 3]))
+    ink = (255 - render(cloud, near)[..., 0].astype(float)) / 255
+    # 50 pixels of focal length, 0.02 for few points, 1.4 of overlap; in half pixels.
+    assert ink[:, 40:].sum() == pytest.approx((round(2 * 1.4 * 5 / 2) / 2) ** 2, rel=0.01)
+    assert ink[:, :40].sum() == pytest.approx((round(2 * 1.4 * 10 / 7) / 2) ** 2, rel=0.01)
+
+
+def test_nothing_in_view_is_white() -> None:
+    cloud = PointCloud([[0.0, 0, -10], [1e6, 0, 10]], np.zeros((2, 3), np.uint8), "mm")
+    assert (render(cloud, PLAIN) == 255).all()
+
+
+def test_points_at_the_border_are_cut() -> None:
+    x = (79.4 - 39.5) / 50 * 10
+    picture = render(PointCloud([[x, 0.0, 10]], [[0, 0, 0]], "mm"), PLAIN, point_width=10)
+    assert (picture[30, -3:] == 0).all()
+    assert (picture[:, :60] == 255).all()
+
+
+def test_dense_points_close_a_surface(cloud: PointCloud) -> None:
+    camera = camera_around(cloud, 20, 10, (300, 300))
+    grey = PointCloud(cloud.points, np.zeros_like(cloud.colors), "mm")
+    picture = render(grey, camera)
+    xy, _ = camera.project(cloud.points)
+    hull = np.zeros((300, 300), np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(xy).astype(np.int32)), 1)
+    inner = cv2.erode(hull, np.ones((9, 9), np.uint8)) > 0
+    assert (picture[inner] == 0).mean() > 0.999
+
+
+def test_pictures_are_equal_from_run_to_run(cloud: PointCloud) -> None:
+    camera = camera_around(cloud, size=(160, 120))
+    np.testing.assert_array_equal(render(cloud, camera), render(cloud, camera))
+
+
+@pytest.mark.parametrize(
+    ("call", "word"),
+    [
+        (lambda c: render(c[:0], PLAIN), "no points"),
+        (lambda c: render(c, PLAIN, point_width=0), "above 0"),
+        (lambda c: camera_around(c[:0]), "no points"),
+        (lambda c: camera_around(c, elevation=91), "elevation"),
+        (lambda c: camera_around(c, size=(0, 5)), "at least one pixel"),
+    ],
+)
+def test_mistakes_are_one_sentence(call, word: str, cloud: PointCloud, one_line) -> None:
+    with pytest.raises(OptionError) as caught:
+        call(cloud)
+    assert word in one_line(caught.value)
+
+
+def test_one_point_can_be_drawn() -> None:
+    cloud = PointCloud([[1.0, 2, 30]], [[0, 0, 0]], "mm")
+    picture = render(cloud, camera_around(cloud, size=(40, 30)))
+    rows, columns = np.nonzero(picture[..., 0] < 128)
+    assert (abs(rows.mean() - 14.5), abs(columns.mean() - 19.5)) <= (0.5, 0.5)
+
+
+def test_a_real_scene_looks_like_its_photograph(shared: Path) -> None:
+    from deepdetect.datasets.middlebury import load_middlebury
+
+    scene = load_middlebury(shared / "data/middlebury/cones")
+    known = scene.disparity > 0
+    y, x = np.nonzero(known)
+    ray = np.column_stack([x - 224.5, y - 187.0, np.full(len(x), 360.0)])
+    cloud = PointCloud(ray / scene.disparity[known][:, None], scene.left[known], "baseline")
+    camera = ViewCamera(np.zeros(3), np.eye(3), 360.0, np.array([224.5, 187.0]), (450, 375))
+    picture = render(cloud, camera, point_width=1)
+    np.testing.assert_array_equal(picture[known], scene.left[known])
+    assert (picture[~known] == 255).all()
