@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect import threads
+from deepdetect._shared import threads
 from deepdetect._shared.threads import in_threads
 
 

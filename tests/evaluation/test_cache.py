@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetectError
+from deepdetect.evaluation import cache as cache_module
 from deepdetect.evaluation.cache import StageCache, file_digest
-from deepdetect.evaluation.protocols import cache as cache_module
 
 ARRAYS = {
     "rows": np.arange(50, dtype=np.int16),

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deepdetect.evaluation import metering
 from deepdetect.evaluation.metering import StageMeters, metered, peak_memory
-from deepdetect.evaluation.protocols import metering
 
 
 def test_the_time_is_that_of_the_block() -> None:

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError
+from deepdetect.evaluation import run as run_module
 from deepdetect.evaluation.baselines import CLASSICAL, Features, Method
 from deepdetect.evaluation.metrics import one_to_one
 from deepdetect.evaluation.protocols import (
@@ -27,7 +28,6 @@ from deepdetect.evaluation.protocols import (
     Report,
     run_benchmarks,
 )
-from deepdetect.evaluation.protocols import run as run_module
 from deepdetect.evaluation.protocols.descriptor_speed import descriptor_steps
 from deepdetect.evaluation.protocols.paper_numbers import NOTEBOOK_MATCHES
 from deepdetect.evaluation.protocols.whole_pairs import whole_pair_steps

@@ -12,10 +12,10 @@ from PIL import Image
 from scipy.spatial.distance import cdist
 
 from deepdetect import OptionError
+from deepdetect.evaluation import stages
 from deepdetect.evaluation.baselines import CLASSICAL, Features, Method
 from deepdetect.evaluation.cache import StageCache, file_digest
 from deepdetect.evaluation.metering import Meter
-from deepdetect.evaluation.protocols import stages
 from deepdetect.evaluation.stages import MatchSettings, find_keypoints, find_matches
 from deepdetect.io.image import load_image, luma
 

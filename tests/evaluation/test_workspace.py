@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError, OptionError
+from deepdetect.evaluation import stages
 from deepdetect.evaluation.baselines import CLASSICAL
 from deepdetect.evaluation.cache import StageCache
-from deepdetect.evaluation.protocols import stages
 from deepdetect.evaluation.workspace import Workspace, image_size, matrix_key
 
 FAST = CLASSICAL["fast"]
