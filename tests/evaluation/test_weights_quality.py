@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, weights_quality
+from deepdetect import DeepDetect
 from deepdetect.datasets.oxford import SCENES, load_oxford
 from deepdetect.detector.heatmap import HeatmapOptions
+from deepdetect.evaluation import weights_quality
 from deepdetect.evaluation.weights_quality import (
     PAIRS,
     THRESHOLDS,

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepdetect import OptionError, threads
+from deepdetect import OptionError
+from deepdetect._shared import threads
 from deepdetect.features.dense_sift import dense_sift, root
 from deepdetect.features.sift import opencv_sift_descriptors
 from deepdetect.io.image import luma

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, OptionError, ReconstructionError, threads
+from deepdetect import DeepDetect, OptionError, ReconstructionError
+from deepdetect._shared import threads
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.controls import EveryPixel

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepdetect import OptionError, threads
+from deepdetect import OptionError
+from deepdetect._shared import threads
 from deepdetect.features.dense_sift import dense_sift
 from deepdetect.features.matchers import match_descriptors
 from deepdetect.features.matchers.exact import exact_neighbours

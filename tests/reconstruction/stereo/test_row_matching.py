@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import ImageError, OptionError, threads
+from deepdetect import ImageError, OptionError
+from deepdetect._shared import threads
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.reconstruction.stereo import COMPLETE, RowMatches, RowMatchingOptions, match_rows
 
