@@ -15,10 +15,31 @@ import pytest
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 # The same examples on every run, no files left behind, no limit on time.
-hypothesis.settings.register_profile(
-    "deepdetect", deadline=None, derandomize=True, database=None, max_examples=60
-)
-hypothesis.settings.load_profile("deepdetect")
+for _name, _examples in (("quick", 15), ("thorough", 60)):
+    hypothesis.settings.register_profile(
+        _name, deadline=None, derandomize=True, database=None, max_examples=_examples
+    )
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that runs the slow tests, too."""
+    parser.addoption("--runslow", action="store_true", help="run tests marked slow, too")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the marker; draw more examples where time is no object."""
+    config.addinivalue_line("markers", "slow: runs with --runslow only (`make test-all`)")
+    hypothesis.settings.load_profile("thorough" if config.getoption("--runslow") else "quick")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip the slow tests unless they are asked for."""
+    if config.getoption("--runslow"):
+        return
+    skip = pytest.mark.skip(reason="slow: give --runslow")
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker(skip)
 
 
 @pytest.fixture(scope="session")
