@@ -1,0 +1,40 @@
+from ._shared.errors import (
+    DeepDetectError as DeepDetectError,
+    ImageError as ImageError,
+    MissingExtraError as MissingExtraError,
+    OptionError as OptionError,
+    ReconstructionError as ReconstructionError,
+    WeightsError as WeightsError,
+)
+from .detector.detector import DeepDetect as DeepDetect
+from .detector.heatmap import HeatmapOptions as HeatmapOptions
+from .features.keypoints import (
+    Keypoints as Keypoints,
+    SelectionOptions as SelectionOptions,
+    select_keypoints as select_keypoints,
+)
+from .geometry.camera import Calibration as Calibration, Camera as Camera
+from .geometry.estimation import (
+    Geometry as Geometry,
+    GeometryOptions as GeometryOptions,
+    estimate_geometry as estimate_geometry,
+)
+from .geometry.point_cloud import PointCloud as PointCloud
+from .io.exporters import save_point_cloud as save_point_cloud
+from .io.image import load_image as load_image
+from .io.tables import (
+    load_keypoints as load_keypoints,
+    save_keypoints as save_keypoints,
+    save_matches as save_matches,
+)
+from .labels import Label as Label, LabelOptions as LabelOptions, fuse as fuse
+from .matching.options import MatchingOptions as MatchingOptions
+from .matching.pipeline import Matches as Matches, match_images as match_images
+from .matching.registration import register as register
+from .reconstruction.pipeline import (
+    ReconstructionOptions as ReconstructionOptions,
+    reconstruct as reconstruct,
+)
+from .reconstruction.result import Reconstruction as Reconstruction
+
+__version__: str
