@@ -10,8 +10,7 @@ import numpy as np
 
 from ..io.image import load_image, scale_short_side
 from .darkening import Darkening, DarkeningRange, darken
-from .variation import VERSION as VARIATION_VERSION
-from .variation import vary
+from .variation import VERSION as VARIATION_VERSION, vary
 
 
 @dataclass(frozen=True)
