@@ -4,7 +4,8 @@ import threading
 from collections.abc import Callable
 
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect._shared import threads
 from deepdetect._shared.threads import in_threads

@@ -3,7 +3,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
 from deepdetect.detector.heatmap import HeatmapOptions, compute_heatmap, compute_heatmap_and_logits

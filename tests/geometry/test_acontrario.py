@@ -4,7 +4,8 @@ from math import comb, log10, pi
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, strategies as st
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from deepdetect.geometry import (
     GeometryOptions,

@@ -6,7 +6,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 from skimage.transform import FundamentalMatrixTransform, ProjectiveTransform
 
 from deepdetect import Geometry, GeometryOptions, OptionError, estimate_geometry

@@ -3,7 +3,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect.evaluation.metrics.homography_accuracy import corner_error
 from deepdetect.geometry.majority_fit import fit_to_majority, robust_homography, share_in_place

@@ -5,7 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect._shared.errors import DeepDetectError, ImageError, OptionError
 from deepdetect.io.exporters import load_depth_png, save_depth_npz, save_depth_png

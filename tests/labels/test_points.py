@@ -5,7 +5,8 @@ from fractions import Fraction
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect.labels.points import empty_mask, keypoints_mask, pixels_mask
 

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
 from deepdetect.labels.registry import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors

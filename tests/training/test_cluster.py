@@ -15,10 +15,8 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-from hypothesis import (
-    given,
-    strategies as st,
-)
+from hypothesis import given  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
 
 from deepdetect import OptionError  # noqa: E402
 from deepdetect.training.cluster import Place, place_in_cluster  # noqa: E402

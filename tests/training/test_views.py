@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect.training.darkening import Darkening, DarkeningRange, darken
 from deepdetect.training.variation import vary

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..io.image import load_image, scale_short_side
 from .darkening import Darkening, DarkeningRange, darken
-from .variation import VERSION as VARIATION_VERSION, vary
+from .variation import VERSION as VARIATION_VERSION
+from .variation import vary
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ import math
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect.evaluation.metrics.homography_accuracy import (
     area_under_curve,

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deepdetect.evaluation.metrics.one_to_one import one_to_one_repeatability
 from deepdetect.geometry import transform_points

@@ -7,7 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..charts import line_chart
-from ..metrics.homography_accuracy import THRESHOLDS as CORNERS, area_under_curve, share_within
+from ..metrics.homography_accuracy import THRESHOLDS as CORNERS
+from ..metrics.homography_accuracy import area_under_curve, share_within
 from ..metrics.match_accuracy import mean_matching_accuracy
 from ..report import Cell, Column, Figure, Table
 from .standard_measures import (
