@@ -99,7 +99,7 @@ def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
     assert told["pose"] is None is told["median_reprojection_error_px"]
     assert told["calibration"]["baseline_mm"] == BASELINE
     assert told["calibration"]["source"].endswith("calib.json")
-    assert set(told["seconds"]) >= {"rectified or not", "keypoints", "default", "files"}
+    assert set(told["seconds"]) >= {"rectified or not", "keypoints", "matching", "files"}
 
     points, colors = ply_points(Path("out/m.ply"))
     assert len(points) == told["points"] > 30_000
@@ -181,8 +181,8 @@ def test_selection_options_and_weights_reach_the_detector(run, folder: Path) -> 
     from deepdetect import DeepDetect
 
     pair = folder / "left.png", folder / "right.png", "--focal", FOCAL, "--rectified", "--json"
-    told = json.loads(run("reconstruct", *pair, "--max-keypoints", 9000).stdout)
-    assert told["keypoints"] == 9000
+    told = json.loads(run("reconstruct", *pair, "--max-keypoints", 3000).stdout)
+    assert told["keypoints"] == 3000
     assert told["rectified_why"] == "as asked for"
     assert Path("deepdetect-output/model.ply").is_file()
     for given, weights in (([], "dense"), (["--weights", "default"], "default")):
@@ -342,5 +342,5 @@ def test_the_progress_counts_every_stage(monkeypatch: pytest.MonkeyPatch, run, f
         paths = [folder / f"{name}.png" for name in pair]
         assert run("reconstruct", *paths, "--focal", FOCAL, *more, "-o", "m.ply").exit_code == 0
     assert [bar.n == bar.total for bar in bars] == [True, True]
-    assert bars[0].stages[:3] == ["rectified or not", "keypoints", "default"]
+    assert bars[0].stages[:3] == ["rectified or not", "keypoints", "matching"]
     assert bars[1].stages == ["keypoints and matching", "reconstruction", "files"]

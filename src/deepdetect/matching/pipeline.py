@@ -142,7 +142,7 @@ def match_images(
         found = one_to_one(found)
     points0 = keypoints[0].xy[found.rows0]
     points1 = keypoints[1].xy[found.rows1]
-    with _timed(seconds, "dense"):
+    with _timed(seconds, "geometry"):
         geometry = _geometry(points0, points1, chosen.geometry, guidance)
     return Matches(
         points0,
@@ -181,7 +181,7 @@ def unguided_matches(
             describe(gray, xy, chosen.keypoint_size, chosen.angle)
             for gray, xy in zip(grays, points, strict=True)
         ]
-    with _timed(seconds, "default"):
+    with _timed(seconds, "matching"):
         return match_descriptors(
             *descriptors,
             get_matcher(chosen.matcher),

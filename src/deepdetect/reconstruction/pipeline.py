@@ -179,7 +179,7 @@ def _from_rows(pair: _Pair) -> Reconstruction:
         selection = replace(options.selection, subpixel=False)
         keypoints = find_keypoints(pair.detector, images[0], selection)
     check_keypoints(len(keypoints), options.selection)
-    with pair.stage("default"):
+    with pair.stage("matching"):
         found = match_rows(*pair.grays, keypoints.xy, options.row_matching)
     row_options = options.row_matching
     sure = row_options.uniqueness > 1
