@@ -1,0 +1,158 @@
+"""Options of commands, generated from the dataclasses that the library takes.
+
+Name, type, default and help of an option are those of the field and its docstring, so that the
+command line says what the library does. A class is imported when its command is run or its help is
+shown: `deepdetect --help` stays fast.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import re
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+Function = Callable[..., Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldOptions:
+    """The fields of a dataclass that are options of a command.
+
+    Attributes:
+        path: module and class, as "features.selection:SelectionOptions", within the package.
+        names: the fields, in the order of the help; empty for all that are initialised.
+        skip: fields that are left out.
+        flags: flags of fields whose flag is not their name, as {"short_sides": "--short-side"}.
+        types: click's types of fields whose annotation does not say it.
+        defaults: what is used unless the option is given, where it is not the field's default; for
+            the help.
+    """
+
+    path: str
+    names: Sequence[str] = ()
+    skip: Sequence[str] = ()
+    flags: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    types: Mapping[str, click.ParamType[Any]] = dataclasses.field(default_factory=dict)
+    defaults: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def make(self) -> list[click.Option]:
+        """Import the class and make the options."""
+        module, name = self.path.split(":")
+        kind = getattr(importlib.import_module(f"..{module}", __package__), name)
+        fields = {field.name: field for field in dataclasses.fields(kind) if field.init}
+        hints, helps = typing.get_type_hints(kind), attribute_helps(inspect.getdoc(kind) or "")
+        chosen = self.names or [name for name in fields if name not in self.skip]
+        return [self._option(fields[name], hints[name], helps[name]) for name in chosen]
+
+    def _option(self, field: dataclasses.Field[Any], hint: Any, text: str) -> click.Option:
+        flag = self.flags.get(field.name, "--" + field.name.replace("_", "-"))
+        settings = _type_settings(hint, flag) | {"help": text}
+        if field.name in self.types:
+            settings["type"] = self.types[field.name]
+        if settings.pop("switch", False):
+            flag = f"{flag}/--no-{flag.removeprefix('--')}"
+        if shown := self.defaults.get(field.name, _default_text(field)):
+            settings["help"] += f"  [default: {shown}]"
+        return click.Option([flag, field.name], **settings)
+
+
+class GeneratedCommand(click.Command):
+    """A command some of whose options are made when they are first needed."""
+
+    generated: Sequence[FieldOptions] = ()
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Return the options, the generated ones before the others."""
+        if self.generated:
+            made = [option for fields in self.generated for option in fields.make()]
+            arguments = [one for one in self.params if isinstance(one, click.Argument)]
+            others = [one for one in self.params if not isinstance(one, click.Argument)]
+            self.params, self.generated = [*arguments, *made, *others], ()
+        return super().get_params(ctx)
+
+
+def generated_command(
+    *fields: FieldOptions, **settings: Any
+) -> Callable[[Function], GeneratedCommand]:
+    """Make a command with options generated from dataclasses.
+
+    An option that is not given is None (or, where it may be repeated, an empty tuple): `given_only`
+    leaves these out.
+    """
+
+    def decorate(function: Function) -> GeneratedCommand:
+        command = click.command(cls=GeneratedCommand, **settings)(function)
+        command.generated = fields
+        return command
+
+    return decorate
+
+
+def given_only(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of the options that were given.
+
+    Example:
+        >>> given_only({"threshold": None, "density": 0.1, "short_sides": ()})
+        {'density': 0.1}
+    """
+    return {name: value for name, value in values.items() if value is not None and value != ()}
+
+
+def attribute_helps(doc: str) -> dict[str, str]:
+    """Return the first sentence on each attribute of a Google style docstring.
+
+    Example:
+        >>> helps = attribute_helps('''Options.
+        ...
+        ... Attributes:
+        ...     ratio, mutual: of the ratio test, which
+        ...         is Lowe's. More text.
+        ... ''')
+        >>> helps["mutual"]
+        "Of the ratio test, which is Lowe's."
+    """
+    match = re.search(r"^Attributes:\n((?:[ \t]+.*\n?|\n)*)", doc, flags=re.MULTILINE)
+    section = textwrap.dedent(match.group(1)) if match else ""
+    helps: dict[str, str] = {}
+    for entry in re.split(r"\n(?=\S)", section.strip()):
+        names, _, text = " ".join(entry.split()).partition(": ")
+        sentence = re.split(r"(?<=[.)])\s(?=[A-Z])", text)[0]
+        helps |= {name.strip(): sentence[:1].upper() + sentence[1:] for name in names.split(",")}
+    return helps
+
+
+def _type_settings(hint: Any, flag: str) -> dict[str, Any]:
+    """Return click's settings for an annotation."""
+    parts = [part for part in typing.get_args(hint) if part is not type(None)]
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return _type_settings(parts[0], flag) if len(parts) == 1 else {"type": str}
+    if typing.get_origin(hint) is Literal:
+        return {"type": click.Choice([str(value) for value in typing.get_args(hint)])}
+    if typing.get_origin(hint) is tuple and len(parts) == 2 and parts[1] is Ellipsis:
+        return _type_settings(parts[0], flag) | {"multiple": True}
+    if hint is bool:
+        return {"switch": True, "default": None}
+    if hint is Path:
+        return {"type": click.Path(path_type=Path)}
+    return {"type": hint if hint in (int, float, str) else str}
+
+
+def _default_text(field: dataclasses.Field[Any]) -> str:
+    """Return a default for the help; none where it is None, which the text explains."""
+    value = field.default
+    if value is dataclasses.MISSING or value is None or value == ():
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, tuple):
+        return " ".join(map(str, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
