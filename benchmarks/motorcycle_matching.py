@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from deepdetect import DeepDetect, match_images
-from deepdetect.datasets.motorcycle import load_motorcycle
+from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.metrics import stereo_score
 
 WAYS: dict[str, dict[str, Any]] = {

@@ -31,7 +31,7 @@ import numpy as np
 
 from deepdetect import DeepDetect
 from deepdetect._shared.errors import ImageError
-from deepdetect.datasets.motorcycle import load_motorcycle
+from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.protocols.stereo_pipelines import sgbm_disparity
 from deepdetect.evaluation.protocols.stereo_truth import truths
 from deepdetect.io.image import load_image

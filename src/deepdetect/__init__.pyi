@@ -20,8 +20,8 @@ from .geometry.estimation import (
     estimate_geometry as estimate_geometry,
 )
 from .geometry.point_cloud import PointCloud as PointCloud
-from .io.exporters import save_point_cloud as save_point_cloud
 from .io.image import load_image as load_image
+from .io.point_cloud import save_point_cloud as save_point_cloud
 from .io.tables import (
     load_keypoints as load_keypoints,
     save_keypoints as save_keypoints,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect.io.exporters import load_depth_png
+from deepdetect.io.depth import load_depth_png
 
 FOCAL, OFFSET, BASELINE = 994.978, 31.086, 193.001
 """In pixels and mm, of the page of skimage.data.stereo_motorcycle."""

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 
 from deepdetect import ImageError
-from deepdetect.datasets.hpatches import LARGE, is_illumination, is_usual, load_hpatches
+from deepdetect.datasets.hpatches import (
+    NOT_IN_D2NET_SUBSET,
+    in_d2net_subset,
+    is_illumination,
+    load_hpatches,
+)
 
 
 @pytest.fixture
@@ -35,8 +40,8 @@ def test_scenes_have_six_images_with_the_light_first(folder: Path) -> None:
 
 
 def test_eight_large_scenes_are_not_the_usual_ones(folder: Path) -> None:
-    assert len(LARGE) == 8
-    assert [scene.name for scene in load_hpatches(folder) if not is_usual(scene)] == ["i_dc"]
+    assert len(NOT_IN_D2NET_SUBSET) == 8
+    assert [scene.name for scene in load_hpatches(folder) if not in_d2net_subset(scene)] == ["i_dc"]
 
 
 def test_what_is_missing_is_named(folder: Path, one_line) -> None:

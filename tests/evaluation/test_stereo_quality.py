@@ -8,7 +8,7 @@ import pytest
 
 from deepdetect import LabelOptions, fuse
 from deepdetect.cli import main
-from deepdetect.datasets.stereo import StereoPair
+from deepdetect.datasets.types import StereoPair
 from deepdetect.evaluation.stereo_quality import LabelKeypoints, stereo_quality
 from deepdetect.io.image import luma
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect._shared.errors import OptionError
-from deepdetect.datasets.planar import read_homography
+from deepdetect.datasets.types import read_homography
 from deepdetect.evaluation.metrics.homography_accuracy import corner_error
 from deepdetect.geometry.homography_refinement import RefinementOptions, refine_homography
 from deepdetect.io.image import load_image, luma

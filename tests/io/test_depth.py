@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect._shared.errors import DeepDetectError, ImageError, OptionError
-from deepdetect.io.exporters import load_depth_png, save_depth_npz, save_depth_png
+from deepdetect.io.depth import load_depth_png, save_depth_npz, save_depth_png
 
 
 @pytest.fixture

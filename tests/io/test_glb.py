@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.io.exporters import save_point_cloud
+from deepdetect.io.point_cloud import save_point_cloud
 
 
 def chunks(path: Path) -> tuple[dict[str, Any], bytes]:

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.io.exporters import save_point_cloud
 from deepdetect.io.html_viewer import page_points
+from deepdetect.io.point_cloud import save_point_cloud
 
 
 class Page(HTMLParser):
@@ -181,14 +181,14 @@ def _kept(cloud: PointCloud) -> np.ndarray:
 def test_the_matrix_is_that_of_a_camera_around_the_target(
     small: PointCloud, tmp_path: Path
 ) -> None:
-    """Checked against the axes of `rendering.camera_around`, which turns in the same way."""
-    from deepdetect.viz.render import camera_around
+    """Checked against the axes of `viz.render.orbit_camera`, which turns in the same way."""
+    from deepdetect.viz.render import orbit_camera
 
     page = saved(small, tmp_path / "page.html")
     view = "{ azimuth: 0.4, elevation: 0.7, distance: 500, target: [5, 6, 800] }"
     matrix = np.reshape(run_node(page, f"return [...clipMatrix(cloud, {view}, 1)];"), (4, 4))
     told = json.loads(page.scripts["cloud"])
-    axes = camera_around(small, np.rad2deg(0.4), np.rad2deg(0.7)).axes
+    axes = orbit_camera(small, np.rad2deg(0.4), np.rad2deg(0.7)).axes
     seen = (np.array([30.0, -40.0, 900.0]) - [5, 6, 800]) @ axes.T + [0, 0, 500]
     level = (np.array([30.0, -40.0, 900.0]) - told["offset"]) / told["step"]
     clip = [*level, 1] @ matrix
@@ -202,4 +202,4 @@ def test_the_matrix_is_that_of_a_camera_around_the_target(
 def test_the_template_is_part_of_the_package() -> None:
     from importlib.resources import files
 
-    assert files("deepdetect.io.exporters").joinpath("viewer.html").is_file()
+    assert files("deepdetect.io").joinpath("viewer.html").is_file()

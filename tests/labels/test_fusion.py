@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
 from deepdetect.io.image import load_image, luma
+from deepdetect.io.masks import load_mask
 from deepdetect.labels import DETECTOR_NAMES, DETECTORS, Label, LabelOptions, fuse
-from deepdetect.labels.batch import load_mask
 
 
 @pytest.fixture(scope="module")

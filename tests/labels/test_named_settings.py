@@ -34,4 +34,4 @@ def test_a_file_is_read_and_a_word_is_a_name(tmp_path: Path) -> None:
     assert change.value == 20
     assert set(LABEL_SETTINGS) == {"paper", "dense"}
     with pytest.raises(OptionError, match="did you mean 'dense'"):
-        find_label_settings("geometri")
+        find_label_settings("densee")

@@ -5,8 +5,8 @@ import pytest
 
 from deepdetect._shared.errors import OptionError
 from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.viz.cloud_figure import draw_clouds
 from deepdetect.viz.draw import CAPTION_HEIGHT
+from deepdetect.viz.render import draw_clouds
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ from deepdetect import DeepDetectError, Keypoints, OptionError
 from deepdetect.viz.draw import (
     GREEN,
     RED,
+    add_caption,
     draw_heatmap,
     draw_keypoints,
     draw_matches,
     save_picture,
-    stacked,
-    with_caption,
+    vstack,
 )
 
 
@@ -63,7 +63,7 @@ def test_pictures_are_saved_as_they_are(tmp_path: Path) -> None:
 
 
 def test_captions_fit_narrow_pictures() -> None:
-    picture = with_caption(np.zeros((20, 60, 3), np.uint8), "a caption that is far too long")
+    picture = add_caption(np.zeros((20, 60, 3), np.uint8), "a caption that is far too long")
     assert picture.shape[1] == 60
     assert picture[20:].any()
     assert not picture[20:, -2:].any()
@@ -82,7 +82,7 @@ def test_a_picture_ends_in_png_or_jpg(tmp_path: Path) -> None:
 
 def test_stacked_rows_are_padded_with_white() -> None:
     rows = [np.zeros((4, 10, 3), np.uint8), np.zeros((5, 6, 3), np.uint8)]
-    picture = stacked(rows, gap=2)
+    picture = vstack(rows, gap=2)
     assert picture.shape == (11, 10, 3)
     assert not picture[:4].any()
     assert (picture[4:6] == 255).all()

@@ -9,7 +9,7 @@ import pytest
 
 from deepdetect._shared.errors import OptionError
 from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.viz.render import ViewCamera, camera_around, render
+from deepdetect.viz.render import ViewCamera, orbit_camera, render
 
 PLAIN = ViewCamera(np.zeros(3), np.eye(3), 50.0, np.array([39.5, 29.5]), (80, 60))
 
@@ -24,7 +24,7 @@ def cloud(photo: np.ndarray) -> PointCloud:
 
 
 def test_projection_is_opencv_s(cloud: PointCloud) -> None:
-    camera = camera_around(cloud, 30, -20, (320, 240))
+    camera = orbit_camera(cloud, 30, -20, (320, 240))
     xy, depth = camera.project(cloud.points)
     matrix = np.array(
         [[camera.focal, 0, camera.middle[0]], [0, camera.focal, camera.middle[1]], [0, 0, 1]]
@@ -51,7 +51,7 @@ def test_from_the_left_camera_the_photograph_comes_back(
 def test_the_cloud_fills_the_picture(
     cloud: PointCloud, azimuth: float, elevation: float, size: tuple[int, int]
 ) -> None:
-    camera = camera_around(cloud, azimuth, elevation, size)
+    camera = orbit_camera(cloud, azimuth, elevation, size)
     xy, _ = camera.project(cloud.points)
     inside = ((xy > -0.5) & (xy < np.array(size) - 0.5)).all(1)
     assert inside.mean() > 0.96
@@ -61,9 +61,9 @@ def test_the_cloud_fills_the_picture(
 
 def test_angles_turn_the_viewer_to_the_right_and_up(cloud: PointCloud) -> None:
     # x right, y down: the viewer on the right has a larger x, the one above a smaller y.
-    front = camera_around(cloud, 0, 0).position
-    assert camera_around(cloud, 30, 0).position[0] > front[0] + 100
-    assert camera_around(cloud, 0, 30).position[1] < front[1] - 100
+    front = orbit_camera(cloud, 0, 0).position
+    assert orbit_camera(cloud, 30, 0).position[0] > front[0] + 100
+    assert orbit_camera(cloud, 0, 30).position[1] < front[1] - 100
     np.testing.assert_allclose(front, 0, atol=80)  # near the left camera
 
 
@@ -73,7 +73,7 @@ def test_wild_points_do_not_change_the_view(cloud: PointCloud) -> None:
         np.concatenate([cloud.colors, np.zeros((20, 3), np.uint8)]),
         "mm",
     )
-    plain, other = camera_around(cloud), camera_around(wild)
+    plain, other = orbit_camera(cloud), orbit_camera(wild)
     np.testing.assert_allclose(
         other.project(cloud.points)[0], plain.project(cloud.points)[0], atol=3
     )
@@ -132,7 +132,7 @@ def test_points_at_the_border_are_cut() -> None:
 
 
 def test_dense_points_close_a_surface(cloud: PointCloud) -> None:
-    camera = camera_around(cloud, 20, 10, (300, 300))
+    camera = orbit_camera(cloud, 20, 10, (300, 300))
     grey = PointCloud(cloud.points, np.zeros_like(cloud.colors), "mm")
     picture = render(grey, camera)
     xy, _ = camera.project(cloud.points)
@@ -143,7 +143,7 @@ def test_dense_points_close_a_surface(cloud: PointCloud) -> None:
 
 
 def test_pictures_are_equal_from_run_to_run(cloud: PointCloud) -> None:
-    camera = camera_around(cloud, size=(160, 120))
+    camera = orbit_camera(cloud, size=(160, 120))
     np.testing.assert_array_equal(render(cloud, camera), render(cloud, camera))
 
 
@@ -152,9 +152,9 @@ def test_pictures_are_equal_from_run_to_run(cloud: PointCloud) -> None:
     [
         (lambda c: render(c[:0], PLAIN), "no points"),
         (lambda c: render(c, PLAIN, point_width=0), "above 0"),
-        (lambda c: camera_around(c[:0]), "no points"),
-        (lambda c: camera_around(c, elevation=91), "elevation"),
-        (lambda c: camera_around(c, size=(0, 5)), "at least one pixel"),
+        (lambda c: orbit_camera(c[:0]), "no points"),
+        (lambda c: orbit_camera(c, elevation=91), "elevation"),
+        (lambda c: orbit_camera(c, size=(0, 5)), "at least one pixel"),
     ],
 )
 def test_mistakes_are_one_sentence(call, word: str, cloud: PointCloud, one_line) -> None:
@@ -165,7 +165,7 @@ def test_mistakes_are_one_sentence(call, word: str, cloud: PointCloud, one_line)
 
 def test_one_point_can_be_drawn() -> None:
     cloud = PointCloud([[1.0, 2, 30]], [[0, 0, 0]], "mm")
-    picture = render(cloud, camera_around(cloud, size=(40, 30)))
+    picture = render(cloud, orbit_camera(cloud, size=(40, 30)))
     rows, columns = np.nonzero(picture[..., 0] < 128)
     assert (abs(rows.mean() - 14.5), abs(columns.mean() - 19.5)) <= (0.5, 0.5)
 

@@ -63,7 +63,7 @@ def detect(
     from .._shared.errors import DeepDetectError
     from .._shared.progress import progress
     from ..features.keypoints import SelectionOptions
-    from ..labels.batch import load_mask
+    from ..io.masks import load_mask
 
     paths = expand_images(images, output)
     mask = load_mask(ignore) if ignore is not None else None
@@ -98,7 +98,7 @@ def _detect_one(
     from ..features.keypoints import select_keypoints
     from ..io.image import load_image
     from ..io.tables import save_keypoints
-    from ..viz.draw import draw_heatmap, draw_keypoints, save_picture, with_caption
+    from ..viz.draw import add_caption, draw_heatmap, draw_keypoints, save_picture
 
     rgb = load_image(path)
     started = time.perf_counter()
@@ -111,7 +111,7 @@ def _detect_one(
     if pictures:
         caption = f"{len(keypoints):,} keypoints, density {keypoints.density:.3f}"
         for name, picture in (
-            ("keypoints", with_caption(draw_keypoints(rgb, keypoints), caption)),
+            ("keypoints", add_caption(draw_keypoints(rgb, keypoints), caption)),
             ("heatmap", draw_heatmap(heatmap)),
         ):
             drawn[name] = output / f"{path.stem}_{name}.png"

@@ -12,7 +12,7 @@ import click
 from .shared import PATH, detector_options, json_option, make_detector, print_json
 
 if TYPE_CHECKING:
-    from ..datasets.planar import PlanarScene
+    from ..datasets.types import PlanarScene
     from ..detector.detector import DeepDetect
     from ..evaluation.mask_scores import MaskScore
     from ..evaluation.scale_quality import ScaleQuality

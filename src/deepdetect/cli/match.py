@@ -184,14 +184,14 @@ def _guidance(matches: Any) -> dict[str, Any] | None:
 
 
 def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
-    from ..viz.draw import draw_matches, save_picture, with_caption
+    from ..viz.draw import add_caption, draw_matches, save_picture
 
     picture = draw_matches(rgb0, rgb1, matches.points0, matches.points1, matches.inliers)
     caption = (
         f"{len(matches):,} matches, {int(matches.inliers.sum()):,} of them inliers "
         f"({matches.kind}); a random sample is drawn: green inliers, red others"
     )
-    save_picture(with_caption(picture, caption), path)
+    save_picture(add_caption(picture, caption), path)
 
 
 def _was_given(context: click.Context, name: str) -> bool:

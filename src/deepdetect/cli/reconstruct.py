@@ -22,7 +22,7 @@ from .shared import (
 )
 
 if TYPE_CHECKING:
-    from ..io.exporters import DepthPng
+    from ..io.depth import DepthPng
     from ..reconstruction.result import Reconstruction
 
 STAGES = 5
@@ -77,10 +77,10 @@ def reconstruct(
     deepdetect reconstruct phone1.jpg phone2.jpg
     """
     from .._shared.progress import progress
-    from ..io.exporters import get_exporter
+    from ..io.point_cloud import find_writer
     from ..reconstruction.pipeline import reconstruct as reconstruct_pair
 
-    get_exporter(output)
+    find_writer(output)
     files = _files(output, [path for path in (left, right, calib) if path is not None])
     detector = make_detector(values)
     chosen = {name: value for name, value in values.items() if value is not None}
@@ -112,9 +112,9 @@ def reconstruct(
 
 def _files(model: Path, inputs: list[Path]) -> dict[str, Path]:
     """Name all files, and check that none of them is an input."""
-    from ..io.exporters import EXPORTERS
+    from ..io.point_cloud import POINT_CLOUD_WRITERS
 
-    endings = (*EXPORTERS, "_depth.png", "_depth.npz", ".json")
+    endings = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", ".json")
     files = {ending: model.with_name(model.stem + ending) for ending in endings}
     files[model.suffix.lower()] = model
     check_inputs_survive(files.values(), inputs, "give the model another name by -o")
@@ -128,7 +128,8 @@ def _write(
     import json
 
     from .._shared.atomic import atomic_path
-    from ..io.exporters import EXPORTERS, save_depth_npz, save_depth_png, save_point_cloud
+    from ..io.depth import save_depth_npz, save_depth_png
+    from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
     from ..reconstruction.report import reconstruction_values
 
     started = time.perf_counter()
@@ -139,7 +140,7 @@ def _write(
         "calibration": found.calibration.source,
         "scale": values["scale"],
     }
-    for ending in EXPORTERS:
+    for ending in POINT_CLOUD_WRITERS:
         save_point_cloud(found.cloud, files[ending], notes)
     depth = found.depth_map()
     told = save_depth_png(depth, files["_depth.png"], found.unit)

@@ -5,11 +5,11 @@ from collections.abc import Callable
 from .._shared.errors import look_up
 from .coco import COCO
 from .download import RemoteFile
-from .motorcycle import load_motorcycle
+from .middlebury import load_motorcycle
 from .remote import RemoteDataset, get_dataset
 from .remote_middlebury import MIDDLEBURY
 from .remote_planar import HPATCHES, OXFORD
-from .stereo import StereoPair
+from .types import StereoPair
 
 STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {
     "motorcycle": load_motorcycle,

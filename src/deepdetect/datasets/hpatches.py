@@ -8,10 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from .._shared.errors import ImageError
-from .planar import PlanarScene, read_homography
+from .types import PlanarScene, read_homography
 
 ENDINGS = (".ppm", ".png")
-LARGE = frozenset(
+NOT_IN_D2NET_SUBSET = frozenset(
     (
         "i_contruction",
         "i_crownnight",
@@ -50,9 +50,9 @@ def is_illumination(scene: PlanarScene) -> bool:
     return scene.name.startswith("i_")
 
 
-def is_usual(scene: PlanarScene) -> bool:
+def in_d2net_subset(scene: PlanarScene) -> bool:
     """Tell whether a scene is one of the 108 that papers usually measure."""
-    return scene.name not in LARGE
+    return scene.name not in NOT_IN_D2NET_SUBSET
 
 
 def _load_scene(folder: Path) -> PlanarScene:

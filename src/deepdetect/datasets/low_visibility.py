@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from .._shared.errors import ImageError
-from .planar import PlanarScene, read_homography
+from .types import PlanarScene, read_homography
 
 SCENES = ("dusty", "smoky")
 ENDINGS = (".png", ".bmp")

@@ -18,9 +18,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from .._shared.errors import ImageError
+from .._shared.errors import ImageError, MissingExtraError
 from ..io.image import load_image
-from .stereo import StereoPair
+from .types import StereoPair
 
 
 def load_middlebury(folder: str | Path) -> StereoPair:
@@ -56,6 +56,27 @@ def load_middlebury(folder: str | Path) -> StereoPair:
         )
     disparity = np.where(stored == unknown, np.nan, stored / value).astype(np.float32)
     return StereoPair(root.name, left, right, _enlarged(disparity, left.shape[:2]))
+
+
+def load_motorcycle() -> StereoPair:
+    """Load the Motorcycle pair of Middlebury 2014 (741x500) and the true disparity.
+
+    It is part of the scikit-image wheel, so nothing is downloaded.
+
+    Raises:
+        MissingExtraError: scikit-image is not installed.
+    """
+    try:
+        from skimage import data
+    except ImportError:
+        raise MissingExtraError(
+            "the Motorcycle pair needs the package scikit-image, which is not installed: "
+            "run pip install scikit-image"
+        ) from None
+    left, right, disparity = data.stereo_motorcycle()
+    disparity = np.asarray(disparity, np.float32).squeeze()
+    unknown = ~np.isfinite(disparity)
+    return StereoPair("motorcycle", left, right, np.where(unknown, np.nan, disparity))
 
 
 def _enlarged(disparity: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

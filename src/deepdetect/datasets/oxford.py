@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from .._shared.errors import ImageError, OptionError, unknown_name
-from .planar import PlanarScene, read_homography
+from .types import PlanarScene, read_homography
 
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
 ENDINGS = (".png", ".ppm", ".pgm")

@@ -11,8 +11,8 @@ import numpy as np
 from .._shared.errors import ImageError
 from .._shared.progress import progress
 from ..io.image import load_image, luma
+from ..io.masks import load_mask
 from ..labels import visibility_of
-from ..labels.batch import load_mask
 
 EPSILON = 1e-7
 """Probabilities are kept so far from 0 and 1: the next float32 under 1 is 6e-8 away."""

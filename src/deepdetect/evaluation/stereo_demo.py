@@ -14,11 +14,11 @@ from ..detector.detector import DeepDetect
 from ..geometry import disparity_errors
 from ..matching.pipeline import Matches, match_images
 from ..viz.draw import (
+    add_caption,
     draw_heatmap,
     draw_keypoints,
     draw_matches,
     save_picture,
-    with_caption,
 )
 from .metrics.stereo_matches import TOLERANCE, StereoScore, score_errors
 from .stereo_quality import match_random_points
@@ -114,11 +114,11 @@ def _draw(
     pictures = {
         "left_keypoints": _keypoint_picture(pair.left, matches.keypoints0),
         "right_keypoints": _keypoint_picture(pair.right, matches.keypoints1),
-        "left_heatmap": with_caption(
+        "left_heatmap": add_caption(
             draw_heatmap(detector.heatmap(pair.left)),
             "probability of a keypoint: dark blue 0, yellow 1",
         ),
-        "matches": with_caption(lines, caption),
+        "matches": add_caption(lines, caption),
     }
     paths = []
     for name, picture in pictures.items():
@@ -129,4 +129,4 @@ def _draw(
 
 def _keypoint_picture(rgb: np.ndarray, keypoints: Any) -> np.ndarray:
     caption = f"{len(keypoints):,} keypoints, density {keypoints.density:.3f}"
-    return with_caption(draw_keypoints(rgb, keypoints), caption)
+    return add_caption(draw_keypoints(rgb, keypoints), caption)

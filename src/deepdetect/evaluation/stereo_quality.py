@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..datasets.stereo import StereoPair
+from ..datasets.types import StereoPair
 from ..io.image import load_image, luma
 from ..labels import LabelOptions, fuse
 from ..matching.pipeline import HeatmapDetector, Matches, match_images

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..datasets.oxford import find_scene
-from ..datasets.planar import PlanarPair, PlanarScene
+from ..datasets.types import PlanarPair, PlanarScene
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions, compute_heatmap
 from ..features.descriptors import get_descriptor

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import DeepDetectError
-from ..datasets.planar import PlanarPair
+from ..datasets.types import PlanarPair
 from ..io.image import load_image
 from .baselines import Method
 from .cache import Arrays, CacheError, StageCache, file_digest

@@ -4,15 +4,31 @@ from __future__ import annotations
 
 import zipfile
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError
 from ..features.keypoints import Keypoints
-from ..matching.pipeline import Matches
 
 FORMATS = ("npz", "csv")
+
+
+class MatchesLike(Protocol):
+    """What `save_matches` writes: the attributes of `deepdetect.Matches` that it reads."""
+
+    points0: np.ndarray
+    points1: np.ndarray
+    ratios: np.ndarray
+    inliers: np.ndarray
+    model: np.ndarray | None
+    kind: str
+    guidance: Any
+
+    @property
+    def guided(self) -> bool:
+        """Whether the matches were guided."""
 
 
 def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
@@ -60,7 +76,7 @@ def load_keypoints(path: str | Path) -> Keypoints:
         raise DeepDetectError(f"{path} holds no keypoints ({error}): write it anew") from None
 
 
-def save_matches(matches: Matches, path: str | Path) -> None:
+def save_matches(matches: MatchesLike, path: str | Path) -> None:
     """Write matches, whole or not at all.
 
     Args:

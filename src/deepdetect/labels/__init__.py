@@ -1,6 +1,6 @@
 """Labels for training: classical detectors, and their fusion into one binary mask."""
 
-from .fusion import Label, LabelOptions, fuse
+from .fusion import Label, LabelOptions, draw_label, fuse
 from .named_settings import LABEL_SETTINGS, find_label_settings
 from .registry import DETECTOR_NAMES, DETECTORS, LabelDetector
 from .settings import LabelSettings, SettingChange, read_label_settings
@@ -16,6 +16,7 @@ __all__ = [
     "LabelOptions",
     "LabelSettings",
     "SettingChange",
+    "draw_label",
     "find_label_settings",
     "fuse",
     "luma_range",

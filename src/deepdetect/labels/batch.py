@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
-
-from .._shared.atomic import atomic_path
-from .._shared.errors import DeepDetectError, ImageError, OptionError
+from .._shared.errors import DeepDetectError, OptionError
 from .._shared.processes import map_in_processes
 from ..io.image import load_image, luma
-from .fusion import Label, LabelOptions, fuse
-
-SETTINGS_KEY = "deepdetect-label"
-"""Name of the PNG text that tells how a mask was made."""
+from ..io.masks import load_mask_settings, save_mask
+from ..viz.draw import save_picture
+from .fusion import LabelOptions, draw_label, fuse
 
 
 @dataclass(frozen=True)
@@ -56,69 +51,6 @@ class LabelReport:
     error: str | None = None
 
 
-def save_mask(mask: np.ndarray, path: str | Path, settings: str = "") -> None:
-    """Write a (H, W) bool mask as a 1-bit PNG, whole or not at all.
-
-    Args:
-        mask: the mask.
-        path: file ending in .png.
-        settings: text kept in the file, by which `mask_settings` tells how it was made.
-    """
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(encode_mask(mask, settings))
-
-
-def encode_mask(mask: np.ndarray, settings: str = "") -> bytes:
-    """Return a (H, W) bool mask as the content of a 1-bit PNG file."""
-    from PIL import Image, PngImagePlugin
-
-    notes = PngImagePlugin.PngInfo()
-    if settings:
-        notes.add_text(SETTINGS_KEY, settings)
-    content = io.BytesIO()
-    Image.fromarray(mask).save(content, format="PNG", pnginfo=notes)
-    return content.getvalue()
-
-
-def load_mask(path: str | Path | bytes) -> np.ndarray:
-    """Read a mask of any bit depth: True where a pixel is brighter than half.
-
-    In a file that holds zeros and ones only, the ones are True.
-
-    Args:
-        path: the file, or its content.
-
-    Returns:
-        (H, W) bool.
-
-    Raises:
-        ImageError: the file is missing, damaged or no image.
-    """
-    from PIL import Image
-
-    name = "the mask" if isinstance(path, bytes) else path
-    try:
-        with Image.open(io.BytesIO(path) if isinstance(path, bytes) else path) as opened:
-            deep = opened.mode.startswith("I")  # 16 bits a pixel
-            values = np.asarray(opened if deep else opened.convert("L"))
-        return values > (0 if values.max() <= 1 else 32767 if deep else 127)
-    except FileNotFoundError:
-        raise ImageError(f"there is no mask {name}: check the path") from None
-    except (OSError, SyntaxError, ValueError) as error:
-        raise ImageError(f"{name} is not a mask that can be read ({error})") from None
-
-
-def mask_settings(path: Path) -> str | None:
-    """Return the settings text of a mask file, or None when it has none."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as opened:
-            return opened.info.get(SETTINGS_KEY)
-    except (OSError, SyntaxError, ValueError):
-        return None
-
-
 def settings_text(options: LabelOptions) -> str:
     """Return the text that identifies label options."""
     values = asdict(options)
@@ -153,7 +85,7 @@ def pending(tasks: Sequence[LabelTask]) -> list[LabelTask]:
     for task in tasks:
         if not task.mask.exists():
             left.append(task)
-        elif mask_settings(task.mask) != settings_text(task.options):
+        elif load_mask_settings(task.mask) != settings_text(task.options):
             raise OptionError(
                 f"{task.mask} is there already, made with other settings: "
                 "choose another folder with -o, or replace it with --overwrite"
@@ -194,14 +126,8 @@ def label_file(task: LabelTask) -> LabelReport:
         rgb = load_image(task.image)
         label = fuse(luma(rgb), task.options)
         if task.picture is not None:
-            _save_figure(rgb, label, task.picture)
+            save_picture(draw_label(rgb, label), task.picture)
         save_mask(label.mask, task.mask, settings_text(task.options))
     except DeepDetectError as error:
         return LabelReport(task.image, task.mask, error=str(error))
     return LabelReport(task.image, task.mask, label.visibility, label.density)
-
-
-def _save_figure(rgb: np.ndarray, label: Label, path: Path) -> None:
-    from ..viz.draw import draw_label, save_picture
-
-    save_picture(draw_label(rgb, label), path)

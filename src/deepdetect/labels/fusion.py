@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..viz.draw import draw_masks
 from .registry import DETECTOR_NAMES, select_detectors
 from .settings import SettingChange, settings_for
 from .visibility import Visibility, VisibilityChoice, visibility_of
@@ -82,3 +83,17 @@ def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
         settings = settings_for(detector, visibility, options.changes)
         marked[detector.kind] |= detector.mask(gray, settings)
     return Label(marked["keypoint"], marked["edge"], visibility)
+
+
+def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
+    """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
+
+    Args:
+        rgb: (H, W, 3) uint8 RGB.
+        label: its label.
+
+    Returns:
+        Four panels in a row, each mask captioned with its density.
+    """
+    masks = {"keypoints": label.keypoints, "edges": label.edges, "combined": label.mask}
+    return draw_masks(rgb, masks, f"image ({label.visibility} visibility settings)")

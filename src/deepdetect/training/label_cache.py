@@ -14,8 +14,8 @@ from .._shared.errors import DeepDetectError
 from .._shared.processes import map_in_processes
 from .._shared.progress import progress
 from ..io.image import load_image, luma
+from ..io.masks import load_mask, save_mask
 from ..labels import LabelOptions, fuse
-from ..labels.batch import load_mask, save_mask
 from ..labels.registry import select_detectors
 from ..labels.settings import settings_for
 from ..labels.visibility import Visibility

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -11,7 +11,6 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError
 from ..features.keypoints import Keypoints
-from ..labels import Label
 
 SPARSE = 5000
 """Up to so many keypoints are drawn as circles, more as single pixels."""
@@ -140,28 +139,25 @@ def draw_matches(
     return canvas
 
 
-def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
-    """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
+def draw_masks(rgb: np.ndarray, masks: Mapping[str, np.ndarray], title: str) -> np.ndarray:
+    """Draw an image and masks of it in a row.
 
     Args:
         rgb: (H, W, 3) uint8 RGB.
-        label: its label.
+        masks: (H, W) bool masks by title.
+        title: the caption of the image.
 
     Returns:
-        Four panels in a row, each with a caption that tells its density.
+        One panel for the image and one per mask, each mask captioned with its density.
     """
-    panels = [with_caption(rgb, f"image ({label.visibility} visibility settings)")]
-    for title, mask in (
-        ("keypoints", label.keypoints),
-        ("edges", label.edges),
-        ("combined", label.mask),
-    ):
+    panels = [add_caption(rgb, title)]
+    for name, mask in masks.items():
         picture = np.repeat((mask * np.uint8(255))[:, :, None], 3, 2)
-        panels.append(with_caption(picture, f"{title}: {mask.mean():.1%} of pixels"))
-    return side_by_side(panels)
+        panels.append(add_caption(picture, f"{name}: {mask.mean():.1%} of pixels"))
+    return hstack(panels)
 
 
-def with_caption(rgb: np.ndarray, text: str) -> np.ndarray:
+def add_caption(rgb: np.ndarray, text: str) -> np.ndarray:
     """Put a line of text under a picture, shrunk to its width where needed."""
     strip = np.zeros((CAPTION_HEIGHT, rgb.shape[1], 3), np.uint8)
     scale = 0.5
@@ -171,7 +167,7 @@ def with_caption(rgb: np.ndarray, text: str) -> np.ndarray:
     return np.concatenate([rgb, strip])
 
 
-def side_by_side(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
+def hstack(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
     """Join pictures of one height in a row, with a white gap."""
     height = max(panel.shape[0] for panel in panels)
     joined = []
@@ -183,7 +179,7 @@ def side_by_side(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
     return np.concatenate(joined, axis=1)
 
 
-def stacked(rows: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
+def vstack(rows: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
     """Join pictures from top to bottom, with a white gap, and white beside narrower ones."""
     width = max(row.shape[1] for row in rows)
     joined = []

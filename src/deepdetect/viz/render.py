@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
 from ..geometry.point_cloud import TAIL, PointCloud, angular_spacing, require_points, robust_box
+from .draw import add_caption, hstack, vstack
 
 SUPERSAMPLING = 2
 """A pixel is the mean of so many by so many: edges are smooth."""
@@ -58,7 +61,7 @@ class ViewCamera:
         return seen[:, :2] * scale[:, None] + self.middle, depth
 
 
-def camera_around(
+def orbit_camera(
     cloud: PointCloud,
     azimuth: float = 12.0,
     elevation: float = 8.0,
@@ -85,7 +88,7 @@ def camera_around(
     Example:
         >>> rng = np.random.default_rng(0)
         >>> cloud = PointCloud(rng.normal((0, 0, 9), 1, (500, 3)), np.zeros((500, 3), int), "mm")
-        >>> camera = camera_around(cloud, azimuth=90, elevation=0)
+        >>> camera = orbit_camera(cloud, azimuth=90, elevation=0)
         >>> camera.axes[2].round(6).tolist()  # it stands on the right and looks to the left
         [-1.0, 0.0, 0.0]
     """
@@ -144,6 +147,54 @@ def render(cloud: PointCloud, camera: ViewCamera, point_width: float | None = No
         fine[row::SUPERSAMPLING, column::SUPERSAMPLING] for row in steps for column in steps
     )
     return np.rint(total / SUPERSAMPLING**2).astype(np.uint8)
+
+
+def draw_clouds(
+    left: np.ndarray,
+    clouds: Mapping[str, PointCloud],
+    azimuth: float = 12.0,
+    elevation: float = 8.0,
+    width: int = 796,
+    columns: int = 2,
+) -> np.ndarray:
+    """Draw the left image and the clouds made from it, all seen by one camera.
+
+    Args:
+        left: (H, W, 3) uint8 RGB, the left image.
+        clouds: by title; the one with the most points decides where the camera stands. All
+            are in the frame of the left camera and in one unit.
+        azimuth, elevation: degrees, as of `orbit_camera`.
+        width: of a panel in pixels.
+        columns: panels a row.
+
+    Returns:
+        (H', W', 3) uint8 RGB: rows of panels, each with its title and its count below.
+
+    Raises:
+        OptionError: there is no cloud with a point, or their units differ.
+
+    Example:
+        >>> left = np.zeros((30, 40, 3), np.uint8)
+        >>> cloud = PointCloud([[0.0, 0.0, 5.0], [1.0, 1.0, 6.0]], left[0, :2], "mm")
+        >>> draw_clouds(left, {"ours": cloud}, width=80).shape
+        (88, 166, 3)
+    """
+    if not any(map(len, clouds.values())):
+        raise OptionError("no cloud has a point: there is nothing to draw")
+    if len({cloud.unit for cloud in clouds.values()}) > 1:
+        raise OptionError("clouds in one figure must have one unit: make them with one calibration")
+    size = (width, max(1, round(width * left.shape[0] / left.shape[1])))
+    shrinks = width < left.shape[1]
+    image = cv2.resize(left, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+    panels = [add_caption(image, "left image")]
+    camera = orbit_camera(max(clouds.values(), key=len), azimuth, elevation, size)
+    for title, cloud in clouds.items():
+        # Without points there is a white panel, which is what a method that finds none shows.
+        empty = np.full((size[1], size[0], 3), 255, np.uint8)
+        drawn = render(cloud, camera) if len(cloud) else empty
+        panels.append(add_caption(drawn, f"{title}: {len(cloud):,} points"))
+    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    return vstack([hstack(row) for row in rows])
 
 
 def _finer(camera: ViewCamera) -> ViewCamera:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, match_images
-from deepdetect.datasets.planar import PlanarPair
+from deepdetect.datasets.types import PlanarPair
 from deepdetect.evaluation.cache import StageCache
 from deepdetect.evaluation.protocols import BenchmarkOptions, run_benchmarks
 from deepdetect.evaluation.protocols.guided import (

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect
-from deepdetect.datasets.hpatches import is_usual
-from deepdetect.datasets.planar import PlanarScene
+from deepdetect.datasets.hpatches import in_d2net_subset
+from deepdetect.datasets.types import PlanarScene
 from deepdetect.evaluation.protocols import BenchmarkOptions, hpatches
 from deepdetect.evaluation.workspace import Workspace
 
@@ -32,7 +32,7 @@ def every() -> list[PlanarScene]:
 
 
 def test_the_usual_scenes_are_108(every: list[PlanarScene]) -> None:
-    assert [one.name for one in every if not is_usual(one)] == list(LARGE)
+    assert [one.name for one in every if not in_d2net_subset(one)] == list(LARGE)
     sets = dict(hpatches._sets(every))
     assert {name: len(chosen) for name, chosen in sets.items()} == {
         "all 116 scenes": 116,

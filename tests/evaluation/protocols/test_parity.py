@@ -8,7 +8,7 @@ import pytest
 
 from deepdetect import DeepDetect
 from deepdetect.datasets.oxford import load_oxford
-from deepdetect.datasets.planar import PlanarScene
+from deepdetect.datasets.types import PlanarScene
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.evaluation.baselines import Method
 from deepdetect.evaluation.baselines.sift import SIFT_LOW, low_sift

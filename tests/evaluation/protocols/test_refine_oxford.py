@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from deepdetect.cli import main
 from deepdetect.datasets.oxford import SCENES, load_oxford
-from deepdetect.datasets.planar import read_homography
+from deepdetect.datasets.types import read_homography
 from deepdetect.evaluation.protocols.refine_oxford import (
     displacement,
     refine_oxford,

@@ -9,7 +9,7 @@ import pytest
 
 from deepdetect import DeepDetect
 from deepdetect.datasets.low_visibility import load_low_visibility
-from deepdetect.datasets.planar import PlanarPair
+from deepdetect.datasets.types import PlanarPair
 from deepdetect.evaluation.baselines import CLASSICAL, Features, Method
 from deepdetect.evaluation.cache import StageCache
 from deepdetect.evaluation.metrics import one_to_one

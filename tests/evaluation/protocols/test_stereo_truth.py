@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.datasets.stereo import StereoPair
+from deepdetect.datasets.types import StereoPair
 from deepdetect.evaluation.protocols.stereo_truth import (
     AS_IT_IS,
     MOVED,

@@ -9,7 +9,7 @@ import pytest
 
 from deepdetect import DeepDetect, match_images
 from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.datasets.stereo import StereoPair
+from deepdetect.datasets.types import StereoPair
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.prewarp import MARGIN, affinity_between, straightened
 from deepdetect.matching.pipeline import Matches

@@ -15,7 +15,7 @@ from deepdetect.reconstruction.stereo.semi_global import SearchRange, semi_globa
 @pytest.fixture(scope="module")
 def motorcycle() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     pytest.importorskip("skimage", reason="needs scikit-image for its stereo pair")
-    from deepdetect.datasets.motorcycle import load_motorcycle
+    from deepdetect.datasets.middlebury import load_motorcycle
 
     pair = load_motorcycle()
     part = slice(150, 310)

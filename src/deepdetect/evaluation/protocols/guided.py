@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..._shared.options import changed
-from ...datasets.planar import PlanarPair
+from ...datasets.types import PlanarPair
 from ...geometry import transform_points
 from ...geometry.residuals import transfer_errors
 from ...io.image import load_image, luma

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ...datasets.hpatches import is_illumination, is_usual, load_hpatches
-from ...datasets.planar import PlanarPair, PlanarScene
+from ...datasets.hpatches import in_d2net_subset, is_illumination, load_hpatches
+from ...datasets.types import PlanarPair, PlanarScene
 from ..options import BenchmarkOptions
 from ..report import Cell, Column, Section, Table
 from ..workspace import Workspace
@@ -56,7 +56,7 @@ def _last_pairs(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:
 
 def _sets(scenes: Sequence[PlanarScene]) -> list[tuple[str, list[PlanarScene]]]:
     """Return all scenes, and those that papers usually take where they are fewer."""
-    usual = [scene for scene in scenes if is_usual(scene)]
+    usual = [scene for scene in scenes if in_d2net_subset(scene)]
     sets = [(f"all {len(scenes)} scenes", list(scenes))]
     if 0 < len(usual) < len(scenes):
         sets.append((f"the usual {len(usual)} scenes", usual))

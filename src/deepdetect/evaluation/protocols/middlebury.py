@@ -12,7 +12,7 @@ import numpy as np
 from ..._shared.errors import ImageError
 from ...geometry.camera import Calibration
 from ...geometry.point_cloud import PointCloud
-from ...viz.cloud_figure import draw_clouds
+from ...viz.render import draw_clouds
 from ..cache import file_digest
 from ..charts import picture
 from ..metering import Meter

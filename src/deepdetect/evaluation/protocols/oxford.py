@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...datasets.oxford import find_scene, load_oxford
-from ...datasets.planar import PlanarPair, PlanarScene
+from ...datasets.types import PlanarPair, PlanarScene
 from ..charts import bar_chart
 from ..options import BenchmarkOptions
 from ..report import Cell, Figure, Section, Table

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ...datasets.planar import PlanarPair, PlanarScene
+from ...datasets.types import PlanarPair, PlanarScene
 from ...detector.pretrained import bundled_weights
 from ...features.keypoints import Keypoints
 from ...geometry.residuals import transfer_errors
 from ...io.image import load_image, luma
-from ...labels import fuse
-from ...viz.draw import draw_keypoints, draw_label, draw_matches, side_by_side, with_caption
+from ...labels import draw_label, fuse
+from ...viz.draw import add_caption, draw_keypoints, draw_matches, hstack
 from ..baselines import CLASSICAL, Method
 from ..charts import line_chart, picture
 from ..options import BenchmarkOptions
@@ -74,10 +74,10 @@ def keypoint_figure(workspace: Workspace, options: BenchmarkOptions, scene: Plan
         found = workspace.keypoints(method, image).features
         inside = np.clip(np.rint(found.xy), 0, np.array(found.image_size) - 1)
         drawn = draw_keypoints(rgb, Keypoints(inside, found.scores, found.image_size))
-        panels.append(with_caption(drawn, f"{method.title}: {len(found):,}"))
+        panels.append(add_caption(drawn, f"{method.title}: {len(found):,}"))
         counts.append(f"{method.title} {len(found):,}")
     title = f"Figure 2: keypoints of {scene.name}: {'; '.join(counts)}"
-    return Figure(f"keypoints_{scene.name}", title, picture(side_by_side(panels)))
+    return Figure(f"keypoints_{scene.name}", title, picture(hstack(panels)))
 
 
 def loss_figure(workspace: Workspace) -> Figure:

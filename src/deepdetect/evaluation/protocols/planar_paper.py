@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...datasets.planar import PlanarPair, PlanarScene
+from ...datasets.types import PlanarPair, PlanarScene
 from ...geometry.residuals import transfer_errors
 from ..baselines import Method
 from ..metrics import published_repeatability

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ...datasets.planar import PlanarScene
+from ...datasets.types import PlanarScene
 from ..options import BenchmarkOptions
 from ..report import Section
 from ..workspace import Workspace

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..._shared.atomic import atomic_path
 from ...datasets.oxford import load_oxford
-from ...datasets.planar import PlanarPair, read_homography
+from ...datasets.types import PlanarPair, read_homography
 from ...features.matchers import get_matcher, match_descriptors
 from ...geometry import GeometryOptions, estimate_geometry, transform_points
 from ...geometry.homography_refinement import Refinement, refine_homography

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...datasets.planar import PlanarPair
+from ...datasets.types import PlanarPair
 from ...geometry import GeometryOptions, estimate_geometry
 from ..baselines import Features, Method
 from ..metrics.homography_accuracy import corner_error

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...datasets.middlebury import load_middlebury
-from ...datasets.stereo import StereoPair
+from ...datasets.types import StereoPair
 from ...io.image import luma
 
 BETTER = 0.7

@@ -10,7 +10,7 @@ import numpy as np
 from ..._shared.errors import DeepDetectError
 from ...datasets.middlebury import load_middlebury
 from ...datasets.oxford import find_scene, load_oxford
-from ...datasets.planar import PlanarPair
+from ...datasets.types import PlanarPair
 from ...detector.detector import DeepDetect
 from ...detector.heatmap import HeatmapOptions
 from ...geometry import disparity_errors, transform_points

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import ImageError
-from ...labels.batch import load_mask
+from ...io.masks import load_mask
 from ..photos import Photo
 from ..prefetch import prefetched
 from ..recipe import TrainingOptions

@@ -12,8 +12,8 @@ from ..._shared.errors import DeepDetectError, ImageError, OptionError
 from ..._shared.processes import map_in_processes
 from ..._shared.progress import progress
 from ...io.image import load_image
+from ...io.masks import encode_mask
 from ...labels import LabelOptions
-from ...labels.batch import encode_mask
 from ..label_cache import label_of_view, settings_digest
 from ..photos import Photo, hold_out, list_photos
 from ..recipe import TrainingOptions

@@ -1,4 +1,4 @@
-"""Scenes of planar data sets: images with the true homographies between them."""
+"""Scenes with ground truth: planar ones with homographies, stereo pairs with disparity."""
 
 from __future__ import annotations
 
@@ -53,6 +53,22 @@ class PlanarScene:
         """Yield the pairs of the first image with each other one."""
         for k, homography in enumerate(self.homographies, start=2):
             yield PlanarPair(self.name, k, self.images[0], self.images[k - 1], homography)
+
+
+@dataclass(frozen=True, eq=False)
+class StereoPair:
+    """Two rectified views: the match of the left (x, y) is the right (x - disparity, y).
+
+    Attributes:
+        name: of the scene.
+        left, right: (H, W, 3) uint8 RGB.
+        disparity: (H, W) float32 in pixels, of the left view; NaN where it is unknown.
+    """
+
+    name: str
+    left: np.ndarray
+    right: np.ndarray
+    disparity: np.ndarray
 
 
 def read_homography(path: Path) -> np.ndarray:

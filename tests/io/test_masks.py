@@ -12,7 +12,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from deepdetect._shared.errors import ImageError
-from deepdetect.labels.batch import load_mask, save_mask
+from deepdetect.io.masks import load_mask, save_mask
 
 MASK = np.random.default_rng(3).random((19, 26)) > 0.6
 

@@ -7,10 +7,15 @@ import pytest
 
 from deepdetect._shared.errors import DeepDetectError, OptionError
 from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.io.exporters import EXPORTERS, get_exporter, save_point_cloud
+from deepdetect.io.point_cloud import (
+    POINT_CLOUD_WRITERS,
+    find_writer,
+    format_metadata,
+    save_point_cloud,
+)
 
 
-@pytest.mark.parametrize("ending", sorted(EXPORTERS))
+@pytest.mark.parametrize("ending", sorted(POINT_CLOUD_WRITERS))
 def test_every_exporter_writes_a_whole_file(ending: str, small: PointCloud, tmp_path: Path) -> None:
     path = tmp_path / "new folder" / f"model{ending.upper()}"
     save_point_cloud(small, path, {"points": np.int64(256), "seconds": np.float32(1.5)})
@@ -20,7 +25,7 @@ def test_every_exporter_writes_a_whole_file(ending: str, small: PointCloud, tmp_
     assert path.read_bytes() == first
 
 
-@pytest.mark.parametrize("ending", sorted(EXPORTERS))
+@pytest.mark.parametrize("ending", sorted(POINT_CLOUD_WRITERS))
 def test_one_point_will_do(ending: str, tmp_path: Path) -> None:
     cloud = PointCloud([[1.0, 2.0, 3.0]], [[1, 2, 3]], "mm")
     save_point_cloud(cloud, tmp_path / f"one{ending}")
@@ -32,7 +37,7 @@ def test_one_point_will_do(ending: str, tmp_path: Path) -> None:
 )
 def test_the_nearest_ending_is_named(name: str, meant: str, one_line) -> None:
     with pytest.raises(OptionError) as caught:
-        get_exporter(name)
+        find_writer(name)
     assert f"did you mean {meant!r}?" in one_line(caught.value)
 
 
@@ -42,7 +47,7 @@ def test_no_ending_is_an_error(small: PointCloud, tmp_path: Path, one_line) -> N
     assert ".ply, .glb, .html" in one_line(caught.value)
 
 
-@pytest.mark.parametrize("ending", sorted(EXPORTERS))
+@pytest.mark.parametrize("ending", sorted(POINT_CLOUD_WRITERS))
 def test_an_empty_cloud_is_not_written(ending: str, tmp_path: Path, one_line) -> None:
     empty = PointCloud(np.empty((0, 3)), np.empty((0, 3), np.uint8), "mm")
     with pytest.raises(OptionError) as caught:
@@ -58,3 +63,19 @@ def test_a_path_that_cannot_be_written_is_one_sentence(
     with pytest.raises(DeepDetectError) as caught:
         save_point_cloud(small, tmp_path / "file" / "model.ply")
     assert "cannot write" in one_line(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (1234567, "1,234,567"),
+        (np.int64(1200), "1,200"),
+        (49979.0, "49,979"),
+        (np.float32(0.95312), "0.9531"),
+        (float("nan"), "nan"),
+        (True, "True"),
+        ("  two\n lines ", "two lines"),
+    ],
+)
+def test_values_become_one_line(value: object, text: str) -> None:
+    assert format_metadata({"a\nname": value}) == {"a name": text}

@@ -1,0 +1,83 @@
+"""Point clouds in files: one registry of formats, chosen by the file's suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from numbers import Real
+from pathlib import Path
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import look_up
+from ..geometry.point_cloud import PointCloud, require_points
+from .glb import write_glb
+from .html_viewer import write_html_page
+from .ply import write_ply
+
+Metadata = Mapping[str, str | int | float]
+PointCloudWriter = Callable[[PointCloud, Path, Mapping[str, str]], None]
+
+POINT_CLOUD_WRITERS: dict[str, PointCloudWriter] = {
+    ".ply": write_ply,
+    ".glb": write_glb,
+    ".html": write_html_page,
+}
+"""By suffix. A new format is a function `(cloud, path, metadata) -> None` and a line here."""
+
+
+def save_point_cloud(cloud: PointCloud, path: str | Path, metadata: Metadata | None = None) -> None:
+    """Write a point cloud, whole or not at all.
+
+    Args:
+        cloud: the cloud.
+        path: its suffix chooses the format:
+            .ply: binary PLY, in the cloud's own frame and unit;
+            .glb: binary glTF 2.0, y up and in metres;
+            .html: a self-contained interactive viewer.
+        metadata: text and numbers by name, stored in the file, as {"source": "cones",
+            "seconds": 2.5}: as PLY comments, as glTF extras, or as the page's caption.
+
+    Raises:
+        OptionError: the suffix is unknown (the nearest right one is named), or the cloud is
+            empty.
+        DeepDetectError: the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8), "mm")
+        >>> save_point_cloud(cloud, Path(tempfile.mkdtemp()) / "model.ply")
+        >>> save_point_cloud(cloud, "model.plyy")
+        Traceback (most recent call last):
+        ...
+        deepdetect.OptionError: unknown ending '.plyy': did you mean '.ply'? \
+(known: .ply, .glb, .html)
+    """
+    write = find_writer(path)
+    require_points(cloud)
+    with atomic_path(path) as temporary:
+        write(cloud, temporary, format_metadata(metadata or {}))
+
+
+def find_writer(path: str | Path) -> PointCloudWriter:
+    """Return the writer for a path; also used to check a suffix before the work begins.
+
+    Raises:
+        OptionError: the suffix is unknown (the nearest right one is named).
+    """
+    return look_up("ending", Path(path).suffix.lower(), POINT_CLOUD_WRITERS)
+
+
+def format_metadata(metadata: Metadata) -> dict[str, str]:
+    """Format each value as one line of text: integers with commas, others with four digits.
+
+    Example:
+        >>> format_metadata({"points": 49979, "within 1 px": 0.95312, "scene": "the  cones"})
+        {'points': '49,979', 'within 1 px': '0.9531', 'scene': 'the cones'}
+    """
+    return {" ".join(str(name).split()): _text(value) for name, value in metadata.items()}
+
+
+def _text(value: str | int | float) -> str:
+    if isinstance(value, bool) or not isinstance(value, Real):  # numpy's numbers are Real
+        return " ".join(str(value).split())
+    return f"{int(value):,}" if float(value).is_integer() else f"{value:.4g}"
