@@ -12,7 +12,7 @@ import pytest
 from deepdetect.detector.heatmap import HeatmapOptions, compute_heatmap
 from deepdetect.features.keypoints import select_keypoints
 from deepdetect.labels import DETECTORS
-from deepdetect.labels.points import keypoints_mask, pixels_mask
+from deepdetect.labels.detectors import keypoints_mask, pixels_mask
 
 
 def to_logits(probability: np.ndarray) -> np.ndarray:

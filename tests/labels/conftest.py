@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from deepdetect.io.image import luma
-from deepdetect.labels import DETECTORS
 
 
 @pytest.fixture
@@ -30,23 +29,6 @@ def gray(photo: np.ndarray) -> np.ndarray:
 def dark(gray: np.ndarray) -> np.ndarray:
     """The same, with 32 grey levels."""
     return (gray // 8 + 10).astype(np.uint8)
-
-
-@pytest.fixture(scope="session")
-def marks_nothing_on_constant_images() -> Callable[[str], None]:
-    """Check a detector on constant images of several levels and sizes, in both settings."""
-
-    def check(name: str) -> None:
-        (detector,) = (one for one in DETECTORS if one.name == name)
-        for settings in (detector.normal, detector.low_visibility):
-            for level in (0, 1, 20, 128, 254, 255):
-                for shape in ((16, 16), (17, 23), (64, 48)):
-                    mask = detector.mask(np.full(shape, level, np.uint8), settings)
-                    assert mask.dtype == bool
-                    assert mask.shape == shape
-                    assert not mask.any(), (settings, level, shape)
-
-    return check
 
 
 @pytest.fixture(scope="session")

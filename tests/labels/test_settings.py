@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from deepdetect import OptionError
-from deepdetect.labels import LabelOptions, SettingChange, fuse, read_label_settings
-from deepdetect.labels.fast import FastSettings, fast_mask
-from deepdetect.labels.registry import DETECTOR_NAMES
+from deepdetect.io.image import luma
+from deepdetect.labels import (
+    LABEL_SETTINGS,
+    LabelOptions,
+    SettingChange,
+    find_label_settings,
+    fuse,
+    read_label_settings,
+)
+from deepdetect.labels.detectors import DETECTOR_NAMES, FastSettings, fast_mask
 
 
 def write(folder: Path, text: str) -> Path:
@@ -91,3 +98,30 @@ def test_the_order_in_the_file_says_nothing(tmp_path: Path) -> None:
         )
     )
     assert first == second
+
+
+def options(name: str) -> LabelOptions:
+    chosen = find_label_settings(name)
+    return LabelOptions(chosen.detectors, changes=chosen.changes)
+
+
+def test_the_paper_s_are_the_default() -> None:
+    assert options("paper") == LabelOptions()
+
+
+def test_those_for_geometry_mark_more_and_nothing_less(photo: np.ndarray) -> None:
+    sparse = fuse(luma(photo), options("paper")).mask
+    dense = fuse(luma(photo), options("dense")).mask
+    assert (dense | sparse).sum() == dense.sum()
+    assert dense.mean() > 1.1 * sparse.mean()
+    assert dense.mean() < 0.95
+
+
+def test_a_file_is_read_and_a_word_is_a_name(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text("[fast]\nnormal = { threshold = 20 }\n")
+    (change,) = find_label_settings(path).changes
+    assert change.value == 20
+    assert set(LABEL_SETTINGS) == {"paper", "dense"}
+    with pytest.raises(OptionError, match="did you mean 'dense'"):
+        find_label_settings("densee")

@@ -1,9 +1,14 @@
 """Labels for training: classical detectors, and their fusion into one binary mask."""
 
+from .detectors import DETECTOR_NAMES, DETECTORS, LabelDetector
 from .fusion import Label, LabelOptions, draw_label, fuse
-from .named_settings import LABEL_SETTINGS, find_label_settings
-from .registry import DETECTOR_NAMES, DETECTORS, LabelDetector
-from .settings import LabelSettings, SettingChange, read_label_settings
+from .settings import (
+    LABEL_SETTINGS,
+    LabelSettings,
+    SettingChange,
+    find_label_settings,
+    read_label_settings,
+)
 from .visibility import LOW_VISIBILITY_RANGE, luma_range, visibility_of
 
 __all__ = [

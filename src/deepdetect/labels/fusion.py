@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..viz.draw import draw_masks
-from .registry import DETECTOR_NAMES, select_detectors
+from .detectors import DETECTOR_NAMES, select_detectors
 from .settings import SettingChange, settings_for
 from .visibility import Visibility, VisibilityChoice, visibility_of
 

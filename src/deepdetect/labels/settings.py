@@ -1,4 +1,4 @@
-"""Changes of the detectors' settings: from Python, or from a TOML file."""
+"""Settings of the label detectors: by name, from a TOML file, or changed one by one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
-from .registry import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
+from .._shared.options import is_path, look_up_word
+from .detectors import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
 from .visibility import Visibility
 
 SECTIONS: dict[str, Visibility] = {"normal": "normal", "low_visibility": "low"}
@@ -102,6 +103,31 @@ class LabelSettings:
                 f"settings of {idle[0]} are given, but it is not among the detectors: "
                 "add it to them, or take its settings away"
             )
+
+
+LABEL_SETTINGS: dict[str, LabelSettings] = {
+    "paper": LabelSettings(),
+    # Denser, for geometry: chosen by true stereo matches (docs/labels.md).
+    "dense": LabelSettings(changes=(SettingChange("sobel", "normal", "relative_threshold", 0.02),)),
+}
+
+
+def find_label_settings(settings: str | Path) -> LabelSettings:
+    """Look settings up by name, or read them from a file.
+
+    Args:
+        settings: a name of `LABEL_SETTINGS`, or the path of a TOML file.
+
+    Raises:
+        OptionError: the name is unknown, or the file cannot be read or is wrong.
+
+    Example:
+        >>> find_label_settings("paper").changes
+        ()
+    """
+    if is_path(settings):
+        return read_label_settings(settings)
+    return look_up_word("label settings", settings, LABEL_SETTINGS)
 
 
 def read_label_settings(path: str | Path) -> LabelSettings:

@@ -16,7 +16,7 @@ from .._shared.progress import progress
 from ..io.image import load_image, luma
 from ..io.masks import load_mask, save_mask
 from ..labels import LabelOptions, fuse
-from ..labels.registry import select_detectors
+from ..labels.detectors import select_detectors
 from ..labels.settings import settings_for
 from ..labels.visibility import Visibility
 from .photos import Photo

@@ -1,19 +1,28 @@
 from __future__ import annotations
 
 import dataclasses
+from fractions import Fraction
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
-from deepdetect.labels.registry import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
+from deepdetect.labels.detectors import (
+    DETECTOR_NAMES,
+    DETECTORS,
+    LabelDetector,
+    keypoints_mask,
+    pixels_mask,
+    select_detectors,
+)
 
 NAMES = ("sift", "orb", "brisk", "fast", "agast", "harris", "shi-tomasi", "canny", "sobel")
 
-# The settings that reproduce the published labels (shared/notes/labels.md).
+# The settings that reproduce the published labels.
 PUBLISHED: dict[str, dict[str, Any]] = {
     "sift": {
         "contrast_threshold": 0.04,
@@ -82,6 +91,17 @@ def test_masks_are_boolean_and_of_the_images_size(
 
 
 @pytest.mark.parametrize("detector", DETECTORS, ids=NAMES)
+def test_constant_images_are_not_marked(detector: LabelDetector) -> None:
+    for settings in (detector.normal, detector.low_visibility):
+        for level in (0, 1, 20, 128, 254, 255):
+            for shape in ((16, 16), (17, 23), (64, 48)):
+                mask = detector.mask(np.full(shape, level, np.uint8), settings)
+                assert mask.dtype == bool
+                assert mask.shape == shape
+                assert not mask.any(), (settings, level, shape)
+
+
+@pytest.mark.parametrize("detector", DETECTORS, ids=NAMES)
 def test_settings_are_frozen(detector: LabelDetector) -> None:
     field = dataclasses.fields(detector.normal)[0].name
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -107,3 +127,74 @@ def test_an_unknown_name_is_told_the_nearest(given: str, nearest: str) -> None:
 def test_no_name() -> None:
     with pytest.raises(OptionError, match="no label detector was chosen"):
         select_detectors([])
+
+
+# Quarter pixels hit the halves often; any float finds the rest.
+COORDINATES = st.integers(-12, 60).map(lambda n: n / 4) | st.floats(-1e6, 1e6)
+
+
+def nearest(value: float) -> int:
+    """The nearest whole number, halves to the even one, by exact fractions."""
+    whole, rest = divmod(Fraction(value), 1)
+    if rest == Fraction(1, 2):
+        return int(whole) + int(whole) % 2
+    return int(whole) + (rest > Fraction(1, 2))
+
+
+@given(
+    shape=st.tuples(st.integers(1, 12), st.integers(1, 12)),
+    points=st.lists(st.tuples(COORDINATES, COORDINATES), max_size=30),
+)
+def test_pixels_equals_a_plain_loop(
+    shape: tuple[int, int], points: list[tuple[float, float]]
+) -> None:
+    expected = np.zeros(shape, bool)
+    for x, y in points:
+        column, row = nearest(x), nearest(y)
+        if 0 <= row < shape[0] and 0 <= column < shape[1]:
+            expected[row, column] = True
+    mask = pixels_mask(shape, np.array(points))
+    assert mask.dtype == bool
+    np.testing.assert_array_equal(mask, expected)
+
+
+@pytest.mark.parametrize(
+    ("x", "column"),
+    [(0.5, 0), (1.5, 2), (2.5, 2), (3.5, 4), (-0.5, 0), (1.49, 1), (1.51, 2), (4.4, 4)],
+)
+def test_pixels_halves_go_to_the_even_pixel(x: float, column: int) -> None:
+    np.testing.assert_array_equal(
+        np.argwhere(pixels_mask((5, 5), np.array([[x, 1.0]]))), [[1, column]]
+    )
+    np.testing.assert_array_equal(
+        np.argwhere(pixels_mask((5, 5), np.array([[1.0, x]]))), [[column, 1]]
+    )
+
+
+@pytest.mark.parametrize("point", [(-0.6, 1), (1, -0.6), (4.6, 1), (1, 3.6), (5, 4), (-5, -5)])
+def test_pixels_outside_are_left_out(point: tuple[float, float]) -> None:
+    assert not pixels_mask((4, 5), np.array([point])).any()
+
+
+@pytest.mark.parametrize(
+    "points", [[], np.empty((0, 2)), np.empty((0, 1, 2), np.float32)], ids=["list", "2-D", "3-D"]
+)
+def test_pixels_no_point(points: object) -> None:
+    mask = pixels_mask((4, 5), points)
+    assert mask.shape == (4, 5)
+    assert not mask.any()
+
+
+def test_pixels_the_shape_of_opencv_corners() -> None:
+    corners = np.array([[[3.0, 1.0]], [[0.0, 2.0]]], np.float32)
+    assert np.argwhere(pixels_mask((4, 5, 3), corners)).tolist() == [[1, 3], [2, 0]]
+
+
+def test_pixels_opencv_keypoints() -> None:
+    gray = np.zeros((6, 9), np.uint8)
+    keypoints = [cv2.KeyPoint(x, y, 3) for x, y in [(7.0, 2.0), (2.5, 3.5), (8.7, 1.0)]]
+    assert np.argwhere(keypoints_mask(gray, keypoints)).tolist() == [[2, 7], [4, 2]]
+    for none in ([], ()):
+        mask = keypoints_mask(gray, none)
+        assert mask.dtype == bool
+        np.testing.assert_array_equal(mask, gray > 0)

@@ -1,16 +1,15 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 import pytest
 
-from deepdetect.labels.canny import CannySettings, canny_mask
-
-
-def test_constant_images(marks_nothing_on_constant_images: Callable[[str], None]) -> None:
-    marks_nothing_on_constant_images("canny")
+from deepdetect.labels.detectors import (
+    CannySettings,
+    SobelSettings,
+    canny_mask,
+    sobel_mask,
+)
 
 
 @pytest.mark.parametrize(
@@ -18,7 +17,7 @@ def test_constant_images(marks_nothing_on_constant_images: Callable[[str], None]
     # A step of c gives a gradient of 4 c: 248 is not above the high threshold 250, 252 is.
     [(30, False), (62, False), (63, True), (200, True)],
 )
-def test_a_step_edge_is_one_pixel_thin(contrast: int, marked: bool) -> None:
+def test_canny_a_step_edge_is_one_pixel_thin(contrast: int, marked: bool) -> None:
     gray = np.full((30, 40), 20, np.uint8)
     gray[:, 17:] += contrast
     mask = canny_mask(gray, CannySettings())
@@ -35,7 +34,7 @@ def test_a_step_edge_is_one_pixel_thin(contrast: int, marked: bool) -> None:
     # 4 * 37 = 148 is not above the low threshold 150, 4 * 38 = 152 is.
     [(37, False), (38, True)],
 )
-def test_a_weak_edge_counts_when_it_continues_a_strong_one(weak: int, marked: bool) -> None:
+def test_canny_a_weak_edge_counts_when_it_continues_a_strong_one(weak: int, marked: bool) -> None:
     gray = np.zeros((60, 40), np.uint8)
     gray[:30, 17:] = 100
     gray[30:, 17:] = weak
@@ -47,7 +46,7 @@ def test_a_weak_edge_counts_when_it_continues_a_strong_one(weak: int, marked: bo
     assert not canny_mask(alone, CannySettings()).any()
 
 
-def test_hysteresis_on_a_photograph(gray: np.ndarray) -> None:
+def test_canny_hysteresis_on_a_photograph(gray: np.ndarray) -> None:
     ndimage = pytest.importorskip("scipy.ndimage")
     settings = CannySettings()
     values = gray.astype(np.float64)
@@ -71,7 +70,7 @@ def test_hysteresis_on_a_photograph(gray: np.ndarray) -> None:
     assert mask[1:-1, 1:-1][ridge].mean() > 0.95
 
 
-def test_agrees_with_scikit_image_up_to_a_pixel(gray: np.ndarray) -> None:
+def test_canny_agrees_with_scikit_image_up_to_a_pixel(gray: np.ndarray) -> None:
     feature = pytest.importorskip("skimage.feature")
     blurred = cv2.GaussianBlur(gray, (0, 0), 1.5)
     ours = canny_mask(blurred, CannySettings(40.0, 80.0))
@@ -81,3 +80,50 @@ def test_agrees_with_scikit_image_up_to_a_pixel(gray: np.ndarray) -> None:
     assert ours.sum() > 1000
     assert theirs.sum() > 1000
     assert cv2.dilate(ours.astype(np.uint8), near).astype(bool)[theirs].mean() > 0.98
+
+
+def sobel_kernels(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """The derivative and the smoothing kernel: binomials, as Sobel's are for any width."""
+    smooth = np.ones(1)
+    for _ in range(size - 2):
+        smooth = np.convolve(smooth, [1, 1])
+    return np.convolve(smooth, [-1, 1]), np.convolve(smooth, [1, 1])
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5])
+@pytest.mark.parametrize("size", [3, 11])
+@pytest.mark.parametrize("image", ["gray", "dark", "square"])
+def test_sobel_equals_scipy(
+    image: str, size: int, share: float, request: pytest.FixtureRequest
+) -> None:
+    ndimage = pytest.importorskip("scipy.ndimage")
+    gray = request.getfixturevalue(image)
+    derivative, smooth = sobel_kernels(size)
+
+    def gradient(axis: int) -> np.ndarray:
+        filtered = ndimage.correlate1d(gray.astype(np.float64), derivative, axis, mode="mirror")
+        return ndimage.correlate1d(filtered, smooth, 1 - axis, mode="mirror")
+
+    magnitude = np.hypot(gradient(0), gradient(1))
+    mask = sobel_mask(gray, SobelSettings(size, share))
+    assert mask.dtype == bool
+    assert 0.001 < mask.mean() < 0.9
+    np.testing.assert_array_equal(mask, magnitude > share * magnitude.max())
+
+
+def test_sobel_a_step_edge_is_a_band_around_it() -> None:
+    gray = np.zeros((40, 60), np.uint8)
+    gray[:, 30:] = 50
+    derivative, _ = sobel_kernels(11)
+    # At distance d from the step the response is a running sum of the derivative kernel.
+    response = np.abs(np.cumsum(derivative))[:-1]
+    width = int((response > 0.1 * response.max()).sum())
+    mask = sobel_mask(gray, SobelSettings())
+    assert width == 6
+    np.testing.assert_array_equal(np.flatnonzero(mask.all(0)), np.arange(27, 33))
+    np.testing.assert_array_equal(np.flatnonzero(mask.any(0)), np.arange(27, 33))
+
+
+def test_sobel_the_mask_turns_with_the_image(gray: np.ndarray) -> None:
+    turned = sobel_mask(np.ascontiguousarray(gray.T), SobelSettings())
+    np.testing.assert_array_equal(turned, sobel_mask(gray, SobelSettings()).T)

@@ -1,0 +1,326 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from deepdetect.labels.detectors import (
+    AgastSettings,
+    BriskSettings,
+    FastSettings,
+    HarrisSettings,
+    OrbSettings,
+    ShiTomasiSettings,
+    SiftSettings,
+    agast_mask,
+    brisk_mask,
+    fast_mask,
+    harris_mask,
+    orb_mask,
+    shi_tomasi_mask,
+    sift_mask,
+)
+
+
+def sift_blob(x: float, y: float, sigma: float) -> np.ndarray:
+    rows, columns = np.mgrid[:64, :90]
+    bump = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
+    return np.rint(200 * bump).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("x", "y", "sigma"), [(40, 22, 4), (31, 40, 3), (61, 33, 5)])
+def test_sift_a_blob_is_marked_at_its_centre(x: int, y: int, sigma: float) -> None:
+    mask = sift_mask(sift_blob(x, y, sigma), SiftSettings())
+    assert mask[y, x]
+
+
+def test_sift_equals_opencv_with_the_published_settings(
+    gray: np.ndarray, naive_mask: Callable
+) -> None:
+    # Arguments by position: features, octave layers, contrast, edge threshold, sigma.
+    expected = naive_mask(gray, cv2.SIFT_create(0, 3, 0.04, 1000, 1.6))
+    mask = sift_mask(gray, SiftSettings())
+    assert mask.dtype == bool
+    assert expected.sum() > 100
+    np.testing.assert_array_equal(mask, expected)
+
+
+def test_sift_the_edge_test_is_all_but_off(gray: np.ndarray) -> None:
+    # OpenCV's own default of 10 drops points on edges.
+    assert sift_mask(gray, SiftSettings()).sum() > sift_mask(gray, SiftSettings(0.04, 10.0)).sum()
+
+
+def test_sift_agrees_with_scikit_image(gray: np.ndarray) -> None:
+    feature = pytest.importorskip("skimage.feature")
+    detector = feature.SIFT(upsampling=2, c_dog=0.04 / 3, c_edge=1000)
+    detector.detect(gray)
+    theirs = np.zeros(gray.shape, np.uint8)
+    for row, column in np.rint(detector.positions).astype(int):
+        theirs[row, column] = 1
+    ours = sift_mask(gray, SiftSettings())
+    near = cv2.dilate(theirs, np.ones((5, 5), np.uint8)).astype(bool)
+    assert near[ours].mean() > 0.7
+    assert near.mean() < 0.3  # by chance alone it would be this
+
+
+def test_orb_the_corners_of_a_square(square: np.ndarray) -> None:
+    row, column = np.nonzero(orb_mask(square, OrbSettings()))
+    corners = [(24, 20), (47, 20), (24, 43), (47, 43)]
+    distance = np.array(
+        [
+            [max(abs(column - x), abs(row - y)).max() for x, y in corners]
+            for column, row in zip(column, row, strict=True)
+        ]
+    )
+    assert distance.min(1).max() <= 2
+    assert distance.min(0).max() <= 2
+
+
+def test_orb_equals_opencv_with_the_published_settings(
+    gray: np.ndarray, naive_mask: Callable
+) -> None:
+    detector = cv2.ORB_create(1_000_000)
+    detector.setScaleFactor(1.2)
+    detector.setNLevels(7)
+    detector.setEdgeThreshold(13)
+    detector.setFastThreshold(13)
+    expected = naive_mask(gray, detector)
+    mask = orb_mask(gray, OrbSettings())
+    assert mask.dtype == bool
+    np.testing.assert_array_equal(mask, expected)
+
+
+def test_orb_nothing_is_cut_off(gray: np.ndarray) -> None:
+    mask, capped = (orb_mask(gray, OrbSettings(features=n)) for n in (1_000_000, 300))
+    assert mask.sum() > 2 * capped.sum()
+
+
+def test_orb_nothing_near_the_border(gray: np.ndarray) -> None:
+    mask = orb_mask(gray, OrbSettings(levels=1))
+    inner = mask[13:-13, 13:-13]
+    assert inner.sum() == mask.sum() > 100
+    assert inner[0].any() | inner[-1].any() | inner[:, 0].any() | inner[:, -1].any()
+
+
+def brisk_create(threshold: int, octaves: int) -> cv2.Feature2D:
+    home = cv2 if hasattr(cv2, "BRISK_create") else cv2.xfeatures2d
+    return home.BRISK_create(threshold, octaves)
+
+
+@pytest.mark.parametrize("image", ["gray", "dark", "square"])
+def test_brisk_equals_opencv_with_the_published_settings(
+    image: str, naive_mask: Callable, request: pytest.FixtureRequest
+) -> None:
+    gray = request.getfixturevalue(image)
+    mask = brisk_mask(gray, BriskSettings())
+    assert mask.dtype == bool
+    assert mask.any()
+    np.testing.assert_array_equal(mask, naive_mask(gray, brisk_create(11, 3)))
+
+
+def test_brisk_marks_lie_at_the_corners_of_a_square(square: np.ndarray) -> None:
+    corners = np.array([(24, 20), (47, 20), (24, 43), (47, 43)])
+    marked = np.argwhere(brisk_mask(square, BriskSettings()))[:, ::-1]
+    assert len(marked) > 0
+    for point in marked:
+        assert np.abs(corners - point).max(1).min() <= 2
+
+
+def test_brisk_settings_are_kept_apart(gray: np.ndarray, naive_mask: Callable) -> None:
+    # The detectors are made once and kept, which must not mix their settings up.
+    for threshold, octaves in [(11, 3), (60, 3), (11, 0), (11, 3)]:
+        np.testing.assert_array_equal(
+            brisk_mask(gray, BriskSettings(threshold, octaves)),
+            naive_mask(gray, brisk_create(threshold, octaves)),
+        )
+
+
+def test_fast_the_corners_of_a_square(square: np.ndarray) -> None:
+    mask = fast_mask(square, FastSettings())
+    row, column = np.nonzero(mask)
+    for y in (20, 43):
+        for x in (24, 47):
+            assert mask[y, x]
+            near = (abs(column - x) <= 2) & (abs(row - y) <= 2)
+            assert near.sum() == mask.sum() / 4
+
+
+@pytest.mark.parametrize("shape", [(40, 50), (41, 33)])
+def test_fast_a_straight_edge_is_no_corner(shape: tuple[int, int]) -> None:
+    gray = np.zeros(shape, np.uint8)
+    gray[:, 20:] = 200
+    assert not fast_mask(gray, FastSettings()).any()
+
+
+@pytest.mark.parametrize(
+    ("contrast", "threshold", "marked"), [(13, 13, False), (14, 13, True), (2, 1, True)]
+)
+def test_fast_one_bright_pixel_must_exceed_the_threshold(
+    contrast: int, threshold: int, marked: bool
+) -> None:
+    gray = np.full((30, 40), 100, np.uint8)
+    gray[11, 17] += contrast
+    mask = fast_mask(gray, FastSettings(threshold=threshold))
+    assert mask[11, 17] == marked
+    assert mask.sum() == marked
+
+
+@pytest.mark.parametrize("threshold", [1, 13, 40])
+def test_fast_equals_scikit_image(gray: np.ndarray, threshold: int) -> None:
+    feature = pytest.importorskip("skimage.feature")
+    expected = feature.corner_fast(gray.astype(np.float64), n=9, threshold=threshold) > 0
+    mask = fast_mask(gray, FastSettings(threshold=threshold))
+    assert expected.sum() > 100
+    np.testing.assert_array_equal(mask, expected)
+
+
+def test_fast_the_low_setting_marks_more(dark: np.ndarray) -> None:
+    normal, low = (fast_mask(dark, FastSettings(threshold=t)) for t in (13, 1))
+    assert low.sum() > 5 * normal.sum()
+    assert (low | normal).sum() == low.sum()
+
+
+def test_fast_suppression_keeps_a_part(gray: np.ndarray) -> None:
+    every, best = (fast_mask(gray, FastSettings(suppression=s)) for s in (False, True))
+    assert 0 < best.sum() < every.sum()
+    assert (every | best).sum() == every.sum()
+
+
+@pytest.mark.parametrize("threshold", [1, 5, 13, 30])
+@pytest.mark.parametrize("image", ["gray", "dark", "square"])
+def test_agast_equals_fast(image: str, threshold: int, request: pytest.FixtureRequest) -> None:
+    gray = request.getfixturevalue(image)
+    mask = agast_mask(gray, AgastSettings(threshold=threshold))
+    assert mask.dtype == bool
+    np.testing.assert_array_equal(mask, fast_mask(gray, FastSettings(threshold=threshold)))
+
+
+@given(
+    gray=arrays(np.uint8, st.tuples(st.integers(16, 24), st.integers(16, 24))),
+    threshold=st.sampled_from([1, 13]),
+)
+def test_agast_equals_fast_on_any_image(gray: np.ndarray, threshold: int) -> None:
+    np.testing.assert_array_equal(
+        agast_mask(gray, AgastSettings(threshold=threshold)),
+        fast_mask(gray, FastSettings(threshold=threshold)),
+    )
+
+
+def test_agast_the_corners_of_a_square(square: np.ndarray) -> None:
+    mask = agast_mask(square, AgastSettings())
+    assert all(mask[y, x] for y in (20, 43) for x in (24, 47))
+    assert not mask[25:39].any()
+
+
+def harris_reference(gray: np.ndarray, settings: HarrisSettings) -> tuple[np.ndarray, np.ndarray]:
+    """The mask, and where it hangs on rounding, by SciPy's filters in float64."""
+    ndimage = pytest.importorskip("scipy.ndimage")
+    derivative, smooth = [-1, -2, 0, 2, 1], [1, 4, 6, 4, 1]  # Sobel of width 5
+    image = gray.astype(np.float64)
+
+    def gradient(axis: int) -> np.ndarray:
+        filtered = ndimage.correlate1d(image, derivative, axis, mode="mirror")
+        return ndimage.correlate1d(filtered, smooth, 1 - axis, mode="mirror")
+
+    def window(product: np.ndarray) -> np.ndarray:
+        return ndimage.uniform_filter(product, settings.block_size, mode="mirror")
+
+    dx, dy = gradient(1), gradient(0)
+    a, b, c = window(dx * dx), window(dx * dy), window(dy * dy)
+    response = a * c - b * b - settings.k * (a + c) ** 2
+    if settings.dilate:
+        response = ndimage.maximum_filter(response, 3, mode="nearest")
+    limit = settings.relative_threshold * response.max()
+    return response > limit, abs(response - limit) < 1e-3 * limit
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        HarrisSettings(),
+        HarrisSettings(dilate=False),
+        HarrisSettings(k=0.04, relative_threshold=0.04),
+    ],
+)
+@pytest.mark.parametrize("image", ["gray", "dark", "square"])
+def test_harris_equals_scipy(
+    image: str, settings: HarrisSettings, request: pytest.FixtureRequest
+) -> None:
+    gray = request.getfixturevalue(image)
+    expected, unsure = harris_reference(gray, settings)
+    mask = harris_mask(gray, settings)
+    assert mask.dtype == bool
+    assert 0.005 < mask.mean() < 0.9
+    assert unsure.mean() < 0.01
+    np.testing.assert_array_equal(mask[~unsure], expected[~unsure])
+
+
+def test_harris_the_corners_of_a_square(square: np.ndarray) -> None:
+    mask = harris_mask(square, HarrisSettings())
+    count, _, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    assert count == 5  # the background and four blobs
+    # A corner lies between the pixels; each blob is centred there and up to 8 pixels wide.
+    corners = [(23.5, 19.5), (47.5, 19.5), (23.5, 43.5), (47.5, 43.5)]
+    for x, y in corners:
+        assert np.abs(centres[1:] - (x, y)).max(1).min() < 1.5
+    assert stats[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max() <= 8
+    np.testing.assert_array_equal(stats[1:, cv2.CC_STAT_AREA], stats[1, cv2.CC_STAT_AREA])
+
+
+def test_harris_the_middle_of_a_straight_edge_is_no_corner() -> None:
+    gray = np.zeros((40, 60), np.uint8)
+    gray[:, 30:] = 200
+    assert not harris_mask(gray, HarrisSettings()).any()
+
+
+def test_harris_the_mask_turns_with_the_image(gray: np.ndarray) -> None:
+    turned = harris_mask(np.ascontiguousarray(gray.T), HarrisSettings())
+    assert (turned != harris_mask(gray, HarrisSettings()).T).mean() < 1e-3
+
+
+def test_shi_tomasi_the_corners_of_a_square(square: np.ndarray) -> None:
+    mask = shi_tomasi_mask(square, ShiTomasiSettings())
+    found = sorted(np.argwhere(mask)[:, ::-1].tolist())
+    # A window of 2 pixels reaches to the left and above, so that its corners lie at its end.
+    assert found == [[25, 21], [25, 43], [47, 21], [47, 43]]
+
+
+def test_shi_tomasi_a_straight_edge_is_no_corner() -> None:
+    gray = np.zeros((40, 60), np.uint8)
+    gray[:, 30:] = 200
+    assert not shi_tomasi_mask(gray, ShiTomasiSettings()).any()
+
+
+@pytest.mark.parametrize("image", ["gray", "dark"])
+def test_shi_tomasi_agrees_with_scipy(image: str, request: pytest.FixtureRequest) -> None:
+    ndimage = pytest.importorskip("scipy.ndimage")
+    gray = request.getfixturevalue(image)
+    settings = ShiTomasiSettings()
+    values = gray.astype(np.float64)
+    dx, dy = (ndimage.sobel(values, axis, mode="mirror") for axis in (1, 0))
+    a, b, c = (
+        ndimage.uniform_filter(product, settings.block_size, mode="mirror")
+        for product in (dx * dx, dx * dy, dy * dy)
+    )
+    smaller = (a + c) / 2 - np.sqrt(((a - c) / 2) ** 2 + b * b)
+    largest_near = ndimage.maximum_filter(smaller, 3, mode="nearest")
+    expected = (smaller > settings.quality_level * smaller.max()) & (
+        smaller >= largest_near * (1 - 1e-6)
+    )
+    expected[[0, -1]] = expected[:, [0, -1]] = False  # OpenCV takes none on the border
+    mask = shi_tomasi_mask(gray, settings)
+    assert mask.dtype == bool
+    assert mask.sum() > 200
+    assert (mask & expected).sum() > 0.99 * max(mask.sum(), expected.sum())
+
+
+def test_shi_tomasi_a_limit_keeps_the_strongest(gray: np.ndarray) -> None:
+    every, some = (shi_tomasi_mask(gray, ShiTomasiSettings(corners=n)) for n in (0, 50))
+    assert some.sum() == 50
+    assert every.sum() > 200
+    assert not (some & ~every).any()
