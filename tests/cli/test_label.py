@@ -51,9 +51,9 @@ def test_masks_of_other_settings_are_not_passed_off(run, photos: Path) -> None:
     assert Path("masks/cat.png").read_bytes() != before
 
 
-def test_explain_draws_four_panels(run, photos: Path) -> None:
-    run("label", photos / "cat.jpg", "-o", "masks", "--explain", "--workers", 1)
-    panels = np.asarray(Image.open("masks/cat_explain.png"))
+def test_visualize_draws_four_panels(run, photos: Path) -> None:
+    run("label", photos / "cat.jpg", "-o", "masks", "--visualize", "--workers", 1)
+    panels = np.asarray(Image.open("masks/cat_labels.png"))
     label = fuse(luma(load_image(photos / "cat.jpg")))
     assert panels.shape[1] == 4 * 200 + 3 * 6
     # The panels in order: image, keypoint mask, edge mask, combined.

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
+from .._shared.errors import OptionError
 from .shared import (
     PATH,
     chosen_label_settings,
@@ -16,6 +19,9 @@ from .shared import (
     report_failures,
     workers_option,
 )
+
+if TYPE_CHECKING:
+    from ..labels.batch import LabelTask
 
 
 @click.command(short_help="Training masks from nine classical detectors.")
@@ -34,8 +40,8 @@ from .shared import (
     help="Detector settings: normal, low, or auto: low when the luma of an image spans fewer "
     "than 64 grey levels from the 1st to the 99th percentile.",
 )
-@click.option("--explain", is_flag=True, help="Write STEM_explain.png too (the paper's Figure 4).")
-@click.option("--overwrite", is_flag=True, help="Make masks anew that are already there.")
+@click.option("--visualize", is_flag=True, help="Also write STEM_labels.png, the paper's Figure 4.")
+@click.option("--overwrite", is_flag=True, help="Replace masks that exist already.")
 @workers_option
 @json_option
 def label(
@@ -44,7 +50,7 @@ def label(
     detectors: str | None,
     label_settings: str | None,
     visibility: str,
-    explain: bool,
+    visualize: bool,
     overwrite: bool,
     workers: int | None,
     as_json: bool,
@@ -52,31 +58,27 @@ def label(
     """Mark the keypoints and edges of IMAGES (files or folders) by nine classical detectors.
 
     Writes a 1-bit PNG mask STEM.png for each image: white where one of the detectors
-    marks the pixel. What is already done is skipped.
+    marks the pixel. Masks that exist already are skipped.
 
     \b
     deepdetect label photos/ -o masks
-    deepdetect label photo.jpg -o masks --detectors fast,sobel --explain
+    deepdetect label photo.jpg -o masks --detectors fast,sobel --visualize
     """
     from .._shared.progress import progress
     from ..labels import LabelOptions
-    from ..labels.batch import LabelTask, check_outputs, label_files, pending
+    from ..labels.batch import LabelTarget, LabelTask, label_files, unfinished_tasks
 
     settings = chosen_label_settings(detectors, label_settings)
     options = LabelOptions(settings.detectors, visibility, settings.changes)
-    tasks = [
-        LabelTask(
-            path,
-            output / f"{path.stem}.png",
-            output / f"{path.stem}_explain.png" if explain else None,
-            options,
-        )
-        for path in expand_images(images, output)
-    ]
-    check_outputs(tasks)
-    left = tasks if overwrite else pending(tasks)
+    tasks = []
+    for image in expand_images(images, output):
+        figure = output / f"{image.stem}_labels.png" if visualize else None
+        target = LabelTarget(output / f"{image.stem}.png", options, figure)
+        tasks.append(LabelTask(image, (target,)))
+    _check_outputs(tasks, overwrite)
+    left = tasks if overwrite else unfinished_tasks(tasks)
     with progress(len(left), "labelling", "image") as bar:
-        reports = label_files(left, workers, lambda report: bar.update(1))
+        reports = label_files(left, workers, lambda _: bar.update(1))
     done = [report for report in reports if report.error is None]
     failures = [report.error for report in reports if report.error is not None]
     mean = sum(report.density for report in done) / len(done) if done else None
@@ -104,3 +106,20 @@ def label(
             text += f"; mean density {mean:.3f}, {low} of low visibility"
         click.echo(f"{text} -> {output}")
     report_failures(failures, len(tasks))
+
+
+def _check_outputs(tasks: Sequence[LabelTask], overwrite: bool) -> None:
+    """Check that no image is replaced, and no mask that was made with other settings."""
+    images = {task.image.resolve() for task in tasks}
+    for target in (target for task in tasks for target in task.targets):
+        for path in (target.mask, target.figure):
+            if path is not None and path.resolve() in images:
+                raise OptionError(
+                    f"{path} would replace an image that is to be labelled: "
+                    "choose another folder with -o"
+                )
+        if not overwrite and target.is_stale:
+            raise OptionError(
+                f"{target.mask} exists already, made with other settings: "
+                "choose another folder with -o, or replace it with --overwrite"
+            )

@@ -1,13 +1,15 @@
-"""Label masks as 1-bit PNG files, made in parallel from image files."""
+"""Labels of image files, written as 1-bit PNG masks by several processes."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from .._shared.errors import DeepDetectError, OptionError
+import numpy as np
+
+from .._shared.errors import DeepDetectError
 from .._shared.processes import map_in_processes
 from ..io.image import load_image, luma
 from ..io.masks import load_mask_settings, save_mask
@@ -16,31 +18,55 @@ from .fusion import LabelOptions, draw_label, fuse
 
 
 @dataclass(frozen=True)
-class LabelTask:
-    """An image to be labelled.
+class LabelTarget:
+    """A mask to be made from an image.
 
     Attributes:
-        image: the image file.
-        mask: the file that the mask is written to.
-        picture: the file for the paper's Figure 4, or None.
+        mask: the file the mask is written to.
         options: how the label is made.
+        figure: the file for the paper's Figure 4 of this label, or None.
+        transform: picklable function from the (H, W, 3) uint8 RGB image to the one that is
+            labelled; None labels the image as it is.
     """
 
-    image: Path
     mask: Path
-    picture: Path | None
     options: LabelOptions
+    figure: Path | None = None
+    transform: Callable[[np.ndarray], np.ndarray] | None = None
+
+    @property
+    def settings(self) -> str:
+        """The label options as text, which is stored in the mask file."""
+        return json.dumps(asdict(self.options), sort_keys=True)
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether the mask file exists and was made with other options."""
+        return self.mask.exists() and load_mask_settings(self.mask) != self.settings
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the mask, and the figure if one is wanted, exist."""
+        return self.mask.exists() and (self.figure is None or self.figure.exists())
+
+
+@dataclass(frozen=True)
+class LabelTask:
+    """An image file, which is read once, and the masks to be made from it."""
+
+    image: Path
+    targets: tuple[LabelTarget, ...]
 
 
 @dataclass(frozen=True)
 class LabelReport:
-    """What became of one image.
+    """The result for one mask.
 
     Attributes:
         image: the image file.
         mask: the mask file.
-        visibility: settings used, "normal" or "low"; None when it failed.
-        density: share of marked pixels; None when it failed.
+        visibility: the settings that were used, "normal" or "low"; None when it failed.
+        density: fraction of the pixels that are marked; None when it failed.
         error: what went wrong, or None.
     """
 
@@ -51,83 +77,60 @@ class LabelReport:
     error: str | None = None
 
 
-def settings_text(options: LabelOptions) -> str:
-    """Return the text that identifies label options."""
-    values = asdict(options)
-    if not values["changes"]:
-        del values["changes"]  # as before there were any
-    return json.dumps(values, sort_keys=True)
-
-
-def check_outputs(tasks: Sequence[LabelTask]) -> None:
-    """Check that no result replaces one of the images.
-
-    Raises:
-        OptionError: one would.
-    """
-    images = {task.image.resolve() for task in tasks}
-    for task in tasks:
-        for path in (task.mask, task.picture):
-            if path is not None and path.resolve() in images:
-                raise OptionError(
-                    f"the result {path} would replace an image that is to be labelled: "
-                    "choose another folder with -o"
-                )
-
-
-def pending(tasks: Sequence[LabelTask]) -> list[LabelTask]:
-    """Leave out what is already done with the same settings.
-
-    Raises:
-        OptionError: a file is there that was made with other settings or otherwise.
-    """
-    left = []
-    for task in tasks:
-        if not task.mask.exists():
-            left.append(task)
-        elif load_mask_settings(task.mask) != settings_text(task.options):
-            raise OptionError(
-                f"{task.mask} is there already, made with other settings: "
-                "choose another folder with -o, or replace it with --overwrite"
-            )
-        elif task.picture is not None and not task.picture.exists():
-            left.append(task)
-    return left
-
-
 def label_files(
     tasks: Sequence[LabelTask],
     workers: int | None = None,
-    advance: Callable[[LabelReport], None] = lambda report: None,
+    callback: Callable[[LabelReport], None] | None = None,
 ) -> list[LabelReport]:
     """Label image files, in parallel over processes.
 
-    An image that cannot be read is reported; the others are labelled all the same. A
-    script must call this under `if __name__ == "__main__":`, since processes are started.
+    An image that cannot be read is reported, and the others are labelled all the same. A script
+    must call this under `if __name__ == "__main__":`, since processes are started.
 
     Args:
-        tasks: what to do.
-        workers: number of processes; default one for each processor.
-        advance: called after each image.
+        tasks: the images and their masks.
+        workers: number of processes; default one per processor.
+        callback: called after each mask.
 
     Returns:
-        A report for each task, in the order in which they were ready.
+        One report per mask, in order of completion.
+
+    Raises:
+        OptionError: `workers` is under 1.
+        DeepDetectError: a worker process died.
     """
     reports = []
-    for report in map_in_processes(label_file, tasks, workers):
-        advance(report)
-        reports.append(report)
+    for made in map_in_processes(label_file, tasks, workers):
+        for report in made:
+            if callback is not None:
+                callback(report)
+            reports.append(report)
     return reports
 
 
-def label_file(task: LabelTask) -> LabelReport:
-    """Label one image file."""
+def label_file(task: LabelTask) -> list[LabelReport]:
+    """Make the masks of one image file."""
+    reports: list[LabelReport] = []
     try:
-        rgb = load_image(task.image)
-        label = fuse(luma(rgb), task.options)
-        if task.picture is not None:
-            save_picture(draw_label(rgb, label), task.picture)
-        save_mask(label.mask, task.mask, settings_text(task.options))
+        image = load_image(task.image)
+        for target in task.targets:
+            rgb = image if target.transform is None else target.transform(image)
+            label = fuse(luma(rgb), target.options)
+            if target.figure is not None:
+                save_picture(draw_label(rgb, label), target.figure)
+            save_mask(label.mask, target.mask, target.settings)
+            reports.append(LabelReport(task.image, target.mask, label.visibility, label.density))
     except DeepDetectError as error:
-        return LabelReport(task.image, task.mask, error=str(error))
-    return LabelReport(task.image, task.mask, label.visibility, label.density)
+        for target in task.targets[len(reports) :]:
+            reports.append(LabelReport(task.image, target.mask, error=str(error)))
+    return reports
+
+
+def unfinished_tasks(tasks: Iterable[LabelTask]) -> list[LabelTask]:
+    """Leave out what is done; whether with the same options, `LabelTarget.is_stale` tells."""
+    left = []
+    for task in tasks:
+        targets = tuple(target for target in task.targets if not target.is_done)
+        if targets:
+            left.append(LabelTask(task.image, targets))
+    return left

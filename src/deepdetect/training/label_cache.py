@@ -5,17 +5,17 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from .._shared.errors import DeepDetectError
-from .._shared.processes import map_in_processes
 from .._shared.progress import progress
-from ..io.image import load_image, luma
-from ..io.masks import load_mask, save_mask
+from ..io.image import luma
+from ..io.masks import load_mask
 from ..labels import LabelOptions, fuse
+from ..labels.batch import LabelTarget, LabelTask, label_files
 from ..labels.detectors import select_detectors
 from ..labels.settings import settings_for
 from ..labels.visibility import Visibility
@@ -23,21 +23,6 @@ from .photos import Photo
 from .views import View, render
 
 VISIBILITIES: tuple[Visibility, ...] = ("normal", "low")
-
-
-@dataclass(frozen=True)
-class PhotoLabelTask:
-    """The labels of one photograph that are to be made.
-
-    Attributes:
-        photo: the photograph's file.
-        views: the views, each with the file of its label.
-        options: the label options; each view decides the visibility itself.
-    """
-
-    photo: Path
-    views: tuple[tuple[View, Path], ...]
-    options: LabelOptions
 
 
 class LabelCache:
@@ -83,43 +68,36 @@ class LabelCache:
         tasks = []
         for photo, views in wanted:
             paths = [(view, self.path(photo, view)) for view in views]
-            missing = tuple((view, path) for view, path in paths if path.name not in there)
-            if missing:
-                tasks.append(PhotoLabelTask(photo.path, missing, self.options))
-        total = sum(len(task.views) for task in tasks)
-        failures = []
+            targets = tuple(
+                LabelTarget(
+                    path, view_options(view, self.options), transform=partial(render, view=view)
+                )
+                for view, path in paths
+                if path.name not in there
+            )
+            if targets:
+                tasks.append(LabelTask(photo.path, targets))
+        total = sum(len(task.targets) for task in tasks)
         with progress(total, "labels", "label", quiet) as bar:
-            for done, failure in map_in_processes(make_labels, tasks, workers):
-                bar.update(done)
-                if failure:
-                    failures.append(failure)
+            reports = label_files(tasks, workers, lambda _: bar.update(1))
+        failures = {report.image: report.error for report in reports if report.error is not None}
         if failures:
             raise DeepDetectError(
                 f"{len(failures)} of {len(wanted)} photographs cannot be read, the labels of the "
-                f"others are kept; the first: {failures[0]}"
+                f"others are kept; the first: {next(iter(failures.values()))}"
             )
         return total
 
 
-def make_labels(task: PhotoLabelTask) -> tuple[int, str | None]:
-    """Make the labels of one photograph; return how many, and what went wrong, or None."""
-    try:
-        rgb = load_image(task.photo)
-        for view, path in task.views:
-            save_mask(label_of_view(rgb, view, task.options), path)
-    except DeepDetectError as error:
-        return len(task.views), str(error)
-    return len(task.views), None
+def view_options(view: View, options: LabelOptions) -> LabelOptions:
+    """Give a dark view the low-visibility settings, a normal one the normal settings."""
+    visibility: Visibility = "normal" if view.darkening is None else "low"
+    return dataclasses.replace(options, visibility=visibility)
 
 
 def label_of_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray:
-    """Make the label of a view of a (H, W, 3) uint8 RGB photograph, (H, W) bool.
-
-    A dark view gets the low-visibility settings, a normal one the normal ones.
-    """
-    visibility = "normal" if view.darkening is None else "low"
-    options = dataclasses.replace(options, visibility=visibility)
-    return fuse(luma(render(rgb, view)), options).mask
+    """Make the label of a view of a (H, W, 3) uint8 RGB photograph, (H, W) bool."""
+    return fuse(luma(render(rgb, view)), view_options(view, options)).mask
 
 
 def settings_digest(options: LabelOptions) -> str:
