@@ -22,6 +22,7 @@ from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.residuals import transfer_errors
 from ..io.image import load_image, luma
 from .guided import Guidance, guided_matches
+from .guided.initial_geometry import InitialMatches
 from .options import MatchingOptions, get_preset
 
 BYTES_A_KEYPOINT = 1500
@@ -88,6 +89,7 @@ def match_images(
     *,
     preset: str = "default",
     options: MatchingOptions | None = None,
+    initial: InitialMatches | None = None,
     **changes: Any,
 ) -> Matches:
     """Detect and match the keypoints of two images.
@@ -100,6 +102,7 @@ def match_images(
             what the paper's published code does, whatever the detector's own resolution
             and channels.
         options: all options at once, instead of a preset.
+        initial: sparse matches of the pair, where `initial_matches` has made them already.
         **changes: single options by name: those of `MatchingOptions`, `SelectionOptions`
             and `GeometryOptions`, as `mutual=True, density=0.1, model="homography"`. The
             options `descriptor`, `keypoint_size`, `angle`, `matcher` and `ratio` have a say only
@@ -135,6 +138,7 @@ def match_images(
                 *(np.rint(points.xy) for points in keypoints),
                 _guiding_model(chosen),
                 chosen.geometry.seed,
+                initial,
             )
     if found is None:
         found = unguided_matches(grays, [points.xy for points in keypoints], chosen, seconds)

@@ -20,11 +20,10 @@ from .._shared.errors import ReconstructionError
 from .._shared.options import changed
 from ..detector.detector import DeepDetect, find_keypoints
 from ..features.keypoints import SelectionOptions
-from ..features.matchers import get_matcher, match_descriptors
-from ..features.sift_detector import sparse_features
 from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
 from ..io.exif import calibration_from_exif
 from ..io.image import load_image, luma
+from ..matching.guided.initial_geometry import InitialMatches, initial_matches
 from ..matching.options import get_preset
 from ..matching.pipeline import HeatmapDetector, match_images
 from .checks import check_images
@@ -41,9 +40,6 @@ from .row_degeneracy import (
 )
 from .stereo import COMPLETE, RowMatchingOptions, match_rows
 from .two_view import TwoViewOptions, reconstruct_two_view
-
-SPARSE_RATIO = 0.85
-"""Ratio test of the few matches that tell whether a pair is rectified."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,11 +132,18 @@ def reconstruct(
         seconds[name] = time.perf_counter() - started
         done(name)
 
-    rectification = None
+    initial = rectification = None
     rectified = chosen.rectified
     if rectified is None:
         with stage("rectified or not"):
-            rectification = _judge(grays, sizes, known, chosen.two_view.seed)
+            initial = initial_matches(*grays)
+            rectification = judge_rectification(
+                initial.points0,
+                initial.points1,
+                *sizes,
+                offset_px=known.disparity_offset_px,
+                seed=chosen.two_view.seed,
+            )
         rectified = rectification.rectified
         if rectification.swapped:
             raise ReconstructionError(
@@ -150,7 +153,9 @@ def reconstruct(
     if detector is None:
         detector = DeepDetect("dense")
     make = _from_rows if rectified else _from_matches
-    return make(_Pair(images, grays, detector, known, chosen, rectification, seconds, stage))
+    return make(
+        _Pair(images, grays, detector, known, chosen, initial, rectification, seconds, stage)
+    )
 
 
 Images = tuple[np.ndarray, np.ndarray]
@@ -165,6 +170,7 @@ class _Pair:
     detector: HeatmapDetector
     calibration: Calibration
     options: ReconstructionOptions
+    initial: InitialMatches | None
     rectification: Rectification | None
     seconds: dict[str, float]
     stage: Callable[[str], Any]
@@ -238,17 +244,20 @@ def _from_rows(pair: _Pair) -> Reconstruction:
 def _from_matches(pair: _Pair) -> Reconstruction:
     """Reconstruct a pair that is not rectified."""
     images, options, seconds = pair.images, pair.options, pair.seconds
+    # Matches are refined from whole pixels of the left image. Suppression would leave few pixels
+    # that are keypoints in both images.
+    radius = options.selection.nms_radius or 0
+    selection = replace(options.selection, subpixel=False, nms_radius=radius)
     with pair.stage("keypoints and matching"):
         found = match_images(
             *images,
             pair.detector,
-            options=changed(
-                get_preset("default"), selection=options.selection, matcher="patchmatch"
-            ),
+            options=changed(get_preset("default"), selection=selection, matcher="patchmatch"),
             # A homography would keep the points of one plane, and drop all that stands before it.
             guidance="fundamental",
             model="none",
             seed=options.two_view.seed,
+            initial=pair.initial,
         )
     with pair.stage("reconstruction"):
         made = reconstruct_two_view(
@@ -282,27 +291,6 @@ def _or_offset(calibration: Calibration) -> str:
     """The other reason for disparities of the wrong sign, where there can be one."""
     offset = calibration.disparity_offset_px
     return f"; or the disparity offset of {offset:g} px is wrong" if offset else ""
-
-
-def _judge(
-    grays: Images, sizes: tuple[tuple[int, int], ...], calibration: Calibration, seed: int
-) -> Rectification:
-    """Tell from few matches of SIFT whether the pair is rectified."""
-    first, second = (sparse_features(gray) for gray in grays)
-    found = match_descriptors(
-        first.descriptors,
-        second.descriptors,
-        get_matcher("exact"),
-        ratio=SPARSE_RATIO,
-        mutual=True,
-    )
-    return judge_rectification(
-        first.xy[found.rows0],
-        second.xy[found.rows1],
-        *sizes,
-        offset_px=calibration.disparity_offset_px,
-        seed=seed,
-    )
 
 
 def _calibration(

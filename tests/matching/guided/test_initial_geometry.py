@@ -11,7 +11,13 @@ from deepdetect.geometry import epipolar_errors, transfer_errors, transform_poin
 from deepdetect.geometry.acontrario import LARGEST
 from deepdetect.geometry.model_selection import has_depth
 from deepdetect.io.image import load_image, luma
-from deepdetect.matching.guided.initial_geometry import LONGEST, THRESHOLDS, FirstPass, first_pass
+from deepdetect.matching.guided.initial_geometry import (
+    LONGEST,
+    THRESHOLDS,
+    FirstPass,
+    first_pass,
+    initial_matches,
+)
 
 MILD = np.array([[0.9, -0.12, 25.0], [0.15, 0.95, -8.0], [2e-4, -1e-4, 1.0]])
 ODD = [
@@ -165,6 +171,28 @@ def test_a_strong_tilt_needs_simulated_views(
     errors = transfer_errors(found.points0, found.points1, true)
     assert np.median(errors) < 2 * tilt
     assert np.quantile(errors, 0.9) < 4 * tilt
+
+
+def test_matches_that_are_there_already_are_not_made_again(
+    photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gray = luma(photo)
+    other = warped(gray, MILD, (256, 256))
+    expected = first_pass(gray, other)
+    initial = initial_matches(gray, other)
+    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.sparse_features", None)
+    found = first_pass(gray, other, initial=initial)
+    np.testing.assert_array_equal(found.matrix, expected.matrix)
+
+
+def test_initial_matches_of_a_large_pair_are_at_its_own_size(photo: np.ndarray) -> None:
+    gray = cv2.resize(luma(photo), (2400, 2400), interpolation=cv2.INTER_CUBIC)
+    shift = np.array([[1.0, 0, 40], [0, 1, -20], [0, 0, 1]])
+    found = initial_matches(gray, warped(gray, shift, (2400, 2400)))
+    assert found.scales == (0.5, 0.5)
+    np.testing.assert_allclose(
+        np.median(found.points1 - found.points0, axis=0), [40, -20], atol=0.2
+    )
 
 
 def test_a_pair_that_needs_none_has_no_simulated_views(

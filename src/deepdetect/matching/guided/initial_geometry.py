@@ -55,8 +55,56 @@ class FirstPass:
     simulated: int
 
 
+@dataclass(frozen=True, eq=False)
+class InitialMatches:
+    """Sparse matches of two images, before any geometry.
+
+    Attributes:
+        views: both images as uint8 luma, shrunk where they are large.
+        scales: of the views, at most 1.
+        features: SIFT features of the views.
+        matched: (M, 2) positions in both views.
+    """
+
+    views: tuple[np.ndarray, np.ndarray]
+    scales: tuple[float, float]
+    features: tuple[SparseFeatures, SparseFeatures]
+    matched: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def points0(self) -> np.ndarray:
+        """Matched positions in the first image at its own size, (M, 2) float64."""
+        return scaled_points(self.matched[0], 1 / self.scales[0])
+
+    @property
+    def points1(self) -> np.ndarray:
+        """Matched positions in the second image at its own size, (M, 2) float64."""
+        return scaled_points(self.matched[1], 1 / self.scales[1])
+
+
+def initial_matches(gray0: np.ndarray, gray1: np.ndarray) -> InitialMatches:
+    """Match sparse SIFT features of two images, exactly, mutually and by the ratio test.
+
+    Args:
+        gray0, gray1: (H, W) uint8 luma.
+
+    Example:
+        >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
+        >>> found = initial_matches(image, image)
+        >>> bool((found.points0 == found.points1).all()), len(found.points0) > 50
+        (True, True)
+    """
+    (view0, scale0), (view1, scale1) = (shrunk(gray, LONGEST) for gray in (gray0, gray1))
+    features = sparse_features(view0), sparse_features(view1)
+    return InitialMatches((view0, view1), (scale0, scale1), features, _matched(*features))
+
+
 def first_pass(
-    gray0: np.ndarray, gray1: np.ndarray, model: str = "auto", seed: int = 0
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    model: str = "auto",
+    seed: int = 0,
+    initial: InitialMatches | None = None,
 ) -> FirstPass:
     """Estimate the geometry of a pair from few points.
 
@@ -65,6 +113,7 @@ def first_pass(
         model: "homography", "fundamental", or "auto": the homography, but for scenes with depth
             (`has_depth`).
         seed: of the random samples.
+        initial: of `initial_matches`, where they are there already; None: they are made.
 
     Returns:
         The geometry, or the kind "none".
@@ -74,27 +123,27 @@ def first_pass(
     """
     if model not in ("auto", *THRESHOLDS):
         raise unknown_name("model", model, ("auto", *THRESHOLDS))
-    (view0, scale0), (view1, scale1) = (shrunk(gray, LONGEST) for gray in (gray0, gray1))
+    if initial is None:
+        initial = initial_matches(gray0, gray1)
+    view1 = initial.views[1]
     best = FirstPass("none", None, *np.empty((2, 0, 2)), 0, float("inf"), 0)
     simulated = 0
-    for pairs, views in _looks(view0, view1):
+    for pairs, views in _looks(initial):
         simulated += views
         found = _estimate(*pairs, model, seed, (view1.shape[1], view1.shape[0]), simulated)
         if found.log_false_alarms < best.log_false_alarms:
             best = found
         if best.log_false_alarms < LARGEST:
-            return _enlarged(best, scale0, scale1)
+            return _enlarged(best, *initial.scales)
     return FirstPass(
         "none", None, *np.empty((2, 0, 2)), best.matches, best.log_false_alarms, simulated
     )
 
 
-def _looks(
-    view0: np.ndarray, view1: np.ndarray
-) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], int]]:
+def _looks(initial: InitialMatches) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], int]]:
     """Yield matched positions and the number of simulated views, from plain to strong tilts."""
-    plain0, plain1 = sparse_features(view0), sparse_features(view1)
-    together = _matched(plain0, plain1)
+    (view0, view1), (plain0, plain1) = initial.views, initial.features
+    together = initial.matched
     yield together, 0
     for tilt in TILTS:
         views = 0

@@ -18,7 +18,7 @@ from ...geometry.majority_fit import fit_to_majority
 from ...geometry.rescaling import scaled_homography, shrunk
 from .epipolar import matches_by_epipolar_line
 from .homography import matches_by_homography
-from .initial_geometry import FirstPass, first_pass
+from .initial_geometry import FirstPass, InitialMatches, first_pass
 from .prewarp import affinity_between, straightened
 
 GUIDANCES = ("auto", "homography", "fundamental", "none")
@@ -66,6 +66,7 @@ def guided_matches(
     xy1: np.ndarray,
     model: str = "auto",
     seed: int = 0,
+    initial: InitialMatches | None = None,
 ) -> tuple[Guidance, DescriptorMatches | None]:
     """Match the keypoints of two images by their geometry.
 
@@ -74,6 +75,7 @@ def guided_matches(
         xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
         model: "homography", "fundamental" or "auto".
         seed: of all random choices.
+        initial: of `initial_matches`, where they are there already.
 
     Returns:
         What guided, and the matches; None when nothing could.
@@ -83,7 +85,7 @@ def guided_matches(
     """
     if model not in GUIDANCES[:3]:
         raise unknown_name("guidance", model, GUIDANCES)
-    first = first_pass(gray0, gray1, model, seed)
+    first = first_pass(gray0, gray1, model, seed, initial)
     if first.kind == "none" or first.matrix is None:
         return _guidance(first, None), None
     if first.kind == "homography":
