@@ -2,53 +2,115 @@
 PYTHON ?= python3
 VENV ?= .venv
 VENV_OPENCV4 ?= .venv-opencv4
+VENV_LOWEST ?= .venv-lowest
 DEMO_OUTPUT ?= demo-output
-LOCK := requirements/lock.txt
-OPENCV4 := opencv-contrib-python-headless==4.14.0.94
-PIP_FLAGS := --quiet --disable-pip-version-check
+# What installs the lock files: uv is eight times as fast as pip, which does the same.
+INSTALLER ?= uv
+# Two processes, each with whole files (what a file sets up is set up once), on one thread each.
+PYTEST := -m pytest -n 2 --dist loadfile
+export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test test-opencv4 lint format clean
+# The label detectors live in other modules of OpenCV 4 than of OpenCV 5.
+TESTS_OPENCV4 ?= tests/labels tests/descriptors tests/matchers tests/geometry tests/methods
+# What touches most of the packages that this one depends on.
+TESTS_LOWEST ?= tests/test_image.py tests/test_detector.py tests/labels tests/descriptors tests/matchers
+
+PIP_FLAGS := --quiet --disable-pip-version-check
+ifeq ($(INSTALLER),uv)
+install = $(1)/bin/uv pip install --quiet --python $(1)/bin/python
+else
+install = $(1)/bin/python -m pip install $(PIP_FLAGS)
+endif
+# The lock files are complete, so that nothing is resolved anew.
+install_locked = $(call install,$(1)) --no-deps --require-hashes -r $(2)
+install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requirements/torch.txt
+install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
+
+.PHONY: demo test test-all test-opencv4 test-lowest coverage lint spelling types contracts check \
+	format lock upgrade check-lock dist clean
 
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
 
-# Two processes, each with whole files: what a file sets up is set up once.
-test: $(VENV)/.test test-opencv4
-	$(VENV)/bin/python -m pytest -n 2 --dist loadfile
+# The fast tests. Those marked as slow run with `make test-all`.
+test: $(VENV)/.test
+	$(VENV)/bin/python $(PYTEST)
 
-# The label detectors live in other modules of OpenCV 4 than of OpenCV 5.
+test-all: $(VENV)/.test test-opencv4
+	$(VENV)/bin/python $(PYTEST) --runslow
+
 test-opencv4: $(VENV_OPENCV4)/.test
-	$(VENV_OPENCV4)/bin/python -m pytest -q -p no:cacheprovider tests/labels tests/descriptors tests/matchers tests/geometry tests/methods
+	$(VENV_OPENCV4)/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_OPENCV4)
 
-lint: $(VENV)/.test
+# The lowest versions that pyproject.toml allows, but for torch.
+test-lowest: $(VENV_LOWEST)/.test
+	$(VENV_LOWEST)/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_LOWEST)
+
+coverage: $(VENV)/.test
+	$(VENV)/bin/python $(PYTEST) --cov --cov-report term:skip-covered --cov-report html
+
+lint: $(VENV)/.test spelling
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+
+spelling: $(VENV)/.test
+	$(VENV)/bin/codespell
+
+types: $(VENV)/.test
+	$(VENV)/bin/mypy
+
+contracts: $(VENV)/.test
+	$(VENV)/bin/lint-imports
+
+# All that continuous integration runs.
+check:
+	bash .ci/run
 
 format: $(VENV)/.test
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
+lock: $(VENV)/bin/uv
+	$(VENV)/bin/python requirements/lock.py
+
+upgrade: $(VENV)/bin/uv
+	$(VENV)/bin/python requirements/lock.py --upgrade
+
+check-lock: $(VENV)/bin/uv
+	$(VENV)/bin/python requirements/lock.py --check
+
+dist: $(VENV)/.test
+	rm -rf dist
+	$(VENV)/bin/python -m build --no-isolation
+
 clean:
-	rm -rf $(VENV) $(VENV_OPENCV4) demo-output
+	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(DEMO_OUTPUT)
+	rm -rf build dist htmlcov .coverage .coverage.* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 
-$(VENV)/bin/hatchling: $(LOCK)
-	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install $(PIP_FLAGS) -c $(LOCK) hatchling editables
+%/bin/uv: requirements/uv.txt
+	$(PYTHON) -m venv $*
+	$*/bin/python -m pip install $(PIP_FLAGS) --require-hashes -r requirements/uv.txt
 	touch $@
 
-$(VENV)/.demo: $(VENV)/bin/hatchling pyproject.toml
-	$(VENV)/bin/python -m pip install $(PIP_FLAGS) -c $(LOCK) --no-build-isolation -e '.[demo]'
+$(VENV)/.demo: $(VENV)/bin/uv requirements/demo.txt pyproject.toml
+	$(call install_locked,$(VENV),requirements/demo.txt)
+	$(call install_package,$(VENV))
 	touch $@
 
-$(VENV)/.test: $(VENV)/bin/hatchling pyproject.toml
-	$(VENV)/bin/python -m pip install $(PIP_FLAGS) -c $(LOCK) --no-build-isolation \
-		-e '.[benchmark,data,demo,faiss,openvino,test,train]'
+# It holds what the demonstration needs, too.
+$(VENV)/.test: $(VENV)/bin/uv requirements/lock.txt requirements/torch.txt pyproject.toml
+	$(call install_locked,$(VENV),requirements/lock.txt)
+	$(call install_torch,$(VENV))
+	$(call install_package,$(VENV))
+	touch $(VENV)/.demo $@
+
+$(VENV_OPENCV4)/.test: $(VENV_OPENCV4)/bin/uv requirements/opencv4.txt pyproject.toml
+	$(call install_locked,$(VENV_OPENCV4),requirements/opencv4.txt)
+	$(call install_package,$(VENV_OPENCV4))
 	touch $@
 
-$(VENV_OPENCV4)/.test: $(LOCK) pyproject.toml
-	$(PYTHON) -m venv $(VENV_OPENCV4)
-	grep -v opencv $(LOCK) > $(VENV_OPENCV4)/lock.txt
-	$(VENV_OPENCV4)/bin/python -m pip install $(PIP_FLAGS) -c $(VENV_OPENCV4)/lock.txt hatchling editables
-	$(VENV_OPENCV4)/bin/python -m pip install $(PIP_FLAGS) -c $(VENV_OPENCV4)/lock.txt --no-build-isolation \
-		-e '.[benchmark,demo,test]' $(OPENCV4)
+$(VENV_LOWEST)/.test: $(VENV_LOWEST)/bin/uv requirements/lowest.txt requirements/torch.txt pyproject.toml
+	$(call install_locked,$(VENV_LOWEST),requirements/lowest.txt)
+	$(call install_torch,$(VENV_LOWEST))
+	$(call install_package,$(VENV_LOWEST))
 	touch $@
