@@ -10,10 +10,10 @@ INSTALLER ?= uv
 PYTEST := -m pytest -n 2 --dist loadfile
 export OMP_NUM_THREADS ?= 1
 
-# The label detectors live in other modules of OpenCV 4 than of OpenCV 5.
-TESTS_OPENCV4 ?= tests/labels tests/descriptors tests/matchers tests/geometry tests/methods
-# What touches most of the packages that this one depends on.
-TESTS_LOWEST ?= tests/test_image.py tests/test_detector.py tests/labels tests/descriptors tests/matchers
+# What calls the parts of OpenCV that moved between its versions 4 and 5.
+TESTS_OPENCV4 ?= tests/labels tests/features tests/geometry tests/evaluation/baselines
+# A quick part that touches most of the packages that this one depends on.
+TESTS_LOWEST ?= tests/io tests/detector tests/labels tests/features
 
 PIP_FLAGS := --quiet --disable-pip-version-check
 ifeq ($(INSTALLER),uv)
