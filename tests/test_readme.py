@@ -88,7 +88,7 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
             "32",
             "--detectors",
             "fast",
-            "--validations",
+            "--val-count",
             "1",
         ]
         words += ["--no-compile", "--workers", "1", "--validation", "PHOTOS"]

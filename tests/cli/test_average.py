@@ -10,7 +10,7 @@ pytest.importorskip("torch", reason="needs torch, which is for training only")
 
 from deepdetect import DeepDetect
 from deepdetect.detector.network.weights import (
-    load_mean_network,
+    average_weights,
     load_network,
     read_notes,
     weights_digest,
@@ -23,7 +23,7 @@ def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo)
     assert result.exit_code == 0, result.output
     files = json.loads(result.output)
     parts = [bundled_weights(name, ".safetensors") for name in ("default", "dense")]
-    expected = load_mean_network([parts[0], parts[0], parts[1]])
+    expected = average_weights([parts[0], parts[0], parts[1]])
     assert weights_digest(load_network(files["weights"])) == weights_digest(expected)
     told = json.loads(read_notes(files["weights"])["parts"])
     assert [part["sha256"] for part in told] == [

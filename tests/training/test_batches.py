@@ -21,8 +21,8 @@ OPTIONS = TrainingOptions(
     stages=(Stage(64, 4, 6), Stage(96, 2, 1)),
     short_sides=(96, 64),
     flips=True,
-    color_changes=0.0,
-    variations=1,
+    color_jitter=0.0,
+    augmentations=1,
     detectors=("fast", "harris", "sobel"),
 )
 
@@ -158,7 +158,7 @@ def test_all_mirrors_come_when_asked_for(batches: Batches) -> None:
 def test_dark_crops_keep_their_luma_to_the_level(batches: Batches) -> None:
     dark = changed(OPTIONS, dark_fraction=1.0)
     plain, gray = (
-        Batches(batches.feed, Schedule(changed(dark, color_changes=share), len(batches.feed)))
+        Batches(batches.feed, Schedule(changed(dark, color_jitter=share), len(batches.feed)))
         for share in (0.0, 1.0)
     )
     for image, other in zip(plain.batch(0)[0], gray.batch(0)[0], strict=True):
@@ -167,7 +167,7 @@ def test_dark_crops_keep_their_luma_to_the_level(batches: Batches) -> None:
 
 
 def test_colors_change_and_labels_do_not(batches: Batches) -> None:
-    options = changed(OPTIONS, color_changes=1.0)
+    options = changed(OPTIONS, color_jitter=1.0)
     colored = Batches(batches.feed, Schedule(options, len(batches.feed)))
     gray = 0
     for step in range(4):

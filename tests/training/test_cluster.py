@@ -19,11 +19,11 @@ from hypothesis import given  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
 from deepdetect import OptionError  # noqa: E402
-from deepdetect.training.cluster import Place, place_in_cluster  # noqa: E402
+from deepdetect.training.cluster import DistributedContext, distributed_context  # noqa: E402
 
 # Eight steps; at higher rates Adam makes much of the rounding in tiny gradients.
 ARGUMENTS = [
-    *("--stage", "64x4x3", "--short-side", "64", "--detectors", "fast,sobel", "--validations"),
+    *("--stage", "64x4x3", "--short-side", "64", "--detectors", "fast,sobel", "--val-count"),
     *("8", "--precision", "float32", "--no-compile", "--threads", "1", "--workers", "1"),
     *("--learning-rate", "0.0003"),
 ]
@@ -105,7 +105,7 @@ engine = Engine(network, DeviceOptions("cpu", "float32", compile=False, threads=
 generator = np.random.default_rng(0)
 rgb = generator.integers(0, 256, (4, 64, 64, 3), np.uint8)
 masks = torch.from_numpy(generator.random((4, 1, 64, 64)) > 0.5).float()
-mine = engine.place.share(4)
+mine = engine.place.local_slice(4)
 network.train()
 if sys.argv[2] == "frozen":
     freeze_batch_norm(network)
@@ -221,7 +221,7 @@ def test_an_error_that_nobody_expected_ends_all(photographs: Path, tmp_path: Pat
         "def learn(*arguments):\n"
         "    raise MemoryError('no more')\n"
         "if os.environ['RANK'] == '1':\n"
-        "    Learner.learn = learn\n"
+        "    Learner.training_step = learn\n"
         f"main({[*arguments, *ARGUMENTS]!r})\n"
     )
     done = subprocess.run([*launcher(2), str(script)], capture_output=True, text=True, timeout=300)
@@ -235,7 +235,9 @@ def test_shares_cover_everything_once(processes: int, part: int) -> None:
     seen = [
         k
         for rank in range(processes)
-        for k in range(count)[Place(rank, processes, rank, processes).share(count)]
+        for k in range(count)[
+            DistributedContext(rank, processes, rank, processes).local_slice(count)
+        ]
     ]
     assert seen == list(range(count))
 
@@ -243,15 +245,17 @@ def test_shares_cover_everything_once(processes: int, part: int) -> None:
 def test_the_place_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
     monkeypatch.setenv("RANK", "3")
-    assert place_in_cluster() == Place(), "a variable of another program is no cluster"
+    assert distributed_context() == DistributedContext(), (
+        "a variable of another program is no cluster"
+    )
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "run")
     monkeypatch.setenv("WORLD_SIZE", "8")
     monkeypatch.setenv("LOCAL_RANK", "1")
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    place = place_in_cluster()
-    assert place == Place(3, 8, 1, 2)
+    place = distributed_context()
+    assert place == DistributedContext(3, 8, 1, 2)
     assert place.machines == 4
     assert not place.is_first
     monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
     with pytest.raises(OptionError, match="as many processes on each machine"):
-        place_in_cluster()
+        distributed_context()

@@ -27,29 +27,29 @@ class Constant(torch.nn.Module):
 @pytest.mark.parametrize("weight", [1.0, 1.3, 0.5])
 def test_a_marked_pixel_counts_by_its_weight(weight: float) -> None:
     """The least loss of a constant is at the odds of the marked pixels times the weight."""
-    learner = Learner(Constant(), PLAIN, marked_weight=weight)
+    learner = Learner(Constant(), PLAIN, pos_weight=weight)
     rgb = np.zeros((2, 16, 16, 3), np.uint8)
     masks = np.zeros((2, 16, 16), bool)
     masks[:, :4] = True
-    first = learner.learn(rgb, masks, 0.05, 0)
+    first = learner.training_step(rgb, masks, 0.05, 0)
     assert first == pytest.approx(math.log(2) * (0.75 + 0.25 * weight), rel=1e-5)
     for step in range(1, 300):
-        learner.learn(rgb, masks, 0.05 * (1 - step / 300), step)
+        learner.training_step(rgb, masks, 0.05 * (1 - step / 300), step)
     assert learner.network.logit.item() == pytest.approx(math.log(weight / 3), abs=0.01)
 
 
 @pytest.mark.parametrize(("marked_rows", "weight"), [(4, 3.0), (4, 1.5), (1, 3.0), (12, 2.0)])
 def test_only_doubtful_marks_may_count_more(marked_rows: int, weight: float) -> None:
     """The least loss is where odds are those of the marked pixels times the weight *there*."""
-    learner = Learner(Constant(), PLAIN, marked_weight=weight, doubtful_only=True)
+    learner = Learner(Constant(), PLAIN, pos_weight=weight, pos_weight_uncertain=True)
     rgb = np.zeros((2, 16, 16, 3), np.uint8)
     masks = np.zeros((2, 16, 16), bool)
     masks[:, :marked_rows] = True
     share = marked_rows / 16
-    first = learner.learn(rgb, masks, 0.05, 0)
+    first = learner.training_step(rgb, masks, 0.05, 0)
     assert first == pytest.approx(math.log(2) * (1 - share + share * weight), rel=1e-5)
     for step in range(1, 400):
-        learner.learn(rgb, masks, 0.05 * (1 - step / 400), step)
+        learner.training_step(rgb, masks, 0.05 * (1 - step / 400), step)
     logit = learner.network.logit.item()
     probability = 1 / (1 + math.exp(-logit))
     there = 1 + (weight - 1) * 4 * probability * (1 - probability)
@@ -59,12 +59,12 @@ def test_only_doubtful_marks_may_count_more(marked_rows: int, weight: float) -> 
 
 def test_dark_images_have_a_weight_of_their_own() -> None:
     """Half of the crops are dark: the first loss is the mean of both kinds."""
-    learner = Learner(Constant(), PLAIN, marked_weight=3.0, dark_marked_weight=1.0)
+    learner = Learner(Constant(), PLAIN, pos_weight=3.0, low_light_pos_weight=1.0)
     rgb = np.zeros((2, 16, 16, 3), np.uint8)
     rgb[:, 8:] = np.array([200, 40], np.uint8)[:, None, None, None]  # grey levels spanned
     masks = np.zeros((2, 16, 16), bool)
     masks[0, :8] = True
-    only_in_normal = learner.learn(rgb, masks, 0.0, 0)
+    only_in_normal = learner.training_step(rgb, masks, 0.0, 0)
     assert only_in_normal == pytest.approx(math.log(2) * (2.0 + 1.0) / 2, rel=1e-5)
-    only_in_dark = learner.learn(rgb, masks[::-1].copy(), 0.0, 1)
+    only_in_dark = learner.training_step(rgb, masks[::-1].copy(), 0.0, 1)
     assert only_in_dark == pytest.approx(math.log(2), rel=1e-5)

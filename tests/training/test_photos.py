@@ -7,7 +7,7 @@ import pytest
 from deepdetect._shared.errors import ImageError
 from deepdetect.labels import LabelOptions
 from deepdetect.training.label_cache import LabelCache
-from deepdetect.training.photos import Photo, hold_out, list_photos, photos_digest
+from deepdetect.training.photos import Photo, list_photos, photos_digest, train_val_split
 from deepdetect.training.recipe import Stage, TrainingOptions
 
 OPTIONS = TrainingOptions(stages=(Stage(64, 2, 1),), short_sides=(96, 64), dark_variants=2)
@@ -29,23 +29,23 @@ def test_views_are_all_sizes_in_both_lights(photographs: Path) -> None:
 
 
 def test_one_in_twenty_is_held_out_and_nothing_is_in_both() -> None:
-    kept, held = hold_out(photos(4000))
+    kept, held = train_val_split(photos(4000))
     assert 150 < len(held) < 250
     assert len(kept) + len(held) == 4000
     assert not {photo.path for photo in kept} & {photo.path for photo in held}
 
 
 def test_photographs_keep_their_side_when_others_come() -> None:
-    _, before = hold_out(photos(500))
-    _, after = hold_out(photos(1000))
+    _, before = train_val_split(photos(500))
+    _, after = train_val_split(photos(1000))
     assert {photo.path for photo in before} <= {photo.path for photo in after}
 
 
 def test_few_photographs_still_give_one_for_validation() -> None:
-    kept, held = hold_out(photos(2))
+    kept, held = train_val_split(photos(2))
     assert (len(kept), len(held)) == (1, 1)
     with pytest.raises(ImageError, match="too few"):
-        hold_out(photos(1))
+        train_val_split(photos(1))
 
 
 def test_photographs_of_one_name_have_their_own_labels(photographs: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from deepdetect.training.recipe import Stage, TrainingOptions
 
 def test_validation_takes_the_first_size_only(photographs: Path, tmp_path: Path) -> None:
     options = TrainingOptions(
-        stages=(Stage(64, 2, 1),), short_sides=(64, 96), detectors=("fast",), held_out=0.3
+        stages=(Stage(64, 2, 1),), short_sides=(64, 96), detectors=("fast",), val_fraction=0.3
     )
     made = prepare(Sources(photographs, tmp_path), options, workers=1)
     names = [path.name for path in (tmp_path / "labels").rglob("*.png")]

@@ -18,7 +18,7 @@ def test_the_papers_recipe() -> None:
     assert paper.stages == (Stage(480, 64, 100),)
     assert (paper.short_sides, paper.square) == ((480,), True)
     assert paper.dark_fraction == 0.25
-    assert paper.max_photos * paper.held_out == pytest.approx(8_000)
+    assert paper.max_photos * paper.val_fraction == pytest.approx(8_000)
     schedule = Schedule(paper, 33_000)
     assert schedule.steps == 51_562
     assert schedule.learning_rate(0) == pytest.approx(1e-3)

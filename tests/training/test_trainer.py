@@ -16,12 +16,12 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-from safetensors.torch import load_file, save_file  # noqa: E402
+from safetensors.torch import load_file  # noqa: E402
 
 from deepdetect import DeepDetect, ImageError, OptionError, WeightsError  # noqa: E402
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
 from deepdetect.detector.network.weights import (  # noqa: E402
-    load_mean_network,
+    average_weights,
     load_network,
     read_notes,
     save_weights,
@@ -41,7 +41,7 @@ def command(photographs: Path, run: Path, labels: Path) -> list[str]:
     """The same tiny run as a command of its own, which can be killed."""
     return [
         *(sys.executable, "-m", "deepdetect", "train", str(photographs), "-o", str(run)),
-        *("--labels", str(labels), "--validations", "8", "--detectors", "fast,sobel"),
+        *("--labels", str(labels), "--val-count", "8", "--detectors", "fast,sobel"),
         *("--precision", "float32", "--no-compile", "--threads", "1", "--workers", "1", "--json"),
         *RECIPE,
     ]
@@ -118,7 +118,6 @@ def test_a_run_writes_weights_and_curves(unbroken: Path) -> None:
 
 
 def test_the_best_weights_are_those_of_the_lowest_validation_loss(unbroken: Path) -> None:
-    import json
 
     from safetensors import safe_open
 
@@ -143,7 +142,6 @@ def test_starting_again_after_the_end_changes_nothing(photographs: Path, unbroke
 
 
 def test_where_weights_come_from_is_written_into_them(unbroken: Path) -> None:
-    import json
 
     from safetensors import safe_open
 
@@ -177,11 +175,11 @@ def test_own_photographs_and_settings_from_the_shipped_weights(
     settings = tmp_path / "labels.toml"
     settings.write_text('detectors = ["fast", "sobel"]\n[fast]\nnormal = { threshold = 30 }\n')
     arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
-    arguments += [str(tmp_path / "run"), "--start", "default", "--label-settings", str(settings)]
+    arguments += [str(tmp_path / "run"), "--init", "default", "--label-settings", str(settings)]
     arguments += ["--stage", "96x4x12", "--short-side", "96", "--learning-rate", "0.0005"]
     arguments += ["--warm-up", "5", "--dark-fraction", "0"]
     arguments += [
-        "--validations",
+        "--val-count",
         "3",
         "--no-compile",
         "--workers",
@@ -203,7 +201,7 @@ def test_frozen_batch_norm_keeps_the_statistics_and_trains_the_rest(
     photographs: Path, tmp_path: Path
 ) -> None:
     arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels")]
-    arguments += ["--start", "default"]
+    arguments += ["--init", "default"]
     subprocess.run(arguments, check=True, capture_output=True)
     before = load_network(bundled_weights("default", ".safetensors")).state_dict()
     after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
@@ -220,7 +218,7 @@ def test_only_the_decoder_may_be_trained(
     photographs: Path, tmp_path: Path, batch_norm: str
 ) -> None:
     arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels"), batch_norm]
-    arguments += ["--start", "default", "--layers", "decoder", "--optimizer", "soap"]
+    arguments += ["--init", "default", "--freeze-encoder", "--optimizer", "soap"]
     subprocess.run(arguments, check=True, capture_output=True)
     before = load_network(bundled_weights("default", ".safetensors")).state_dict()
     after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
@@ -237,42 +235,18 @@ def test_training_the_decoder_alone_needs_trained_weights(
     photographs: Path, tmp_path: Path
 ) -> None:
     arguments = command(photographs, tmp_path / "run", tmp_path / "labels")
-    for layers, hint in (("decoder", "--start"), ("decodr", "decoder")):
-        done = subprocess.run([*arguments, "--layers", layers], capture_output=True, text=True)
-        assert done.returncode == 2
-        assert hint in done.stderr
-        assert "Traceback" not in done.stderr
+    done = subprocess.run([*arguments, "--freeze-encoder"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "--init" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_frozen_batch_norm_needs_trained_weights(photographs: Path, tmp_path: Path) -> None:
     arguments = command(photographs, tmp_path / "run", tmp_path / "labels")
     done = subprocess.run([*arguments, "--frozen-batch-norm"], capture_output=True, text=True)
     assert done.returncode == 2
-    assert "--start" in done.stderr
+    assert "--init" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_a_run_of_an_older_version_goes_on(
-    photographs: Path, unbroken: Path, tmp_path: Path
-) -> None:
-    """Its options lack what came later: crops were flipped and nothing else was done to them."""
-    shutil.copytree(unbroken, tmp_path / "run")
-    path = tmp_path / "run" / "checkpoint.safetensors"
-    found = read_checkpoint(path)
-    options = json.loads(found.state["options"])
-    later = ("interleave", "optimizer", "frozen_batch_norm", "flips", "transpositions")
-    for name in (*later, "color_changes", "variations"):
-        del options[name]
-    for stage in options["stages"]:
-        del stage["sides"]
-    state = {**found.state, "options": json.dumps(options)}
-    save_file(found.tensors, path, metadata={"state": json.dumps(state)})
-    arguments = command(photographs, tmp_path / "run", unbroken.parent / "labels")
-    done = subprocess.run(arguments, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert "color_changes, flips, transpositions" in done.stderr
-    arguments += ["--flips", "--no-transpositions", "--color-changes", "0"]
-    subprocess.run(arguments, check=True, capture_output=True)
 
 
 def test_other_options_are_refused_in_the_same_folder(photographs: Path, unbroken: Path) -> None:
@@ -289,12 +263,12 @@ def test_a_run_can_start_from_trained_weights(
     from safetensors import safe_open
 
     options = TrainingOptions(
-        stages=(Stage(64, 4, 1),), short_sides=(64,), detectors=("fast",), validations=1
+        stages=(Stage(64, 4, 1),), short_sides=(64,), detectors=("fast",), val_count=1
     )
     start = unbroken / "best.safetensors"
     still = dataclasses.replace(options, learning_rate=0.0, final_learning_rate=0.0)
     for name, recipe in (("still", still), ("moved", options)):
-        train(photographs, tmp_path / name, recipe, start=start, device=PLAIN, workers=1)
+        train(photographs, tmp_path / name, recipe, init_weights=start, device=PLAIN, workers=1)
     before, after = load_file(start), load_file(tmp_path / "still" / "best.safetensors")
     names = dict(ESPNet().named_parameters())
     assert all(torch.equal(before[name], after[name]) for name in names)
@@ -315,23 +289,25 @@ def test_a_run_can_start_from_the_mean_of_several_weights(
     with torch.no_grad():
         changed.classifier.weight += 2
     save_weights(changed, other, {})
-    mean = load_mean_network([first, other]).state_dict()
+    mean = average_weights([first, other]).state_dict()
     for name, value in load_network(first).state_dict().items():
         expected = value + 1 if name == "classifier.weight" else value
         torch.testing.assert_close(mean[name], expected)
     recipe = TrainingOptions(
-        stages=(Stage(64, 4, 1),), short_sides=(64,), detectors=("fast",), validations=1
+        stages=(Stage(64, 4, 1),), short_sides=(64,), detectors=("fast",), val_count=1
     )
-    train(photographs, tmp_path / "run", recipe, start=[first, other], device=PLAIN, workers=1)
+    train(
+        photographs, tmp_path / "run", recipe, init_weights=[first, other], device=PLAIN, workers=1
+    )
     notes = read_notes(tmp_path / "run" / "best.safetensors")
-    assert notes["start"] == weights_digest(load_mean_network([first, other]))
+    assert notes["start"] == weights_digest(average_weights([first, other]))
 
 
 def test_missing_weights_to_start_from_are_refused_before_any_work(
     photographs: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(WeightsError, match="there is no weights file"):
-        train(photographs, tmp_path / "run", start=tmp_path / "none.safetensors")
+        train(photographs, tmp_path / "run", init_weights=tmp_path / "none.safetensors")
     assert not (tmp_path / "run").exists()
 
 
@@ -423,13 +399,12 @@ def test_bad_device_options_are_refused(bad: dict, hint: str) -> None:
 
 
 def test_a_photograph_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path) -> None:
-    import shutil
 
     folder = tmp_path / "photos"
     shutil.copytree(photographs, folder)
     (folder / "broken.jpg").write_bytes(b"no photograph")
     options = TrainingOptions(
-        stages=(Stage(64, 2, 1),), short_sides=(64,), detectors=("fast",), validations=1
+        stages=(Stage(64, 2, 1),), short_sides=(64,), detectors=("fast",), val_count=1
     )
     with pytest.raises(Exception, match=r"broken\.jpg") as caught:
         train(folder, tmp_path / "run", options, device=PLAIN, workers=1)
@@ -446,7 +421,7 @@ def test_a_missing_or_empty_folder_is_refused(tmp_path: Path, make) -> None:
 
 def test_one_seed_gives_one_result(photographs: Path, tmp_path: Path) -> None:
     options = TrainingOptions(
-        stages=(Stage(64, 4, 1),), short_sides=(64,), detectors=("fast",), validations=1
+        stages=(Stage(64, 4, 1),), short_sides=(64,), detectors=("fast",), val_count=1
     )
     for name in ("a", "b"):
         train(photographs, tmp_path / name, options, labels=tmp_path / "l", device=PLAIN, workers=1)

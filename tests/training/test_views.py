@@ -50,12 +50,12 @@ def test_views_of_a_photograph(name: str, short_sides: tuple[int, ...], variants
 
 def test_varied_views_come_last_and_leave_the_others_alone() -> None:
     plain = views_of("a.jpg", (96, 64), RANGE, 2)
-    normal, dark = views_of("a.jpg", (96, 64), RANGE, 2, variations=3)
+    normal, dark = views_of("a.jpg", (96, 64), RANGE, 2, augmentations=3)
     assert (normal[:2], dark[:4]) == plain
     assert [view.short_side for view in normal[2:] + dark[4:]] == [96] * 6
     assert [view.variation for view in normal[2:]] == [view.variation for view in dark[4:]]
     assert len({view.variation for view in normal}) == 4
-    other, _ = views_of("b.jpg", (96, 64), RANGE, 2, variations=3)
+    other, _ = views_of("b.jpg", (96, 64), RANGE, 2, augmentations=3)
     assert {view.variation for view in other[2:]}.isdisjoint(v.variation for v in normal[2:])
     assert len({view.name for view in normal + dark}) == 5 + 7
 

@@ -19,7 +19,7 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
     """Write the mean of WEIGHTS: best.safetensors and deepdetect.onnx.
 
     The mean of runs that went on from one another is often better than each of them; name one
-    twice to give it twice the weight. WEIGHTS are .safetensors files, or matching or geometry.
+    twice to give it twice the weight. WEIGHTS are .safetensors files, or default or dense.
 
     \b
     deepdetect average first/best.safetensors second/best.safetensors -o mean
@@ -36,7 +36,7 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
     from .._shared.provenance import provenance
     from ..detector.network.onnx_export import export_onnx
     from ..detector.network.weights import (
-        load_mean_network,
+        average_weights,
         load_network,
         read_notes,
         save_weights,
@@ -47,7 +47,7 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
     if len(weights) < 2:
         raise OptionError("name two weights at least: the mean of one is itself")
     paths = [find_weights(name, ".safetensors") for name in weights]
-    network = load_mean_network(paths)
+    network = average_weights(paths)
     parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]
     files = {"weights": output / "best.safetensors", "onnx": output / "deepdetect.onnx"}
     save_weights(network, files["weights"], {"parts": json.dumps(parts), **provenance()})

@@ -21,13 +21,13 @@ def ending_all_processes() -> Iterator[None]:
     for this one; and Python's own end can meet gloo's threads, and hang with them
     (pytorch#190489). A process alone goes the usual way.
     """
-    from ..training.cluster import place_in_cluster
+    from ..training.cluster import distributed_context
 
     status = 0
     try:
         yield
     except BaseException as error:
-        if place_in_cluster().processes == 1:
+        if distributed_context().processes == 1:
             raise
         if isinstance(error, DeepDetectError):
             click.echo(f"deepdetect: {error}", err=True)
@@ -35,7 +35,7 @@ def ending_all_processes() -> Iterator[None]:
         else:
             traceback.print_exc()
             status = 130 if isinstance(error, KeyboardInterrupt) else 1
-    if place_in_cluster().processes > 1:
+    if distributed_context().processes > 1:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)

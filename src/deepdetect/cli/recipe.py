@@ -16,7 +16,7 @@ preset_option = click.option(
     default="default",
     show_default=True,
     help="Recipe that the other options change: default (its values are shown below), paper "
-    "(the paper's own), or geometry (normal light only, denser labels).",
+    "(the paper's own), or dense (normal light only, denser labels).",
 )
 short_sides_option = click.option(
     "--short-side",
@@ -27,8 +27,8 @@ short_sides_option = click.option(
     "the first.  "
     "[default: 480 360 240]",
 )
-variations_option = click.option(
-    "--variations",
+augmentations_option = click.option(
+    "--augmentations",
     type=int,
     help="Varied views of each photograph at the first size, in normal and in dark light: turned, "
     "relit, blurred, noisy or compressed; each is taken as often as the plain one.  [default: 0]",

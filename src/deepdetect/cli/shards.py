@@ -8,11 +8,11 @@ from typing import Any
 import click
 
 from .recipe import (
+    augmentations_option,
     chosen_recipe,
     detectors_option,
     preset_option,
     short_sides_option,
-    variations_option,
 )
 from .shared import (
     PATH,
@@ -29,11 +29,11 @@ from .shared import (
 @click.option("-o", "--output", type=PATH, required=True, help="Folder for the shards.")
 @preset_option
 @short_sides_option
-@variations_option
+@augmentations_option
 @detectors_option
 @label_settings_option
 @click.option(
-    "--photos-a-shard",
+    "--shard-size",
     type=click.IntRange(min=1),
     default=256,
     show_default=True,
@@ -47,7 +47,7 @@ def shards(
     preset: str,
     detectors: str | None,
     label_settings: str | None,
-    photos_a_shard: int,
+    shard_size: int,
     workers: int | None,
     as_json: bool,
     **values: Any,
@@ -72,7 +72,7 @@ def shards(
         photos,
         output,
         options,
-        photos_a_shard=photos_a_shard,
+        shard_size=shard_size,
         workers=workers,
         quiet=as_json,
     )

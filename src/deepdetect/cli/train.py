@@ -10,11 +10,11 @@ import click
 
 from .cluster import ending_all_processes
 from .recipe import (
+    augmentations_option,
     chosen_recipe,
     detectors_option,
     preset_option,
     short_sides_option,
-    variations_option,
 )
 from .shared import (
     PATH,
@@ -41,10 +41,11 @@ if TYPE_CHECKING:
 )
 @click.option("--labels", type=PATH, help="Folder for the label cache.  [default: in the run's]")
 @click.option(
-    "--start",
+    "--init",
+    "init_weights",
     multiple=True,
     metavar="NAME|FILE",
-    help="Weights to start from: matching or geometry, the bundled ones, or a .safetensors "
+    help="Weights to start from: default or dense, the bundled ones, or a .safetensors "
     "file; repeated, the mean of all.  [default: random ones]",
 )
 @click.option(
@@ -62,7 +63,7 @@ if TYPE_CHECKING:
 )
 @short_sides_option
 @click.option("--dark-fraction", type=float, help="Share of darkened images.  [default: 0.25]")
-@variations_option
+@augmentations_option
 @click.option(
     "--flips/--no-flips",
     default=None,
@@ -74,7 +75,7 @@ if TYPE_CHECKING:
     help="Mirror crops along their diagonal, where labels are the same.  [default: yes]",
 )
 @click.option(
-    "--color-changes",
+    "--color-jitter",
     type=float,
     help="Share of crops with other colours of the same luma.  [default: 0.5]",
 )
@@ -87,27 +88,28 @@ if TYPE_CHECKING:
     help="Keep the start weights' batch statistics.  [default: with --start]",
 )
 @click.option(
-    "--marked-weight",
+    "--pos-weight",
     type=float,
     help="Weight of marked pixels in the loss: above 1 gives more keypoints.  [default: 1]",
 )
 @click.option(
-    "--dark-marked-weight",
+    "--low-light-pos-weight",
     type=float,
     help="The same in crops of low visibility.  [default: that of all others]",
 )
 @click.option(
-    "--doubtful-only/--all-marked",
+    "--pos-weight-uncertain/--pos-weight-all",
     default=None,
     help="These weights only where the network is not sure.  [default: wherever it is]",
 )
 @click.option(
-    "--layers",
-    help="all, or decoder: the encoder stays as it is.  [default: all]",
+    "--freeze-encoder/--train-encoder",
+    default=None,
+    help="Train the decoder only; the encoder stays as it is.  [default: train both]",
 )
 @detectors_option
 @label_settings_option
-@click.option("--validations", type=int, help="How often the loss is validated.  [default: 12]")
+@click.option("--val-count", type=int, help="How often the loss is validated.  [default: 12]")
 @click.option("--seed", type=int, help="Of all random choices.  [default: 0]")
 @click.option("--device", default="auto", show_default=True, help="cpu, cuda or auto.")
 @click.option(
@@ -121,7 +123,7 @@ if TYPE_CHECKING:
 )
 @click.option("--threads", type=int, help="CPU threads.  [default: torch's choice]")
 @click.option(
-    "--loaders",
+    "--num-workers",
     type=int,
     help="Threads that make batches.  [default: 1 beside a CPU that trains, else all but one]",
 )
@@ -138,12 +140,12 @@ def train(
     output: Path,
     validation: Path | None,
     labels: Path | None,
-    start: tuple[str, ...],
+    init_weights: tuple[str, ...],
     device: str,
     precision: str,
     compile_network: bool | None,
     threads: int | None,
-    loaders: int | None,
+    num_workers: int | None,
     timed: bool,
     preset: str,
     detectors: str | None,
@@ -179,10 +181,10 @@ def train(
     arguments = {
         "validation": validation,
         "labels": labels,
-        "start": start or None,
-        "device": DeviceOptions(device, precision, compile_network, threads, loaders),
+        "init_weights": init_weights or None,
+        "device": DeviceOptions(device, precision, compile_network, threads, num_workers),
         "workers": workers,
-        "say": None if as_json else click.echo,
+        "log": None if as_json else click.echo,
     }
     options = chosen_recipe(preset, detectors, label_settings, values)
     with ending_all_processes():
@@ -193,9 +195,9 @@ def train(
 
 
 def _print_result(result: TrainingResult, as_json: bool) -> None:
-    from ..training.cluster import place_in_cluster
+    from ..training.cluster import distributed_context
 
-    if not place_in_cluster().is_first:
+    if not distributed_context().is_first:
         return
     best = result.best
     if as_json:
@@ -226,9 +228,9 @@ def _print_result(result: TrainingResult, as_json: bool) -> None:
 def _print_profiles(profiles: list[StageProfile], as_json: bool) -> None:
     from dataclasses import asdict
 
-    from ..training.cluster import place_in_cluster
+    from ..training.cluster import distributed_context
 
-    if not place_in_cluster().is_first:
+    if not distributed_context().is_first:
         return
     if as_json:
         print_json([asdict(profile) for profile in profiles])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .augmentation import flip, transpose, turn_hue, without_color
-from .cluster import Place
+from .cluster import DistributedContext
 from .feed import Example, Feed
 from .photos import Photo
 from .prefetch import prefetched
@@ -36,21 +36,25 @@ class Batches:
         feed: the photographs.
         schedule: the steps.
         place: this process's place among those of the run; it makes its part of each batch.
-        loaders: threads that make batches, each whole ones.
+        num_workers: threads that make batches, each whole ones.
 
     Raises:
         OptionError: a batch cannot be shared evenly by the processes.
     """
 
     def __init__(
-        self, feed: Feed, schedule: Schedule, place: Place = Place(), loaders: int = 1
+        self,
+        feed: Feed,
+        schedule: Schedule,
+        place: DistributedContext = DistributedContext(),
+        num_workers: int = 1,
     ) -> None:
         for stage in schedule.options.stages:
-            place.share(stage.batch)
+            place.local_slice(stage.batch)
         self.feed = feed
         self.schedule = schedule
         self.place = place
-        self.loaders = loaders
+        self.num_workers = num_workers
 
     def batch(self, step: int) -> tuple[np.ndarray, np.ndarray]:
         """Make a step's batch, or this process's part of it.
@@ -71,7 +75,7 @@ class Batches:
         """
         end = self.schedule.steps if last is None else last
         plans = self._plans(first, end)
-        yield from prefetched(self._make, plans, self.loaders, self.loaders + 3)
+        yield from prefetched(self._make, plans, self.num_workers, self.num_workers + 3)
 
     def _plans(self, first: int, last: int) -> Iterator[_Plan]:
         """Yield what the batches are made of; all processes go through the same photographs."""
@@ -88,7 +92,7 @@ class Batches:
                     examples = self.feed.epoch(epoch, place)
                 draws.append((next(examples), epoch, place))
                 running[position.number] = (epoch, place + 1), examples
-            yield _Plan(position.stage, draws[self.place.share(position.stage.batch)])
+            yield _Plan(position.stage, draws[self.place.local_slice(position.stage.batch)])
 
     def _make(self, plan: _Plan) -> tuple[np.ndarray, np.ndarray]:
         crops = [self._crop(*draw, plan.stage) for draw in plan.draws]
@@ -113,7 +117,7 @@ class Batches:
                 image, mask = flip(image, mask, axis)
         if options.transpositions and generator.random() < 0.5:
             image, mask = transpose(image, mask)
-        if generator.random() < options.color_changes:
+        if generator.random() < options.color_jitter:
             # In the dark, where one level more or less makes a keypoint, only what is exact.
             if view.darkening is not None or generator.random() < 0.5:
                 image = without_color(image)

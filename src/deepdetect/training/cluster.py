@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 from .._shared.errors import OptionError
 
-PATIENCE = datetime.timedelta(hours=24)
+BARRIER_TIMEOUT = datetime.timedelta(hours=24)
 _meetings = itertools.count()  # each has its own name in the store
 
 
 @dataclass(frozen=True)
-class Place:
+class DistributedContext:
     """A process among those of a run.
 
     Attributes:
@@ -46,14 +46,14 @@ class Place:
         """How many machines there are, with as many processes each."""
         return self.processes // self.local_processes
 
-    def share(self, count: int) -> slice:
+    def local_slice(self, count: int) -> slice:
         """Return this process's part of a batch, all parts being of one size.
 
         Raises:
             OptionError: it cannot be shared evenly.
 
         Example:
-            >>> Place(rank=1, processes=2, local_rank=1, local_processes=2).share(8)
+            >>> DistributedContext(1, 2, 1, 2).local_slice(8)
             slice(4, 8, None)
         """
         if count % self.processes:
@@ -65,23 +65,23 @@ class Place:
         return slice(self.rank * part, (self.rank + 1) * part)
 
 
-def place_in_cluster() -> Place:
+def distributed_context() -> DistributedContext:
     """Read this process's place; without `torchrun` it is the only one.
 
     Raises:
         OptionError: the machines have different numbers of processes.
 
     Example:
-        >>> place_in_cluster().processes >= 1
+        >>> distributed_context().processes >= 1
         True
     """
     if "TORCHELASTIC_RUN_ID" not in os.environ:
-        return Place()
+        return DistributedContext()
     names = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
-    return Place(*(int(os.environ[name]) for name in names))
+    return DistributedContext(*(int(os.environ[name]) for name in names))
 
 
-def wait_for_all(place: Place) -> None:
+def wait_for_all(place: DistributedContext) -> None:
     """Wait until every process has come here, for hours if need be.
 
     Through torchrun's own store, so that the time limits of the training itself, within
@@ -100,4 +100,4 @@ def wait_for_all(place: Place) -> None:
     restart = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
     meeting = PrefixStore(f"deepdetect-{restart}-{next(_meetings)}", store)
     meeting.set(str(place.rank), "here")
-    meeting.wait([str(rank) for rank in range(place.processes)], PATIENCE)
+    meeting.wait([str(rank) for rank in range(place.processes)], BARRIER_TIMEOUT)

@@ -20,7 +20,7 @@ from .._shared.errors import OptionError, unknown_name
 from .._shared.memory import keep_freed_memory
 from .._shared.processes import processor_count
 from .batch_norm import synchronize_batch_norm
-from .cluster import Place, place_in_cluster
+from .cluster import DistributedContext, distributed_context
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -38,7 +38,7 @@ class DeviceOptions:
             computes with it.
         compile: torch.compile; None means when a C++ compiler is at hand.
         threads: CPU threads of torch; None leaves torch's choice.
-        loaders: threads that make batches; None means one beside a CPU that trains, and
+        num_workers: threads that make batches; None means one beside a CPU that trains, and
             all but one of the processors beside a GPU.
     """
 
@@ -46,7 +46,7 @@ class DeviceOptions:
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     compile: bool | None = None
     threads: int | None = None
-    loaders: int | None = None
+    num_workers: int | None = None
 
     def __post_init__(self) -> None:
         if self.device not in ("auto", "cpu", "cuda"):
@@ -55,7 +55,7 @@ class DeviceOptions:
             raise unknown_name("precision", self.precision, PRECISIONS)
         if self.device == "cuda" and not torch.cuda.is_available():
             raise OptionError("there is no CUDA device: use --device cpu")
-        for name in ("threads", "loaders"):
+        for name in ("threads", "num_workers"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise OptionError(f"{name} must be at least 1, not {value}")
@@ -70,7 +70,7 @@ class Engine:
     """
 
     def __init__(self, network: nn.Module, options: DeviceOptions) -> None:
-        self.place = place_in_cluster()
+        self.place = distributed_context()
         kind = options.device
         if kind == "auto":
             kind = "cuda" if torch.cuda.is_available() else "cpu"
@@ -94,7 +94,7 @@ class Engine:
             # Sums over processes, inside the batch normalisation, break the graph.
             compiled = has_compiler and self.place.processes == 1
         self.compiled = bool(compiled)
-        self.loaders = options.loaders or _loaders(kind, self.place)
+        self.num_workers = options.num_workers or _loaders(kind, self.place)
         self._may_fall_back = options.compile is None
         self._forward = self._set_up()
 
@@ -107,9 +107,9 @@ class Engine:
 
     def images(self, rgb: np.ndarray | torch.Tensor) -> torch.Tensor:
         """Turn (B, H, W, 3) uint8 into (B, 3, H, W) float32 in [0, 1], channels last."""
-        return self.place_tensor(rgb).permute(0, 3, 1, 2).float().div_(255)
+        return self.to_device(rgb).permute(0, 3, 1, 2).float().div_(255)
 
-    def place_tensor(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
+    def to_device(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
         """Bring values onto the device."""
         tensor = torch.as_tensor(values)
         if self.device.type == "cuda":
@@ -189,7 +189,7 @@ class Engine:
         return ", ".join(words)
 
 
-def _fabric(kind: str, place: Place) -> Fabric:
+def _fabric(kind: str, place: DistributedContext) -> Fabric:
     from lightning_fabric import Fabric
     from lightning_fabric.plugins.environments import LightningEnvironment, TorchElasticEnvironment
     from lightning_fabric.strategies import DDPStrategy
@@ -212,7 +212,7 @@ def _fabric(kind: str, place: Place) -> Fabric:
     )
 
 
-def _loaders(kind: str, place: Place) -> int:
+def _loaders(kind: str, place: DistributedContext) -> int:
     """Return how many threads make batches: a CPU that trains has none to spare."""
     if kind == "cpu":
         return 1

@@ -25,11 +25,11 @@ class Learner:
         device: how it is run.
         optimizer: name of the optimiser.
         frozen_batch_norm: keep the statistics of the batch normalisation as they are.
-        marked_weight: weight of a marked pixel in the loss; others have 1.
-        dark_marked_weight: the same in images of low visibility; None: as in all others.
-        doubtful_only: these weights are those of pixels at a probability of one half, and come
-            to 1 where the network is sure.
-        layers: "all", or "decoder": the network's `encoder` stays as it is.
+        pos_weight: weight of a marked pixel in the loss; others have 1.
+        low_light_pos_weight: the same in images of low visibility; None: as in all others.
+        pos_weight_uncertain: scale these weights by the uncertainty p(1 - p): they hold at a
+            probability of one half and fall to 1 where the network is certain.
+        freeze_encoder: keep the network's `encoder` as it is.
     """
 
     def __init__(
@@ -38,23 +38,23 @@ class Learner:
         device: DeviceOptions,
         optimizer: str = "adam",
         frozen_batch_norm: bool = False,
-        marked_weight: float = 1.0,
-        dark_marked_weight: float | None = None,
-        doubtful_only: bool = False,
-        layers: str = "all",
+        pos_weight: float = 1.0,
+        low_light_pos_weight: float | None = None,
+        pos_weight_uncertain: bool = False,
+        freeze_encoder: bool = False,
     ) -> None:
         self.frozen_batch_norm = frozen_batch_norm
-        self.frozen_encoder = layers == "decoder"
-        if self.frozen_encoder:  # before it is compiled, which then leaves its gradients out
+        self.freeze_encoder = freeze_encoder
+        if self.freeze_encoder:  # before it is compiled, which then leaves its gradients out
             network.encoder.requires_grad_(False)
         self.engine = Engine(network, device)
         self.network = self.engine.network
         self.optimizers = make_optimizers(optimizer, self.network, self.engine.share)
-        dark = marked_weight if dark_marked_weight is None else dark_marked_weight
-        self.marked_weights = {"normal": marked_weight, "low": dark}
-        self.doubtful_only = doubtful_only
+        dark = pos_weight if low_light_pos_weight is None else low_light_pos_weight
+        self.pos_weights = {"normal": pos_weight, "low": dark}
+        self.pos_weight_uncertain = pos_weight_uncertain
 
-    def learn(self, rgb: np.ndarray, masks: np.ndarray, rate: float, step: int) -> float:
+    def training_step(self, rgb: np.ndarray, masks: np.ndarray, rate: float, step: int) -> float:
         """Make one optimiser step.
 
         Args:
@@ -72,17 +72,17 @@ class Learner:
         self.network.train()
         if self.frozen_batch_norm:
             freeze_batch_norm(self.network)
-        elif self.frozen_encoder:
+        elif self.freeze_encoder:
             freeze_batch_norm(self.network.encoder)
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
             for group in optimizer.param_groups:
                 group["lr"] = rate
         images = self.engine.images(rgb)
-        truth = self.engine.place_tensor(masks)[:, None].float()
+        truth = self.engine.to_device(masks)[:, None].float()
         logits = self.engine.logits(images)
         weight = self._weight_of_marked(rgb)
-        if self.doubtful_only and weight is not None:
+        if self.pos_weight_uncertain and weight is not None:
             probability = logits.detach().sigmoid()
             weight = 1 + (weight - 1) * 4 * probability * (1 - probability)
         loss = binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
@@ -101,10 +101,10 @@ class Learner:
 
     def _weight_of_marked(self, rgb: np.ndarray) -> torch.Tensor | None:
         """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
-        normal, dark = self.marked_weights["normal"], self.marked_weights["low"]
+        normal, dark = self.pos_weights["normal"], self.pos_weights["low"]
         if normal == dark == 1:
             return None
         if normal == dark:  # the images need not be looked at
-            return self.engine.place_tensor(np.full(1, normal, np.float32))
-        found = [self.marked_weights[visibility_of(luma(image))] for image in rgb]
-        return self.engine.place_tensor(np.array(found, np.float32)[:, None, None, None])
+            return self.engine.to_device(np.full(1, normal, np.float32))
+        found = [self.pos_weights[visibility_of(luma(image))] for image in rgb]
+        return self.engine.to_device(np.array(found, np.float32)[:, None, None, None])

@@ -64,14 +64,14 @@ def list_photos(
                 options.darkening,
                 options.dark_variants,
                 options.square,
-                options.variations,
+                options.augmentations,
             ),
         )
         for path in paths
     ]
 
 
-def hold_out(photos: list[Photo], share: float = 0.05) -> tuple[list[Photo], list[Photo]]:
+def train_val_split(photos: list[Photo], share: float = 0.05) -> tuple[list[Photo], list[Photo]]:
     """Split off a share of the photographs for validation, by the checksums of their names.
 
     A photograph stays on its side when others are added.

@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from .cluster import place_in_cluster, wait_for_all
+from .cluster import distributed_context, wait_for_all
 from .feed import Example, Feed, FileFeed, StoredExample
 from .label_cache import LabelCache
-from .photos import Photo, hold_out, list_photos, photos_digest
+from .photos import Photo, list_photos, photos_digest, train_val_split
 from .recipe import TrainingOptions
 from .shards import HeldExamples, ShardFeed, Shards, has_shards
 from .view_store import ViewStore
@@ -71,13 +71,13 @@ def prepare(
         DeepDetectError: a photograph cannot be read.
     """
     for stage in options.stages:
-        place_in_cluster().share(stage.batch)  # an uneven share is told before the labels
+        distributed_context().local_slice(stage.batch)  # an uneven share is told before the labels
     if has_shards(sources.photos):
         return _sharded(sources, options, workers, quiet)
     exclude = (sources.output, sources.label_cache)
     training = list_photos(sources.photos, options, exclude, options.max_photos)
     if sources.validation is None:
-        training, held = hold_out(training, options.held_out)
+        training, held = train_val_split(training, options.val_fraction)
     else:
         held = list_photos(Path(sources.validation), options, exclude)
     store = _stored(sources, options, training, held, workers, quiet)
@@ -115,7 +115,7 @@ def _stored(
     dark_ones = options.dark_fraction > 0
     wanted = [(photo, photo.normal + photo.dark * dark_ones) for photo in training]
     wanted += [(photo, (photo.normal[0], photo.dark[0])) for photo in held]
-    place = place_in_cluster()
+    place = distributed_context()
     if place.local_rank == 0:
         store.labels.make(wanted, workers, quiet or not place.is_first)
     wait_for_all(place)

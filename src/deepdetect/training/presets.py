@@ -16,16 +16,16 @@ PRESETS: dict[str, TrainingOptions] = {
         short_sides=(480,),
         square=True,
         max_photos=41_000,
-        held_out=8 / 41,
+        val_fraction=8 / 41,
         dark_fraction=0.25,
         transpositions=False,
-        color_changes=0.0,
+        color_jitter=0.0,
         learning_rate=1e-3,
         final_learning_rate=1e-6,
-        validations=20,
+        val_count=20,
     ),
     # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser
-    # labels. Meant to go on from trained weights, as --start default.
+    # labels. Meant to go on from trained weights, as --init default.
     "dense": TrainingOptions(
         stages=(Stage(480, 8, 5, (480,)), Stage(480, 8, 1, (720,)), Stage(240, 32, 3, (240,))),
         interleave=True,
@@ -35,7 +35,7 @@ PRESETS: dict[str, TrainingOptions] = {
         optimizer="soap",
         learning_rate=1.5e-3,
         warm_up=100,
-        validations=6,
+        val_count=6,
     ),
 }
 

@@ -86,7 +86,7 @@ def _profile(
             waited, started = 0.0, asked
         rgb, masks = next(stream)
         waited += time.perf_counter() - asked
-        learner.learn(rgb, masks, batches.schedule.learning_rate(step), step)
+        learner.training_step(rgb, masks, batches.schedule.learning_rate(step), step)
         done(1)
     # Reading the loss has waited for the GPU at each step.
     seconds = time.perf_counter() - started

@@ -5,14 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 from dataclasses import dataclass, field
-from typing import Literal
 
-from .._shared.errors import OptionError, look_up, unknown_name
+from .._shared.errors import OptionError, look_up
 from ..labels import DETECTOR_NAMES, LabelOptions, SettingChange
 from .darkening import DarkeningRange
 from .optimizers import OPTIMIZERS
-
-LAYERS = ("all", "decoder")
 
 
 @dataclass(frozen=True)
@@ -77,17 +74,17 @@ class TrainingOptions:
         square: squash the photographs to squares, as the paper does, instead.
         max_photos: use no more photographs than so many, those held out among them; None
             uses all.
-        held_out: share of the photographs held out for validation, when no folder is named.
+        val_fraction: share of the photographs held out for validation, when no folder is named.
         dark_fraction: share of darkened images (paper: a quarter).
         dark_variants: darkened versions of each photograph at each size.
         darkening: ranges of the darkening.
-        variations: varied views of each photograph at the first size, in normal and in dark
+        augmentations: varied views of each photograph at the first size, in normal and in dark
             light: turned, relit, blurred, noisy or compressed (`variation.vary`). Each is taken
             as often as the plain view of a size.
         flips: mirror crops left to right and upside down. The label of a mirrored photograph
             is another one, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
         transpositions: mirror crops along their diagonal, which changes labels of BRISK only.
-        color_changes: share of crops whose colours are taken away or turned around the luma,
+        color_jitter: share of crops whose colours are taken away or turned around the luma,
             on which alone labels depend.
         optimizer: "adam", or "soap", which learns more from an image (measured in the model
             card of the bundled weights).
@@ -97,18 +94,19 @@ class TrainingOptions:
         frozen_batch_norm: normalise by the statistics that the start weights bring along, as
             the finished network does, not by those of each batch, which vary much from one
             batch of a few images to the next. None: when a run starts from trained weights.
-        marked_weight: weight of a marked pixel in the loss. With 1, where the network is not sure
+        pos_weight: weight of a marked pixel in the loss. With 1, where the network is not sure
             it marks too little, since most pixels are not marked: the keypoints above a
             probability of 0.5 are fewer than the labels'. Above 1 there are more of them.
-        dark_marked_weight: the same in crops of low visibility; None: as in all others.
-        doubtful_only: these weights are those of pixels at a probability of one half; the surer
-            the network is, the nearer to 1 they come, so that what it is sure of hardly moves.
-        layers: "all", or "decoder": the encoder, nearly all of the weights, stays as it is, a
+        low_light_pos_weight: the same in crops of low visibility; None: as in all others.
+        pos_weight_uncertain: scale these weights by the uncertainty p(1 - p): they hold at a
+            probability of one half and fall to 1 where the network is certain, so that certain
+            probabilities hardly move.
+        freeze_encoder: the encoder, nearly all of the weights, stays as it is, a
             step takes about half of the time, and what the start weights know is kept. For few
             photographs, and for changes of how many pixels are marked.
         detectors: label detectors to fuse.
         label_changes: settings of label detectors that differ from the paper's.
-        validations: how often the validation loss is taken.
+        val_count: how often the validation loss is taken.
         seed: decides the start weights, the order, the crops and what is done to them.
 
     Raises:
@@ -120,33 +118,31 @@ class TrainingOptions:
     short_sides: tuple[int, ...] = (480, 360, 240)
     square: bool = False
     max_photos: int | None = None
-    held_out: float = 0.05
+    val_fraction: float = 0.05
     dark_fraction: float = 0.25
     dark_variants: int = 1
     darkening: DarkeningRange = field(default_factory=DarkeningRange)
-    variations: int = 0
+    augmentations: int = 0
     flips: bool = False
     transpositions: bool = True
-    color_changes: float = 0.5
+    color_jitter: float = 0.5
     optimizer: str = "adam"
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-6
     warm_up: int = 0
     frozen_batch_norm: bool | None = None
-    marked_weight: float = 1.0
-    dark_marked_weight: float | None = None
-    doubtful_only: bool = False
-    layers: Literal["all", "decoder"] = "all"
+    pos_weight: float = 1.0
+    low_light_pos_weight: float | None = None
+    pos_weight_uncertain: bool = False
+    freeze_encoder: bool = False
     detectors: tuple[str, ...] = DETECTOR_NAMES
     label_changes: tuple[SettingChange, ...] = ()
-    validations: int = 12
+    val_count: int = 12
     seed: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "detectors", LabelOptions(self.detectors).detectors)
         look_up("optimizer", self.optimizer, OPTIMIZERS)
-        if self.layers not in LAYERS:
-            raise unknown_name("layers", self.layers, LAYERS)
         if not self.stages:
             raise OptionError("a training run needs at least one stage")
         if not self.short_sides or min(self.short_sides) < 16:
@@ -165,25 +161,25 @@ class TrainingOptions:
             )
         if self.max_photos is not None and self.max_photos < 2:
             raise OptionError(f"max_photos must be at least 2, not {self.max_photos}")
-        if not 0 < self.held_out < 1:
-            raise OptionError(f"the share held out must lie in (0, 1), not {self.held_out}")
+        if not 0 < self.val_fraction < 1:
+            raise OptionError(f"the share held out must lie in (0, 1), not {self.val_fraction}")
         if not 0 <= self.dark_fraction <= 1:
             raise OptionError(f"the dark fraction must lie in [0, 1], not {self.dark_fraction}")
-        if not 0 <= self.color_changes <= 1:
+        if not 0 <= self.color_jitter <= 1:
             raise OptionError(
-                f"the share of colour changes must lie in [0, 1], not {self.color_changes}"
+                f"the share of colour changes must lie in [0, 1], not {self.color_jitter}"
             )
-        if self.variations < 0:
-            raise OptionError(f"the variations must not be negative, not {self.variations}")
-        if self.dark_variants < 1 or self.validations < 1:
-            raise OptionError("dark variants and validations must be at least 1")
-        for weight in (self.marked_weight, self.dark_marked_weight):
+        if self.augmentations < 0:
+            raise OptionError(f"the augmentations must not be negative, not {self.augmentations}")
+        if self.dark_variants < 1 or self.val_count < 1:
+            raise OptionError("dark variants and val_count must be at least 1")
+        for weight in (self.pos_weight, self.low_light_pos_weight):
             if weight is not None and not 0.1 <= weight <= 10:
                 raise OptionError(
                     f"the weight of marked pixels must lie in [0.1, 10], not {weight}"
                 )
-        if self.doubtful_only and {self.marked_weight, self.dark_marked_weight or 1} == {1}:
-            raise OptionError("doubtful_only needs a weight of marked pixels: give --marked-weight")
+        if self.pos_weight_uncertain and {self.pos_weight, self.low_light_pos_weight or 1} == {1}:
+            raise OptionError("pos_weight_uncertain needs a pos_weight other than 1")
         if self.warm_up < 0:
             raise OptionError(f"the warm-up must not be negative, not {self.warm_up} steps")
         if not 0 <= self.seed < 2**31:

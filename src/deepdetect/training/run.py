@@ -66,7 +66,7 @@ class Run:
         options: the recipe.
         device: how the network is run.
         network: the network with the weights that it starts from.
-        say: takes lines of text for the user; without it there is no progress bar either.
+        log: takes lines of text for the user; without it there is no progress bar either.
         resume: go on from the folder's checkpoint.
 
     Raises:
@@ -80,7 +80,7 @@ class Run:
         options: TrainingOptions,
         device: DeviceOptions,
         network: ESPNet,
-        say: Callable[[str], None] | None = None,
+        log: Callable[[str], None] | None = None,
         resume: bool = True,
     ) -> None:
         self.photographs, self.folder, self.options = photographs, folder, options
@@ -91,15 +91,17 @@ class Run:
             device,
             options.optimizer,
             bool(options.frozen_batch_norm),
-            options.marked_weight,
-            options.dark_marked_weight,
-            options.doubtful_only,
-            options.layers,
+            options.pos_weight,
+            options.low_light_pos_weight,
+            options.pos_weight_uncertain,
+            options.freeze_encoder,
         )
         self.engine, self.network = self.learner.engine, self.learner.network
         self.place = self.engine.place
-        self.say = say if self.place.is_first else None
-        self.batches = Batches(photographs.training, self.schedule, self.place, self.engine.loaders)
+        self.log = log if self.place.is_first else None
+        self.batches = Batches(
+            photographs.training, self.schedule, self.place, self.engine.num_workers
+        )
         self.origin = {**provenance(), "run_on": self.engine.describe()}
         self._check_agreement()
         self.step = 0
@@ -109,20 +111,20 @@ class Run:
         if resume:
             self._resume()
 
-    def finish(self) -> TrainingResult:
+    def fit(self) -> TrainingResult:
         """Train to the last step."""
-        milestones = self.schedule.milestones(self.options.validations)
+        milestones = self.schedule.milestones(self.options.val_count)
         started, pixels = time.monotonic(), 0
         saved = started
-        if self.step < self.schedule.steps and self.say is not None:
-            self.say(f"training on {self.engine.describe()}")
+        if self.step < self.schedule.steps and self.log is not None:
+            self.log(f"training on {self.engine.describe()}")
         if self.step in milestones and self.step not in {point.step for point in self.points}:
             self._validate()  # the run was killed while it validated
-        bar = progress(self.schedule.steps, "training", "step", self.say is None, self.step)
+        bar = progress(self.schedule.steps, "training", "step", self.log is None, self.step)
         with bar:
             for rgb, masks in self.batches.stream(self.step):
                 rate = self.schedule.learning_rate(self.step)
-                loss = self.learner.learn(rgb, masks, rate, self.step)
+                loss = self.learner.training_step(rgb, masks, rate, self.step)
                 batch = len(masks) * self.place.processes
                 pixels += batch * masks[0].size
                 self.loss_sum += loss
@@ -187,9 +189,9 @@ class Run:
         """Score the network on a view of the photographs held out, shared by the processes."""
         held = iter(self.photographs.held)
         mine = itertools.islice(held, self.place.rank, None, self.place.processes)
-        loaders = self.engine.loaders
+        num_workers = self.engine.num_workers
         pairs = prefetched(
-            lambda example: example.load(view_of(example.photo)), mine, loaders, loaders + 1
+            lambda example: example.load(view_of(example.photo)), mine, num_workers, num_workers + 1
         )
         scores = score_network(self.network, pairs, self.engine.device)
         return mean_score(self.engine.gather(scores))
@@ -267,7 +269,7 @@ def _difference(stored: str, options: TrainingOptions) -> list[str]:
     """
     now = json.loads(options.to_json())
     older = TrainingOptions(
-        frozen_batch_norm=False, flips=True, transpositions=False, color_changes=0.0
+        frozen_batch_norm=False, flips=True, transpositions=False, color_jitter=0.0
     )
     before = {**json.loads(older.to_json()), **json.loads(stored)}
     before["stages"] = [{"sides": [], **stage} for stage in before["stages"]]

@@ -11,7 +11,7 @@ import torch
 from .._shared.errors import OptionError
 from .._shared.progress import progress
 from ..detector.network.espnet import ESPNet
-from ..detector.network.weights import load_mean_network
+from ..detector.network.weights import average_weights
 from ..detector.pretrained import find_weights
 from .device import DeviceOptions
 from .preparation import Sources, prepare
@@ -27,10 +27,10 @@ def train(
     *,
     validation: str | Path | None = None,
     labels: str | Path | None = None,
-    start: str | Path | Sequence[str | Path] | None = None,
+    init_weights: str | Path | Sequence[str | Path] | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> TrainingResult:
     """Train the network on a folder of photographs.
 
@@ -45,11 +45,11 @@ def train(
         options: the recipe.
         validation: folder of other photographs; default: some are held out.
         labels: folder for the label cache; default: in `output`.
-        start: weights (.safetensors) to start from, or "default" or "dense" for those
+        init_weights: weights (.safetensors) to start from, or "default" or "dense" for those
             inside the package; of several, their mean; default: random ones, by the seed.
         device: how the network is run.
         workers: processes that make labels; default one for each processor.
-        say: takes the one line that says how the network is run; without it there is
+        log: takes the one line that says how the network is run; without it there is
             no progress bar either.
 
     Returns:
@@ -64,11 +64,13 @@ def train(
     Example:
         >>> train("photographs", "run")  # doctest: +SKIP
     """
-    options, network = _start(options, start)  # before the labels, which take minutes
+    options, network = _initial_network(
+        options, init_weights
+    )  # before the labels, which take minutes
     sources = Sources(Path(photos), Path(output), validation, labels)
-    made = prepare(sources, options, workers, quiet=say is None)
-    run = Run(made, Path(output), options, device, network, say)
-    result = run.finish()
+    made = prepare(sources, options, workers, quiet=log is None)
+    run = Run(made, Path(output), options, device, network, log)
+    result = run.fit()
     run.engine.close()
     return result
 
@@ -81,16 +83,17 @@ def profile(
     steps: int = 30,
     validation: str | Path | None = None,
     labels: str | Path | None = None,
-    start: str | Path | Sequence[str | Path] | None = None,
+    init_weights: str | Path | Sequence[str | Path] | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
-    say: Callable[[str], None] | None = None,
+    log: Callable[[str], None] | None = None,
 ) -> list[StageProfile]:
     """Time some steps of each stage of a run; nothing but the label cache is written.
 
     Args:
         steps: steps to time in each stage.
-        photos, output, options, validation, labels, start, device, workers, say: as of `train`.
+        photos, output, options, validation, labels, init_weights, device, workers, log: as of
+            `train`.
 
     Returns:
         One profile a stage.
@@ -102,38 +105,38 @@ def profile(
         >>> profile("photographs", "run")[0].images_per_second  # doctest: +SKIP
     """
     options = dataclasses.replace(options, interleave=False)  # each stage by itself
-    options, network = _start(options, start)
+    options, network = _initial_network(options, init_weights)
     sources = Sources(Path(photos), Path(output), validation, labels)
-    made = prepare(sources, options, workers, quiet=say is None)
+    made = prepare(sources, options, workers, quiet=log is None)
     run = Run(made, Path(output), options, device, network, resume=False)
     total = sum(min(n, steps + WARM_UP_STEPS) for n in run.schedule.steps_of_stage)
-    shown = say is not None and run.place.is_first
+    shown = log is not None and run.place.is_first
     if shown:
-        say(f"timing {run.engine.describe()}")
+        log(f"timing {run.engine.describe()}")
     with progress(total, "timing", "step", not shown) as bar:
         profiles = profile_stages(run.learner, run.batches, steps, bar.update)
     run.engine.close()
     return profiles
 
 
-def _start(
-    options: TrainingOptions, start: str | Path | Sequence[str | Path] | None
+def _initial_network(
+    options: TrainingOptions, init_weights: str | Path | Sequence[str | Path] | None
 ) -> tuple[TrainingOptions, ESPNet]:
     """Make the network with the weights that the run starts from, and settle what hangs on them."""
-    if start is not None:
+    if init_weights is not None:
         if options.frozen_batch_norm is None:
             options = dataclasses.replace(options, frozen_batch_norm=True)
-        chosen = [start] if isinstance(start, (str, Path)) else list(start)
-        return options, load_mean_network([find_weights(name, ".safetensors") for name in chosen])
+        chosen = [init_weights] if isinstance(init_weights, (str, Path)) else list(init_weights)
+        return options, average_weights([find_weights(name, ".safetensors") for name in chosen])
     if options.frozen_batch_norm:
         raise OptionError(
-            "random weights have no batch statistics to keep: name trained ones with --start, "
+            "random weights have no batch statistics to keep: name trained ones with --init, "
             "or leave out --frozen-batch-norm"
         )
-    if options.layers != "all":
+    if options.freeze_encoder:
         raise OptionError(
-            "an encoder of random weights would stay random: name trained weights with --start, "
-            "or leave out --layers"
+            "an encoder of random weights would stay random: name trained weights with --init, "
+            "or leave out --freeze-encoder"
         )
     torch.manual_seed(options.seed)
     return dataclasses.replace(options, frozen_batch_norm=False), ESPNet()

@@ -9,7 +9,7 @@ import numpy as np
 
 from .._shared.errors import ImageError
 from .._shared.memory import free_memory
-from .cluster import place_in_cluster
+from .cluster import distributed_context
 from .label_cache import LabelCache
 from .photos import Photo
 from .views import View, render
@@ -27,7 +27,7 @@ class ViewStore:
     def __init__(self, labels: LabelCache, memory: int | None = None) -> None:
         self.labels = labels
         if memory is None:
-            memory = free_memory() // (2 * place_in_cluster().local_processes)
+            memory = free_memory() // (2 * distributed_context().local_processes)
         self.memory = memory
         self._kept: dict[tuple[Path, View], tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()

@@ -48,7 +48,7 @@ def views_of(
     darkening: DarkeningRange,
     variants: int,
     square: bool = False,
-    variations: int = 0,
+    augmentations: int = 0,
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
     """List the normal and the dark views of a photograph, the same on every call.
 
@@ -58,7 +58,7 @@ def views_of(
         darkening: ranges of the factors.
         variants: dark views of each size.
         square: squash the photograph to squares.
-        variations: varied views of the first size, each in normal and in dark light.
+        augmentations: varied views of the first size, each in normal and in dark light.
 
     Returns:
         The normal views and the dark ones, of each size in turn, the varied ones last.
@@ -71,7 +71,7 @@ def views_of(
         for _ in range(variants)
     )
     drawn = np.random.default_rng([zlib.crc32(name.encode()), 1])
-    for _ in range(variations):
+    for _ in range(augmentations):
         seed = int(drawn.integers(2**32))
         normal += (View(short_sides[0], None, False, seed),)
         dark += (View(short_sides[0], darkening.draw(drawn), False, seed),)

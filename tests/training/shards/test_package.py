@@ -20,7 +20,7 @@ from deepdetect import DeepDetectError, ImageError, OptionError
 from deepdetect.io.image import luma
 from deepdetect.labels import LabelOptions, fuse
 from deepdetect.training.batches import Batches
-from deepdetect.training.cluster import Place
+from deepdetect.training.cluster import DistributedContext
 from deepdetect.training.preparation import Sources, prepare
 from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.schedule import Schedule
@@ -31,16 +31,16 @@ from deepdetect.training.views import render
 OPTIONS = TrainingOptions(
     stages=(Stage(64, 2, 3), Stage(96, 2, 2)),
     short_sides=(96, 64),
-    variations=1,
+    augmentations=1,
     detectors=("fast", "harris", "sobel"),
-    held_out=0.2,
+    val_fraction=0.2,
 )
 
 
 @pytest.fixture(scope="module")
 def shards(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> Shards:
     folder = tmp_path_factory.mktemp("shards")
-    return write_shards(photographs, folder, OPTIONS, photos_a_shard=2, workers=1)
+    return write_shards(photographs, folder, OPTIONS, shard_size=2, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,9 @@ def test_batches_are_a_pure_function_of_the_step_and_shared_by_processes(feed: S
     for step, (images, masks) in enumerate(Batches(feed, schedule).stream(4), start=4):
         np.testing.assert_array_equal(images, whole[step][0])
         np.testing.assert_array_equal(masks, whole[step][1])
-    parts = [Batches(feed, schedule, Place(rank, 2, rank, 2)).stream(0) for rank in range(2)]
+    parts = [
+        Batches(feed, schedule, DistributedContext(rank, 2, rank, 2)).stream(0) for rank in range(2)
+    ]
     for (images, _), *halves in zip(whole, *parts, strict=True):
         np.testing.assert_array_equal(images, np.concatenate([half[0] for half in halves]))
 
@@ -107,20 +109,20 @@ def test_batches_are_a_pure_function_of_the_step_and_shared_by_processes(feed: S
 def test_the_same_photographs_give_the_same_files(
     photographs: Path, shards: Shards, tmp_path: Path
 ) -> None:
-    again = write_shards(photographs, tmp_path, OPTIONS, photos_a_shard=2, workers=1)
+    again = write_shards(photographs, tmp_path, OPTIONS, shard_size=2, workers=1)
     for (first, _), (second, _) in zip(shards.training, again.training, strict=True):
         assert first.read_bytes() == second.read_bytes()
 
 
 def test_a_broken_off_call_goes_on(photographs: Path, tmp_path: Path) -> None:
-    made = write_shards(photographs, tmp_path, OPTIONS, photos_a_shard=2, workers=1)
+    made = write_shards(photographs, tmp_path, OPTIONS, shard_size=2, workers=1)
     kept, lost = made.training[0][0], made.training[1][0]
     content, written = lost.read_bytes(), kept.stat().st_mtime_ns
     lost.unlink()
     (tmp_path / "shards.json").unlink()
     with pytest.raises(ImageError, match="not finished"):
         has_shards(tmp_path)
-    write_shards(photographs, tmp_path, OPTIONS, photos_a_shard=2, workers=1)
+    write_shards(photographs, tmp_path, OPTIONS, shard_size=2, workers=1)
     assert has_shards(tmp_path)
     assert lost.read_bytes() == content
     assert kept.stat().st_mtime_ns == written
@@ -129,20 +131,20 @@ def test_a_broken_off_call_goes_on(photographs: Path, tmp_path: Path) -> None:
 def test_shards_of_an_older_version_are_those_without_variations(
     photographs: Path, tmp_path: Path
 ) -> None:
-    options = dataclasses.replace(OPTIONS, variations=0, detectors=("fast",))
-    write_shards(photographs, tmp_path, options, photos_a_shard=6, workers=1)
+    options = dataclasses.replace(OPTIONS, augmentations=0, detectors=("fast",))
+    write_shards(photographs, tmp_path, options, shard_size=6, workers=1)
     path = tmp_path / "shards.json"
     index = json.loads(path.read_text())
-    del index["options"]["variations"]
+    del index["options"]["augmentations"]
     path.write_text(json.dumps(index))
     assert Shards.open(tmp_path, options).training
-    with pytest.raises(OptionError, match="variations"):
-        Shards.open(tmp_path, dataclasses.replace(options, variations=1))
+    with pytest.raises(OptionError, match="augmentations"):
+        Shards.open(tmp_path, dataclasses.replace(options, augmentations=1))
 
 
 def test_other_options_are_refused(photographs: Path, shards: Shards) -> None:
     other = TrainingOptions(stages=OPTIONS.stages, short_sides=(96,), detectors=("fast",))
-    with pytest.raises(OptionError, match="short_sides, held_out, variations, labels"):
+    with pytest.raises(OptionError, match="short_sides, val_fraction, augmentations, labels"):
         Shards.open(shards.folder, other)
     with pytest.raises(OptionError, match="another folder"):
         write_shards(photographs, shards.folder, other)
@@ -152,7 +154,7 @@ def test_other_options_are_refused(photographs: Path, shards: Shards) -> None:
 
 def test_other_packing_is_another_set(photographs: Path, shards: Shards, tmp_path: Path) -> None:
     """The order of the photographs depends on it, so a run must not go on with it."""
-    other = write_shards(photographs, tmp_path, OPTIONS, photos_a_shard=3, workers=1)
+    other = write_shards(photographs, tmp_path, OPTIONS, shard_size=3, workers=1)
     assert other.digest != shards.digest
 
 
@@ -168,14 +170,14 @@ def test_an_unreadable_photograph_can_be_mended(photographs: Path, tmp_path: Pat
     bad = folder / "photo05.png"
     bad.write_bytes(b"no image")
     with pytest.raises(DeepDetectError, match=r"1 of \d shards .*photo05\.png is not an image"):
-        write_shards(folder, output, OPTIONS, photos_a_shard=2, workers=1)
+        write_shards(folder, output, OPTIONS, shard_size=2, workers=1)
     left = {path: path.stat().st_mtime_ns for path in output.iterdir()}
     assert left
     for path in left:
         with tarfile.open(path) as tar:
             assert tar.getmembers(), "only whole shards are there"
     bad.write_bytes((folder / "photo06.png").read_bytes())
-    made = write_shards(folder, output, OPTIONS, photos_a_shard=2, workers=1)
+    made = write_shards(folder, output, OPTIONS, shard_size=2, workers=1)
     for path, written in left.items():
         assert path.stat().st_mtime_ns == written, "what was done is not done again"
     assert len(made.training) + len(made.validation) == len(left) + 1
@@ -183,9 +185,9 @@ def test_an_unreadable_photograph_can_be_mended(photographs: Path, tmp_path: Pat
 
 def test_few_shards_change_when_a_photograph_goes(photographs: Path, tmp_path: Path) -> None:
     folder = copies(photographs, tmp_path / "photos")
-    before = write_shards(folder, tmp_path / "out", OPTIONS, photos_a_shard=2, workers=1)
+    before = write_shards(folder, tmp_path / "out", OPTIONS, shard_size=2, workers=1)
     (folder / next(iter(ShardFeed(before, OPTIONS).epoch(0))).photo.path).unlink()
-    after = write_shards(folder, tmp_path / "out", OPTIONS, photos_a_shard=2, workers=1)
+    after = write_shards(folder, tmp_path / "out", OPTIONS, shard_size=2, workers=1)
     assert len(set(before.training) - set(after.training)) == 1
 
 
@@ -257,14 +259,14 @@ def test_the_two_commands(photographs: Path, tmp_path: Path) -> None:
     program = [sys.executable, "-m", "deepdetect"]
     shards, run = str(tmp_path / "shards"), tmp_path / "run"
     made = subprocess.run(
-        [*program, "shards", str(photographs), "-o", shards, "--photos-a-shard", "3", *same],
+        [*program, "shards", str(photographs), "-o", shards, "--shard-size", "3", *same],
         check=True,
         capture_output=True,
         text=True,
     )
     counts = json.loads(made.stdout)
     assert counts["training"] + counts["validation"] == 12
-    tiny = ["--stage", "64x4x4", "--validations", "2", "--no-compile", "--precision", "float32"]
+    tiny = ["--stage", "64x4x4", "--val-count", "2", "--no-compile", "--precision", "float32"]
     command = [*program, "train", shards, "-o", str(run), *same, *tiny, "--threads", "1"]
     subprocess.run(command, check=True, capture_output=True)
     rows = list(csv.DictReader((run / "curves.csv").read_text().splitlines()))

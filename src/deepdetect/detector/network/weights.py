@@ -54,7 +54,7 @@ def load_network(path: str | Path) -> ESPNet:
     return network.eval()
 
 
-def load_mean_network(paths: Sequence[str | Path]) -> ESPNet:
+def average_weights(paths: Sequence[str | Path]) -> ESPNet:
     """Make the network from the mean of several weights files.
 
     The mean of runs that went on from one another is often better than each of them

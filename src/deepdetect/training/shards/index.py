@@ -108,9 +108,9 @@ def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
         "short_sides": options.short_sides,
         "square": options.square,
         "max_photos": options.max_photos,
-        "held_out": options.held_out,
+        "val_fraction": options.val_fraction,
         "dark_variants": options.dark_variants,
-        "variations": options.variations,
+        "augmentations": options.augmentations,
         "darkening": dataclasses.asdict(options.darkening),
         "labels": settings_digest(options.label_options),
     }
@@ -119,7 +119,7 @@ def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
 
 def _compare(folder: Path, made: dict[str, Any], options: TrainingOptions) -> None:
     fixed = _fixed_options(options)
-    made = {"variations": 0, **made}  # shards of an older version have none
+    made = {"augmentations": 0, **made}  # shards of an older version have none
     other = [name for name in fixed if made.get(name) != fixed[name]]
     if other:
         raise OptionError(

@@ -18,7 +18,7 @@ from ..views import View, render, views_of
 from .index import Shards
 from .library import webdataset
 
-MIXED = 4
+SHUFFLE_BUFFER_SHARDS = 4
 """So many shards are in memory at a time, mixed; and as many more on their way."""
 
 
@@ -74,7 +74,10 @@ class ShardFeed:
         """
         files = self.shards.training
         order = np.random.default_rng([self.options.seed, 3, number]).permutation(len(files))
-        groups = [order[k : k + MIXED] for k in range(0, len(order), MIXED)]
+        groups = [
+            order[k : k + SHUFFLE_BUFFER_SHARDS]
+            for k in range(0, len(order), SHUFFLE_BUFFER_SHARDS)
+        ]
         tasks = []
         for k, group in enumerate(groups):
             count = sum(files[shard][1] for shard in group)
@@ -155,7 +158,7 @@ def _example(shard: Path, sample: dict[str, Any], options: TrainingOptions) -> S
         options.darkening,
         options.dark_variants,
         options.square,
-        options.variations,
+        options.augmentations,
     )
     photo = Photo(Path(name), sample["__key__"].rpartition("_")[2], *views)
     return ShardExample(shard, photo, content, labels)

@@ -15,7 +15,7 @@ from ...io.image import load_image
 from ...io.masks import encode_mask
 from ...labels import LabelOptions
 from ..label_cache import label_of_view, settings_digest
-from ..photos import Photo, hold_out, list_photos
+from ..photos import Photo, list_photos, train_val_split
 from ..recipe import TrainingOptions
 from ..views import View
 from .index import Shards, check_index, write_index
@@ -57,7 +57,7 @@ def write_shards(
     output: Path,
     options: TrainingOptions,
     *,
-    photos_a_shard: int = 256,
+    shard_size: int = 256,
     workers: int | None = None,
     quiet: bool = True,
 ) -> Shards:
@@ -70,7 +70,7 @@ def write_shards(
         photos: folder of photographs.
         output: another folder, for the shards.
         options: the recipe of the runs to come; some of its photographs are held out.
-        photos_a_shard: about so many photographs go into a shard.
+        shard_size: about so many photographs go into a shard.
         workers: number of processes; default one for each processor.
         quiet: show no progress bar.
 
@@ -82,8 +82,8 @@ def write_shards(
     Example:
         >>> write_shards(Path("photos"), Path("shards"), TrainingOptions())  # doctest: +SKIP
     """
-    if photos_a_shard < 1:
-        raise OptionError(f"a shard needs at least one photograph, not {photos_a_shard}")
+    if shard_size < 1:
+        raise OptionError(f"a shard needs at least one photograph, not {shard_size}")
     if photos.resolve() == output.resolve():
         raise OptionError(f"{output} holds the photographs: choose another folder with -o")
     webdataset()  # missing, it is missed before the work
@@ -91,11 +91,11 @@ def write_shards(
     listed = list_photos(photos, options, (output,), options.max_photos)
     files: dict[str, list[tuple[Path, int]]] = {}
     tasks = []
-    training, held = hold_out(listed, options.held_out)
+    training, held = train_val_split(listed, options.val_fraction)
     for kind, part in (("training", training), ("validation", held)):
         members = [_member(photo, photos, kind) for photo in part]
         files[kind] = []
-        for number, shard in enumerate(_dealt(members, photos_a_shard)):
+        for number, shard in enumerate(_dealt(members, shard_size)):
             if not shard:
                 continue
             path = output / f"{kind}-{number:06d}-{_digest(shard, options)}.tar"
@@ -143,13 +143,13 @@ def _member(photo: Photo, root: Path, kind: str) -> Member:
     return Member(photo, photo.path.relative_to(root).as_posix(), views)
 
 
-def _dealt(members: Sequence[Member], photos_a_shard: int) -> list[list[Member]]:
+def _dealt(members: Sequence[Member], shard_size: int) -> list[list[Member]]:
     """Deal photographs to shards by the checksums of their names.
 
     So no shard holds one kind of photograph only, and most shards stay as they are when a
     photograph goes or comes.
     """
-    shards: list[list[Member]] = [[] for _ in range(-(-len(members) // photos_a_shard))]
+    shards: list[list[Member]] = [[] for _ in range(-(-len(members) // shard_size))]
     for member in members:
         checksum = hashlib.sha256(member.name.encode()).digest()
         shards[int.from_bytes(checksum[:8], "big") % len(shards)].append(member)
