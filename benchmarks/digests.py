@@ -78,7 +78,7 @@ def results() -> Any:
 
 
 GUIDED: dict[str, Any] = {}
-UNGUIDED: dict[str, Any] = {"guidance": "none"}
+UNGUIDED: dict[str, Any] = {"guided": False}
 
 
 def keypoint_arrays(keypoints: Any) -> list[np.ndarray]:
@@ -89,8 +89,7 @@ def keypoint_arrays(keypoints: Any) -> list[np.ndarray]:
 def match_arrays(matches: Any) -> list[np.ndarray]:
     """Return what the matches of a pair consist of, but for their scores."""
     parts = [matches.points0, matches.points1, matches.inliers]
-    model = getattr(matches, "model", None)
-    return parts if model is None else [*parts, model]
+    return parts if matches.matrix is None else [*parts, matches.matrix]
 
 
 def cloud_arrays(made: Any) -> list[np.ndarray]:

@@ -18,8 +18,8 @@ from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.metrics import stereo_score
 
 WAYS: dict[str, dict[str, Any]] = {
-    'guidance="auto"': {"guidance": "auto"},
-    'guidance="none"': {},
+    "guided": {"guided": True},
+    "guided=False": {},
     "... mutual=True": {"mutual": True},
     "... ratio=0.9": {"ratio": 0.9},
     "... ratio=0.9, mutual=True": {"ratio": 0.9, "mutual": True},
@@ -38,7 +38,7 @@ def main() -> None:
     pair = load_motorcycle()
     print("| options | matches, within 1 px | inliers, within 1 px |\n|---|---|---|")
     for name, options in WAYS.items():
-        found = match_images(pair.left, pair.right, detector, **{"guidance": "none", **options})
+        found = match_images(pair.left, pair.right, detector, **{"guided": False, **options})
         cells = []
         for kept in (np.ones(len(found), bool), found.inliers):
             score = stereo_score(found.points0[kept], found.points1[kept], pair.disparity)

@@ -160,7 +160,7 @@ def run_evaluate(tmp_path: Path) -> Callable[..., str]:
     from PIL import Image
 
     from deepdetect.cli import main
-    from deepdetect.detector.pretrained import bundled_weights
+    from deepdetect.detector.pretrained import pretrained_weights
 
     generator = np.random.default_rng(0)
     Image.fromarray(generator.integers(0, 256, (64, 64, 3), np.uint8)).save(
@@ -169,7 +169,7 @@ def run_evaluate(tmp_path: Path) -> Callable[..., str]:
     Image.fromarray(generator.random((64, 64)) > 0.5).save(tmp_path / "mask_image_1.png")
 
     def run(*arguments: object) -> str:
-        given = [bundled_weights() if str(a).endswith(".onnx") else a for a in arguments]
+        given = [pretrained_weights() if str(a).endswith(".onnx") else a for a in arguments]
         result = CliRunner().invoke(main, ["evaluate", str(tmp_path), *map(str, given)])
         assert result.exit_code == 0, result.output
         return result.output

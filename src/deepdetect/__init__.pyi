@@ -13,6 +13,7 @@ from .features.keypoints import (
     SelectionOptions as SelectionOptions,
     select_keypoints as select_keypoints,
 )
+from .features.matches import Guide as Guide, Matches as Matches
 from .geometry.camera import Calibration as Calibration, Camera as Camera
 from .geometry.estimation import (
     Geometry as Geometry,
@@ -24,12 +25,13 @@ from .io.image import load_image as load_image
 from .io.point_cloud import save_point_cloud as save_point_cloud
 from .io.tables import (
     load_keypoints as load_keypoints,
+    load_matches as load_matches,
     save_keypoints as save_keypoints,
     save_matches as save_matches,
 )
 from .labels import Label as Label, LabelOptions as LabelOptions, fuse as fuse
 from .matching.options import MatchingOptions as MatchingOptions
-from .matching.pipeline import Matches as Matches, match_images as match_images
+from .matching.pipeline import match_images as match_images
 from .matching.registration import register as register
 from .reconstruction.pipeline import (
     ReconstructionOptions as ReconstructionOptions,

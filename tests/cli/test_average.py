@@ -15,14 +15,14 @@ from deepdetect.detector.network.weights import (
     read_notes,
     weights_digest,
 )
-from deepdetect.detector.pretrained import bundled_weights
+from deepdetect.detector.pretrained import pretrained_weights
 
 
 def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo) -> None:
     result = run("average", "default", "default", "dense", "-o", tmp_path, "--json")
     assert result.exit_code == 0, result.output
     files = json.loads(result.output)
-    parts = [bundled_weights(name, ".safetensors") for name in ("default", "dense")]
+    parts = [pretrained_weights(name, ".safetensors") for name in ("default", "dense")]
     expected = average_weights([parts[0], parts[0], parts[1]])
     assert weights_digest(load_network(files["weights"])) == weights_digest(expected)
     told = json.loads(read_notes(files["weights"])["parts"])
@@ -39,7 +39,7 @@ def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo)
 
 def test_the_mean_of_equals_is_the_same(run, tmp_path: Path) -> None:
     assert run("average", "default", "default", "-o", tmp_path).exit_code == 0
-    own = load_network(bundled_weights("default", ".safetensors"))
+    own = load_network(pretrained_weights("default", ".safetensors"))
     assert weights_digest(load_network(tmp_path / "best.safetensors")) == weights_digest(own)
 
 

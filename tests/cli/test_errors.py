@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError, Keypoints
-from deepdetect.detector.pretrained import bundled_weights
+from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.io.tables import save_keypoints
 
 
@@ -206,7 +206,7 @@ def test_bad_weights_make_no_noise_of_native_code(
     photos: Path, tmp_path: Path, backend: str, content: str
 ) -> None:
     pytest.importorskip(backend, reason=f"needs {backend}")
-    whole = bundled_weights().read_bytes()
+    whole = pretrained_weights().read_bytes()
     path = tmp_path / "weights.onnx"
     path.write_bytes(b"no network" if content == "text" else whole[: len(whole) // 2])
     command = [sys.executable, "-m", "deepdetect", "detect", str(photos / "cat.jpg")]

@@ -17,8 +17,8 @@ def test_writes_matches_and_a_picture(run, photos: Path) -> None:
         np.testing.assert_array_equal(file["points0"], expected.points0)
         np.testing.assert_array_equal(file["points1"], expected.points1)
         np.testing.assert_array_equal(file["inliers"], expected.inliers)
-        np.testing.assert_allclose(file["model"], expected.model)
-        assert str(file["kind"]) == expected.kind
+        np.testing.assert_allclose(file["matrix"], expected.matrix)
+        assert str(file["model"]) == expected.model
     assert np.asarray(Image.open("out/left_right_matches.png")).shape[1] == 400
     assert f"{len(expected):,}" in result.stdout
 
@@ -27,7 +27,7 @@ def test_options_reach_the_matcher(run, photos: Path) -> None:
     result = run(
         *("match", photos / "left.png", photos / "right.png", "--json", "--no-pictures"),
         *("--ratio", 0.8, "--mutual", "--model", "none", "--matcher", "exact"),
-        *("--max-keypoints", 500, "--descriptor", "rootsift", "--guidance", "none"),
+        *("--max-keypoints", 500, "--descriptor", "rootsift", "--unguided"),
     )
     report = json.loads(result.stdout)
     expected = match_images(
@@ -39,11 +39,11 @@ def test_options_reach_the_matcher(run, photos: Path) -> None:
         matcher="exact",
         max_keypoints=500,
         descriptor="rootsift",
-        guidance="none",
+        guided=False,
     )
     assert report["keypoints0"] == 500
     assert report["matches"] == len(expected)
-    assert report["model"] is None
+    assert report["matrix"] is None
 
 
 def test_the_preset_is_changed_by_given_options_only(run, photos: Path) -> None:
@@ -54,7 +54,7 @@ def test_the_preset_is_changed_by_given_options_only(run, photos: Path) -> None:
     expected = match_images(photos / "left.png", photos / "right.png", preset="published")
     report = json.loads(result.stdout)
     assert report["matches"] == len(expected)
-    assert report["kind"] == "none"
+    assert report["model"] == "none"
 
 
 def test_a_given_homography_judges(run, photos: Path) -> None:
@@ -64,7 +64,7 @@ def test_a_given_homography_judges(run, photos: Path) -> None:
         "--no-pictures",
     )
     report = json.loads(result.stdout)
-    assert report["kind"] == "homography"
+    assert report["model"] == "homography"
     assert report["inliers"] > 0.9 * report["matches"] > 0
 
 
@@ -74,7 +74,7 @@ def test_csv(run, photos: Path) -> None:
         *("--no-pictures", "--density", "0.02"),
     )
     lines = Path("out/left_right_matches.csv").read_text().splitlines()
-    assert lines[0] == "x0,y0,x1,y1,ratio,inlier"
+    assert lines[0] == "x0,y0,x1,y1,score,inlier"
     table = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
     expected = match_images(photos / "left.png", photos / "right.png", DeepDetect(), density=0.02)
     np.testing.assert_allclose(table[:, :2], expected.points0)
@@ -96,7 +96,7 @@ def test_an_essential_matrix_from_camera_files(run, photos: Path) -> None:
         *("--camera0", "K.txt", "--json", "--no-pictures"),
     )
     report = json.loads(result.stdout)
-    assert report["kind"] == "essential"
+    assert report["model"] == "essential"
     assert report["inliers"] > 0.3 * report["matches"]
 
 

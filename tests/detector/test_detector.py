@@ -18,7 +18,7 @@ from deepdetect import (
     select_keypoints,
 )
 from deepdetect._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
-from deepdetect.detector.pretrained import bundled_weights
+from deepdetect.detector.pretrained import pretrained_weights
 
 # The bundled weights change, so nothing here depends on the values that they give.
 
@@ -31,7 +31,7 @@ needs = {
     name: pytest.mark.skipif(not there, reason=f"needs {name}, which is not installed")
     for name, there in INSTALLED.items()
 }
-TORCH_WEIGHTS = bundled_weights().with_suffix(".safetensors")
+TORCH_WEIGHTS = pretrained_weights().with_suffix(".safetensors")
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def run_by_hand(rgb: np.ndarray) -> np.ndarray:
     import onnxruntime
 
     session = onnxruntime.InferenceSession(
-        str(bundled_weights()), providers=["CPUExecutionProvider"]
+        str(pretrained_weights()), providers=["CPUExecutionProvider"]
     )
     planes = (rgb.transpose(2, 0, 1)[None] / 255).astype(np.float32)
     return session.run(None, {session.get_inputs()[0].name: planes})[0][0, 0]
@@ -213,7 +213,7 @@ def test_ignored_pixels(detector: DeepDetect, image: np.ndarray) -> None:
 
 
 def open_backends() -> list[Any]:
-    weights = {"onnxruntime": bundled_weights(), "openvino": bundled_weights()}
+    weights = {"onnxruntime": pretrained_weights(), "openvino": pretrained_weights()}
     weights["torch"] = TORCH_WEIGHTS
     return [pytest.param(name, path, id=name, marks=needs[name]) for name, path in weights.items()]
 
@@ -379,7 +379,7 @@ def text(name: str) -> Callable[[Path], Path]:
 
 def half(suffix: str) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        content = bundled_weights().with_suffix(suffix).read_bytes()
+        content = pretrained_weights().with_suffix(suffix).read_bytes()
         (folder / f"half{suffix}").write_bytes(content[: len(content) // 2])
         return folder / f"half{suffix}"
 
@@ -606,7 +606,7 @@ def test_an_unknown_keyword(
 @needs["safetensors"]
 def test_logits_are_the_network_s_own(image: np.ndarray) -> None:
     for name in ("default", "dense"):
-        torch_maps = DeepDetect(bundled_weights(name, ".safetensors")).heatmap_and_logits(image)
+        torch_maps = DeepDetect(pretrained_weights(name, ".safetensors")).heatmap_and_logits(image)
         onnx_maps = DeepDetect(name, backend="onnxruntime").heatmap_and_logits(image)
         np.testing.assert_allclose(onnx_maps[1], torch_maps[1], atol=2e-3)
         probability = 1 / (1 + np.exp(-onnx_maps[1].astype(np.float64)))

@@ -6,42 +6,42 @@ from pathlib import Path
 import pytest
 
 from deepdetect import DeepDetect, OptionError
-from deepdetect.detector.pretrained import BUNDLED, bundled_weights, find_weights
+from deepdetect.detector.pretrained import PRETRAINED, pretrained_weights, resolve_weights
 
 
-@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize("name", PRETRAINED)
 @pytest.mark.parametrize("suffix", [".onnx", ".safetensors"])
 def test_every_name_has_its_files(name: str, suffix: str) -> None:
-    path = bundled_weights(name, suffix)
+    path = pretrained_weights(name, suffix)
     assert path.is_file()
     assert path.suffix == suffix
     assert 1e6 < path.stat().st_size < 2e6
 
 
 def test_the_names_stand_for_different_weights() -> None:
-    assert len({bundled_weights(name).read_bytes() for name in BUNDLED}) == len(BUNDLED)
-    assert DeepDetect().weights == DeepDetect("default").weights == bundled_weights()
-    assert DeepDetect("dense").weights == bundled_weights("dense")
+    assert len({pretrained_weights(name).read_bytes() for name in PRETRAINED}) == len(PRETRAINED)
+    assert DeepDetect().weights == DeepDetect("default").weights == pretrained_weights()
+    assert DeepDetect("dense").weights == pretrained_weights("dense")
 
 
 def test_a_path_is_left_as_it_is(tmp_path: Path) -> None:
     for path in ("best.safetensors", "run/deepdetect.onnx", tmp_path / "weights"):
-        assert find_weights(path) == Path(path)
+        assert resolve_weights(path) == Path(path)
 
 
 def test_an_unknown_name_says_the_nearest() -> None:
     with pytest.raises(OptionError, match="did you mean 'dense'"):
-        DeepDetect("geometri")
+        DeepDetect("densee")
 
 
-@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize("name", PRETRAINED)
 def test_weights_tell_where_they_come_from(name: str) -> None:
     pytest.importorskip("safetensors", reason="needs safetensors, which is for training only")
     pytest.importorskip("torch", reason="needs torch, which is for training only")
     from deepdetect.detector.network.weights import read_notes
 
     means, runs = [], []
-    found = [read_notes(bundled_weights(name, ".safetensors"))]
+    found = [read_notes(pretrained_weights(name, ".safetensors"))]
     while found:  # a mean's parts may be means
         notes = found.pop()
         (means if "parts" in notes else runs).append(notes)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, ImageError
-from deepdetect.detector.pretrained import bundled_weights
+from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.evaluation.mask_scores import MaskScore, mean_score, score_heatmap, score_samples
 
 
@@ -58,7 +58,7 @@ def test_samples_without_a_mask_are_an_error(tmp_path: Path, photo: np.ndarray) 
 
 def bundled_scores(shared: Path, backend: str) -> dict[str, MaskScore]:
     pytest.importorskip(backend, reason=f"needs {backend}")
-    weights = bundled_weights()
+    weights = pretrained_weights()
     if backend == "torch":
         weights = weights.with_suffix(".safetensors")
     detector = DeepDetect(weights, backend=backend)
@@ -66,9 +66,9 @@ def bundled_scores(shared: Path, backend: str) -> dict[str, MaskScore]:
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "openvino", "torch"])
-def test_bundled_weights_score_as_their_model_card_says(shared: Path, backend: str) -> None:
+def test_pretrained_weights_score_as_their_model_card_says(shared: Path, backend: str) -> None:
     """The card's first two rows, so that it cannot fall behind the weights."""
-    card = bundled_weights().with_name("MODEL_CARD.md").read_text()
+    card = pretrained_weights().with_name("MODEL_CARD.md").read_text()
     scores = bundled_scores(shared, backend)
     for name, light in (("normal", "normal"), ("low", "darkened")):
         row = re.search(rf"published validation samples, {light} \| 5 \| ([\d.]+) / ([\d.]+)", card)
@@ -76,7 +76,7 @@ def test_bundled_weights_score_as_their_model_card_says(shared: Path, backend: s
         assert scores[name].iou == pytest.approx(float(row[2]), abs=0.002)
 
 
-def test_bundled_weights_reach_the_bar(shared: Path) -> None:
+def test_pretrained_weights_reach_the_bar(shared: Path) -> None:
     """What was asked of weights from two CPU cores alone: BCE and IoU of the published samples."""
     scores = bundled_scores(shared, "onnxruntime")
     assert scores["normal"].loss <= 0.125

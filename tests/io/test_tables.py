@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from deepdetect import DeepDetectError, Keypoints, Matches, OptionError
-from deepdetect.io.tables import load_keypoints, save_keypoints, save_matches
-from deepdetect.matching.guided import Guidance
+from deepdetect.features.matches import Guide
+from deepdetect.io.tables import load_keypoints, load_matches, save_keypoints, save_matches
 
 
 def keypoints(count: int) -> Keypoints:
@@ -42,39 +42,70 @@ def test_csv_keeps_float32_positions(tmp_path: Path) -> None:
     assert np.array_equal(np.array(row.split(","), np.float32)[:2], points.xy[0])
 
 
-@pytest.mark.parametrize("model", [None, np.arange(9.0).reshape(3, 3)])
-def test_matches_are_plain_arrays(tmp_path: Path, model: np.ndarray | None) -> None:
+def matches_of(guide: Guide | None = None, matrix: np.ndarray | None = None) -> Matches:
     points = keypoints(5)
-    kind = "none" if model is None else "homography"
-    matches = Matches(
-        *(points.xy, points.xy[::-1], points.scores, model, np.arange(5) > 2, kind),
-        *(points, points),
+    model = "none" if matrix is None else "homography"
+    inliers = np.arange(5) > 2
+    return Matches(
+        *(points.xy, points.xy[::-1], points.scores, inliers, model, matrix, points, points[:3]),
+        guide=guide,
     )
-    save_matches(matches, tmp_path / "m.npz")
-    with np.load(tmp_path / "m.npz", allow_pickle=False) as file:
-        np.testing.assert_array_equal(file["points0"], matches.points0)
-        np.testing.assert_array_equal(file["points1"], matches.points1)
-        np.testing.assert_array_equal(file["ratios"], matches.ratios)
-        np.testing.assert_array_equal(file["inliers"], matches.inliers)
-        assert file["model"].shape == ((0, 0) if model is None else (3, 3))
-        assert str(file["kind"]) == kind
 
 
-@pytest.mark.parametrize("kind", [None, "none", "homography", "fundamental"])
-def test_what_guided_is_in_the_file(tmp_path: Path, kind: str | None) -> None:
-    points = keypoints(5)
-    guidance = None if kind is None else Guidance(kind, None, 0, 0, float("inf"), 0)
-    matches = Matches(
-        *(points.xy, points.xy, points.scores, None, np.ones(5, bool), "none", points, points),
-        guidance=guidance,
-    )
+GUIDES = {
+    None: None,
+    "none": Guide("none", None, 7, 0, float("inf"), 60),
+    "homography": Guide("homography", np.eye(3), 90, 80, -120.5, 0),
+    "fundamental": Guide("fundamental", np.diag([1.0, 2, 0]), 90, 80, -120.5, 6),
+}
+
+
+@pytest.mark.parametrize("matrix", [None, np.arange(9.0).reshape(3, 3)])
+def test_matches_are_plain_arrays(tmp_path: Path, matrix: np.ndarray | None) -> None:
+    matches = matches_of(matrix=matrix)
     save_matches(matches, tmp_path / "m.npz")
     with np.load(tmp_path / "m.npz", allow_pickle=False) as file:
-        assert (file["guided"].dtype, file["guided"].shape) == (np.bool_, ())
-        assert bool(file["guided"]) == matches.guided == (kind in ("homography", "fundamental"))
-        assert str(file["guidance"]) == (kind or "none")
+        for name in ("points0", "points1", "scores", "inliers"):
+            np.testing.assert_array_equal(file[name], getattr(matches, name))
+        assert file["matrix"].shape == ((0, 0) if matrix is None else (3, 3))
+        assert str(file["model"]) == ("none" if matrix is None else "homography")
+
+
+@pytest.mark.parametrize("matrix", [None, np.arange(9.0).reshape(3, 3)])
+@pytest.mark.parametrize("guide", GUIDES)
+def test_matches_survive_the_round_trip(
+    tmp_path: Path, guide: str | None, matrix: np.ndarray | None
+) -> None:
+    saved = matches_of(GUIDES[guide], matrix)
+    save_matches(saved, tmp_path / "m.npz")
+    loaded = load_matches(tmp_path / "m.npz")
+    for name in ("points0", "points1", "scores", "inliers", "matrix"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(saved, name), err_msg=name)
+    assert (loaded.model, loaded.guided) == (saved.model, guide in ("homography", "fundamental"))
+    for one, other in (
+        (loaded.keypoints0, saved.keypoints0),
+        (loaded.keypoints1, saved.keypoints1),
+    ):
+        np.testing.assert_array_equal(one.xy, other.xy)
+        np.testing.assert_array_equal(one.scores, other.scores)
+        assert one.image_size == other.image_size
+    if guide is None:
+        assert loaded.guide is None
+        return
+    found, given = vars(loaded.guide), vars(GUIDES[guide])
+    np.testing.assert_array_equal(found.pop("matrix"), given["matrix"])
+    assert found == {name: value for name, value in given.items() if name != "matrix"}
+
+
+def test_matches_as_csv(tmp_path: Path) -> None:
+    matches = matches_of()
     save_matches(matches, tmp_path / "m.csv")
-    assert (tmp_path / "m.csv").read_text().splitlines()[0] == "x0,y0,x1,y1,ratio,inlier"
+    header, *rows = (tmp_path / "m.csv").read_text().splitlines()
+    assert header == "x0,y0,x1,y1,score,inlier"
+    table = np.loadtxt(rows, delimiter=",")
+    np.testing.assert_allclose(table[:, :2], matches.points0, rtol=1e-6)
+    np.testing.assert_allclose(table[:, 4], matches.scores, rtol=1e-6)
+    np.testing.assert_array_equal(table[:, 5], matches.inliers)
 
 
 @pytest.mark.parametrize("name", ["k.pkl", "k", "k.npy"])
@@ -83,13 +114,14 @@ def test_other_endings_are_refused(tmp_path: Path, name: str) -> None:
         save_keypoints(keypoints(1), tmp_path / name)
 
 
-def test_files_without_keypoints_are_refused(tmp_path: Path) -> None:
+def test_files_of_something_else_are_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     (tmp_path / "text.npz").write_text("nothing")
     np.savez(tmp_path / "pickle.npz", keypoints=np.array([{}], dtype=object), scores=[1])
     for name in ("other.npz", "text.npz", "pickle.npz", "missing.npz"):
-        with pytest.raises(DeepDetectError):
-            load_keypoints(tmp_path / name)
+        for load in (load_keypoints, load_matches):
+            with pytest.raises(DeepDetectError, match=name):
+                load(tmp_path / name)
 
 
 def test_logits_survive_the_round_trip(tmp_path: Path) -> None:

@@ -120,11 +120,11 @@ def test_one_view_stored_badly(level: Any, detector: DeepDetect, one_line) -> No
     assert "nothing moves between the images" in message
 
 
-@pytest.mark.parametrize("guidance", ["auto", "fundamental"])
+@pytest.mark.parametrize("guide", ["auto", "fundamental"])
 def test_a_camera_that_only_turned(
-    level: Any, only_turned: np.ndarray, detector: DeepDetect, guidance: str, one_line
+    level: Any, only_turned: np.ndarray, detector: DeepDetect, guide: str, one_line
 ) -> None:
-    found = match_images(level.left, only_turned, detector, guidance=guidance)
+    found = match_images(level.left, only_turned, detector, guide=guide)
     points = found.points0, found.points1
     camera = level.calibration.camera0
     assert "a turn of the camera explains all" in refusal(
@@ -157,7 +157,7 @@ def test_unrelated_photographs(detector: DeepDetect, unguided: bool, one_line) -
         np.ascontiguousarray(image[:250, :370]) for image in (data.astronaut(), data.coffee())
     )
     if unguided:
-        found = match_images(first, second, detector, guidance="none", model="none", density=0.1)
+        found = match_images(first, second, detector, guided=False, model="none", density=0.1)
         points = found.points0, found.points1
         assert len(points[0]) > 1000
     else:

@@ -27,7 +27,7 @@ from deepdetect.detector.network.weights import (  # noqa: E402
     save_weights,
     weights_digest,
 )
-from deepdetect.detector.pretrained import bundled_weights  # noqa: E402
+from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 from deepdetect.training.checkpoint import read_checkpoint, restore, save_checkpoint  # noqa: E402
 from deepdetect.training.device import DeviceOptions, Engine  # noqa: E402
 from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
@@ -203,7 +203,7 @@ def test_frozen_batch_norm_keeps_the_statistics_and_trains_the_rest(
     arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels")]
     arguments += ["--init", "default"]
     subprocess.run(arguments, check=True, capture_output=True)
-    before = load_network(bundled_weights("default", ".safetensors")).state_dict()
+    before = load_network(pretrained_weights("default", ".safetensors")).state_dict()
     after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
     kept = {name for name in before if torch.equal(before[name], after[name])}
     statistics = {name for name in before if name.rpartition(".")[2].startswith(("running", "num"))}
@@ -220,7 +220,7 @@ def test_only_the_decoder_may_be_trained(
     arguments = [*command(photographs, tmp_path / "run", tmp_path / "labels"), batch_norm]
     arguments += ["--init", "default", "--freeze-encoder", "--optimizer", "soap"]
     subprocess.run(arguments, check=True, capture_output=True)
-    before = load_network(bundled_weights("default", ".safetensors")).state_dict()
+    before = load_network(pretrained_weights("default", ".safetensors")).state_dict()
     after = load_network(tmp_path / "run" / "best.safetensors").state_dict()
     kept = {name for name in before if torch.equal(before[name], after[name])}
     encoder = {name for name in before if name.startswith("encoder.")}

@@ -42,11 +42,11 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
         save_weights,
         weights_digest,
     )
-    from ..detector.pretrained import find_weights
+    from ..detector.pretrained import resolve_weights
 
     if len(weights) < 2:
         raise OptionError("name two weights at least: the mean of one is itself")
-    paths = [find_weights(name, ".safetensors") for name in weights]
+    paths = [resolve_weights(name, ".safetensors") for name in weights]
     network = average_weights(paths)
     parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]
     files = {"weights": output / "best.safetensors", "onnx": output / "deepdetect.onnx"}

@@ -62,12 +62,18 @@ def detect(
     """
     from .._shared.errors import DeepDetectError
     from .._shared.progress import progress
-    from ..features.keypoints import SelectionOptions
     from ..io.masks import load_mask
 
     paths = expand_images(images, output)
     mask = load_mask(ignore) if ignore is not None else None
-    selection = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel, mask)
+    selection = {
+        "threshold": threshold,
+        "density": density,
+        "max_keypoints": max_keypoints,
+        "nms_radius": nms_radius,
+        "subpixel": subpixel,
+        "ignore": mask,
+    }
     detector = make_detector(values)
     results: list[dict[str, Any]] = []
     failures = []
@@ -92,18 +98,21 @@ def detect(
 
 
 def _detect_one(
-    path: Path, detector: Any, selection: Any, output: Path, file_format: str, pictures: bool
+    path: Path,
+    detector: Any,
+    selection: dict[str, Any],
+    output: Path,
+    file_format: str,
+    pictures: bool,
 ) -> dict[str, Any]:
     """Detect, save and draw the keypoints of one image; return its numbers."""
-    from ..features.keypoints import select_keypoints
     from ..io.image import load_image
     from ..io.tables import save_keypoints
     from ..viz.draw import add_caption, draw_heatmap, draw_keypoints, save_picture
 
     rgb = load_image(path)
     started = time.perf_counter()
-    heatmap, logits = detector.heatmap_and_logits(rgb)
-    keypoints = select_keypoints(heatmap, selection, logits)
+    keypoints, heatmap = detector.detect(rgb, **selection, return_heatmap=True)
     seconds = time.perf_counter() - started
     file = output / f"{path.stem}.{file_format}"
     save_keypoints(keypoints, file)

@@ -45,7 +45,7 @@ def evaluate_stereo(
     from .._shared.progress import progress
     from ..datasets.middlebury import load_middlebury
     from ..detector.detector import DeepDetect
-    from ..detector.pretrained import BUNDLED
+    from ..detector.pretrained import PRETRAINED
     from ..evaluation.stereo_quality import LabelKeypoints, stereo_quality
     from ..labels import LabelOptions, find_label_settings
 
@@ -55,7 +55,7 @@ def evaluate_stereo(
         chosen = find_label_settings(name)
         options = LabelOptions(chosen.detectors, changes=chosen.changes)
         sources[f"labels {name}"] = LabelKeypoints(options)
-    for name in weights if weights or labels else tuple(BUNDLED):
+    for name in weights if weights or labels else tuple(PRETRAINED):
         sources[f"weights {name}"] = DeepDetect(name)
     total = len(pairs) * (2 * len(sources) + 1)
     with progress(total, "matching", "pair", as_json) as bar:

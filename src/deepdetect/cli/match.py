@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -50,17 +51,24 @@ from .shared import (
 @click.option(
     "--mutual/--no-mutual",
     default=None,
-    help="Keep mutual nearest neighbours only; guided: the surest match of each keypoint.",
+    help="Keep mutual nearest neighbours only; guided: the best match of each keypoint.",
 )
 @click.option(
-    "--guidance",
-    help="A geometry from few points proposes the matches: auto, homography (planes, pure "
-    "rotation), fundamental, or none: match everything with everything.  [default: auto]",
+    "--guided/--unguided",
+    default=None,
+    help="A geometry from a few matches guides the matching, or all descriptors are compared with "
+    "all others.  [default: guided]",
 )
 @click.option(
     "--model",
-    help="fundamental (any static scene), essential (the same with known cameras), homography "
-    "(planes, pure rotation), none, or auto: homography or fundamental.  [default: auto]",
+    help="The geometry, which also guides: fundamental (any static scene), essential (the same "
+    "with known cameras), homography (planes, pure rotation), none, or auto: homography or "
+    "fundamental.  [default: auto]",
+)
+@click.option(
+    "--guide",
+    help="Which geometry guides with the models auto and none: homography, fundamental or auto.  "
+    "[default: auto]",
 )
 @click.option("--estimator", help="magsac or ransac.  [default: magsac]")
 @click.option("--inlier-threshold", type=float, help="Pixels.  [default: 1]")
@@ -91,14 +99,14 @@ def match(
 ) -> None:
     """Match the keypoints of IMAGE0 and IMAGE1.
 
-    Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their ratios,
+    Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores,
     the estimated geometry and which matches agree with it, and a picture of them. Options that
-    are "unguided only" have a say with --guidance none, and where no geometry can be trusted.
+    are "unguided only" apply with --unguided, and where no geometry can be trusted.
 
     \b
     deepdetect match left.jpg right.jpg
     deepdetect match page1.jpg page2.jpg --model homography --mutual
-    deepdetect match left.jpg right.jpg --guidance none --ratio 0.9 --mutual
+    deepdetect match left.jpg right.jpg --unguided --ratio 0.9 --mutual
     deepdetect match a.png b.png --preset published --homography H1to2p
     """
     from ..io.image import load_image
@@ -136,10 +144,10 @@ def match(
         "density1": round(matches.keypoints1.density, 6),
         "matches": len(matches),
         "inliers": int(matches.inliers.sum()),
-        "kind": matches.kind,
+        "model": matches.model,
+        "matrix": None if matches.matrix is None else matches.matrix.tolist(),
         "guided": matches.guided,
-        "guidance": _guidance(matches),
-        "model": None if matches.model is None else matches.model.tolist(),
+        "guide": _guide_numbers(matches),
         "backend": detector.backend,
         "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
         "file": file,
@@ -147,8 +155,8 @@ def match(
     }
     if matches.guided and (unused := [name for name in UNGUIDED_ONLY if name in given]):
         words = " and ".join("--" + name.replace("_", "-") for name in unused)
-        verb = "has" if len(unused) == 1 else "have"
-        click.echo(f"{words} {verb} a say only in unguided matching: add --guidance none", err=True)
+        verb = "applies" if len(unused) == 1 else "apply"
+        click.echo(f"{words} {verb} only to unguided matching: add --unguided", err=True)
     if as_json:
         print_json(numbers)
         return
@@ -157,29 +165,29 @@ def match(
             ("keypoints", f"{numbers['keypoints0']:,} and {numbers['keypoints1']:,}"),
             ("density", f"{numbers['density0']:.3f} and {numbers['density1']:.3f}"),
             ("matches", f"{len(matches):,}"),
-            (f"inliers ({matches.kind})", f"{numbers['inliers']:,}"),
-            ("guided by", matches.guidance.kind if matches.guided else "nothing"),
+            (f"inliers ({matches.model})", f"{numbers['inliers']:,}"),
+            ("guided by", matches.guide.model if matches.guided else "nothing"),
             *seconds_rows(matches.seconds),
             ("written", ", ".join(str(path) for path in (file, picture) if path)),
         ],
         f"{image0} and {image1}",
     )
-    if matches.guidance is not None and not matches.guided:
+    if matches.guide is not None and not matches.guided:
         click.echo("no geometry could be trusted: these matches are unguided", err=True)
-    if matches.model is None and matches.kind != "none":
-        click.echo(f"no {matches.kind} could be estimated from these matches", err=True)
+    if matches.matrix is None and matches.model != "none":
+        click.echo(f"no {matches.model} could be estimated from these matches", err=True)
 
 
-def _guidance(matches: Any) -> dict[str, Any] | None:
-    if matches.guidance is None:
+def _guide_numbers(matches: Any) -> dict[str, Any] | None:
+    guide = matches.guide
+    if guide is None:
         return None
-    found = matches.guidance
     return {
-        "kind": found.kind,
-        "sparse_matches": found.sparse_matches,
-        "sparse_inliers": found.sparse_inliers,
-        "log_false_alarms": found.log_false_alarms if abs(found.log_false_alarms) < 1e9 else None,
-        "simulated_views": found.simulated_views,
+        "model": guide.model,
+        "sparse_matches": guide.sparse_matches,
+        "sparse_inliers": guide.sparse_inliers,
+        "log10_nfa": guide.log10_nfa if math.isfinite(guide.log10_nfa) else None,
+        "simulated_views": guide.simulated_views,
     }
 
 
@@ -189,7 +197,7 @@ def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
     picture = draw_matches(rgb0, rgb1, matches.points0, matches.points1, matches.inliers)
     caption = (
         f"{len(matches):,} matches, {int(matches.inliers.sum()):,} of them inliers "
-        f"({matches.kind}); a random sample is drawn: green inliers, red others"
+        f"({matches.model}); a random sample is drawn: green inliers, red others"
     )
     save_picture(add_caption(picture, caption), path)
 

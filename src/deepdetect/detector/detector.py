@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, overload
 
 import numpy as np
 
@@ -14,7 +14,15 @@ from ..features.keypoints import Keypoints, SelectionOptions, select_keypoints
 from ..io.image import load_image
 from .backends import RuntimeOptions, open_network
 from .heatmap import HeatmapOptions, compute_heatmap_and_logits
-from .pretrained import find_weights
+from .pretrained import resolve_weights
+
+
+class HeatmapDetector(Protocol):
+    """What matching and reconstruction ask of a detector."""
+
+    def heatmap(self, image: Any) -> np.ndarray:
+        """Map an image to a (H, W) float32 probability of a keypoint."""
+        ...
 
 
 class DeepDetect:
@@ -63,7 +71,7 @@ class DeepDetect:
         threads: int | None = None,
         channels: Literal["rgb", "bgr"] = "rgb",
     ) -> None:
-        self.weights = find_weights(weights)
+        self.weights = resolve_weights(weights)
         self.heatmap_options = HeatmapOptions(resolution, channels)
         self._runtime = RuntimeOptions(backend, providers, threads)
         self._network, self.backend = open_network(self.weights, self._runtime)
@@ -81,7 +89,7 @@ class DeepDetect:
             WeightsError: the weights are missing, damaged or do not fit.
         """
         other = self.configured(self.heatmap_options)
-        other.weights = find_weights(weights)
+        other.weights = resolve_weights(weights)
         other._network, other.backend = open_network(other.weights, self._runtime)
         return other
 
@@ -112,7 +120,46 @@ class DeepDetect:
         Raises:
             ImageError: the image cannot be read or is not fit.
         """
-        return compute_heatmap_and_logits(load_image(image), self._network, self.heatmap_options)
+        return self._run(load_image(image))
+
+    def _run(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the heat map and the logits of an image that `load_image` returned."""
+        return compute_heatmap_and_logits(rgb, self._network, self.heatmap_options)
+
+    def __repr__(self) -> str:
+        shown = self.heatmap_options
+        return (
+            f"DeepDetect({self.weights.name}, resolution={shown.resolution!r}, "
+            f"channels={shown.channels!r}, backend={self.backend!r})"
+        )
+
+    @overload
+    def detect(
+        self,
+        image: Any,
+        threshold: float = ...,
+        *,
+        density: float | None = ...,
+        max_keypoints: int | None = ...,
+        nms_radius: int | None = ...,
+        subpixel: bool | None = ...,
+        ignore: np.ndarray | None = ...,
+        return_heatmap: Literal[False] = ...,
+    ) -> Keypoints: ...
+
+    @overload
+    def detect(
+        self,
+        image: Any,
+        threshold: float = ...,
+        *,
+        density: float | None = ...,
+        max_keypoints: int | None = ...,
+        nms_radius: int | None = ...,
+        subpixel: bool | None = ...,
+        ignore: np.ndarray | None = ...,
+        return_heatmap: Literal[True],
+    ) -> tuple[Keypoints, np.ndarray]: ...
 
     @suggest_keywords
     def detect(
@@ -125,7 +172,8 @@ class DeepDetect:
         nms_radius: int | None = None,
         subpixel: bool | None = None,
         ignore: np.ndarray | None = None,
-    ) -> Keypoints:
+        return_heatmap: bool = False,
+    ) -> Keypoints | tuple[Keypoints, np.ndarray]:
         """Detect keypoints.
 
         Args:
@@ -138,29 +186,38 @@ class DeepDetect:
                 else 0.
             subpixel: refine positions to a fraction of a pixel. None: with `max_keypoints` only.
             ignore: (H, W) array, true where no keypoint is wanted.
+            return_heatmap: return the heat map, too.
 
         Returns:
-            The keypoints in the order of rows and columns, on pixel centres unless `subpixel`.
+            The keypoints in the order of rows and columns, on pixel centres unless `subpixel`;
+            with `return_heatmap`, the keypoints and the (H, W) float32 heat map.
 
         Raises:
             ImageError: the image cannot be read or is not fit.
             OptionError: an option is out of its range.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel, ignore)
-        return find_keypoints(self, load_image(image), options)
+        heatmap, logits = self._run(load_image(image))
+        keypoints = select_keypoints(heatmap, options, logits)
+        return (keypoints, heatmap) if return_heatmap else keypoints
 
 
-def find_keypoints(detector: Any, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
-    """Choose the keypoints of an image, ranked by logits where the detector gives them.
+def find_keypoints(
+    detector: HeatmapDetector, rgb: np.ndarray, options: SelectionOptions
+) -> Keypoints:
+    """Choose the keypoints of a loaded image, ranked by logits where the detector gives them.
 
     Args:
         detector: a `DeepDetect`, or anything with a method `heatmap`.
-        rgb: (H, W, 3) uint8 RGB.
+        rgb: (H, W, 3) uint8 RGB, as `load_image` returns it.
         options: what to choose.
 
     Raises:
         OptionError: the detector's map has another size than the image, or is not finite.
     """
+    if isinstance(detector, DeepDetect):
+        heatmap, logits = detector._run(rgb)
+        return select_keypoints(heatmap, options, logits)
     logits = None
     if hasattr(detector, "heatmap_and_logits"):
         heatmap, logits = detector.heatmap_and_logits(rgb)

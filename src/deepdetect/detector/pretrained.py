@@ -8,14 +8,14 @@ from pathlib import Path
 from .._shared.errors import look_up
 from .._shared.options import is_path, look_up_word
 
-BUNDLED: dict[str, str] = {
+PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
     "dense": "dense",  # two views of a scene in normal light, denser
 }
 """File names without ending, by the names that users choose them by."""
 
 
-def bundled_weights(name: str = "default", suffix: str = ".onnx") -> Path:
+def pretrained_weights(name: str = "default", suffix: str = ".onnx") -> Path:
     """Return the path of weights inside the package.
 
     Args:
@@ -27,29 +27,29 @@ def bundled_weights(name: str = "default", suffix: str = ".onnx") -> Path:
         OptionError: the name is unknown (the nearest right one is named).
 
     Example:
-        >>> bundled_weights("dense").name
+        >>> pretrained_weights("dense").name
         'dense.onnx'
     """
     return Path(
-        str(files("deepdetect") / "detector" / "weights" / look_up("weights", name, BUNDLED))
+        str(files("deepdetect") / "detector" / "weights" / look_up("weights", name, PRETRAINED))
     ).with_suffix(suffix)
 
 
-def find_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
+def resolve_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
     """Return the path of weights that are named, or are a file.
 
     Args:
-        weights: a name of `BUNDLED`, or a path (`is_path`).
-        suffix: as of `bundled_weights`.
+        weights: a name of `PRETRAINED`, or a path (`is_path`).
+        suffix: as of `pretrained_weights`.
 
     Raises:
         OptionError: it is a word that is no name.
 
     Example:
-        >>> find_weights("run/best.safetensors").name
+        >>> resolve_weights("run/best.safetensors").name
         'best.safetensors'
     """
     if is_path(weights):
         return Path(weights)
-    look_up_word("weights", weights, BUNDLED)
-    return bundled_weights(str(weights), suffix)
+    look_up_word("weights", weights, PRETRAINED)
+    return pretrained_weights(str(weights), suffix)

@@ -9,7 +9,7 @@ from pathlib import Path
 from .._shared.errors import ImageError, look_up
 from .._shared.progress import progress
 from .._shared.provenance import provenance
-from ..detector.pretrained import find_weights
+from ..detector.pretrained import resolve_weights
 from .cache import StageCache, file_digest
 from .metering import peak_memory
 from .options import BenchmarkOptions
@@ -71,7 +71,7 @@ def run_benchmarks(
 def _weights(chosen: Sequence[Benchmark], options: BenchmarkOptions) -> dict[str, str]:
     """Return the names of the weights that were run, with the beginning of their SHA-256."""
     files = {"default": [options.detector.weights]}
-    files["dense"] = [find_weights(weights) for weights in options.geometry_weights]
+    files["dense"] = [resolve_weights(weights) for weights in options.geometry_weights]
     titles = {"default": "weights (SHA-256)", "dense": "weights for stereo pairs (SHA-256)"}
     return {
         title: ", ".join(f"{file.name} ({file_digest(file)[:16]})" for file in files[kind])

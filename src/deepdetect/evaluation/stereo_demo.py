@@ -11,8 +11,9 @@ import numpy as np
 
 from ..datasets import StereoPair
 from ..detector.detector import DeepDetect
+from ..features.matches import Matches
 from ..geometry import disparity_errors
-from ..matching.pipeline import Matches, match_images
+from ..matching.pipeline import match_images
 from ..viz.draw import (
     add_caption,
     draw_heatmap,

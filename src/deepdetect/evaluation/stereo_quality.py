@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from ..datasets.types import StereoPair
+from ..detector.detector import HeatmapDetector
+from ..features.matches import Matches
 from ..io.image import load_image, luma
 from ..labels import LabelOptions, fuse
-from ..matching.pipeline import HeatmapDetector, Matches, match_images
+from ..matching.pipeline import match_images
 from .controls import EveryPixel, RandomPoints
 from .metrics.stereo_matches import StereoScore, stereo_score
 
@@ -95,7 +97,7 @@ def stereo_quality(
 
 def match_stereo(pair: StereoPair, detector: HeatmapDetector, **changes: Any) -> Matches:
     """Match both views, unguided and without looking for their geometry."""
-    return match_images(pair.left, pair.right, detector, guidance="none", model="none", **changes)
+    return match_images(pair.left, pair.right, detector, guided=False, model="none", **changes)
 
 
 def match_random_points(pair: StereoPair, density: float) -> Matches:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..datasets.oxford import find_scene
 from ..datasets.types import PlanarPair, PlanarScene
-from ..detector.detector import DeepDetect
+from ..detector.detector import DeepDetect, HeatmapDetector
 from ..detector.heatmap import HeatmapOptions, compute_heatmap
 from ..features.descriptors import get_descriptor
 from ..features.keypoints import Keypoints, SelectionOptions, select_keypoints
@@ -19,7 +19,6 @@ from ..geometry.residuals import transfer_errors
 from ..io.image import load_image, luma
 from ..labels import fuse
 from ..matching.options import get_preset
-from ..matching.pipeline import HeatmapDetector
 from .metrics import published_repeatability
 
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)

@@ -3,32 +3,19 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError
 from ..features.keypoints import Keypoints
+from ..features.matches import Guide, Matches
 
 FORMATS = ("npz", "csv")
-
-
-class MatchesLike(Protocol):
-    """What `save_matches` writes: the attributes of `deepdetect.Matches` that it reads."""
-
-    points0: np.ndarray
-    points1: np.ndarray
-    ratios: np.ndarray
-    inliers: np.ndarray
-    model: np.ndarray | None
-    kind: str
-    guidance: Any
-
-    @property
-    def guided(self) -> bool:
-        """Whether the matches were guided."""
 
 
 def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
@@ -62,50 +49,109 @@ def load_keypoints(path: str | Path) -> Keypoints:
     Raises:
         DeepDetectError: the file is missing or is no such file.
     """
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return Keypoints(
-                arrays["keypoints"],
-                arrays["scores"],
-                tuple(arrays["image_size"]),
-                arrays.get("logits"),
-            )
-    except FileNotFoundError:
-        raise DeepDetectError(f"there is no file {path}: check the path") from None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise DeepDetectError(f"{path} holds no keypoints ({error}): write it anew") from None
+    with _reading(path, "keypoints") as arrays:
+        return Keypoints(
+            arrays["keypoints"],
+            arrays["scores"],
+            tuple(arrays["image_size"]),
+            arrays.get("logits"),
+        )
 
 
-def save_matches(matches: MatchesLike, path: str | Path) -> None:
+def save_matches(matches: Matches, path: str | Path) -> None:
     """Write matches, whole or not at all.
 
     Args:
         matches: the matches.
-        path: ending in .npz (arrays `points0` and `points1` (M, 2) float32, `ratios`
-            (M,) float32, `inliers` (M,) bool, `model` (3, 3), or (0, 0) without one, `kind` of
-            that model, `guided` bool, and `guidance`: what guided, "homography" or
-            "fundamental", or "none") or .csv (columns x0, y0, x1, y1, ratio, inlier; it does
-            not say what guided). What the ratios are depends on `guided` (`Matches`).
+        path: ending in .npz (arrays named as the attributes of `Matches`: `points0` and `points1`
+            (M, 2) float32, `scores` (M,) float32, `inliers` (M,) bool, `model` a string, `matrix`
+            (3, 3), or (0, 0) without one; `guided` bool; `keypoints0` (N, 2) float32,
+            `keypoint_scores0` (N,) float32 and `image_size0` (width, height), and the same of the
+            second image; and of a `Guide` its attributes, as `guide_model`) or .csv (columns x0,
+            y0, x1, y1, score, inlier).
 
     Raises:
         OptionError: the file's ending is another.
         DeepDetectError: the file cannot be written.
     """
-    if _format(path) == "npz":
-        _save_npz(
-            path,
-            points0=matches.points0,
-            points1=matches.points1,
-            ratios=matches.ratios,
-            inliers=matches.inliers,
-            model=np.empty((0, 0)) if matches.model is None else matches.model,
-            kind=np.array(matches.kind),
-            guided=np.array(matches.guided),
-            guidance=np.array("none" if matches.guidance is None else matches.guidance.kind),
+    if _format(path) == "csv":
+        columns = [matches.points0, matches.points1, matches.scores, matches.inliers]
+        _save_csv(path, "x0,y0,x1,y1,score,inlier", np.column_stack(columns))
+        return
+    arrays = {name: getattr(matches, name) for name in ("points0", "points1", "scores", "inliers")}
+    arrays |= {"model": matches.model, "matrix": _or_empty(matches.matrix)}
+    arrays["guided"] = matches.guided
+    for side, keypoints in enumerate((matches.keypoints0, matches.keypoints1)):
+        arrays[f"keypoints{side}"] = keypoints.xy
+        arrays[f"keypoint_scores{side}"] = keypoints.scores
+        arrays[f"image_size{side}"] = keypoints.image_size
+    if matches.guide is not None:
+        arrays |= {f"guide_{name}": value for name, value in vars(matches.guide).items()}
+        arrays["guide_matrix"] = _or_empty(matches.guide.matrix)
+    _save_npz(path, **{name: np.asarray(value) for name, value in arrays.items()})
+
+
+def load_matches(path: str | Path) -> Matches:
+    """Read matches from the npz file that `save_matches` wrote.
+
+    Returns:
+        The matches. Their `seconds` are empty, and their keypoints have no logits.
+
+    Raises:
+        DeepDetectError: the file is missing or is no such file.
+    """
+    with _reading(path, "matches") as arrays:
+        keypoints = [
+            Keypoints(
+                arrays[f"keypoints{side}"],
+                arrays[f"keypoint_scores{side}"],
+                tuple(arrays[f"image_size{side}"]),
+            )
+            for side in (0, 1)
+        ]
+        guide = None
+        if "guide_model" in arrays:
+            guide = Guide(
+                str(arrays["guide_model"]),
+                _or_none(arrays["guide_matrix"]),
+                int(arrays["guide_sparse_matches"]),
+                int(arrays["guide_sparse_inliers"]),
+                float(arrays["guide_log10_nfa"]),
+                int(arrays["guide_simulated_views"]),
+            )
+        return Matches(
+            arrays["points0"],
+            arrays["points1"],
+            arrays["scores"],
+            arrays["inliers"],
+            str(arrays["model"]),
+            _or_none(arrays["matrix"]),
+            keypoints[0],
+            keypoints[1],
+            guide=guide,
         )
-    else:
-        columns = [matches.points0, matches.points1, matches.ratios, matches.inliers]
-        _save_csv(path, "x0,y0,x1,y1,ratio,inlier", np.column_stack(columns))
+
+
+@contextmanager
+def _reading(path: str | Path, content: str) -> Iterator[Any]:
+    """Open an npz file; errors of reading it, and of names that it lacks, say so."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            yield arrays
+    except FileNotFoundError:
+        raise DeepDetectError(f"there is no file {path}: check the path") from None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise DeepDetectError(
+            f"{path} holds no {content} ({error}): write the file again"
+        ) from None
+
+
+def _or_empty(matrix: np.ndarray | None) -> np.ndarray:
+    return np.empty((0, 0)) if matrix is None else matrix
+
+
+def _or_none(matrix: np.ndarray) -> np.ndarray | None:
+    return matrix if matrix.size else None
 
 
 def _format(path: str | Path) -> str:

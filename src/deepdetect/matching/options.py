@@ -10,18 +10,26 @@ from ..features.descriptors import get_descriptor
 from ..features.keypoints import SelectionOptions
 from ..features.matchers import get_matcher
 from ..geometry import GeometryOptions
-from .guided import GUIDANCES
+
+GUIDES = ("auto", "homography", "fundamental")
+
+GUIDES_OF_MODELS = {
+    "homography": "homography",
+    "fundamental": "fundamental",
+    "essential": "fundamental",
+}
+"""The geometry that guides for each `model`; the other models leave it open."""
 
 UNGUIDED_ONLY = ("descriptor", "keypoint_size", "angle", "matcher", "ratio")
-"""Options of `MatchingOptions` that have no say in matches that a geometry guided."""
+"""Options of `MatchingOptions` that do not apply to guided matches."""
 
 
 @dataclass(frozen=True, eq=False)
 class MatchingOptions:
     """How two images are matched.
 
-    Those of `UNGUIDED_ONLY` (descriptor, keypoint_size, angle, matcher, ratio) have a say only in
-    unguided matching: with the guidance "none", or where no geometry can be trusted.
+    Those of `UNGUIDED_ONLY` (descriptor, keypoint_size, angle, matcher, ratio) apply only to
+    matches by descriptors alone: with `guided=False`, or where no geometry can be trusted.
 
     Attributes:
         heatmap: how the network sees the images; None leaves the detector's own way.
@@ -33,14 +41,16 @@ class MatchingOptions:
             descriptors).
         ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
         mutual: keep only pairs that are each other's nearest; guided, of those that share a
-            keypoint of the second image only the one with the smallest ratio.
-        guidance: "auto", "homography" or "fundamental": a geometry from few points proposes the
-            matches; "auto" chooses which (`guidance.guided`), but takes the one that `model` asks
-            for. "none": the matcher alone.
-        geometry: which geometry is estimated, and how.
+            keypoint of the second image only the best.
+        guided: whether a geometry from a few matches guides the matching; else the matcher alone
+            decides.
+        guide: which one: "homography", "fundamental", or "auto": the one that fits
+            `geometry.model`, and for the models "auto" and "none" the one that fits the images.
+        geometry: which geometry is estimated in the end, and how.
 
     Raises:
-        OptionError: a name is unknown or a value out of its range.
+        OptionError: a name is unknown, a value out of its range, or the guide contradicts the
+            model.
     """
 
     heatmap: HeatmapOptions | None = None
@@ -51,7 +61,8 @@ class MatchingOptions:
     matcher: str = "flann"
     ratio: float = 0.99
     mutual: bool = False
-    guidance: str = "auto"
+    guided: bool = True
+    guide: str = "auto"
     geometry: GeometryOptions = field(default_factory=lambda: GeometryOptions(model="auto"))
 
     def __post_init__(self) -> None:
@@ -61,8 +72,14 @@ class MatchingOptions:
             raise OptionError(
                 "the matcher hamming compares binary descriptors, as ORB's: take exact or flann"
             )
-        if self.guidance not in GUIDANCES:
-            raise unknown_name("guidance", self.guidance, GUIDANCES)
+        if self.guide not in GUIDES:
+            raise unknown_name("guide", self.guide, GUIDES)
+        fitting = GUIDES_OF_MODELS.get(self.geometry.model, self.guide)
+        if self.guide not in ("auto", fitting):
+            raise OptionError(
+                f"the guide {self.guide} contradicts the model {self.geometry.model}: "
+                "leave one of them out"
+            )
         if not 0 < self.keypoint_size <= 100:
             raise OptionError(
                 f"the keypoint size must be above 0 and at most 100 pixels, "
@@ -72,6 +89,13 @@ class MatchingOptions:
             raise OptionError(f"the angle must lie in [0, 360) or be -1, not {self.angle}")
         if not 0 < self.ratio <= 1:
             raise OptionError(f"the ratio must be above 0 and at most 1, not {self.ratio}")
+
+    @property
+    def guiding_model(self) -> str:
+        """The geometry that guides: a plane would drop what is off it, so `model` decides."""
+        if self.guide != "auto":
+            return self.guide
+        return GUIDES_OF_MODELS.get(self.geometry.model, "auto")
 
 
 PRESETS: dict[str, MatchingOptions] = {
@@ -86,7 +110,7 @@ PRESETS: dict[str, MatchingOptions] = {
         angle=-1.0,
         matcher="flann",
         ratio=0.99,
-        guidance="none",
+        guided=False,
         geometry=GeometryOptions(model="none"),
     ),
 }

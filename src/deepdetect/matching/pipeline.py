@@ -2,86 +2,34 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal
 
 import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.memory import free_memory
-from .._shared.options import changed
-from ..detector.detector import DeepDetect, find_keypoints
+from .._shared.options import changed, suggest_keywords
+from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
 from ..detector.heatmap import HeatmapOptions
 from ..features.descriptors import get_descriptor
-from ..features.keypoints import Keypoints
 from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors, one_to_one
+from ..features.matches import Guide, Matches
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.residuals import transfer_errors
 from ..io.image import load_image, luma
-from .guided import Guidance, guided_matches
+from .guided import guided_matches
 from .guided.initial_geometry import InitialMatches
 from .options import MatchingOptions, get_preset
 
-BYTES_A_KEYPOINT = 1500
+BYTES_PER_KEYPOINT = 1500
 """Memory that matching takes: 128 float32 of the descriptor, twice with FLANN's trees and copy."""
 
-GUIDING_MODELS = {
-    "homography": "homography",
-    "fundamental": "fundamental",
-    "essential": "fundamental",
-}
-"""Geometries that guide when they are asked for; any other model leaves the choice open."""
 
-
-class HeatmapDetector(Protocol):
-    """What `match_images` asks of a detector."""
-
-    def heatmap(self, image: Any) -> np.ndarray:
-        """Map an image to a (H, W) float32 probability of a keypoint."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class Matches:
-    """Matched keypoints of two images.
-
-    Attributes:
-        points0, points1: (M, 2) float32 positions in the first and in the second
-            image, matched row by row; centre of the first pixel (0, 0).
-        ratios: (M,) float32: small is sure. Unguided, the distance to the best over that to the
-            second-best descriptor; guided (`guided`), the distance over that of strangers.
-        model: (3, 3) float64 geometry between the images, or None.
-        inliers: (M,) bool, the matches that agree with the model.
-        kind: what `model` is: "homography", "fundamental", "essential" or "none".
-        keypoints0, keypoints1: all keypoints of the two images.
-        seconds: time of each stage, both images together.
-        guidance: what guided the matching; None when no guidance was asked for. With the kind
-            "none" no geometry could be trusted, and the matches are unguided.
-    """
-
-    points0: np.ndarray
-    points1: np.ndarray
-    ratios: np.ndarray
-    model: np.ndarray | None
-    inliers: np.ndarray
-    kind: str
-    keypoints0: Keypoints
-    keypoints1: Keypoints
-    seconds: dict[str, float] = field(default_factory=dict)
-    guidance: Guidance | None = None
-
-    @property
-    def guided(self) -> bool:
-        """Whether a geometry proposed these matches."""
-        return self.guidance is not None and self.guidance.kind != "none"
-
-    def __len__(self) -> int:
-        return len(self.points0)
-
-
+@suggest_keywords
 def match_images(
     image0: Any,
     image1: Any,
@@ -90,27 +38,62 @@ def match_images(
     preset: str = "default",
     options: MatchingOptions | None = None,
     initial: InitialMatches | None = None,
-    **changes: Any,
+    guided: bool | None = None,
+    model: str | None = None,
+    guide: str | None = None,
+    mutual: bool | None = None,
+    threshold: float | None = None,
+    density: float | None = None,
+    max_keypoints: int | None = None,
+    nms_radius: int | None = None,
+    subpixel: bool | None = None,
+    ignore: np.ndarray | None = None,
+    resolution: Literal["native"] | int | None = None,
+    channels: Literal["rgb", "bgr"] | None = None,
+    descriptor: str | None = None,
+    keypoint_size: float | None = None,
+    angle: float | None = None,
+    matcher: str | None = None,
+    ratio: float | None = None,
+    estimator: str | None = None,
+    inlier_threshold: float | None = None,
+    homography: np.ndarray | None = None,
+    camera0: np.ndarray | None = None,
+    camera1: np.ndarray | None = None,
+    confidence: float | None = None,
+    iterations: int | None = None,
+    seed: int | None = None,
 ) -> Matches:
     """Detect and match the keypoints of two images.
 
+    Every option that is None is as in `options`, or in the preset.
+
     Args:
-        image0, image1: anything `DeepDetect.heatmap` takes.
-        detector: a `DeepDetect`, or anything with its `heatmap` method; default
-            `DeepDetect()` with the bundled weights.
+        image0, image1: anything `load_image` takes.
+        detector: a `DeepDetect`, or anything with its `heatmap` method; default `DeepDetect()`.
         preset: name of the options to start from: "default", or "published" for exactly
             what the paper's published code does, whatever the detector's own resolution
             and channels.
         options: all options at once, instead of a preset.
         initial: sparse matches of the pair, where `initial_matches` has made them already.
-        **changes: single options by name: those of `MatchingOptions`, `SelectionOptions`
-            and `GeometryOptions`, as `mutual=True, density=0.1, model="homography"`. The
-            options `descriptor`, `keypoint_size`, `angle`, `matcher` and `ratio` have a say only
-            in unguided matching: with `guidance="none"`, or where no geometry can be trusted.
+        guided: whether a geometry from a few matches guides the matching, or descriptors alone
+            decide.
+        model: the geometry, "homography" (planes, pure rotation), "fundamental" (any static
+            scene), "essential" (with `camera0` and `camera1`), "auto" (one of the first two) or
+            "none"; it also chooses what guides.
+        guide: which geometry guides where `model` leaves it open: "auto", "homography" or
+            "fundamental".
+        mutual: keep only mutual nearest neighbours; guided, the best match of each keypoint.
+        threshold, density, max_keypoints, nms_radius, subpixel, ignore: which pixels become
+            keypoints (`SelectionOptions`).
+        resolution, channels: how the network sees the images (`HeatmapOptions`).
+        descriptor, keypoint_size, angle, matcher, ratio: of matches by descriptors alone; they do
+            not apply to guided ones (`MatchingOptions`).
+        estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations, seed:
+            how the geometry is estimated (`GeometryOptions`).
 
     Returns:
-        The matches, the geometry, and which agree with it. Guided they are those that look alike
-        where the geometry points, unguided those that pass the ratio test.
+        The matches, the geometry, and which agree with it.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
@@ -119,24 +102,55 @@ def match_images(
     Example:
         >>> rng = np.random.default_rng(0)
         >>> image = rng.integers(0, 256, (64, 64), np.uint8).repeat(2, 0).repeat(2, 1)
-        >>> matches = match_images(image, image, model="homography", matcher="exact")
+        >>> matches = match_images(image, image, model="homography")
         >>> bool((matches.points0 == matches.points1).all())
         True
     """
-    chosen = changed(options if options is not None else get_preset(preset), **changes)
+    chosen = options if options is not None else get_preset(preset)
+    if chosen.heatmap is None and not (resolution is None and channels is None):
+        own = getattr(detector, "heatmap_options", HeatmapOptions())
+        chosen = dataclasses.replace(chosen, heatmap=own)
+    given = {
+        "guided": guided,
+        "model": model,
+        "guide": guide,
+        "mutual": mutual,
+        "threshold": threshold,
+        "density": density,
+        "max_keypoints": max_keypoints,
+        "nms_radius": nms_radius,
+        "subpixel": subpixel,
+        "ignore": ignore,
+        "resolution": resolution,
+        "channels": channels,
+        "descriptor": descriptor,
+        "keypoint_size": keypoint_size,
+        "angle": angle,
+        "matcher": matcher,
+        "ratio": ratio,
+        "estimator": estimator,
+        "inlier_threshold": inlier_threshold,
+        "homography": homography,
+        "camera0": camera0,
+        "camera1": camera1,
+        "confidence": confidence,
+        "iterations": iterations,
+        "seed": seed,
+    }
+    chosen = changed(chosen, **{name: value for name, value in given.items() if value is not None})
     seconds: dict[str, float] = {}
     rgb = load_image(image0), load_image(image1)
     detector = _configured(detector, chosen.heatmap)
     with _timed(seconds, "keypoints"):
         keypoints = [find_keypoints(detector, image, chosen.selection) for image in rgb]
     grays = luma(rgb[0]), luma(rgb[1])
-    guidance, found = None, None
-    if chosen.guidance != "none":
+    found_guide, found = None, None
+    if chosen.guided:
         with _timed(seconds, "guided matching"):
-            guidance, found = guided_matches(
+            found_guide, found = guided_matches(
                 *grays,
                 *(np.rint(points.xy) for points in keypoints),
-                _guiding_model(chosen),
+                chosen.guiding_model,
                 chosen.geometry.seed,
                 initial,
             )
@@ -147,17 +161,18 @@ def match_images(
     points0 = keypoints[0].xy[found.rows0]
     points1 = keypoints[1].xy[found.rows1]
     with _timed(seconds, "geometry"):
-        geometry = _geometry(points0, points1, chosen.geometry, guidance)
+        geometry = _final_geometry(points0, points1, chosen.geometry, found_guide)
     return Matches(
         points0,
         points1,
-        found.ratios,
-        geometry.matrix,
+        np.clip(1 - found.ratios, 0, 1),
         geometry.inliers,
         geometry.kind,
-        *keypoints,
+        geometry.matrix,
+        keypoints[0],
+        keypoints[1],
         seconds,
-        guidance,
+        found_guide,
     )
 
 
@@ -172,7 +187,7 @@ def unguided_matches(
     Args:
         grays: (H, W) uint8 luma of both images.
         points: (N, 2) float32 keypoints of both.
-        chosen: the options; their guidance is not looked at.
+        chosen: the options; whether they ask for guided matching does not matter.
         seconds: takes the time of each stage.
 
     Raises:
@@ -196,23 +211,18 @@ def unguided_matches(
         )
 
 
-def _guiding_model(chosen: MatchingOptions) -> str:
-    """What is asked for guides, where nothing else is said: a plane would drop all depth."""
-    if chosen.guidance != "auto":
-        return chosen.guidance
-    return GUIDING_MODELS.get(chosen.geometry.model, "auto")
-
-
-def _geometry(
-    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, guidance: Guidance | None
+def _final_geometry(
+    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, guide: Guide | None
 ) -> Geometry:
-    """Take the geometry that guided where that is what is asked for, else estimate it."""
-    known = guidance is not None and guidance.kind == "homography"
-    if known and options.model in ("auto", "homography") and options.homography is None:
-        assert guidance is not None
-        assert guidance.matrix is not None
-        errors = transfer_errors(points0, points1, guidance.matrix)
-        return Geometry("homography", guidance.matrix, errors < options.inlier_threshold)
+    """Return the guide's own geometry where that is asked for, else estimate one of its kind."""
+    if guide is None or guide.model == "none" or options.homography is not None:
+        return estimate_geometry(points0, points1, options)
+    if guide.model == "homography" and options.model in ("auto", "homography"):
+        assert guide.matrix is not None
+        errors = transfer_errors(points0, points1, guide.matrix)
+        return Geometry("homography", guide.matrix, errors < options.inlier_threshold)
+    if options.model == "auto":  # plane or depth is decided once
+        options = dataclasses.replace(options, model=guide.model)
     return estimate_geometry(points0, points1, options)
 
 
@@ -241,7 +251,7 @@ def check_memory(keypoints: Sequence[int]) -> None:
     Raises:
         OptionError: there are too many.
     """
-    needed = sum(keypoints) * BYTES_A_KEYPOINT
+    needed = sum(keypoints) * BYTES_PER_KEYPOINT
     if needed > free_memory():
         raise OptionError(
             f"{' and '.join(f'{count:,}' for count in keypoints)} keypoints need about "

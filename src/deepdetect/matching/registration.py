@@ -1,24 +1,22 @@
-"""Laying one photograph onto another: the direct use of guided matching."""
+"""Registering one image to another by a homography."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 
-from .._shared.errors import DeepDetectError, OptionError
-from ..geometry import GeometryOptions
+from .._shared.errors import DeepDetectError
+from .._shared.options import suggest_keywords
+from ..detector.detector import HeatmapDetector
 from ..geometry.zncc import agreement
 from ..io.image import load_image, luma
-from .pipeline import HeatmapDetector, match_images
+from .pipeline import match_images
 
 SQUARES = 8
 """Squares of the checkerboard along the shorter side."""
-
-FIXED = {"guidance", *(field.name for field in fields(GeometryOptions))} - {"seed"}
-"""Options of `match_images` that a registration does not take: it is by a homography."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,22 +52,37 @@ class Registration:
         return np.where(self.seen[..., None], cv2.absdiff(self.first, self.warped), 0)
 
 
+@suggest_keywords
 def register(
-    image0: Any, image1: Any, detector: HeatmapDetector | None = None, **changes: Any
+    image0: Any,
+    image1: Any,
+    detector: HeatmapDetector | None = None,
+    *,
+    threshold: float | None = None,
+    density: float | None = None,
+    max_keypoints: int | None = None,
+    nms_radius: int | None = None,
+    subpixel: bool | None = None,
+    ignore: np.ndarray | None = None,
+    resolution: Literal["native"] | int | None = None,
+    channels: Literal["rgb", "bgr"] | None = None,
+    mutual: bool | None = None,
+    seed: int | None = None,
 ) -> Registration:
-    """Find the homography of two images and lay the second onto the first.
+    """Find the homography between two images and warp the second into the frame of the first.
 
-    For planes, and for photographs from one place. The homography comes from few points, is
-    sharpened by the images and confirmed by the dense matches (`guidance`).
+    For planes, and for photographs from one place. The homography comes from a few matches, is
+    refined on the images and verified by the dense matches.
 
     Args:
-        image0, image1: anything `DeepDetect.heatmap` takes.
-        detector: as of `match_images`.
-        **changes: options of `match_images`, but for `guidance` and those of the geometry
-            (`GeometryOptions`, without its `seed`).
+        image0, image1: anything `load_image` takes.
+        detector: as for `match_images`.
+        threshold, density, max_keypoints, nms_radius, subpixel, ignore, resolution, channels,
+            mutual, seed: as for `match_images`.
 
     Raises:
-        OptionError: an option is unknown, out of its range, or one of those.
+        ImageError: an image cannot be read or is not fit.
+        OptionError: an option is unknown or out of its range.
         DeepDetectError: no homography between the images can be trusted.
 
     Example:
@@ -81,32 +94,39 @@ def register(
         >>> found.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
-    for name in changes:
-        if name in FIXED:
-            raise OptionError(
-                f"a registration is by a homography and does not take the option {name}: leave it "
-                "out, or call match_images"
-            )
     first, second = load_image(image0), load_image(image1)
     found = match_images(
-        first, second, detector, **changes, guidance="homography", model="homography"
+        first,
+        second,
+        detector,
+        model="homography",
+        threshold=threshold,
+        density=density,
+        max_keypoints=max_keypoints,
+        nms_radius=nms_radius,
+        subpixel=subpixel,
+        ignore=ignore,
+        resolution=resolution,
+        channels=channels,
+        mutual=mutual,
+        seed=seed,
     )
-    if not found.guided or found.model is None:
+    if not found.guided or found.matrix is None:
         raise DeepDetectError(
             "no homography can be trusted between these images: they must overlap, and show a "
             "plane or be taken from one place"
         )
     size = (first.shape[1], first.shape[0])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(second, found.model, size, flags=flags)
+    warped = cv2.warpPerspective(second, found.matrix, size, flags=flags)
     whole = np.full(second.shape[:2], 255, np.uint8)
     nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    seen = cv2.warpPerspective(whole, found.model, size, flags=nearest) > 0
+    seen = cv2.warpPerspective(whole, found.matrix, size, flags=nearest) > 0
     return Registration(
-        found.model,
+        found.matrix,
         first,
         warped,
         seen,
         len(found),
-        agreement(luma(first), luma(second), found.model),
+        agreement(luma(first), luma(second), found.matrix),
     )

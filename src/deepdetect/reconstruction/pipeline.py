@@ -18,14 +18,14 @@ import numpy as np
 
 from .._shared.errors import ReconstructionError
 from .._shared.options import changed
-from ..detector.detector import DeepDetect, find_keypoints
+from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
 from ..features.keypoints import SelectionOptions
 from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
 from ..io.exif import calibration_from_exif
 from ..io.image import load_image, luma
 from ..matching.guided.initial_geometry import InitialMatches, initial_matches
 from ..matching.options import get_preset
-from ..matching.pipeline import HeatmapDetector, match_images
+from ..matching.pipeline import match_images
 from .checks import check_images
 from .outliers import statistical_inliers_on_grid
 from .rectification import Rectification, judge_rectification
@@ -254,7 +254,7 @@ def _from_matches(pair: _Pair) -> Reconstruction:
             pair.detector,
             options=changed(get_preset("default"), selection=selection, matcher="patchmatch"),
             # A homography would keep the points of one plane, and drop all that stands before it.
-            guidance="fundamental",
+            guide="fundamental",
             model="none",
             seed=options.two_view.seed,
             initial=pair.initial,

@@ -12,7 +12,7 @@ from .._shared.errors import OptionError
 from .._shared.progress import progress
 from ..detector.network.espnet import ESPNet
 from ..detector.network.weights import average_weights
-from ..detector.pretrained import find_weights
+from ..detector.pretrained import resolve_weights
 from .device import DeviceOptions
 from .preparation import Sources, prepare
 from .profile import WARM_UP_STEPS, StageProfile, profile_stages
@@ -127,7 +127,7 @@ def _initial_network(
         if options.frozen_batch_norm is None:
             options = dataclasses.replace(options, frozen_batch_norm=True)
         chosen = [init_weights] if isinstance(init_weights, (str, Path)) else list(init_weights)
-        return options, average_weights([find_weights(name, ".safetensors") for name in chosen])
+        return options, average_weights([resolve_weights(name, ".safetensors") for name in chosen])
     if options.frozen_batch_norm:
         raise OptionError(
             "random weights have no batch statistics to keep: name trained ones with --init, "

@@ -35,11 +35,11 @@ assert dict(os.environ) == before
 assert sys.modules.get("openvino_telemetry", before) is not None
 """
 ONNX_METHOD = """
-from deepdetect.detector.pretrained import bundled_weights
+from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect._shared.errors import WeightsError
 from deepdetect.evaluation.baselines.onnx_file import onnx_method
 try:
-    onnx_method(bundled_weights())
+    onnx_method(pretrained_weights())
 except WeightsError as error:
     assert "outputs keypoints and scores" in str(error), error
 """

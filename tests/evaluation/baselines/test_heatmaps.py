@@ -8,7 +8,7 @@ from scipy.spatial import KDTree
 
 from deepdetect import DeepDetect, SelectionOptions
 from deepdetect.detector.heatmap import HeatmapOptions
-from deepdetect.detector.pretrained import bundled_weights
+from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.evaluation.baselines import (
     CLASSICAL,
     Features,
@@ -63,7 +63,7 @@ def test_the_version_follows_all_that_the_points_depend_on(
     detector: DeepDetect, tmp_path: Path
 ) -> None:
     changed = tmp_path / "other.onnx"
-    changed.write_bytes(bundled_weights("dense").read_bytes())
+    changed.write_bytes(pretrained_weights("dense").read_bytes())
     methods = [
         deepdetect_method(detector),
         deepdetect_method(detector, SelectionOptions(0.7)),

@@ -13,7 +13,7 @@ from PIL import Image
 from deepdetect import DeepDetect
 from deepdetect.detector.backends import RuntimeOptions
 from deepdetect.detector.heatmap import HeatmapOptions
-from deepdetect.detector.pretrained import bundled_weights
+from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.io.image import load_image, luma
 
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
@@ -29,7 +29,7 @@ class EdgeDetector(DeepDetect):
     """A stand-in whose heat map is the strength of the edges."""
 
     def __init__(self) -> None:
-        self.weights = bundled_weights()
+        self.weights = pretrained_weights()
         self.backend = "none"
         self.heatmap_options = HeatmapOptions()
         self._runtime = RuntimeOptions()  # of `with_weights`

@@ -63,7 +63,7 @@ def test_what_a_photograph_hides_is_not_matched(name: str, photograph: str, shar
     )
     found = match_images(pair.left, right, DeepDetect("default"))
     assert found.guided
-    assert found.guidance.kind == "fundamental"
+    assert found.guide.model == "fundamental"
 
     def under(points: np.ndarray) -> np.ndarray:
         x, y = points.astype(int).T

@@ -41,7 +41,7 @@ def test_most_of_what_can_be_matched_is(shared: Path, scene: str, number: int) -
     share, precision = BARS[scene, number]
     assert np.count_nonzero(errors < 1) >= share * ceiling
     assert (errors < 1).mean() >= precision
-    assert corner_error(found.model, pair.homography, rgb[0].shape[1::-1]) <= 1.5
+    assert corner_error(found.matrix, pair.homography, rgb[0].shape[1::-1]) <= 1.5
 
 
 @pytest.mark.parametrize(("scene", "photograph"), [("ubc", "chelsea"), ("leuven", "astronaut")])

@@ -64,7 +64,7 @@ def test_a_turned_and_scaled_view_is_matched_nearly_as_well(
     second, to_turned = turned(cones.right, degrees, scale)
     matches = match(second)
     assert matches.guided
-    assert matches.kind == matches.guidance.kind == "fundamental"
+    assert matches.model == matches.guide.model == "fundamental"
     number, share = right_ones(matches, cones, to_turned)
     assert upright[0] > 45_000
     assert number > 0.75 * upright[0]

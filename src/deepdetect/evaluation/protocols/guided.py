@@ -39,7 +39,7 @@ class FoundGuided:
     """The matches of a pair by one seed, as `match_images` gives them.
 
     Attributes:
-        kind: what guided, as of `Guidance`; with "none" the matches are unguided.
+        kind: what guided, as of `Guide`; with "none" the matches are unguided.
         matrix: the geometry, or None.
         points0, points1: (M, 2) matched positions.
         seconds, memory: of the guided matching alone, also where it found nothing: neither heat
@@ -215,13 +215,13 @@ def find_guided(workspace: Workspace, method: Method, pair: PlanarPair, seed: in
     def make() -> dict[str, np.ndarray]:
         grays = [luma(load_image(image)) for image in images]
         with metered() as meter:
-            guidance, found = guided_matches(*grays, *points, seed=seed)
+            guide, found = guided_matches(*grays, *points, seed=seed)
         if found is None:
             options = changed(get_preset("default"), seed=seed)
             found = unguided_matches(grays, points, options, {})
         return {
-            "kind": np.array(guidance.kind),
-            "matrix": np.empty((0, 3)) if guidance.matrix is None else guidance.matrix,
+            "kind": np.array(guide.model),
+            "matrix": np.empty((0, 3)) if guide.matrix is None else guide.matrix,
             "rows0": found.rows0.astype(np.int32),
             "rows1": found.rows1.astype(np.int32),
             "meter": np.array([meter.seconds, meter.memory], np.float64),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...datasets.types import PlanarPair, PlanarScene
-from ...detector.pretrained import bundled_weights
+from ...detector.pretrained import pretrained_weights
 from ...features.keypoints import Keypoints
 from ...geometry.residuals import transfer_errors
 from ...io.image import load_image, luma
@@ -36,7 +36,7 @@ def oxford_figures(
     shown = [scene for scene in scenes if scene.name in KEYPOINT_SCENES]
     tasks: list[tuple[Any, ...]] = [(keypoint_figure, options, scene) for scene in shown]
     tasks.append((mask_figure, scenes[0]))
-    if options.detector.weights == bundled_weights("default"):
+    if options.detector.weights == pretrained_weights("default"):
         tasks.append((loss_figure,))
     else:
         workspace.left_out.append(

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..._shared.errors import MissingExtraError, WeightsError
 from ...detector.detector import DeepDetect
-from ...detector.pretrained import BUNDLED
+from ...detector.pretrained import PRETRAINED
 
 RATIO = 0.99
 
@@ -34,7 +34,7 @@ def published_detector(detector: DeepDetect) -> DeepDetect:
     if not weights.is_file():
         raise WeightsError(
             f"the published pipeline runs in torch and needs {weights}, which is not there: name "
-            f"a safetensors file, or one of {', '.join(BUNDLED)}"
+            f"a safetensors file, or one of {', '.join(PRETRAINED)}"
         )
     try:
         found = DeepDetect(weights, backend="torch")

@@ -14,11 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ...detector.detector import DeepDetect
+from ...detector.detector import DeepDetect, HeatmapDetector
 from ...detector.heatmap import HeatmapOptions
 from ...geometry.camera import Calibration, read_calibration
 from ...io.image import load_image
-from ...matching.pipeline import HeatmapDetector
 from ...reconstruction.pipeline import reconstruct
 from ...reconstruction.stereo.search_range import find_search_range
 from ..baselines import CLASSICAL

@@ -132,7 +132,7 @@ def _ours(pair: WholePair) -> int:
     found = match_images(
         *pair.images,
         pair.detector,
-        guidance="none",
+        guided=False,
         matcher="patchmatch",
         descriptor="rootsift",
         ratio=RATIO,

@@ -1,5 +1,5 @@
-"""Guidance: a geometry from few points, and the dense matches that it proposes and that hold."""
+"""Guided matching: a geometry from a few matches proposes dense ones, which are verified."""
 
-from .pipeline import GUIDANCES, Guidance, guided_matches
+from .pipeline import guided_matches
 
-__all__ = ["GUIDANCES", "Guidance", "guided_matches"]
+__all__ = ["guided_matches"]

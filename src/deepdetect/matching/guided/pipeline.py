@@ -6,12 +6,13 @@ Geometry only proposes: a pair stays when both places look alike once the geomet
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ..._shared.errors import unknown_name
 from ...features.matchers import DescriptorMatches
+from ...features.matches import Guide
 from ...geometry import GeometryOptions, estimate_geometry
 from ...geometry.homography_refinement import RefinementOptions, refine_homography
 from ...geometry.majority_fit import fit_to_majority
@@ -21,7 +22,7 @@ from .homography import matches_by_homography
 from .initial_geometry import FirstPass, InitialMatches, first_pass
 from .prewarp import affinity_between, straightened
 
-GUIDANCES = ("auto", "homography", "fundamental", "none")
+MODELS = ("auto", "homography", "fundamental")
 
 LONGEST = 1600
 """Longer sides are shrunk to so many pixels where the geometry is sharpened."""
@@ -37,28 +38,6 @@ FEWEST = 0.02
 """With fewer matches than this share of the keypoints, the geometry is not trusted after all."""
 
 
-@dataclass(frozen=True, eq=False)
-class Guidance:
-    """What guided the matching of two images.
-
-    Attributes:
-        kind: "homography", "fundamental", or "none": no geometry could be trusted, and the
-            matches are unguided.
-        matrix: (3, 3) the geometry, sharpened; None without one.
-        sparse_matches: matches of few points that it was first estimated from.
-        sparse_inliers: those that agree with it.
-        log_false_alarms: decimal logarithm of its number of false alarms.
-        simulated_views: number of views from the side that the first pass took.
-    """
-
-    kind: str
-    matrix: np.ndarray | None
-    sparse_matches: int
-    sparse_inliers: int
-    log_false_alarms: float
-    simulated_views: int
-
-
 def guided_matches(
     gray0: np.ndarray,
     gray1: np.ndarray,
@@ -67,7 +46,7 @@ def guided_matches(
     model: str = "auto",
     seed: int = 0,
     initial: InitialMatches | None = None,
-) -> tuple[Guidance, DescriptorMatches | None]:
+) -> tuple[Guide, DescriptorMatches | None]:
     """Match the keypoints of two images by their geometry.
 
     Args:
@@ -83,19 +62,19 @@ def guided_matches(
     Raises:
         OptionError: the model is unknown.
     """
-    if model not in GUIDANCES[:3]:
-        raise unknown_name("guidance", model, GUIDANCES)
+    if model not in MODELS:
+        raise unknown_name("model", model, MODELS)
     first = first_pass(gray0, gray1, model, seed, initial)
     if first.kind == "none" or first.matrix is None:
-        return _guidance(first, None), None
+        return _guide(first, None), None
     if first.kind == "homography":
         matrix = sharpened(gray0, gray1, first.matrix)
         rows0, rows1, ratios = matches_by_homography(gray0, gray1, xy0, xy1, matrix, seed)
     else:
         matrix, (rows0, rows1, ratios) = _by_lines(gray0, gray1, xy0, xy1, first, seed)
     if len(rows0) < FEWEST * min(len(xy0), len(xy1)):
-        return _guidance(replace(first, kind="none", points0=first.points0[:0]), None), None
-    return _guidance(first, matrix), DescriptorMatches(rows0, rows1, ratios)
+        return _guide(replace(first, kind="none", points0=first.points0[:0]), None), None
+    return _guide(first, matrix), DescriptorMatches(rows0, rows1, ratios)
 
 
 def _by_lines(
@@ -145,8 +124,8 @@ def sharpened(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> n
     return scaled_homography(found, 1 / scale0, 1 / scale1)
 
 
-def _guidance(first: FirstPass, matrix: np.ndarray | None) -> Guidance:
-    return Guidance(
+def _guide(first: FirstPass, matrix: np.ndarray | None) -> Guide:
+    return Guide(
         first.kind,
         matrix,
         first.matches,

@@ -1,0 +1,91 @@
+"""Matched keypoints of two images, and the geometry between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .._shared.errors import OptionError
+from .keypoints import Keypoints
+
+
+@dataclass(frozen=True, eq=False)
+class Guide:
+    """The geometry that guided the matching of two images.
+
+    Attributes:
+        model: "homography", "fundamental", or "none": no geometry could be trusted, and the
+            matches are by descriptors alone.
+        matrix: (3, 3) float64, refined, of the first image to the second; None without one.
+        sparse_matches: number of sparse matches that it was first estimated from.
+        sparse_inliers: number of those that agree with it.
+        log10_nfa: decimal logarithm of its number of false alarms (a contrario).
+        simulated_views: number of views that were simulated to find it, as in ASIFT.
+    """
+
+    model: str
+    matrix: np.ndarray | None
+    sparse_matches: int
+    sparse_inliers: int
+    log10_nfa: float
+    simulated_views: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Matches:
+    """Matched keypoints of two images.
+
+    Attributes:
+        points0, points1: (M, 2) float32 positions in the first and in the second
+            image, matched row by row; centre of the first pixel (0, 0).
+        scores: (M,) float32 in [0, 1], higher is better. Guided, 1 - the dissimilarity of the two
+            patches (0: only just more similar than unrelated patches); else 1 - Lowe's ratio.
+        inliers: (M,) bool, the matches that agree with the geometry.
+        model: which geometry that is: "homography", "fundamental", "essential" or "none".
+        matrix: (3, 3) float64, the geometry; None when it could not be estimated, or was not
+            asked for. A homography maps the first image to the second; else x1^T M x0 = 0
+            (essential: in normalised coordinates).
+        keypoints0, keypoints1: all keypoints of the two images.
+        seconds: time of each stage, both images together.
+        guide: the geometry that guided the matching; None when guided matching was not asked for.
+
+    Example:
+        >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
+        >>> Matches(points.xy, points.xy, [0.5, 0.2], [True, False], "none", None, points, points)
+        Matches(2 matches of 2 and 2 keypoints, 1 inliers, model='none', guided=False)
+    """
+
+    points0: np.ndarray
+    points1: np.ndarray
+    scores: np.ndarray
+    inliers: np.ndarray
+    model: str
+    matrix: np.ndarray | None
+    keypoints0: Keypoints
+    keypoints1: Keypoints
+    seconds: dict[str, float] = field(default_factory=dict)
+    guide: Guide | None = None
+
+    def __post_init__(self) -> None:
+        counts = [len(self.points0), len(self.points1), len(self.scores), len(self.inliers)]
+        if len(set(counts)) > 1:
+            raise OptionError(
+                "matches need as many points0, points1, scores and inliers, not "
+                f"{', '.join(map(str, counts))}"
+            )
+
+    @property
+    def guided(self) -> bool:
+        """Whether a geometry guided these matches."""
+        return self.guide is not None and self.guide.model != "none"
+
+    def __len__(self) -> int:
+        return len(self.points0)
+
+    def __repr__(self) -> str:
+        return (
+            f"Matches({len(self)} matches of {len(self.keypoints0)} and {len(self.keypoints1)} "
+            f"keypoints, {np.count_nonzero(self.inliers)} inliers, model={self.model!r}, "
+            f"guided={self.guided})"
+        )
