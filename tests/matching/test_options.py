@@ -95,6 +95,7 @@ def test_a_preset_like_no_other_brings_the_whole_list() -> None:
         ("density", 0.1, "selection.density"),
         ("max_keypoints", 50, "selection.max_keypoints"),
         ("nms_radius", 2, "selection.nms_radius"),
+        ("subpixel", True, "selection.subpixel"),
         ("ignore", MASK, "selection.ignore"),
         ("model", "homography", "geometry.model"),
         ("estimator", "ransac", "geometry.estimator"),
