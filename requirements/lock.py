@@ -79,7 +79,7 @@ def make(lock: LockFile, *, upgrade: bool) -> None:
             *(option for group in lock.groups for option in ("--group", group)),
             *(["--overrides", lock.overrides] if lock.overrides else []),
             *(["--resolution", "lowest-direct"] if lock.lowest else ["--universal"]),
-            # Otherwise uv keeps a locked version that fits, though a lower one may be allowed by now.
+            # Otherwise uv keeps locked versions that fit, though lower ones may be allowed by now.
             *(f"--upgrade-package={each.name}" for each in _declared(lock) if lock.lowest),
             *(["--upgrade"] if upgrade else []),
         ]
