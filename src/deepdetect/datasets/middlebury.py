@@ -19,25 +19,24 @@ import cv2
 import numpy as np
 
 from .._shared.errors import ImageError, MissingExtraError
+from ..geometry.camera import read_calibration
 from ..io.image import load_image
 from .types import StereoPair
 
 
 def load_middlebury(folder: str | Path) -> StereoPair:
-    """Load a scene; its disparity is at the size of the image, in the image's pixels.
+    """Load a scene with its ground truth, at the size and in the pixels of the images.
 
     Args:
         folder: the scene.
 
+    Returns:
+        The pair, with `disparity`.
+
     Raises:
         ImageError: a file is missing or damaged, or the scene has no ground truth.
     """
-    root = Path(folder).resolve()
-    if not root.is_dir():
-        raise ImageError(f"there is no folder {folder}: name the folder of a stereo scene")
-    left, right = load_image(root / "left.png"), load_image(root / "right.png")
-    if left.shape != right.shape:
-        raise ImageError(f"left.png and right.png in {root} differ in size: take a rectified pair")
+    root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:
         truth = json.loads(path.read_text(encoding="utf-8")).get("ground_truth")
@@ -56,6 +55,25 @@ def load_middlebury(folder: str | Path) -> StereoPair:
         )
     disparity = np.where(stored == unknown, np.nan, stored / value).astype(np.float32)
     return StereoPair(root.name, left, right, _enlarged(disparity, left.shape[:2]))
+
+
+def load_calibrated_pair(folder: str | Path) -> StereoPair:
+    """Load a scene with the calibration of its calib.json; it may lack a ground truth.
+
+    Args:
+        folder: the scene.
+
+    Returns:
+        The pair, with `calibration`.
+
+    Raises:
+        ImageError: an image is missing or damaged, or the two differ in size.
+        ReconstructionError: the calibration is missing or damaged.
+    """
+    root, left, right = _load_views(folder)
+    size = (left.shape[1], left.shape[0])
+    calibration = read_calibration(root / "calib.json", size, size)
+    return StereoPair(root.name, left, right, calibration=calibration)
 
 
 def load_motorcycle() -> StereoPair:
@@ -77,6 +95,16 @@ def load_motorcycle() -> StereoPair:
     disparity = np.asarray(disparity, np.float32).squeeze()
     unknown = ~np.isfinite(disparity)
     return StereoPair("motorcycle", left, right, np.where(unknown, np.nan, disparity))
+
+
+def _load_views(folder: str | Path) -> tuple[Path, np.ndarray, np.ndarray]:
+    root = Path(folder).resolve()
+    if not root.is_dir():
+        raise ImageError(f"there is no folder {folder}: name the folder of a stereo scene")
+    left, right = load_image(root / "left.png"), load_image(root / "right.png")
+    if left.shape != right.shape:
+        raise ImageError(f"left.png and right.png in {root} differ in size: take a rectified pair")
+    return root, left, right
 
 
 def _enlarged(disparity: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.errors import ImageError
+from ..geometry.camera import Calibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +61,18 @@ class StereoPair:
     """Two rectified views: the match of the left (x, y) is the right (x - disparity, y).
 
     Attributes:
-        name: of the scene.
+        name: the scene's name.
         left, right: (H, W, 3) uint8 RGB.
-        disparity: (H, W) float32 in pixels, of the left view; NaN where it is unknown.
+        disparity: (H, W) float32 true disparity of the left view in pixels, NaN where it is
+            unknown; None when the ground truth was not loaded.
+        calibration: of both cameras; None when it was not loaded.
     """
 
     name: str
     left: np.ndarray
     right: np.ndarray
-    disparity: np.ndarray
+    disparity: np.ndarray | None = None
+    calibration: Calibration | None = None
 
 
 def read_homography(path: Path) -> np.ndarray:

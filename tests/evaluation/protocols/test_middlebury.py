@@ -12,13 +12,15 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, OptionError
+from deepdetect.datasets.middlebury import load_calibrated_pair
+from deepdetect.datasets.types import StereoPair
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.evaluation.cache import StageCache
 from deepdetect.evaluation.protocols import BenchmarkOptions
 from deepdetect.evaluation.protocols.middlebury import middlebury_sections, middlebury_steps, voxels
 from deepdetect.evaluation.protocols.published_pipeline import published_detector
 from deepdetect.evaluation.protocols.published_stereo import SETTINGS, published_points
-from deepdetect.evaluation.protocols.stereo_pipelines import STAGES, load_scene, pipelines, sgbm
+from deepdetect.evaluation.protocols.stereo_pipelines import STAGES, pipelines, sgbm
 from deepdetect.evaluation.report import Section
 from deepdetect.evaluation.workspace import Workspace
 from deepdetect.geometry.camera import Calibration, Camera
@@ -186,15 +188,14 @@ def test_sgbm_finds_a_shift() -> None:
     texture = cv2.GaussianBlur(texture, (0, 0), 1)
     left, right = texture[:, :180], texture[:, 9:189]
     camera = Camera((180, 80), 100.0)
-    from deepdetect.evaluation.protocols.stereo_pipelines import StereoScene
 
-    found = sgbm(StereoScene("shift", left, right, Calibration(camera, camera)))
+    found = sgbm(StereoPair("shift", left, right, calibration=Calibration(camera, camera)))
     assert (np.abs(found.disparity - 9) < 0.5).mean() > 0.98
     assert len(found.pixels) > 0.9 * 80 * 171
 
 
 def test_the_published_pipeline_keeps_what_lies_on_a_row(data: Path) -> None:
-    scene = load_scene(data / "middlebury" / "cones")
+    scene = load_calibrated_pair(data / "middlebury" / "cones")
     detector = published_detector(DeepDetect("dense").configured(HeatmapOptions(480, "bgr")))
     stages: list[str] = []
     points0, points1 = published_points(

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from deepdetect import DeepDetect
+from deepdetect.datasets.middlebury import load_calibrated_pair
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.types import PlanarScene
 from deepdetect.detector.heatmap import HeatmapOptions
@@ -30,7 +31,6 @@ from deepdetect.evaluation.protocols.published_stereo import (
     sift_points,
     stereo_settings,
 )
-from deepdetect.evaluation.protocols.stereo_pipelines import load_scene
 from deepdetect.evaluation.weights_quality import PAIRS
 from deepdetect.evaluation.workspace import Workspace
 
@@ -114,7 +114,7 @@ def test_sift_low_on_wall_as_in_the_notebook(workspace: Workspace, shared: Path)
 
 def test_voxels_of_cones(shared: Path) -> None:
     """The paper's 49,979, with its second weights, within 0.3 %."""
-    scene = load_scene(shared / "data" / "middlebury" / "cones")
+    scene = load_calibrated_pair(shared / "data" / "middlebury" / "cones")
     weights = shared / "reference" / "published_reconstruction.safetensors"
     detector = DeepDetect(weights).configured(HeatmapOptions(480, "bgr"))
     settings = stereo_settings("cones", scene.calibration.camera0.matrix)
@@ -124,7 +124,7 @@ def test_voxels_of_cones(shared: Path) -> None:
 
 def test_voxels_of_cones_by_sift(shared: Path) -> None:
     """The authors' notebook prints 14,128 for SIFT with low settings, by an older OpenCV."""
-    scene = load_scene(shared / "data" / "middlebury" / "cones")
+    scene = load_calibrated_pair(shared / "data" / "middlebury" / "cones")
     settings = stereo_settings("cones", scene.calibration.camera0.matrix)
     points, _ = sift_points((scene.left, scene.right), low_sift(), settings)
     assert len(points) == pytest.approx(SIFT_LOW_POINTS["cones"], rel=0.05)

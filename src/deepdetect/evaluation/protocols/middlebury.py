@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ..._shared.errors import ImageError
+from ...datasets.middlebury import load_calibrated_pair
+from ...datasets.types import StereoPair
 from ...geometry.camera import Calibration
 from ...geometry.point_cloud import PointCloud
 from ...viz.render import draw_clouds
@@ -27,8 +29,6 @@ from .stereo_pipelines import (
     STAGES,
     Pipeline,
     StereoPoints,
-    StereoScene,
-    load_scene,
     pipelines,
 )
 from .stereo_truth import AS_IT_IS, MOVED, truths
@@ -48,7 +48,7 @@ def middlebury_sections(workspace: Workspace, options: BenchmarkOptions) -> list
     ways = pipelines(options)
     for folder in _scenes(workspace):
         found: dict[str, StereoPoints] = {}
-        scene = workspace.attempt(f"the scene {folder.name}", load_scene, folder)
+        scene = workspace.attempt(f"the scene {folder.name}", load_calibrated_pair, folder)
         for way in ways:
             if scene is not None:
                 what = f"{way.title} on {folder.name}"
@@ -88,7 +88,7 @@ def _scenes(workspace: Workspace) -> list[Path]:
     return scenes
 
 
-def _points(workspace: Workspace, way: Pipeline, scene: StereoScene, folder: Path) -> StereoPoints:
+def _points(workspace: Workspace, way: Pipeline, scene: StereoPair, folder: Path) -> StereoPoints:
     """Reconstruct a scene, or read its points from the cache."""
 
     def make() -> dict[str, np.ndarray]:
@@ -121,7 +121,7 @@ def _points(workspace: Workspace, way: Pipeline, scene: StereoScene, folder: Pat
 
 
 def _table(
-    scene: StereoScene,
+    scene: StereoPair,
     ways: list[Pipeline],
     found: dict[str, StereoPoints],
     name: str,
@@ -231,7 +231,7 @@ def _space(
 
 
 def _figure(
-    scene: StereoScene, ways: list[Pipeline], found: dict[str, StereoPoints]
+    scene: StereoPair, ways: list[Pipeline], found: dict[str, StereoPoints]
 ) -> Figure | None:
     clouds = {}
     unit = "mm" if scene.calibration.baseline_mm else "baseline"

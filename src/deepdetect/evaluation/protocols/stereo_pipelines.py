@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from pathlib import Path
 
 import cv2
 import numpy as np
 
+from ...datasets.types import StereoPair
 from ...detector.detector import DeepDetect, HeatmapDetector
 from ...detector.heatmap import HeatmapOptions
-from ...geometry.camera import Calibration, read_calibration
-from ...io.image import load_image
 from ...reconstruction.pipeline import reconstruct
 from ...reconstruction.stereo.search_range import find_search_range
 from ..baselines import CLASSICAL
@@ -40,22 +38,6 @@ ROUNDS = 3
 """Runs of what takes seconds; the one of median time is told."""
 
 PUBLISHED = "published pipeline"
-
-
-@dataclass(frozen=True, eq=False)
-class StereoScene:
-    """A rectified pair to be reconstructed.
-
-    Attributes:
-        name: of the scene.
-        left, right: (H, W, 3) uint8 RGB.
-        calibration: of calib.json.
-    """
-
-    name: str
-    left: np.ndarray
-    right: np.ndarray
-    calibration: Calibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,23 +80,11 @@ class Pipeline:
     """
 
     title: str
-    run: Callable[[StereoScene], StereoPoints]
+    run: Callable[[StereoPair], StereoPoints]
     version: str = ""
     rounds: int = ROUNDS
     drawn: str = ""
     paper: Mapping[str, int] = field(default_factory=dict)
-
-
-def load_scene(folder: Path) -> StereoScene:
-    """Load both views of a scene and its calibration.
-
-    Raises:
-        ImageError: an image is missing.
-        ReconstructionError: the calibration is.
-    """
-    left, right = load_image(folder / "left.png"), load_image(folder / "right.png")
-    sizes = tuple((image.shape[1], image.shape[0]) for image in (left, right))
-    return StereoScene(folder.name, left, right, read_calibration(folder / "calib.json", *sizes))
 
 
 def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
@@ -149,8 +119,8 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
 
 def _ours(
     detector: HeatmapDetector, density: float | None = None
-) -> Callable[[StereoScene], StereoPoints]:
-    def run(scene: StereoScene) -> StereoPoints:
+) -> Callable[[StereoPair], StereoPoints]:
+    def run(scene: StereoPair) -> StereoPoints:
         _compiled()
         return _reconstructed(scene, detector, density)
 
@@ -158,7 +128,7 @@ def _ours(
 
 
 def _reconstructed(
-    scene: StereoScene, detector: HeatmapDetector, density: float | None
+    scene: StereoPair, detector: HeatmapDetector, density: float | None
 ) -> StereoPoints:
     meters = StageMeters()
 
@@ -180,8 +150,8 @@ def _reconstructed(
     return StereoPoints(found.pixels, found.disparity, filled, meters.stages, meters.memory)
 
 
-def _random(like: DeepDetect) -> Callable[[StereoScene], StereoPoints]:
-    def run(scene: StereoScene) -> StereoPoints:
+def _random(like: DeepDetect) -> Callable[[StereoPair], StereoPoints]:
+    def run(scene: StereoPair) -> StereoPoints:
         _compiled()
         density = float((like.heatmap(scene.left) > 0.5).mean())
         generator = np.random.default_rng(0)
@@ -195,8 +165,8 @@ def _random(like: DeepDetect) -> Callable[[StereoScene], StereoPoints]:
     return run
 
 
-def _published(detector: DeepDetect) -> Callable[[StereoScene], StereoPoints]:
-    def run(scene: StereoScene) -> StereoPoints:
+def _published(detector: DeepDetect) -> Callable[[StereoPair], StereoPoints]:
+    def run(scene: StereoPair) -> StereoPoints:
         network = published_detector(detector)
         network.heatmap(scene.left)  # the first run of a size takes longer
         meters = StageMeters()
@@ -206,8 +176,8 @@ def _published(detector: DeepDetect) -> Callable[[StereoScene], StereoPoints]:
     return run
 
 
-def _sift(make: Callable[[], cv2.SIFT]) -> Callable[[StereoScene], StereoPoints]:
-    def run(scene: StereoScene) -> StereoPoints:
+def _sift(make: Callable[[], cv2.SIFT]) -> Callable[[StereoPair], StereoPoints]:
+    def run(scene: StereoPair) -> StereoPoints:
         meters = StageMeters()
         found = sift_points((scene.left, scene.right), make(), _settings(scene), meters.lap)
         return _from_matches(*found, meters)
@@ -215,11 +185,11 @@ def _sift(make: Callable[[], cv2.SIFT]) -> Callable[[StereoScene], StereoPoints]
     return run
 
 
-def _settings(scene: StereoScene) -> StereoSettings:
+def _settings(scene: StereoPair) -> StereoSettings:
     return stereo_settings(scene.name, scene.calibration.camera0.matrix)
 
 
-def sgbm(scene: StereoScene) -> StereoPoints:
+def sgbm(scene: StereoPair) -> StereoPoints:
     """Run OpenCV's semi-global matching on every pixel.
 
     With the range that ours finds, made a multiple of 16. Both views are continued on the left by
