@@ -16,8 +16,8 @@ import numpy as np
 
 from deepdetect import DeepDetect, HeatmapOptions, SelectionOptions, select_keypoints
 from deepdetect.datasets.oxford import find_scene, load_oxford
-from deepdetect.features.descriptors import get_descriptor
 from deepdetect.features.matchers import get_matcher, match_descriptors
+from deepdetect.features.sift import get_descriptor
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image, luma
 

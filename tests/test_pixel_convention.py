@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deepdetect.detector.heatmap import HeatmapOptions, compute_heatmap
-from deepdetect.features.keypoints import select_keypoints
+from deepdetect.features.selection import select_keypoints
 from deepdetect.labels import DETECTORS
 from deepdetect.labels.detectors import keypoints_mask, pixels_mask
 

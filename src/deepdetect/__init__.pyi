@@ -8,8 +8,8 @@ from ._shared.errors import (
 )
 from .detector.detector import DeepDetect as DeepDetect
 from .detector.heatmap import HeatmapOptions as HeatmapOptions
-from .features.keypoints import (
-    Keypoints as Keypoints,
+from .features.keypoints import Keypoints as Keypoints
+from .features.selection import (
     SelectionOptions as SelectionOptions,
     select_keypoints as select_keypoints,
 )

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 import pytest
 
 from deepdetect._shared.errors import OptionError
-from deepdetect._shared.options import changed, option_names
-from deepdetect.features.keypoints import SelectionOptions
+from deepdetect._shared.options import option_names, replace_options
+from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry import GeometryOptions
 from deepdetect.matching.options import PRESETS, MatchingOptions
 
@@ -44,7 +44,7 @@ class Outer:
 )
 def test_changed(changes: dict[str, object], expected: Outer) -> None:
     options = Outer()
-    assert changed(options, **changes) == expected
+    assert replace_options(options, **changes) == expected
     assert options == Outer()
 
 
@@ -57,18 +57,20 @@ def test_names_of_nested_options() -> None:
 )
 def test_an_unknown_name(given: str, meant: str) -> None:
     with pytest.raises(OptionError, match=f"unknown option '{given}': did you mean '{meant}'"):
-        changed(Outer(), **{given: 1})
+        replace_options(Outer(), **{given: 1})
 
 
 def test_a_refused_value() -> None:
     with pytest.raises(OptionError, match="plain must be 0 or more, not -1"):
-        changed(Outer(), plain=-1)
+        replace_options(Outer(), plain=-1)
     with pytest.raises(OptionError, match="threshold"):
-        changed(MatchingOptions(), threshold=2)
+        replace_options(MatchingOptions(), threshold=2)
 
 
 def test_matching_options() -> None:
-    options = changed(MatchingOptions(), threshold=0.25, ratio=0.8, estimator="ransac", seed=4)
+    options = replace_options(
+        MatchingOptions(), threshold=0.25, ratio=0.8, estimator="ransac", seed=4
+    )
     assert options.selection.threshold == 0.25
     assert options.ratio == 0.8
     assert (options.geometry.estimator, options.geometry.seed) == ("ransac", 4)
@@ -76,7 +78,7 @@ def test_matching_options() -> None:
 
 
 def test_a_whole_group_and_one_value_of_it() -> None:
-    options = changed(
+    options = replace_options(
         MatchingOptions(),
         geometry=GeometryOptions(model="homography"),
         seed=4,

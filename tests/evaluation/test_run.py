@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 
 from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError
 from deepdetect.evaluation import run as run_module
-from deepdetect.evaluation.baselines import CLASSICAL, Features, Method
+from deepdetect.evaluation.baselines import CLASSICAL, Method
 from deepdetect.evaluation.metrics import one_to_one
 from deepdetect.evaluation.protocols import (
     BENCHMARKS,
@@ -32,6 +32,7 @@ from deepdetect.evaluation.protocols.descriptor_speed import descriptor_steps
 from deepdetect.evaluation.protocols.paper_numbers import NOTEBOOK_MATCHES
 from deepdetect.evaluation.protocols.whole_pairs import whole_pair_steps
 from deepdetect.evaluation.workspace import Workspace
+from deepdetect.features.keypoints import Keypoints
 
 MADE = "results made, not found in the cache"
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
@@ -43,7 +44,7 @@ def gray(path: Path) -> np.ndarray:
 
 
 def broken_method() -> Method:
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         raise cv2.error("it fails,\nas OpenCV does")
 
     return Method("broken", "Broken", detect, CLASSICAL["fast"].describe)

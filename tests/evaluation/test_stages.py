@@ -13,10 +13,11 @@ from scipy.spatial.distance import cdist
 
 from deepdetect import OptionError
 from deepdetect.evaluation import stages
-from deepdetect.evaluation.baselines import CLASSICAL, Features, Method
+from deepdetect.evaluation.baselines import CLASSICAL, Method
 from deepdetect.evaluation.cache import StageCache, file_digest
 from deepdetect.evaluation.metering import Meter
 from deepdetect.evaluation.stages import MatchSettings, find_keypoints, find_matches
+from deepdetect.features.keypoints import Keypoints
 from deepdetect.io.image import load_image, luma
 
 Pair = tuple[Path, Path]
@@ -35,11 +36,11 @@ def counted(method: Method) -> tuple[Method, list[str]]:
     """Return the method, and what was asked of it."""
     asked: list[str] = []
 
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         asked.append("detect")
         return method.detect(rgb)
 
-    def describe(rgb: np.ndarray, features: Features) -> np.ndarray:
+    def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         asked.append("describe")
         return method.describe(rgb, features)
 
@@ -49,14 +50,14 @@ def counted(method: Method) -> tuple[Method, list[str]]:
 def points(*rows: tuple[float, float], **more: np.ndarray) -> Method:
     """Make a method that finds the same points everywhere."""
 
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         xy = np.array(rows, np.float32).reshape(-1, 2)
-        return Features(xy, np.linspace(1, 0, len(xy)), (rgb.shape[1], rgb.shape[0]), **more)
+        return Keypoints(xy, np.linspace(1, 0, len(xy)), (rgb.shape[1], rgb.shape[0]), **more)
 
     return Method("points", "Points", detect, CLASSICAL["harris"].describe)
 
 
-def assert_same(first: Features, second: Features) -> None:
+def assert_same(first: Keypoints, second: Keypoints) -> None:
     for name in ("xy", "scores", "sizes", "angles", "octaves", "descriptors"):
         one, other = getattr(first, name), getattr(second, name)
         if one is None:

@@ -18,7 +18,7 @@ from deepdetect.evaluation.weights_quality import (
     oxford_quality,
     oxford_steps,
 )
-from deepdetect.features.matchers.ratio import DescriptorMatches
+from deepdetect.features.matchers.matching import DescriptorMatches
 from deepdetect.geometry.residuals import transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.labels import fuse

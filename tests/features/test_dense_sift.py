@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepdetect import OptionError
-from deepdetect._shared import threads
-from deepdetect.features.dense_sift import dense_sift, root
-from deepdetect.features.sift import opencv_sift_descriptors
+from deepdetect._shared import parallel
+from deepdetect.features.dense_sift import dense_sift
+from deepdetect.features.sift import opencv_sift_descriptors, to_root_sift
 from deepdetect.io.image import luma
 
 
@@ -65,8 +65,8 @@ def test_does_not_depend_on_the_number_of_threads(
     xy = every_pixel(gray)
     found = []
     for count in (1, 2, 7):
-        monkeypatch.setattr(threads, "processor_count", lambda count=count: count)
-        found.append(root(dense_sift(gray, xy)))
+        monkeypatch.setattr(parallel, "processor_count", lambda count=count: count)
+        found.append(to_root_sift(dense_sift(gray, xy)))
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_array_equal(found[0], found[2])
 
@@ -74,7 +74,7 @@ def test_does_not_depend_on_the_number_of_threads(
 def test_a_flat_image_has_no_gradient(photo: np.ndarray) -> None:
     flat = np.full((60, 60), 90, np.uint8)
     assert not dense_sift(flat, every_pixel(flat)).any()
-    assert not root(dense_sift(flat, every_pixel(flat))).any()
+    assert not to_root_sift(dense_sift(flat, every_pixel(flat))).any()
 
 
 def test_no_keypoints_give_no_descriptors() -> None:
@@ -94,9 +94,9 @@ def test_root_in_place_is_the_same(photo: np.ndarray) -> None:
     gray = luma(photo)
     sift = dense_sift(gray, every_pixel(gray)[:500])
     kept = sift.copy()
-    expected = root(sift)
+    expected = to_root_sift(sift)
     np.testing.assert_array_equal(sift, kept)
-    assert root(sift, overwrite=True) is sift
+    assert to_root_sift(sift, overwrite=True) is sift
     np.testing.assert_array_equal(sift, expected)
 
 
@@ -104,5 +104,7 @@ def test_root_is_the_root_of_each_share(photo: np.ndarray) -> None:
     gray = luma(photo)[:60, :60]
     sift = dense_sift(gray, every_pixel(gray))
     shares = sift / np.maximum(sift.sum(1, keepdims=True), 1)
-    np.testing.assert_allclose(root(sift), np.minimum(512 * np.sqrt(shares), 255), atol=0.501)
-    assert cv2.norm(root(sift)[1000].astype(np.float32)) == pytest.approx(512, rel=0.005)
+    np.testing.assert_allclose(
+        to_root_sift(sift), np.minimum(512 * np.sqrt(shares), 255), atol=0.501
+    )
+    assert cv2.norm(to_root_sift(sift)[1000].astype(np.float32)) == pytest.approx(512, rel=0.005)

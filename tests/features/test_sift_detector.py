@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.features.sift_detector import CELLS, MOST, sparse_features, spread
+from deepdetect.features.sift_detector import SiftOptions, detect_sift, spread_over_grid
 from deepdetect.io.image import luma
 
 
@@ -17,7 +17,7 @@ def blob(x: float, y: float, sigma: float, shape: tuple[int, int] = (120, 140)) 
 
 
 def cells_of(xy: np.ndarray, size: tuple[int, int]) -> list[tuple[int, int]]:
-    side = max(size) / CELLS
+    side = max(size) / SiftOptions.grid_cells
     return [(int(x // side), int(y // side)) for x, y in xy]
 
 
@@ -25,15 +25,15 @@ def cells_of(xy: np.ndarray, size: tuple[int, int]) -> list[tuple[int, int]]:
 @pytest.mark.parametrize(("x", "y"), [(60, 50), (80.3, 41.7)])
 def test_a_blob_is_found_at_its_centre(x: float, y: float, sigma: float) -> None:
     """The centre of the first pixel is (0, 0)."""
-    found = sparse_features(blob(x, y, sigma)).xy
+    found = detect_sift(blob(x, y, sigma)).xy
     assert len(found)
     np.testing.assert_allclose(found, np.broadcast_to([x, y], found.shape), atol=0.1)
 
 
 def test_there_is_one_descriptor_for_each_position(photo: np.ndarray) -> None:
     gray = luma(photo)
-    found = sparse_features(gray)
-    assert 100 < len(found) == len(found.xy) == len(found.descriptors) <= MOST
+    found = detect_sift(gray)
+    assert 100 < len(found) == len(found.xy) == len(found.descriptors) <= SiftOptions.max_keypoints
     assert found.xy.dtype == np.float32
     assert found.descriptors.dtype == np.uint8
     assert found.descriptors.shape[1] == 128
@@ -43,13 +43,13 @@ def test_there_is_one_descriptor_for_each_position(photo: np.ndarray) -> None:
 
 def test_descriptors_are_rootsift(photo: np.ndarray) -> None:
     """Square roots of shares that sum to 1 have the norm 1, here times 512."""
-    descriptors = sparse_features(luma(photo)).descriptors.astype(float)
+    descriptors = detect_sift(luma(photo)).descriptors.astype(float)
     np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 512, rtol=0.01)
 
 
 def test_descriptors_turn_with_the_image(photo: np.ndarray) -> None:
     gray = luma(photo)
-    upright, turned = sparse_features(gray), sparse_features(np.rot90(gray).copy())
+    upright, turned = detect_sift(gray), detect_sift(np.rot90(gray).copy())
     first, second = (each.descriptors.astype(np.float32) for each in (upright, turned))
     nearest = ((first**2).sum(1)[:, None] + (second**2).sum(1) - 2 * first @ second.T).argmin(1)
     # A quarter turn takes the pixel (x, y) to (y, W - 1 - x).
@@ -60,26 +60,26 @@ def test_descriptors_turn_with_the_image(photo: np.ndarray) -> None:
 
 @pytest.mark.parametrize("most", [0, 1, 7, 120])
 def test_there_are_no_more_than_asked_for(photo: np.ndarray, most: int) -> None:
-    assert len(sparse_features(luma(photo), most)) == most
+    assert len(detect_sift(luma(photo), SiftOptions(max_keypoints=most))) == most
 
 
 def test_faint_parts_have_keypoints_too(photo: np.ndarray) -> None:
     """The strongest of all would nearly all be right of the middle."""
     gray = luma(photo)
     gray[:, :128] = 90 + gray[:, :128] // 4
-    xy = sparse_features(gray, 150).xy
+    xy = detect_sift(gray, SiftOptions(max_keypoints=150)).xy
     assert (xy[:, 0] < 120).mean() > 0.15
 
 
 def test_is_the_same_on_repetition(photo: np.ndarray) -> None:
-    first, second = (sparse_features(luma(photo), 90) for _ in range(2))
+    first, second = (detect_sift(luma(photo), SiftOptions(max_keypoints=90)) for _ in range(2))
     np.testing.assert_array_equal(first.xy, second.xy)
     np.testing.assert_array_equal(first.descriptors, second.descriptors)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (5, 5), (1, 9), (64, 80)])
 def test_a_flat_image_has_no_keypoints(shape: tuple[int, int]) -> None:
-    found = sparse_features(np.full(shape, 90, np.uint8))
+    found = detect_sift(np.full(shape, 90, np.uint8))
     assert found.xy.shape == (0, 2)
     assert found.descriptors.shape == (0, 128)
     assert found.descriptors.dtype == np.uint8
@@ -91,7 +91,7 @@ def test_a_flat_image_has_no_keypoints(shape: tuple[int, int]) -> None:
 )
 def test_tiny_images_are_taken(shape: tuple[int, int], seed: int) -> None:
     gray = np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
-    found = sparse_features(gray)
+    found = detect_sift(gray)
     assert found.xy.shape == (len(found), 2)
     assert found.descriptors.shape == (len(found), 128)
 
@@ -99,16 +99,16 @@ def test_tiny_images_are_taken(shape: tuple[int, int], seed: int) -> None:
 def test_spread_takes_the_strongest_of_each_cell_before_any_second() -> None:
     xy = np.array([[1, 1], [2, 2], [3, 1], [50, 50], [51, 50], [95, 5]], float)
     strength = np.array([9.0, 8, 7, 2, 3, 1])
-    assert spread(xy, strength, (100, 100), 6).tolist() == [0, 4, 5, 1, 3, 2]
-    assert spread(xy, strength, (100, 100), 3).tolist() == [0, 4, 5]
+    assert spread_over_grid(xy, strength, (100, 100), 6).tolist() == [0, 4, 5, 1, 3, 2]
+    assert spread_over_grid(xy, strength, (100, 100), 3).tolist() == [0, 4, 5]
 
 
 def test_spread_has_square_cells() -> None:
     """24 of them along the longer side, here of 10 pixels each way."""
     xy = np.array([[5, 5], [5, 9], [5, 11], [9, 5], [11, 5]], float)
     strength = np.arange(5, 0, -1.0)
-    assert spread(xy, strength, (240, 40), 3).tolist() == [0, 2, 4]
-    assert spread(xy[:, ::-1], strength, (40, 240), 3).tolist() == [0, 2, 4]
+    assert spread_over_grid(xy, strength, (240, 40), 3).tolist() == [0, 2, 4]
+    assert spread_over_grid(xy[:, ::-1], strength, (40, 240), 3).tolist() == [0, 2, 4]
 
 
 @given(
@@ -124,7 +124,7 @@ def test_spread_takes_cells_in_turn(
     generator = np.random.default_rng(seed)
     xy = generator.random((count, 2)) ** (1 + clumped) * size
     strength = generator.permutation(count).astype(float)
-    rows = spread(xy, strength, size, most).tolist()
+    rows = spread_over_grid(xy, strength, size, most).tolist()
     assert len(rows) == len(set(rows)) == min(count, most)
     cell = cells_of(xy, size)
     waiting = {

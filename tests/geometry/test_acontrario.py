@@ -13,10 +13,10 @@ from deepdetect.geometry import (
     estimate_geometry,
     transfer_errors,
 )
-from deepdetect.geometry.acontrario import DRAWN, LARGEST, false_alarms
+from deepdetect.geometry.acontrario import MAX_LOG10_NFA, MINIMAL_SAMPLE_SIZE, log10_nfa
 
 SIZE = (640, 480)
-KINDS = sorted(DRAWN)
+KINDS = sorted(MINIMAL_SAMPLE_SIZE)
 
 
 def errors(inliers: int, count: int) -> np.ndarray:
@@ -34,10 +34,10 @@ def chance(kind: str, threshold: float, size: tuple[int, int]) -> float:
 @pytest.mark.parametrize(("inliers", "count"), [(8, 9), (12, 100), (30, 30), (200, 1000)])
 def test_equals_the_formula_of_moisan_and_stival(kind: str, inliers: int, count: int) -> None:
     """(n - d) (n over k) (k over d) p^(k - d), in whole numbers of any length."""
-    drawn = DRAWN[kind]
+    drawn = MINIMAL_SAMPLE_SIZE[kind]
     tests = (count - drawn) * comb(count, inliers) * comb(inliers, drawn)
     expected = log10(tests) + (inliers - drawn) * log10(chance(kind, 2, SIZE))
-    found = false_alarms(errors(inliers, count), kind, 2, SIZE)
+    found = log10_nfa(errors(inliers, count), kind, 2, SIZE)
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
@@ -52,12 +52,12 @@ def test_more_inliers_are_less_likely_to_be_chance(
     kind: str, count: int, share: float, threshold: float, size: tuple[int, int]
 ) -> None:
     """Of as many matches, once they are more than chance alone would give."""
-    drawn = DRAWN[kind]
+    drawn = MINIMAL_SAMPLE_SIZE[kind]
     inliers = drawn + 1 + int(share * (count - drawn - 2))
     assume(inliers < count)
     assume(inliers - drawn > count * chance(kind, threshold, size))
     fewer, more = (
-        false_alarms(errors(k, count), kind, threshold, size) for k in (inliers, inliers + 1)
+        log10_nfa(errors(k, count), kind, threshold, size) for k in (inliers, inliers + 1)
     )
     assert more < fewer
 
@@ -72,45 +72,42 @@ def test_as_many_inliers_as_chance_gives_are_no_evidence(
     kind: str, count: int, threshold: float, size: tuple[int, int]
 ) -> None:
     inliers = int(count * chance(kind, threshold, size))
-    assert false_alarms(errors(inliers, count), kind, threshold, size) > 0
+    assert log10_nfa(errors(inliers, count), kind, threshold, size) > 0
 
 
 @given(kind=st.sampled_from(KINDS), inliers=st.integers(8, 200), further=st.integers(1, 500))
 def test_more_wrong_matches_are_less_trusted(kind: str, inliers: int, further: int) -> None:
     alone, among = (
-        false_alarms(errors(inliers, count), kind, 1.5, SIZE)
-        for count in (inliers, inliers + further)
+        log10_nfa(errors(inliers, count), kind, 1.5, SIZE) for count in (inliers, inliers + further)
     )
     assert among > alone
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_inliers_in_a_larger_image_are_trusted_more(kind: str) -> None:
-    small, large = (
-        false_alarms(errors(20, 60), kind, 3, size) for size in [(200, 150), (800, 600)]
-    )
+    small, large = (log10_nfa(errors(20, 60), kind, 3, size) for size in [(200, 150), (800, 600)])
     assert large < small
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [0, 1, 4, 7])
 def test_as_few_as_a_model_is_drawn_from_are_never_evidence(kind: str, count: int) -> None:
-    inliers = min(count, DRAWN[kind])
-    assert false_alarms(errors(inliers, count), kind, 3, SIZE) == float("inf")
-    assert false_alarms(errors(inliers, 500), kind, 3, SIZE) == float("inf")
+    inliers = min(count, MINIMAL_SAMPLE_SIZE[kind])
+    assert log10_nfa(errors(inliers, count), kind, 3, SIZE) == float("inf")
+    assert log10_nfa(errors(inliers, 500), kind, 3, SIZE) == float("inf")
 
 
 def test_errors_at_the_threshold_or_unknown_do_not_count() -> None:
     given_ = np.concatenate([np.zeros(20), np.full(3, 3.0), np.full(3, np.inf), np.full(3, np.nan)])
-    expected = false_alarms(errors(20, 29), "homography", 3, SIZE)
-    assert false_alarms(given_, "homography", 3, SIZE) == expected
+    expected = log10_nfa(errors(20, 29), "homography", 3, SIZE)
+    assert log10_nfa(given_, "homography", 3, SIZE) == expected
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_in_an_image_of_a_few_pixels_everything_is_near(kind: str) -> None:
     """The chance is 1, not more."""
-    assert false_alarms(errors(30, 30), kind, 3, (5, 5)) > 0
-    assert np.isfinite(false_alarms(errors(30, 30), kind, 3, (1, 1)))
+    assert log10_nfa(errors(30, 30), kind, 3, (5, 5)) > 0
+    assert np.isfinite(log10_nfa(errors(30, 30), kind, 3, (1, 1)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -124,4 +121,4 @@ def test_random_matches_are_not_trusted(kind: str) -> None:
         matrix = estimate_geometry(points0, points1, options).matrix
         if matrix is not None:
             found = measure(points0, points1, matrix)
-            assert false_alarms(found, kind, threshold, (200, 200)) > LARGEST
+            assert log10_nfa(found, kind, threshold, (200, 200)) > MAX_LOG10_NFA

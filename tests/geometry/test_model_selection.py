@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect import GeometryOptions, estimate_geometry
-from deepdetect.geometry.model_selection import has_depth
+from deepdetect.geometry.model_selection import select_model
 
 CAMERA = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], float)
 PLANE = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 30.0], [1e-4, 5e-5, 1.0]])
@@ -40,12 +40,12 @@ def test_auto_of_too_few_matches_is_nothing() -> None:
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
 def test_what_a_plane_explains_has_no_depth(explained: list[bool]) -> None:
     inliers = np.array(explained)
-    assert not has_depth(inliers, inliers)
-    assert not has_depth(np.ones_like(inliers), inliers)
+    assert select_model(inliers, inliers) == "homography"
+    assert select_model(np.ones_like(inliers), inliers) == "homography"
 
 
 def test_depth_needs_a_share_of_the_rest_and_of_all() -> None:
     index = np.arange(1000)
-    assert has_depth(index < 800, index < 950)
-    assert not has_depth(index < 800, index < 880)  # less than half of the rest
-    assert not has_depth(index < 950, index < 1000)  # next to nothing of all
+    assert select_model(index < 800, index < 950) == "fundamental"
+    assert select_model(index < 800, index < 880) == "homography"  # less than half of the rest
+    assert select_model(index < 950, index < 1000) == "homography"  # next to nothing of all

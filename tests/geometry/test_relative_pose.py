@@ -38,7 +38,7 @@ def test_exact_matches_give_the_exact_pose(turned: Any) -> None:
     assert turned.direction_error(pose.translation) < 0.1
     assert np.linalg.norm(pose.translation) == pytest.approx(1)
     np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-12)
-    assert pose.in_front == 1
+    assert pose.cheirality_ratio == 1
     assert pose.inliers.all()
 
 
@@ -62,7 +62,7 @@ def test_real_matches_give_the_pose(
     pose = estimate_relative_pose(*turned_matches, turned.calibration)
     assert turned.rotation_error(pose.rotation) < 0.5
     assert turned.direction_error(pose.translation) < 3
-    assert pose.in_front > 0.95
+    assert pose.cheirality_ratio > 0.95
 
 
 def test_is_the_same_for_a_seed(turned: Any) -> None:

@@ -5,10 +5,10 @@ import pytest
 
 from deepdetect.geometry import epipolar_errors, transform_points
 from deepdetect.geometry.rescaling import (
+    downscale,
     scaled_fundamental,
     scaled_homography,
     scaled_points,
-    shrunk,
 )
 
 MILD = np.array([[0.9, -0.12, 25.0], [0.15, 0.95, -8.0], [2e-4, -1e-4, 1.0]])
@@ -35,7 +35,7 @@ def centre(gray: np.ndarray) -> np.ndarray:
     ],
 )
 def test_a_spot_is_where_its_scaled_position_says(x: int, y: int, width: int, height: int) -> None:
-    small, scale = shrunk(spot(x, y, width, height), 200)
+    small, scale = downscale(spot(x, y, width, height), 200)
     assert max(small.shape) == 200
     np.testing.assert_allclose(centre(small), scaled_points(np.array([x, y]), scale), atol=0.05)
 
@@ -43,13 +43,13 @@ def test_a_spot_is_where_its_scaled_position_says(x: int, y: int, width: int, he
 @pytest.mark.parametrize("shape", [(1, 1), (1, 200), (150, 200)])
 def test_small_images_stay_as_they_are(shape: tuple[int, int]) -> None:
     gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    same, scale = shrunk(gray, 200)
+    same, scale = downscale(gray, 200)
     assert scale == 1
     np.testing.assert_array_equal(same, gray)
 
 
 def test_a_line_of_pixels_keeps_one_row() -> None:
-    assert shrunk(np.zeros((1, 5000), np.uint8), 200)[0].shape == (1, 200)
+    assert downscale(np.zeros((1, 5000), np.uint8), 200)[0].shape == (1, 200)
 
 
 def test_a_scaled_homography_maps_scaled_points() -> None:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from deepdetect.geometry import epipolar_errors
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.triangulation import (
+    correct_matches,
     fundamental_matrix,
-    onto_epipolar_lines,
     triangulate,
 )
 
@@ -56,9 +56,9 @@ def test_is_exact_without_noise(
     points, seen0, seen1, *pose = scene(angles, direction)
     before = (points @ pose[0].T + pose[1])[:, 2] > 0.5
     found = triangulate(seen0, seen1, BOTH, *pose)
-    wide = before & (found.parallax > np.radians(0.05))
+    wide = before & (found.triangulation_angle > np.radians(0.05))
     np.testing.assert_allclose(found.points[wide], points[wide], rtol=1e-5, atol=1e-5)
-    assert found.in_front[wide].all()
+    assert found.cheirality[wide].all()
     assert found.reprojection_errors[before].max() < 1e-6
 
 
@@ -102,7 +102,7 @@ def test_agrees_with_opencvs_correction() -> None:
     generator = np.random.default_rng(1)
     noisy0, noisy1 = (seen + generator.normal(0, 1, seen.shape) for seen in (seen0, seen1))
     fundamental = fundamental_matrix(BOTH, *pose)
-    moved = onto_epipolar_lines(noisy0, noisy1, fundamental)
+    moved = correct_matches(noisy0, noisy1, fundamental)
     assert epipolar_errors(*moved, fundamental).max() < 2e-3  # two steps, not the root
     expected = cv2.correctMatches(fundamental, noisy0[None], noisy1[None])
     for own, other in zip(moved, expected, strict=True):
@@ -111,15 +111,15 @@ def test_agrees_with_opencvs_correction() -> None:
 
 def test_what_lies_behind_a_camera_is_told() -> None:
     _, seen0, seen1, rotation, translation = scene()
-    assert triangulate(seen0, seen1, BOTH, rotation, translation).in_front.all()
-    assert not triangulate(seen0, seen1, BOTH, rotation, -translation).in_front.any()
+    assert triangulate(seen0, seen1, BOTH, rotation, translation).cheirality.all()
+    assert not triangulate(seen0, seen1, BOTH, rotation, -translation).cheirality.any()
     # Before the first camera, behind the second, which has passed it.
     one = np.array([[0.1, 0.2, 2.0]])
     passed = np.array([0.3, 0, -4.0])
     seen = CAMERA0.project(one), CAMERA1.project(one + passed)
     found = triangulate(*seen, BOTH, np.eye(3), passed)
     np.testing.assert_allclose(found.points, one)
-    assert not found.in_front[0]
+    assert not found.cheirality[0]
 
 
 def test_the_parallax_is_the_angle_between_the_rays() -> None:
@@ -129,7 +129,7 @@ def test_the_parallax_is_the_angle_between_the_rays() -> None:
     to_first, to_second = points, points - centre
     lengths = np.linalg.norm(to_first, axis=1) * np.linalg.norm(to_second, axis=1)
     expected = np.arccos(np.einsum("ij,ij->i", to_first, to_second) / lengths)
-    np.testing.assert_allclose(found.parallax, expected, rtol=1e-6)
+    np.testing.assert_allclose(found.triangulation_angle, expected, rtol=1e-6)
 
 
 def test_parallel_rays_and_no_matches_raise_nothing() -> None:
@@ -137,7 +137,7 @@ def test_parallel_rays_and_no_matches_raise_nothing() -> None:
     both = Calibration(camera, camera)
     point = np.array([[100.0, 200.0]])
     found = triangulate(point, point, both, np.eye(3), np.array([-1.0, 0, 0]))
-    assert not found.in_front[0]
+    assert not found.cheirality[0]
     assert not np.isfinite(found.points).all()
-    assert found.parallax[0] == pytest.approx(0)
+    assert found.triangulation_angle[0] == pytest.approx(0)
     assert triangulate(*np.empty((2, 0, 2)), both, np.eye(3), np.ones(3)).points.shape == (0, 3)

@@ -5,12 +5,12 @@ import pytest
 from scipy.ndimage import shift as shifted
 
 from deepdetect.geometry.zncc import (
-    agreement,
-    away_from_border,
-    local_correlation,
-    locally_normalised,
-    smoothed,
-    warp_back,
+    erode_mask,
+    gaussian_blur,
+    local_zncc,
+    median_local_zncc,
+    normalise_local_contrast,
+    warp_to_reference,
 )
 
 
@@ -20,14 +20,14 @@ def noise(seed: int = 0, size: tuple[int, int] = (64, 80)) -> np.ndarray:
 
 def test_equals_numpys_correlation_of_a_window() -> None:
     first, second = noise(0), noise(1) // 2 + noise(0) // 2
-    found = local_correlation(first, second, np.ones(first.shape, bool))
+    found = local_zncc(first, second, np.ones(first.shape, bool))
     windows = [image[20:35, 30:45].ravel() for image in (first, second)]
     assert found[27, 37] == pytest.approx(np.corrcoef(*windows)[0, 1], abs=1e-5)
 
 
 def test_light_and_contrast_do_not_matter() -> None:
     first = noise() // 2
-    found = local_correlation(first, first + 90, np.ones(first.shape, bool))
+    found = local_zncc(first, first + 90, np.ones(first.shape, bool))
     assert np.nanmin(found) == pytest.approx(1, abs=1e-6)
 
 
@@ -36,7 +36,7 @@ def test_flat_windows_and_those_beyond_the_overlap_do_not_count() -> None:
     image[:, :40] = 7
     valid = np.ones(image.shape, bool)
     valid[40:] = False
-    found = local_correlation(image, image, valid)
+    found = local_zncc(image, image, valid)
     assert np.isnan(found[:, :32]).all()  # flat, seven pixels before the edge at 40
     assert np.isnan(found[33:]).all()
     assert np.isfinite(found[8:32, 48:70]).all()
@@ -46,18 +46,18 @@ def test_warping_back_undoes_a_shift_of_whole_pixels() -> None:
     image = noise()
     moved = shifted(image, (3, 5), order=0, cval=0)  # B(x + 5, y + 3) = A(x, y)
     homography = np.array([[1.0, 0, 5], [0, 1, 3], [0, 0, 1]])
-    warped, seen = warp_back(moved, homography, (80, 64))
+    warped, seen = warp_to_reference(moved, homography, (80, 64))
     assert seen[: 64 - 3, : 80 - 5].all()
     assert not seen[64 - 3 :].any()
     assert not seen[:, 80 - 5 :].any()
     np.testing.assert_array_equal(warped[:61, :75], image[:61, :75])
-    assert agreement(image, moved, homography) == pytest.approx(1, abs=1e-6)
-    assert abs(agreement(image, moved, np.eye(3))) < 0.2
+    assert median_local_zncc(image, moved, homography) == pytest.approx(1, abs=1e-6)
+    assert abs(median_local_zncc(image, moved, np.eye(3))) < 0.2
 
 
 def test_without_an_overlap_nothing_agrees() -> None:
     far = np.array([[1.0, 0, 500], [0, 1, 0], [0, 0, 1]])
-    assert agreement(noise(), noise(), far) == -1
+    assert median_local_zncc(noise(), noise(), far) == -1
 
 
 def test_what_lies_beyond_the_border_does_not_bleed_in() -> None:
@@ -65,8 +65,8 @@ def test_what_lies_beyond_the_border_does_not_bleed_in() -> None:
     second[:, 60:] = 255
     seen = np.ones(first.shape, bool)
     seen[:, 60:] = False
-    inside = away_from_border(seen, 1.25)
-    difference = np.abs(smoothed(first, 1.25) - smoothed(second, 1.25))
+    inside = erode_mask(seen, 1.25)
+    difference = np.abs(gaussian_blur(first, 1.25) - gaussian_blur(second, 1.25))
     assert inside[8:-8, 8:55].all()
     assert difference[inside].max() < 0.5
     assert difference[:, 57:60].max() > 5
@@ -74,7 +74,7 @@ def test_what_lies_beyond_the_border_does_not_bleed_in() -> None:
 
 def test_normalised_images_correlate_as_their_windows_do() -> None:
     first, second = noise(0), noise(1) // 2 + noise(0) // 2
-    a, b = (locally_normalised(image)[10:-10, 10:-10] for image in (first, second))
-    windows = local_correlation(first, second, np.ones(first.shape, bool))
+    a, b = (normalise_local_contrast(image)[10:-10, 10:-10] for image in (first, second))
+    windows = local_zncc(first, second, np.ones(first.shape, bool))
     assert (a * b).mean() == pytest.approx(np.nanmean(windows), abs=0.03)
-    assert np.abs(locally_normalised(np.full((40, 40), 9, np.uint8))).max() < 1e-3
+    assert np.abs(normalise_local_contrast(np.full((40, 40), 9, np.uint8))).max() < 1e-3

@@ -13,7 +13,7 @@ from deepdetect import (
     OptionError,
     SelectionOptions,
 )
-from deepdetect._shared.options import changed, option_names
+from deepdetect._shared.options import option_names, replace_options
 from deepdetect.matching.options import PRESETS, get_preset
 
 MATRIX = np.array([[1, 0, 7], [0, 1, 0], [0, 0, 1]], float)
@@ -115,7 +115,7 @@ def test_a_single_option_finds_its_place_and_leaves_the_others(
 ) -> None:
     preset = get_preset("published")
     before = flat(preset)
-    options = changed(preset, **{name: value})
+    options = replace_options(preset, **{name: value})
     after = flat(options)
     assert type(options) is MatchingOptions
     np.testing.assert_array_equal(value_at(options, path), value)
@@ -144,15 +144,15 @@ def test_every_option_is_in_the_table_above() -> None:
     ],
 )
 def test_a_whole_group_can_be_given(name: str, value: Any) -> None:
-    assert getattr(changed(get_preset("published"), **{name: value}), name) is value
+    assert getattr(replace_options(get_preset("published"), **{name: value}), name) is value
 
 
 def test_the_two_cameras_of_an_essential_matrix_come_with_it() -> None:
     """Options that are only valid together can be given together."""
-    options = changed(MatchingOptions(), model="essential", camera0=MATRIX, camera1=MATRIX)
+    options = replace_options(MatchingOptions(), model="essential", camera0=MATRIX, camera1=MATRIX)
     assert options.geometry.model == "essential"
     with pytest.raises(OptionError, match="needs both cameras"):
-        changed(MatchingOptions(), model="essential", camera0=MATRIX)
+        replace_options(MatchingOptions(), model="essential", camera0=MATRIX)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +168,7 @@ def test_the_two_cameras_of_an_essential_matrix_come_with_it() -> None:
 )
 def test_an_unknown_option_brings_the_nearest(name: str, meant: str) -> None:
     with pytest.raises(OptionError, match=f"unknown option '{name}': did you mean '{meant}'"):
-        changed(MatchingOptions(), **{name: 1})
+        replace_options(MatchingOptions(), **{name: 1})
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,10 @@ def test_an_unknown_option_brings_the_nearest(name: str, meant: str) -> None:
     ],
 )
 def test_wrong_options_say_what_is_wrong(values: dict[str, Any], message: str) -> None:
-    for make in (MatchingOptions, lambda **values: changed(get_preset("published"), **values)):
+    for make in (
+        MatchingOptions,
+        lambda **values: replace_options(get_preset("published"), **values),
+    ):
         with pytest.raises(OptionError) as caught:
             make(**values)
         assert message in str(caught.value)

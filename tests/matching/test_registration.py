@@ -30,7 +30,7 @@ def test_the_second_image_comes_to_lie_on_the_first(photo: np.ndarray, second: n
     assert np.abs(found.warped.astype(int) - photo)[inside].mean() < 4
     assert found.difference()[inside].mean() < 4
     assert not found.difference()[~found.seen].any()
-    assert found.agreement > 0.95
+    assert found.zncc > 0.95
     assert found.matches > 5000
 
 

@@ -15,7 +15,7 @@ from PIL import Image
 from deepdetect import DeepDetect, match_images
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
-from deepdetect.features.sift_detector import sparse_features
+from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.geometry.camera import Calibration, Camera, calibration_from_focal
 from deepdetect.geometry.relative_pose import RelativePose, estimate_relative_pose
 from deepdetect.io.image import load_image, luma
@@ -24,7 +24,6 @@ from deepdetect.reconstruction.checks import (
     check_images,
     check_matches,
     check_pose,
-    one_a_cell,
 )
 from deepdetect.reconstruction.subpixel import refine_matches
 
@@ -37,7 +36,9 @@ def detector() -> DeepDetect:
 
 
 def sparse(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    described = [sparse_features(luma(image), 2000) for image in (first, second)]
+    described = [
+        detect_sift(luma(image), SiftOptions(max_keypoints=2000)) for image in (first, second)
+    ]
     found = match_descriptors(
         *(features.descriptors for features in described),
         get_matcher("exact"),
@@ -181,7 +182,7 @@ def test_scenes_with_depth_pass(shared: Path, name: str) -> None:
     evidence = check_matches(*points, SIZE)
     assert evidence.explained.mean() > 0.8
     assert evidence.by_homography < 0.6
-    assert evidence.log_false_alarms < -50
+    assert evidence.log10_nfa < -50
 
 
 def test_a_good_pair_passes_with_its_pose_and_focal_length(turned: Any, refined: Any) -> None:
@@ -244,7 +245,7 @@ def test_no_pose_and_points_behind(turned: Any, refined: Any, one_line) -> None:
     calibration = turned.calibration
     evidence = check_matches(*refined, SIZE, calibration)
     pose = estimate_relative_pose(*refined, calibration)
-    behind = replace(pose, in_front=0.4)
+    behind = replace(pose, cheirality_ratio=0.4)
     for one, message in (
         (None, "no pose of the cameras fits"),
         (behind, "only 40% of the points would lie before both cameras"),
@@ -257,13 +258,3 @@ def test_no_pose_and_points_behind(turned: Any, refined: Any, one_line) -> None:
 
 def _worse(pose: RelativePose) -> RelativePose:
     return replace(pose, errors=pose.errors + 2)
-
-
-def test_one_match_of_each_cell() -> None:
-    points = np.random.default_rng(0).uniform(0, 100, (5000, 2))
-    rows = one_a_cell(points, cell=10)
-    assert len(rows) == 100
-    assert len(np.unique(points[rows] // 10, axis=0)) == 100
-    assert (np.diff(rows) > 0).all()
-    np.testing.assert_array_equal(rows, one_a_cell(points, cell=10))
-    assert (rows != one_a_cell(points, seed=1, cell=10)).any()

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, OptionError, ReconstructionError
-from deepdetect._shared import threads
+from deepdetect._shared import parallel
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.controls import EveryPixel
@@ -263,7 +263,7 @@ def test_is_the_same_for_any_number_of_threads(
     before = cv2.getNumThreads()
     try:
         for count in (1, 3):
-            monkeypatch.setattr(threads, "processor_count", lambda count=count: count)
+            monkeypatch.setattr(parallel, "processor_count", lambda count=count: count)
             cv2.setNumThreads(count)
             results.append(
                 [

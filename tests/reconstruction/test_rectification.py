@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect.features.matchers import get_matcher, match_descriptors
-from deepdetect.features.sift_detector import sparse_features
+from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.io.image import load_image, luma
 from deepdetect.reconstruction.rectification import judge_rectification
 
@@ -21,7 +21,7 @@ OXFORD = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
 def sparse_matches(first: Path, second: Path) -> tuple[np.ndarray, ...]:
     """Match SIFT keypoints without any geometry; positions and (width, height) of both images."""
     grays = [luma(load_image(path)) for path in (first, second)]
-    described = [sparse_features(gray, 2000) for gray in grays]
+    described = [detect_sift(gray, SiftOptions(max_keypoints=2000)) for gray in grays]
     found = match_descriptors(
         *(features.descriptors for features in described),
         get_matcher("exact"),

@@ -10,7 +10,7 @@ import pytest
 
 from deepdetect._shared.errors import ReconstructionError
 from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.features.keypoints import SelectionOptions
+from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
 from deepdetect.reconstruction.row_degeneracy import (

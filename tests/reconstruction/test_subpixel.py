@@ -113,7 +113,7 @@ def test_the_number_of_threads_does_not_matter(
 ) -> None:
     other = moved(gray, 0.4, -0.3)
     many = refine_matches(gray, other, pixels, pixels)
-    monkeypatch.setattr(subpixel, "in_threads", lambda count, work: work(0, count))
+    monkeypatch.setattr(subpixel, "parallel_for", lambda count, work: work(0, count))
     one = refine_matches(gray, other, pixels, pixels)
     np.testing.assert_array_equal(many.points1, one.points1)
     np.testing.assert_array_equal(many.converged, one.converged)

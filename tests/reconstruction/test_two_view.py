@@ -35,7 +35,7 @@ def test_pose_and_depth_are_true(turned: Any, turned_matches: Any, found: Any) -
     assert np.median(errors) < 0.015
     assert (errors < 0.05).mean() > 0.9
     assert found.unit == "baseline"
-    assert found.pose.in_front > 0.99
+    assert found.pose.cheirality_ratio > 0.99
 
 
 def test_whole_pixels_give_a_worse_model(turned: Any, turned_matches: Any, found: Any) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect._shared.options import changed
+from deepdetect._shared.options import replace_options
 from deepdetect.io.image import luma
 from deepdetect.labels import LabelOptions, fuse
 from deepdetect.training.batches import Batches
@@ -110,7 +110,7 @@ def _found(image: np.ndarray, mask: np.ndarray, view: np.ndarray, label: np.ndar
 
 def test_mirrors_come_only_when_asked_for(batches: Batches) -> None:
     """Without flips and transpositions each crop is a part of a view as it is."""
-    options = changed(OPTIONS, flips=False, transpositions=False)
+    options = replace_options(OPTIONS, flips=False, transpositions=False)
     plain = Batches(batches.feed, Schedule(options, len(batches.feed)))
     views = [
         render(photo.path, view)
@@ -127,7 +127,7 @@ def test_mirrors_come_only_when_asked_for(batches: Batches) -> None:
 
 def test_all_mirrors_come_when_asked_for(batches: Batches) -> None:
     """Crops of an image that every mirror changes: each of the eight is seen."""
-    options = changed(OPTIONS, stages=(Stage(64, 4, 60),), dark_fraction=0.0)
+    options = replace_options(OPTIONS, stages=(Stage(64, 4, 60),), dark_fraction=0.0)
 
     class Corners:
         """One image for all views, with another value at each corner."""
@@ -147,7 +147,7 @@ def test_all_mirrors_come_when_asked_for(batches: Batches) -> None:
             return iter([Corners()] * (12 - first))
 
     for flips, transpositions, count in ((True, True, 8), (True, False, 4), (False, True, 2)):
-        recipe = changed(options, flips=flips, transpositions=transpositions)
+        recipe = replace_options(options, flips=flips, transpositions=transpositions)
         seen = set()
         for images, masks in Batches(OneFeed(), Schedule(recipe, 12)).stream(0, 40):
             np.testing.assert_array_equal(masks, images[..., 0] > 0)
@@ -156,9 +156,11 @@ def test_all_mirrors_come_when_asked_for(batches: Batches) -> None:
 
 
 def test_dark_crops_keep_their_luma_to_the_level(batches: Batches) -> None:
-    dark = changed(OPTIONS, dark_fraction=1.0)
+    dark = replace_options(OPTIONS, dark_fraction=1.0)
     plain, gray = (
-        Batches(batches.feed, Schedule(changed(dark, color_jitter=share), len(batches.feed)))
+        Batches(
+            batches.feed, Schedule(replace_options(dark, color_jitter=share), len(batches.feed))
+        )
         for share in (0.0, 1.0)
     )
     for image, other in zip(plain.batch(0)[0], gray.batch(0)[0], strict=True):
@@ -167,7 +169,7 @@ def test_dark_crops_keep_their_luma_to_the_level(batches: Batches) -> None:
 
 
 def test_colors_change_and_labels_do_not(batches: Batches) -> None:
-    options = changed(OPTIONS, color_jitter=1.0)
+    options = replace_options(OPTIONS, color_jitter=1.0)
     colored = Batches(batches.feed, Schedule(options, len(batches.feed)))
     gray = 0
     for step in range(4):
@@ -206,7 +208,7 @@ def test_memory_limit_changes_nothing_but_the_time(batches: Batches) -> None:
 
 
 def test_a_stage_can_take_some_views_only(batches: Batches) -> None:
-    options = changed(OPTIONS, stages=(Stage(64, 12, 1, sides=(64,)),))
+    options = replace_options(OPTIONS, stages=(Stage(64, 12, 1, sides=(64,)),))
     small = Batches(batches.feed, Schedule(options, len(batches.feed)))
     views = [
         render(photo.path, view)
@@ -233,7 +235,7 @@ def _inside(image: np.ndarray, view: np.ndarray) -> bool:
 
 
 def test_interleaved_batches_are_those_of_the_stages_in_turn(batches: Batches) -> None:
-    schedule = Schedule(changed(OPTIONS, interleave=True), len(batches.feed))
+    schedule = Schedule(replace_options(OPTIONS, interleave=True), len(batches.feed))
     mixed = Batches(batches.feed, schedule)
     sums = sorted(int(images.sum()) for images, _ in mixed.stream(0))
     assert sums == sorted(int(images.sum()) for images, _ in batches.stream(0))

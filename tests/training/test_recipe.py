@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
-from deepdetect._shared.options import changed
+from deepdetect._shared.options import replace_options
 from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.schedule import Schedule
 
@@ -49,7 +49,7 @@ def test_bad_options_are_refused(bad: dict) -> None:
 
 def test_an_unknown_option_names_the_nearest() -> None:
     with pytest.raises(OptionError, match="did you mean 'learning_rate'"):
-        changed(TrainingOptions(), learning_rat=1)
+        replace_options(TrainingOptions(), learning_rat=1)
 
 
 def test_options_are_kept_as_json() -> None:
@@ -106,7 +106,7 @@ def test_the_last_step_is_a_milestone(steps: int, count: int) -> None:
 def test_interleaved_stages_advance_together(photos: int, stages: list[tuple[int, int]]) -> None:
     made = tuple(Stage(16, batch, epochs) for batch, epochs in stages)
     options = TrainingOptions(stages=made, short_sides=(16,))
-    mixed = Schedule(changed(options, interleave=True), photos)
+    mixed = Schedule(replace_options(options, interleave=True), photos)
     plain = Schedule(options, photos)
     positions = [mixed.position(step) for step in range(mixed.steps)]
     expected = [plain.position(step) for step in range(plain.steps)]

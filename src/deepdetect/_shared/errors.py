@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
-from typing import TypeVar
-
-Entry = TypeVar("Entry")
+from collections.abc import Iterable
 
 
 class DeepDetectError(Exception):
@@ -56,26 +53,6 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
     nearest = difflib.get_close_matches(str(name).lower(), spelled, n=1, cutoff=0.5)
     hint = f"did you mean {spelled[nearest[0]]!r}? " if nearest else ""
     return OptionError(f"unknown {kind} {name!r}: {hint}(known: {', '.join(names)})")
-
-
-def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
-    """Find an entry of a registry by its name.
-
-    Args:
-        kind: what the entries are, as "matcher".
-        name: the name.
-        registry: the entries by name.
-
-    Raises:
-        OptionError: the name is unknown (the nearest right one is named).
-
-    Example:
-        >>> look_up("answer", "yes", {"yes": True, "no": False})
-        True
-    """
-    if name not in registry:
-        raise unknown_name(kind, name, registry)
-    return registry[name]
 
 
 for _error in (

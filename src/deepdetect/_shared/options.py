@@ -5,15 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-import os
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
 from .errors import unknown_name
 
 Options = TypeVar("Options")
-Entry = TypeVar("Entry")
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
@@ -48,29 +45,7 @@ def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Paramet
     return call
 
 
-def is_path(value: str | Path) -> bool:
-    """Tell a file's path from a name: it has an ending, or a folder before it.
-
-    Example:
-        >>> [is_path(text) for text in ("dense", "dense.onnx", "./dense")]
-        [False, True, True]
-    """
-    text = str(value)
-    return bool(Path(text).suffix) or any(mark in text for mark in (os.sep, os.altsep) if mark)
-
-
-def look_up_word(kind: str, word: str | Path, registry: Mapping[str, Entry]) -> Entry:
-    """Find an entry of a registry by a word that is no path.
-
-    Raises:
-        OptionError: there is none (the nearest right one is named, and that a file would do).
-    """
-    if str(word) not in registry:
-        raise unknown_name(kind, str(word), (*registry, "or a file with its ending"))
-    return registry[str(word)]
-
-
-def changed(options: Options, **changes: Any) -> Options:
+def replace_options(options: Options, **changes: Any) -> Options:
     """Return options with some values changed, also those of options inside them.
 
     Args:
@@ -83,9 +58,9 @@ def changed(options: Options, **changes: Any) -> Options:
 
     Example:
         >>> from deepdetect.geometry import GeometryOptions
-        >>> changed(GeometryOptions(), estimator="ransac").estimator
+        >>> replace_options(GeometryOptions(), estimator="ransac").estimator
         'ransac'
-        >>> changed(GeometryOptions(), estimater="ransac")
+        >>> replace_options(GeometryOptions(), estimater="ransac")
         Traceback (most recent call last):
         ...
         deepdetect.OptionError: unknown option 'estimater': did you mean 'estimator'? \
@@ -100,7 +75,7 @@ seed)
 
 
 def option_names(options: Any) -> list[str]:
-    """List the names that `changed` takes for these options, the outer ones first."""
+    """List the names that `replace_options` takes for these options, the outer ones first."""
     fields = [field.name for field in dataclasses.fields(options) if field.init]
     inner = [getattr(options, name) for name in fields]
     nested = [option_names(value) for value in inner if dataclasses.is_dataclass(value)]

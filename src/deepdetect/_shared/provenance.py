@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from .processes import processor_count
+from .parallel import processor_count
 
 PACKAGES = ("numpy", "opencv-contrib-python-headless", "pillow", "torch", "lightning-fabric")
 """The packages that pixels, labels and weights go through."""

@@ -88,7 +88,8 @@ def benchmark(
     if name == "refine-oxford":
         _refine_oxford(data, output, as_json)
         return
-    from .._shared.errors import OptionError, look_up
+    from .._shared.errors import OptionError
+    from .._shared.registry import look_up
     from ..evaluation.baselines import CLASSICAL, find_method
     from ..evaluation.formats import report_values, save_report, table_text
     from ..evaluation.protocols import BENCHMARKS, PROTOCOLS, BenchmarkOptions, run_benchmarks

@@ -48,7 +48,7 @@ def chosen_recipe(
         detectors, label_settings: as of `chosen_label_settings`.
         values: the others, by name; None and () stand for what is not given.
     """
-    from .._shared.options import changed
+    from .._shared.options import replace_options
     from ..training.presets import training_preset
 
     given = {name: value for name, value in values.items() if value not in (None, ())}
@@ -59,4 +59,4 @@ def chosen_recipe(
     if label_settings is None:  # the preset's, as far as its detectors are taken
         chosen = given.get("detectors", recipe.detectors)
         given["label_changes"] = tuple(c for c in recipe.label_changes if c.detector in chosen)
-    return changed(recipe, **given)
+    return replace_options(recipe, **given)

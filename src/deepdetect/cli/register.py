@@ -64,7 +64,7 @@ def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: 
         "homography": found.homography.tolist(),
         "matches": found.matches,
         "overlap": round(float(found.seen.mean()), 4),
-        "correlation": round(found.agreement, 4),
+        "correlation": round(found.zncc, 4),
         "files": files,
     }
     if as_json:
@@ -74,7 +74,7 @@ def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: 
         [
             ("matches", f"{found.matches:,}"),
             ("overlap", f"{numbers['overlap']:.1%} of the first image"),
-            ("correlation", f"{found.agreement:.3f} (median of small windows; 1 is the same)"),
+            ("correlation", f"{found.zncc:.3f} (median of small windows; 1 is the same)"),
             ("written", ", ".join(str(path) for path in files)),
         ],
         f"{image1} on {image0}",

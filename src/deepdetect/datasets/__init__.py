@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from .._shared.errors import look_up
+from .._shared.registry import look_up
 from .coco import COCO
 from .download import RemoteFile
 from .middlebury import load_motorcycle

@@ -10,7 +10,8 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
-from ..features.keypoints import Keypoints, SelectionOptions, select_keypoints
+from ..features.keypoints import Keypoints
+from ..features.selection import SelectionOptions, select_keypoints
 from ..io.image import load_image
 from .backends import RuntimeOptions, open_network
 from .heatmap import HeatmapOptions, compute_heatmap_and_logits

@@ -5,8 +5,7 @@ from __future__ import annotations
 from importlib.resources import files
 from pathlib import Path
 
-from .._shared.errors import look_up
-from .._shared.options import is_path, look_up_word
+from .._shared.registry import look_up, resolve_name_or_path
 
 PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
@@ -49,7 +48,7 @@ def resolve_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
         >>> resolve_weights("run/best.safetensors").name
         'best.safetensors'
     """
-    if is_path(weights):
-        return Path(weights)
-    look_up_word("weights", weights, PRETRAINED)
+    found = resolve_name_or_path("weights", weights, PRETRAINED)
+    if isinstance(found, Path):
+        return found
     return pretrained_weights(str(weights), suffix)

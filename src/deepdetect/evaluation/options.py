@@ -9,7 +9,7 @@ from pathlib import Path
 from .._shared.errors import OptionError, unknown_name
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
-from ..features.keypoints import SelectionOptions
+from ..features.selection import SelectionOptions
 from .baselines import (
     CLASSICAL,
     COMMON_DESCRIPTOR,

@@ -6,9 +6,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from .._shared.errors import ImageError, look_up
+from .._shared.errors import ImageError
 from .._shared.progress import progress
 from .._shared.provenance import provenance
+from .._shared.registry import look_up
 from ..detector.pretrained import resolve_weights
 from .cache import StageCache, file_digest
 from .metering import peak_memory

@@ -11,10 +11,11 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from ..features.keypoints import Keypoints
 from ..features.matchers import get_matcher, match_descriptors
 from ..io.image import load_image
 from ..matching.pipeline import check_memory
-from .baselines import Features, Method
+from .baselines import Method
 from .cache import StageCache, file_digest, source_digest
 from .metering import Meter, metered
 
@@ -50,7 +51,7 @@ class Timed:
 class FoundFeatures(Timed):
     """The keypoints of an image."""
 
-    features: Features
+    features: Keypoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +150,7 @@ def versions() -> dict[str, Any]:
     return {"sources": source_digest(), "opencv": cv2.__version__, "numpy": np.__version__}
 
 
-def _packed(features: Features) -> dict[str, np.ndarray]:
+def _packed(features: Keypoints) -> dict[str, np.ndarray]:
     """Store positions on whole pixels as such: they are most of a cache."""
     small = bool((np.abs(features.xy) < 2**15).all())
     whole = features.xy.astype(np.int16) if small else features.xy
@@ -165,10 +166,10 @@ def _packed(features: Features) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _unpacked(arrays: Mapping[str, np.ndarray]) -> Features:
+def _unpacked(arrays: Mapping[str, np.ndarray]) -> Keypoints:
     width, height = arrays["image_size"].tolist()
     optional = {name: arrays.get(name) for name in ("sizes", "angles", "octaves", "descriptors")}
-    return Features(arrays["xy"], arrays["scores"], (width, height), **optional)
+    return Keypoints(arrays["xy"], arrays["scores"], (width, height), **optional)
 
 
 def _meter_arrays(stage: str, meter: Meter) -> dict[str, np.ndarray]:

@@ -12,9 +12,10 @@ from ..datasets.oxford import find_scene
 from ..datasets.types import PlanarPair, PlanarScene
 from ..detector.detector import DeepDetect, HeatmapDetector
 from ..detector.heatmap import HeatmapOptions, compute_heatmap
-from ..features.descriptors import get_descriptor
-from ..features.keypoints import Keypoints, SelectionOptions, select_keypoints
+from ..features.keypoints import Keypoints
 from ..features.matchers import get_matcher, match_descriptors
+from ..features.selection import SelectionOptions, select_keypoints
+from ..features.sift import get_descriptor
 from ..geometry.residuals import transfer_errors
 from ..io.image import load_image, luma
 from ..labels import fuse

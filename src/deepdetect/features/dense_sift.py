@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
-from .._shared.threads import in_threads
+from .._shared.parallel import parallel_for
+from .keypoints import on_pixels
 
 SIZES = (2.0, 8.0)
 """Smallest and largest keypoint, in pixels."""
@@ -47,7 +48,7 @@ def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarra
         raise OptionError(f"the keypoint size must lie in [{SIZES[0]:g}, {SIZES[1]:g}], not {size}")
     if not on_pixels(xy, gray.shape):
         raise OptionError("dense SIFT takes keypoints on whole pixels within the image only")
-    from .dense_sift_kernel import TILE_HEIGHT, TILE_WIDTH, describe_tiles
+    from .descriptor_kernels import TILE_HEIGHT, TILE_WIDTH, describe_tiles
 
     magnitude, orientation = _gradient(gray)
     taps = _taps(size)
@@ -65,34 +66,8 @@ def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarra
             *(taps, spans, out),
         )
 
-    in_threads(across * down, work)
+    parallel_for(across * down, work)
     return out
-
-
-def on_pixels(xy: np.ndarray, shape: tuple[int, ...]) -> bool:
-    """Tell whether all positions are whole pixels of an image of shape (H, W)."""
-    xy = np.asarray(xy)
-    inside = (xy >= 0).all() and (xy < (shape[1], shape[0])).all()
-    return bool(inside and (xy == np.rint(xy)).all())
-
-
-def root(descriptors: np.ndarray, overwrite: bool = False) -> np.ndarray:
-    """Turn SIFT descriptors into RootSIFT (Arandjelovic, 2012).
-
-    Its Euclidean distance is the Hellinger distance of SIFT.
-
-    Args:
-        descriptors: (N, 128) uint8.
-        overwrite: put the result where the descriptors are, which saves the time of a copy.
-
-    Returns:
-        (N, 128) uint8: the square roots of the L1-normalised ones times 512, at most 255.
-    """
-    from .dense_sift_kernel import square_root
-
-    result = descriptors if overwrite else descriptors.copy()
-    in_threads(len(result), lambda first, last: square_root(first, last, result))
-    return result
 
 
 def _gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,267 +1,226 @@
-"""From a heat map to keypoints: threshold or density, suppression, a maximum number."""
+"""The keypoints of one image: positions, scores, and what their descriptors need."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
-from .even_order import even_order
 
-LARGEST_OFFSET = 0.499
-"""In pixels: a refined keypoint is still nearest to the pixel that it was found at."""
+MAX_COORDINATE_BITS = 12
+"""Of a position in `bayer_order`: float32 holds the order exactly up to this many."""
+
+_OPTIONAL: dict[str, Any] = {
+    "logits": np.float32,
+    "sizes": np.float32,
+    "angles": np.float32,
+    "octaves": np.int32,
+}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Keypoints:
     """Keypoints of one image.
 
     Attributes:
         xy: (N, 2) float32 positions, x right and y down in pixels, centre of the
             first pixel (0, 0).
-        scores: (N,) float32 probabilities. Float32 rounds the highest to 1: to rank keypoints,
-            use `best`, or the logits.
+        scores: (N,) float32, the higher the better; probabilities where they are DeepDetect's.
+            Float32 rounds the highest to 1: to rank keypoints, use `best`, or the logits.
         image_size: (width, height) of the image in pixels.
-        logits: (N,) float32 logits of the probabilities, or None where the detector gives
-            probabilities only.
+        logits: (N,) float32 logits of the probabilities, or None.
+        sizes: (N,) float32 diameters in pixels, or None where all keypoints have the same.
+        angles: (N,) float32 orientations in degrees (-1: unset), or None where all have the same.
+        octaves: (N,) int32 as OpenCV packs them, or None.
+        descriptors: (N, D) uint8 or float32, of a detector that describes its own keypoints, or
+            None.
 
     `len`, iteration over (x, y) rows and indexing by slices, masks and index arrays work.
 
     Raises:
-        OptionError: the shapes do not fit together.
+        OptionError: the shapes do not fit together, or a position or score is not finite.
 
     Example:
         >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
-        >>> len(points), points[points.scores > 0.8].xy.tolist()
-        (2, [[1.0, 2.0]])
+        >>> points
+        Keypoints(2 in 8x8 pixels, scores 0.6 to 0.9)
+        >>> points[points.scores > 0.8].xy.tolist()
+        [[1.0, 2.0]]
     """
 
     xy: np.ndarray
     scores: np.ndarray
     image_size: tuple[int, int]
     logits: np.ndarray | None = None
+    sizes: np.ndarray | None = None
+    angles: np.ndarray | None = None
+    octaves: np.ndarray | None = None
+    descriptors: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         xy = np.asarray(self.xy, np.float32)
+        xy = xy.reshape(0, 2) if xy.size == 0 else xy
         scores = np.asarray(self.scores, np.float32)
-        if xy.size == 0:
-            xy = xy.reshape(0, 2)
         if xy.ndim != 2 or xy.shape[1] != 2 or scores.shape != xy.shape[:1]:
             raise OptionError(
                 f"keypoints need (N, 2) positions and (N,) scores, "
                 f"not {xy.shape} and {scores.shape}"
             )
-        if self.logits is not None:
-            logits = np.asarray(self.logits, np.float32)
-            if logits.shape != scores.shape:
-                raise OptionError(
-                    f"keypoints need as many logits as scores, not {logits.shape} and "
-                    f"{scores.shape}"
-                )
-            object.__setattr__(self, "logits", logits)
+        if not (np.isfinite(xy).all() and np.isfinite(scores).all()):
+            raise OptionError("keypoints need finite positions and scores")
         object.__setattr__(self, "xy", xy)
         object.__setattr__(self, "scores", scores)
         object.__setattr__(self, "image_size", (int(self.image_size[0]), int(self.image_size[1])))
+        for name, dtype in _OPTIONAL.items():
+            if getattr(self, name) is None:
+                continue
+            values = np.asarray(getattr(self, name), dtype)
+            if values.shape != scores.shape:
+                raise OptionError(
+                    f"keypoints need as many {name} as scores, not {values.shape} and "
+                    f"{scores.shape}"
+                )
+            object.__setattr__(self, name, values)
+        if self.descriptors is not None:
+            descriptors = np.asarray(self.descriptors)
+            if descriptors.dtype != np.uint8:
+                descriptors = descriptors.astype(np.float32)
+            if descriptors.ndim != 2 or len(descriptors) != len(scores):
+                raise OptionError(
+                    f"{len(scores)} keypoints need ({len(scores)}, D) descriptors, "
+                    f"not {descriptors.shape}"
+                )
+            object.__setattr__(self, "descriptors", descriptors)
 
     @classmethod
     def empty(cls, image_size: tuple[int, int]) -> Keypoints:
-        """Make a set without keypoints."""
+        """Return a set without keypoints."""
         return cls(np.empty((0, 2), np.float32), np.empty(0, np.float32), image_size)
+
+    @classmethod
+    def from_opencv(
+        cls, keypoints: Sequence[cv2.KeyPoint], image_size: tuple[int, int]
+    ) -> Keypoints:
+        """Convert OpenCV's keypoints; their responses become the scores.
+
+        Args:
+            keypoints: as a `cv2.Feature2D` detects them.
+            image_size: (width, height) of the image in pixels.
+
+        Example:
+            >>> Keypoints.from_opencv([cv2.KeyPoint(3, 4, 7, 90, 0.5)], (8, 8)).sizes.tolist()
+            [7.0]
+        """
+        if not len(keypoints):
+            return cls.empty(image_size)
+        return cls(
+            cv2.KeyPoint_convert(keypoints),
+            np.array([point.response for point in keypoints], np.float32),
+            image_size,
+            sizes=np.array([point.size for point in keypoints], np.float32),
+            angles=np.array([point.angle for point in keypoints], np.float32),
+            octaves=np.array([point.octave for point in keypoints], np.int32),
+        )
+
+    def to_opencv(self, size: float = 3.0, angle: float = -1.0) -> list[cv2.KeyPoint]:
+        """Convert to OpenCV's keypoints, whose responses are the scores.
+
+        Args:
+            size: diameter in pixels where the keypoints have no sizes.
+            angle: orientation in degrees where they have no angles (-1: unset).
+
+        Example:
+            >>> (point,) = Keypoints([[3, 4]], [0.5], (8, 8)).to_opencv(size=5)
+            >>> point.pt, point.size, point.response
+            ((3.0, 4.0), 5.0, 0.5)
+        """
+        count = len(self)
+        columns = (
+            *self.xy.T.tolist(),
+            [size] * count if self.sizes is None else self.sizes.tolist(),
+            [angle] * count if self.angles is None else self.angles.tolist(),
+            self.scores.tolist(),
+            [0] * count if self.octaves is None else self.octaves.tolist(),
+        )
+        return [cv2.KeyPoint(*row) for row in zip(*columns, strict=True)]
 
     @property
     def density(self) -> float:
-        """Keypoints a pixel."""
+        """Keypoints per pixel."""
         width, height = self.image_size
         return len(self) / (width * height)
 
     def best(self, count: int) -> Keypoints:
         """Return the keypoints with the highest logits (or scores), in the order they have here.
 
-        Equal ones come in an order that spreads them evenly over the image.
+        Ties are broken by an order that spreads them evenly over the image.
         """
         if len(self) <= count:
             return self
         ranks = self.scores if self.logits is None else self.logits
-        spread = even_order(self.xy, self.image_size)
-        return self[np.sort(np.lexsort((spread, -ranks))[:count])]
+        order = bayer_order(self.xy, self.image_size)
+        return self[np.sort(np.lexsort((order, -ranks))[:count])]
+
+    def distinct(self) -> Keypoints:
+        """Return each position once, with its highest score (SIFT repeats some for directions)."""
+        order = np.argsort(-self.scores, kind="stable")
+        # Both float32 as one number: ten times faster than by rows; + 0 makes -0 the same as 0.
+        keys = np.ascontiguousarray(self.xy[order] + np.float32(0)).view(np.uint64).ravel()
+        _, first = np.unique(keys, return_index=True)
+        return self if len(first) == len(self) else self[np.sort(order[first])]
 
     def __len__(self) -> int:
         return len(self.xy)
 
-    def __getitem__(self, index: slice | np.ndarray | list[int]) -> Keypoints:
-        if isinstance(index, (int, np.integer)):
-            index = [int(index)]
-        logits = None if self.logits is None else self.logits[index]
-        return Keypoints(self.xy[index], self.scores[index], self.image_size, logits)
+    def __getitem__(self, index: slice | np.ndarray | list[int] | int) -> Keypoints:
+        rows = [int(index)] if isinstance(index, (int, np.integer)) else index
+        parts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "image_size"}
+        return replace(self, **{k: v[rows] for k, v in parts.items() if v is not None})
 
     def __iter__(self) -> Iterator[np.ndarray]:
         return iter(self.xy)
 
-
-@dataclass(frozen=True, eq=False)
-class SelectionOptions:
-    """Which pixels of a heat map become keypoints.
-
-    Attributes:
-        threshold: tau: pixels with a probability above it (paper: 0.5).
-        density: wanted number of keypoints per pixel, in (0, 1]; takes the place of the
-            threshold: the most probable pixels are taken, as many as that.
-        max_keypoints: at most this many are kept, the most probable ones.
-        nms_radius: non-maximum suppression: only pixels are kept that rank highest among those
-            at most this many pixels away in x and in y (0 suppresses none). None: 1 (a window of
-            3x3) with `max_keypoints`, else 0.
-        subpixel: move each keypoint from its pixel's centre to the maximum of a parabola through
-            the pixel and its two neighbours, in x and in y, less than half a pixel. None: with
-            `max_keypoints` only.
-        ignore: (H, W) bool or number array, true where no keypoint is wanted.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    threshold: float = 0.5
-    density: float | None = None
-    max_keypoints: int | None = None
-    nms_radius: int | None = None
-    subpixel: bool | None = None
-    ignore: np.ndarray | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.threshold <= 1:
-            raise OptionError(f"the threshold must lie in [0, 1], not {self.threshold}")
-        if self.density is not None and not 0 < self.density <= 1:
-            raise OptionError(f"the density must lie in (0, 1], not {self.density}")
-        if self.max_keypoints is not None and self.max_keypoints < 1:
-            raise OptionError(f"max_keypoints must be at least 1, not {self.max_keypoints}")
-        if self.nms_radius is not None:
-            if self.nms_radius < 0:
-                raise OptionError(f"nms_radius must be 0 or more pixels, not {self.nms_radius}")
-            if self.nms_radius != int(self.nms_radius):
-                raise OptionError(
-                    f"nms_radius must be a whole number of pixels, not {self.nms_radius}"
-                )
-
-    @property
-    def suppression_radius(self) -> int:
-        """The radius of suppression in pixels, with the default filled in."""
-        if self.nms_radius is None:
-            return 0 if self.max_keypoints is None else 1
-        return int(self.nms_radius)
-
-    @property
-    def refines(self) -> bool:
-        """Whether positions are refined, with the default filled in."""
-        return self.max_keypoints is not None if self.subpixel is None else self.subpixel
+    def __repr__(self) -> str:
+        width, height = self.image_size
+        text = f"{len(self)} in {width}x{height} pixels"
+        if len(self):
+            text += f", scores {self.scores.min():.3g} to {self.scores.max():.3g}"
+        if self.descriptors is not None:
+            text += f", {self.descriptors.shape[1]}-D {self.descriptors.dtype} descriptors"
+        return f"Keypoints({text})"
 
 
-def select_keypoints(
-    heatmap: np.ndarray,
-    options: SelectionOptions = SelectionOptions(),
-    logits: np.ndarray | None = None,
-) -> Keypoints:
-    """Choose the keypoints of a heat map.
+def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Rank positions as an ordered dither does: the first N are spread evenly, for any N.
+
+    It is Bayer's matrix, of the image's own size: neighbours come far apart in the order.
 
     Args:
-        heatmap: (H, W) float32 probability.
-        options: what to choose. The order is: ignore mask, threshold, suppression,
-            density or maximum number, sub-pixel positions.
-        logits: (H, W) float32 logits of the map, by which keypoints are ranked; by default the
-            map itself, though float32 rounds its highest probabilities to 1. Equal ones come
-            in an order that spreads the keypoints evenly (`even_order`).
+        xy: (N, 2) positions; their nearest pixels count.
+        size: (width, height) of the image.
 
     Returns:
-        Keypoints in the order of rows and columns, on pixel centres unless `subpixel`.
-
-    Raises:
-        OptionError: the ignore mask or the logits have another size than the map.
+        (N,) float32 in [0, 1), the first the lowest.
 
     Example:
-        >>> heatmap = np.zeros((16, 16), np.float32)
-        >>> heatmap[4, 9] = 0.9
-        >>> select_keypoints(heatmap).xy.tolist()
-        [[9.0, 4.0]]
+        >>> bayer_order(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]), (2, 2)).tolist()
+        [0.0, 0.5, 0.75, 0.25]
     """
-    height, width = heatmap.shape
-    ranking = heatmap if logits is None else logits
-    if ranking.shape != heatmap.shape:
-        raise OptionError(
-            f"the logits have shape {ranking.shape}, the heat map {heatmap.shape}: "
-            "they must be equal"
-        )
-    # With a density wanted, all but the impossible pixels may be needed.
-    wanted = heatmap > (options.threshold if options.density is None else 0.0)
-    if options.ignore is not None:
-        ignore = np.asarray(options.ignore)
-        if ignore.shape != heatmap.shape:
-            raise OptionError(
-                f"the ignore mask has shape {ignore.shape}, the image (height, width) "
-                f"{heatmap.shape}: they must be equal"
-            )
-        wanted &= ~ignore.astype(bool)
-    pixels = np.flatnonzero(wanted)
-    ranks = ranking.ravel()
-    if options.suppression_radius and len(pixels):
-        pixels = pixels[_suppress(pixels, ranks[pixels], heatmap.shape, options.suppression_radius)]
-    count = _wanted_count(options, heatmap.size)
-    if count is not None and len(pixels) > count:
-        pixels = pixels[np.sort(_ranked(pixels, ranks[pixels], heatmap.shape)[:count])]
-    row, column = np.divmod(pixels, width)
-    xy = np.stack([column, row], 1).astype(np.float32)
-    if options.refines:
-        xy += np.stack([_peak_offset(ranking, row, column, axis) for axis in (1, 0)], 1)
-    found = None if logits is None else ranks[pixels]
-    return Keypoints(xy, heatmap.ravel()[pixels], (width, height), found)
+    column, row = np.rint(np.asarray(xy).reshape(-1, 2)).astype(np.int64).T
+    bits = min(MAX_COORDINATE_BITS, max(1, (max(size) - 1).bit_length()))
+    order = np.zeros(len(row), np.int64)
+    for _ in range(bits):  # the lowest bits of the position decide most
+        order = 4 * order + 2 * ((column ^ row) & 1) + (row & 1)
+        column, row = column >> 1, row >> 1
+    return (order / 4**bits).astype(np.float32)
 
 
-def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
-    """Return where the parabola through pixels and their neighbours along an axis peaks.
-
-    The offset stays under half a pixel, so that the nearest pixel is the keypoint's own. It is 0 on
-    the image's border, and where a pixel is no maximum along the axis.
-    """
-    position, last = (row, column)[axis], ranking.shape[axis] - 1
-    inner = (position > 0) & (position < last)
-    before, after = (
-        ranking[
-            np.clip(row + step * (axis == 0), 0, ranking.shape[0] - 1),
-            np.clip(column + step * (axis == 1), 0, ranking.shape[1] - 1),
-        ].astype(np.float64)
-        for step in (-1, 1)
-    )
-    middle = ranking[row, column].astype(np.float64)
-    bend = 2 * middle - before - after
-    peaked = inner & (middle >= before) & (middle >= after) & (bend > 0)
-    offset = np.where(peaked, (after - before) / np.where(peaked, 2 * bend, 1), 0)
-    return np.clip(offset, -LARGEST_OFFSET, LARGEST_OFFSET).astype(np.float32)
-
-
-def _ranked(pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the rows from the best to the worst; equals are spread evenly over the image."""
-    row, column = np.divmod(pixels, shape[1])
-    spread = even_order(np.column_stack([column, row]), (shape[1], shape[0]))
-    return np.lexsort((spread, -scores))
-
-
-def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
-    counts = []
-    if options.density is not None:
-        counts.append(round(options.density * pixels))
-    if options.max_keypoints is not None:
-        counts.append(options.max_keypoints)
-    return min(counts) if counts else None
-
-
-def _suppress(
-    pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...], radius: int
-) -> np.ndarray:
-    """Tell which pixels rank highest in the window around them.
-
-    Pixels are compared by rank, which has no ties: one of a plateau stays.
-    """
-    rank = np.zeros(shape, np.float32 if len(pixels) < 2**24 else np.float64)
-    rank.ravel()[pixels[_ranked(pixels, scores, shape)]] = np.arange(len(pixels), 0, -1)
-    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # a box is dilated in linear time
-    return (cv2.dilate(rank, window) == rank).ravel()[pixels]  # beyond the border is -infinity
+def on_pixels(xy: np.ndarray, shape: tuple[int, ...] | None = None) -> bool:
+    """Return whether all positions are whole pixels (of an image of this shape, if given)."""
+    xy = np.asarray(xy)
+    inside = (xy >= 0).all() and (shape is None or (xy < (shape[1], shape[0])).all())
+    return bool(inside and (xy == np.rint(xy)).all())

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 
-from .dense_sift import SIZES, dense_sift, on_pixels, root
+from .._shared.parallel import parallel_for
+from .._shared.registry import look_up
+from .dense_sift import SIZES, dense_sift
+from .keypoints import on_pixels
 
 DENSE = 0.02
 """Keypoints a pixel from which all at once (`dense_sift`) takes less time than one by one."""
@@ -58,5 +63,80 @@ def opencv_sift_descriptors(
 def root_sift_descriptors(
     gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
 ) -> np.ndarray:
-    """Compute RootSIFT, the root of L1-normalised SIFT, as whole numbers (`dense_sift.root`)."""
-    return root(sift_descriptors(gray, xy, size, angle), overwrite=True)
+    """Compute RootSIFT, the root of L1-normalised SIFT, as whole numbers (`to_root_sift`)."""
+    return to_root_sift(sift_descriptors(gray, xy, size, angle), overwrite=True)
+
+
+def to_root_sift(descriptors: np.ndarray, overwrite: bool = False) -> np.ndarray:
+    """Turn SIFT descriptors into RootSIFT (Arandjelovic, 2012).
+
+    Its Euclidean distance is the Hellinger distance of SIFT.
+
+    Args:
+        descriptors: (N, 128) uint8.
+        overwrite: put the result where the descriptors are, which saves the time of a copy.
+
+    Returns:
+        (N, 128) uint8: the square roots of the L1-normalised ones times 512, at most 255.
+    """
+    from .descriptor_kernels import square_root
+
+    result = descriptors if overwrite else descriptors.copy()
+    parallel_for(len(result), lambda first, last: square_root(first, last, result))
+    return result
+
+
+def correlation_distance(
+    first: np.ndarray,
+    rows0: np.ndarray,
+    second: np.ndarray,
+    rows1: np.ndarray,
+    mean: np.ndarray,
+) -> np.ndarray:
+    """Compare pairs of descriptors by their correlation about a mean descriptor.
+
+    Args:
+        first, second: (N, D), (M, D) uint8 descriptors.
+        rows0, rows1: (K,) rows of the pairs.
+        mean: (D,) float32, taken away from both.
+
+    Returns:
+        (K,) float32: 1 - correlation, from 0 to 2: 0 where the two are equal, 0 but for rounding
+        where they differ by a factor; 1 where one of them is the mean.
+
+    Example:
+        >>> a = np.array([[10, 20, 30], [30, 20, 10]], np.uint8)
+        >>> mean = np.full(3, 20, np.float32)
+        >>> correlation_distance(a, np.array([0, 0]), a, np.array([0, 1]), mean).round(3)
+        array([0., 2.], dtype=float32)
+    """
+    from .descriptor_kernels import correlation_distances
+
+    rows0, rows1 = (np.ascontiguousarray(rows, np.int64) for rows in (rows0, rows1))
+    mean = np.ascontiguousarray(mean, np.float32)
+    out = np.empty(len(rows0), np.float32)
+    parallel_for(
+        len(out),
+        lambda start, stop: correlation_distances(
+            start, stop, first, rows0, second, rows1, mean, out
+        ),
+    )
+    return out
+
+
+Descriptor = Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]
+
+DESCRIPTORS: dict[str, Descriptor] = {
+    "sift": sift_descriptors,
+    "rootsift": root_sift_descriptors,
+    "sift-opencv": opencv_sift_descriptors,
+}
+
+
+def get_descriptor(name: str) -> Descriptor:
+    """Look a descriptor up.
+
+    Raises:
+        OptionError: the name is unknown.
+    """
+    return look_up("descriptor", name, DESCRIPTORS)

@@ -1,90 +1,106 @@
-"""Few, well-spread SIFT keypoints with directions and sizes, for the first look at a pair."""
+"""A few thousand well-spread SIFT keypoints with their own sizes and orientations."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from .dense_sift import root
-
-MOST = 4000
-"""Keypoints of an image."""
-
-ENOUGH = 1000
-CONTRASTS = (0.04, 0.01, 0.0025)
-"""SIFT's threshold of contrast (Lowe: 0.04); the next is tried where there are not enough."""
-
-CELLS = 24
-"""Cells along the longer side; each gives its strongest keypoints, so that all parts have some."""
+from .._shared.errors import OptionError
+from .keypoints import Keypoints
+from .sift import to_root_sift
 
 
-@dataclass(frozen=True, eq=False)
-class SparseFeatures:
-    """Described keypoints.
+@dataclass(frozen=True)
+class SiftOptions:
+    """How many SIFT keypoints are detected, and where.
 
     Attributes:
-        xy: (N, 2) float32 positions, centre of the first pixel (0, 0).
-        descriptors: (N, 128) uint8 RootSIFT, turned into the keypoints' directions.
+        max_keypoints: per image.
+        min_keypoints: with fewer than this, the next lower contrast threshold is tried.
+        contrast_thresholds: of SIFT (Lowe: 0.04), in the order in which they are tried.
+        grid_cells: along the longer side of the image; each cell gives its strongest keypoints
+            in turn, so that all parts of the image have some.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
-    xy: np.ndarray
-    descriptors: np.ndarray
+    max_keypoints: int = 4000
+    min_keypoints: int = 1000
+    contrast_thresholds: tuple[float, ...] = (0.04, 0.01, 0.0025)
+    grid_cells: int = 24
 
-    def __len__(self) -> int:
-        return len(self.xy)
+    def __post_init__(self) -> None:
+        if not self.contrast_thresholds or min(self.contrast_thresholds) <= 0:
+            raise OptionError("contrast_thresholds needs one or more values above 0")
+        if self.grid_cells < 1:
+            raise OptionError(f"grid_cells must be at least 1, not {self.grid_cells}")
 
 
-def sparse_features(gray: np.ndarray, most: int = MOST) -> SparseFeatures:
-    """Find SIFT keypoints, spread over the image.
+def detect_sift(gray: np.ndarray, options: SiftOptions = SiftOptions()) -> Keypoints:
+    """Detect SIFT keypoints, spread over the image, and describe them by RootSIFT.
 
     Args:
         gray: (H, W) uint8 luma.
-        most: of them.
+        options: how many, and where.
+
+    Returns:
+        Keypoints with sizes, angles, octaves and (N, 128) uint8 descriptors, which are rotated to
+        the keypoints' angles.
 
     Example:
         >>> gray = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
-        >>> len(sparse_features(gray, 20))
-        20
+        >>> detect_sift(gray, SiftOptions(max_keypoints=20))
+        Keypoints(20 in 99x99 pixels, scores 0.0135 to 0.0788, 128-D uint8 descriptors)
     """
-    for contrast in CONTRASTS:
+    size = (gray.shape[1], gray.shape[0])
+    for contrast in options.contrast_thresholds:
         # Without this OpenCV's positions are a quarter of a pixel off, right and down.
         sift = cv2.SIFT_create(contrastThreshold=contrast, enable_precise_upscale=True)
         keypoints = sift.detect(gray, None)
-        if len(keypoints) >= min(ENOUGH, most):
+        if len(keypoints) >= min(options.min_keypoints, options.max_keypoints):
             break
-    xy = cv2.KeyPoint_convert(keypoints)
-    if not len(xy) or most < 1:
-        return SparseFeatures(np.empty((0, 2), np.float32), np.empty((0, 128), np.uint8))
+    if not len(keypoints) or options.max_keypoints < 1:
+        return Keypoints(np.empty((0, 2)), [], size, descriptors=np.empty((0, 128), np.uint8))
     strength = np.array([keypoint.response for keypoint in keypoints])
-    chosen = spread(xy, strength, (gray.shape[1], gray.shape[0]), most)
+    xy = cv2.KeyPoint_convert(keypoints)
+    chosen = spread_over_grid(xy, strength, size, options.max_keypoints, options.grid_cells)
     kept, descriptors = sift.compute(gray, [keypoints[k] for k in chosen])
-    return SparseFeatures(cv2.KeyPoint_convert(kept), root(descriptors.astype(np.uint8)))
+    found = Keypoints.from_opencv(kept, size)
+    return replace(found, descriptors=to_root_sift(descriptors.astype(np.uint8)))
 
 
-def spread(xy: np.ndarray, strength: np.ndarray, size: tuple[int, int], most: int) -> np.ndarray:
-    """Choose keypoints by strength, in turn from all cells of a grid.
+def spread_over_grid(
+    xy: np.ndarray,
+    scores: np.ndarray,
+    image_size: tuple[int, int],
+    max_keypoints: int,
+    grid_cells: int = SiftOptions.grid_cells,
+) -> np.ndarray:
+    """Choose keypoints by score, in turn from all cells of a grid.
 
     Args:
         xy: (N, 2) positions.
-        strength: (N,) of each.
-        size: (width, height) of the image.
-        most: how many to choose.
+        scores: (N,), the higher the better.
+        image_size: (width, height) of the image.
+        max_keypoints: how many to choose.
+        grid_cells: along the longer side.
 
     Returns:
-        (M,) rows, M <= `most`: first the strongest of each cell, then the second-strongest, ...
+        (M,) rows, M <= `max_keypoints`: first the best of each cell, then the second-best, ...
 
     Example:
         >>> xy = np.array([[1, 1], [2, 1], [99, 99]])
-        >>> spread(xy, np.array([3.0, 2.0, 1.0]), (100, 100), 2).tolist()
+        >>> spread_over_grid(xy, np.array([3.0, 2.0, 1.0]), (100, 100), 2).tolist()
         [0, 2]
     """
-    side = max(size) / CELLS
+    side = max(image_size) / grid_cells
     cell = np.floor(np.maximum(xy, 0) / side).astype(np.int64)
-    cell = cell[:, 1] * (CELLS + 1) + cell[:, 0]
-    order = np.lexsort((-strength, cell))
+    cell = cell[:, 1] * (grid_cells + 1) + cell[:, 0]
+    order = np.lexsort((-scores, cell))
     first = np.flatnonzero(np.diff(cell[order], prepend=-1))
     begins = np.repeat(first, np.diff(first, append=len(order)))
     rank = np.arange(len(order)) - begins
-    return order[np.lexsort((-strength[order], rank))][:most]
+    return order[np.lexsort((-scores[order], rank))][:max_keypoints]

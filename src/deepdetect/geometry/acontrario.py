@@ -11,14 +11,14 @@ from math import lgamma, log, pi
 
 import numpy as np
 
-LARGEST = -6.0
+MAX_LOG10_NFA = -6.0
 """A geometry is trusted when fewer than 10 to this many random pairs would give its like."""
 
-DRAWN = {"homography": 4, "fundamental": 7}
+MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7}
 """Matches that a model is drawn from."""
 
 
-def false_alarms(errors: np.ndarray, model: str, threshold: float, size: tuple[int, int]) -> float:
+def log10_nfa(errors: np.ndarray, model: str, threshold: float, size: tuple[int, int]) -> float:
     """Return the decimal logarithm of the number of false alarms.
 
     Args:
@@ -32,12 +32,12 @@ def false_alarms(errors: np.ndarray, model: str, threshold: float, size: tuple[i
 
     Example:
         >>> near, far = np.zeros(30), np.full(70, 50.0)
-        >>> false_alarms(np.concatenate([near, far]), "homography", 3, (640, 480)) < -50
+        >>> log10_nfa(np.concatenate([near, far]), "homography", 3, (640, 480)) < -50
         True
-        >>> false_alarms(np.concatenate([near[:6], far]), "homography", 3, (640, 480)) > -6
+        >>> log10_nfa(np.concatenate([near[:6], far]), "homography", 3, (640, 480)) > -6
         True
     """
-    drawn = DRAWN[model]
+    drawn = MINIMAL_SAMPLE_SIZE[model]
     count, inliers = len(errors), int(np.count_nonzero(errors < threshold))
     if inliers <= drawn:
         return float("inf")

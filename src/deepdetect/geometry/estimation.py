@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
-from .model_selection import has_depth
+from .model_selection import select_model
 from .residuals import epipolar_errors, transfer_errors
 
 ESTIMATORS = ("magsac", "ransac")
@@ -23,7 +23,7 @@ class GeometryOptions:
 
     Attributes:
         model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto"
-            (one of these two: the homography, but for scenes with depth; `model_choice`),
+            (one of these two: the homography, but for scenes with depth; `select_model`),
             "essential" (known cameras), or "none".
         estimator: "magsac" or "ransac".
         inlier_threshold: a match is an inlier when it is nearer to the model than this, in
@@ -143,12 +143,13 @@ def estimate_geometry(
     if options.model == "none":
         return Geometry("none", None, np.ones(len(points0), bool))
     if options.model == "auto":
-        plane, space = (
+        plane, depth = (
             estimate_geometry(points0, points1, replace(options, model=model))
             for model in ("homography", "fundamental")
         )
-        depth = plane.matrix is None or has_depth(plane.inliers, space.inliers)
-        return space if depth else plane
+        if plane.matrix is None or select_model(plane.inliers, depth.inliers) == "fundamental":
+            return depth
+        return plane
     model = MODELS[options.model]
     nothing = Geometry(options.model, None, np.zeros(len(points0), bool))
     if len(points0) < model.fewest:

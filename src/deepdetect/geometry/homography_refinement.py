@@ -17,14 +17,15 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .residuals import transform_points
 from .zncc import (
     WINDOW,
-    agreement,
-    away_from_border,
-    local_correlation,
-    locally_normalised,
-    smoothed,
-    warp_back,
+    erode_mask,
+    gaussian_blur,
+    local_zncc,
+    median_local_zncc,
+    normalise_local_contrast,
+    warp_to_reference,
 )
 
 FEWEST = 30
@@ -39,6 +40,23 @@ LEAST_GAIN = 0.001
 
 LEAST_GAIN_OF_ALL = 0.0001
 """The same by a step that takes all pixels, which has less noise."""
+
+IN_PLACE = 0.5
+"""A pixel is in place when what is around it lies at most so far off, in pixels."""
+
+MORE = 1.1
+"""The fit to the majority is taken when it puts so many times as many pixels in place."""
+
+TRACK_WINDOW = 31
+"""Side of the tracked windows in pixels."""
+
+SURROUNDINGS = 41
+"""Side in pixels of the window around a pixel that says how far off it lies."""
+
+SCALE = 1.0
+"""Of Cauchy's weights in pixels: corners so far off have half the say."""
+
+IRLS_ROUNDS = 30
 
 
 @dataclass(frozen=True)
@@ -85,14 +103,14 @@ class Refinement:
 
     Attributes:
         homography: (3, 3) from the first image to the second, its last element 1.
-        agreement: median local correlation of the images under it.
-        before: the same under the homography that it began with.
+        zncc: median local ZNCC of the images under it.
+        initial_zncc: the same under the homography that it began with.
         steps: number of steps that were kept.
     """
 
     homography: np.ndarray
-    agreement: float
-    before: float
+    zncc: float
+    initial_zncc: float
     steps: int
 
 
@@ -113,7 +131,7 @@ def refine_homography(
         The best homography found; the one given when no step made it better.
     """
     current = np.asarray(homography, np.float64)
-    before = best = agreement(gray0, gray1, current)
+    before = best = median_local_zncc(gray0, gray1, current)
     track = [partial(_track, gray0, window=side, options=options) for side in options.windows]
     align = [partial(_align, gray0, blur=blur) for blur in options.blurs]
     steps = [
@@ -124,11 +142,11 @@ def refine_homography(
     for _ in range(options.rounds):
         kept_before = kept
         for step, least_gain in steps:
-            correction = step(*warp_back(gray1, current, (gray0.shape[1], gray0.shape[0])))
+            correction = step(*warp_to_reference(gray1, current, (gray0.shape[1], gray0.shape[0])))
             if correction is None:
                 continue
             candidate = current @ correction
-            reached = agreement(gray0, gray1, candidate)
+            reached = median_local_zncc(gray0, gray1, candidate)
             if reached > best + least_gain:
                 current, best, kept = candidate, reached, kept + 1
         if kept == kept_before:
@@ -141,9 +159,9 @@ def _align(
 ) -> np.ndarray | None:
     """Return the homography from the first image to the warped second one, by all pixels."""
     # Blur first, then windows reach over the border.
-    inside = away_from_border(away_from_border(seen, blur), WINDOW / 6)
-    images = [smoothed(gray, blur) for gray in (gray0, warped)]
-    alike = local_correlation(*images, inside)
+    inside = erode_mask(erode_mask(seen, blur), WINDOW / 6)
+    images = [gaussian_blur(gray, blur) for gray in (gray0, warped)]
+    alike = local_zncc(*images, inside)
     if not np.isfinite(alike).any():
         return None
     inside = alike > np.nanquantile(alike, LEFT_OUT)
@@ -151,7 +169,7 @@ def _align(
     start = np.eye(3, dtype=np.float32)
     try:
         _, correction = cv2.findTransformECC(
-            *map(locally_normalised, images),
+            *map(normalise_local_contrast, images),
             start,
             cv2.MOTION_HOMOGRAPHY,
             criteria,
@@ -225,3 +243,104 @@ def tracked_corners(
     if good.sum() < FEWEST:
         return None
     return corners.reshape(-1, 2)[good], there.reshape(-1, 2)[good]
+
+
+def refine_homography_irls(
+    gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray
+) -> np.ndarray:
+    """Return the homography given, or one that puts clearly more pixels in place.
+
+    Args:
+        gray0, gray1: (H, W) uint8 luma.
+        homography: (3, 3) from the first image to the second, right within some pixels.
+
+    Returns:
+        (3, 3), its last element 1.
+    """
+    size = (gray0.shape[1], gray0.shape[0])
+    warped, seen = warp_to_reference(gray1, homography, size)
+    corners = tracked_corners(gray0, warped, seen, TRACK_WINDOW, RefinementOptions())
+    if corners is None:
+        return homography
+    correction = fit_homography_irls(*corners)
+    if correction is None:
+        return homography
+    candidate = homography @ correction
+    before = aligned_fraction(gray0, warped, seen)
+    after = aligned_fraction(gray0, *warp_to_reference(gray1, candidate, size))
+    return candidate / candidate[2, 2] if after > MORE * before else homography
+
+
+def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
+    """Fit a homography by iteratively reweighted least squares with Cauchy's weights.
+
+    Args:
+        points0, points1: (N, 2), most of them at most some pixels from where they were.
+
+    Returns:
+        (3, 3), its last element 1; None when the points do not determine it.
+
+    Example:
+        >>> points = np.array([[0, 0], [9, 0], [9, 9], [0, 9], [4, 5.0]])
+        >>> fit_homography_irls(points, points + (2, -1)).round(6)[:2, 2].tolist()
+        [2.0, -1.0]
+    """
+    if len(points0) < 4:
+        return None
+    middle = points0.mean(axis=0)
+    spread = float(np.abs(points0 - middle).mean())
+    if not spread > 0:
+        return None
+    inwards = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, spread]]) / spread
+    first, second = ((points - middle) / spread for points in (points0, points1))
+    homography = np.eye(3)
+    for _ in range(IRLS_ROUNDS):
+        depth = first @ homography[2, :2] + 1
+        mapped = transform_points(first, homography)
+        gaps = second - mapped
+        weight = 1 / (1 + (gaps**2).sum(axis=1) * (spread / SCALE) ** 2)
+        place = np.column_stack([first, np.ones(len(first))]) / depth[:, None]
+        none = np.zeros_like(place)
+        across = np.column_stack([place, none, -mapped[:, :1] * place[:, :2]])
+        down = np.column_stack([none, place, -mapped[:, 1:] * place[:, :2]])
+        normal = (across.T * weight) @ across + (down.T * weight) @ down
+        right = (across.T * weight) @ gaps[:, 0] + (down.T * weight) @ gaps[:, 1]
+        try:
+            step = np.linalg.solve(normal, right)
+        except np.linalg.LinAlgError:
+            return None
+        if not np.isfinite(step).all():
+            return None
+        homography = homography + np.append(step, 0).reshape(3, 3)
+        if np.abs(step).max() < 1e-9:
+            break
+    found = np.linalg.inv(inwards) @ homography @ inwards
+    return found / found[2, 2]
+
+
+def aligned_fraction(gray0: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> float:
+    """Return the share of the seen pixels that lie at most `IN_PLACE` px off.
+
+    How far is one step of Lucas-Kanade's at each pixel, over a window, after both images are
+    equalised.
+
+    Args:
+        gray0, warped: (H, W) uint8.
+        seen: (H, W) bool, where the second has content.
+    """
+    if not seen.any():
+        return 0.0
+    equalise = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply
+    first, second = (
+        cv2.GaussianBlur(equalise(gray).astype(np.float32), (0, 0), 1) for gray in (gray0, warped)
+    )
+    x, y = (cv2.Scharr(first, cv2.CV_32F, *order) / 32 for order in ((1, 0), (0, 1)))
+    window = (SURROUNDINGS, SURROUNDINGS)
+    change = second - first
+    change -= cv2.blur(change, window)
+    xx, xy, yy, xt, yt = (
+        cv2.blur(product, window) for product in (x * x, x * y, y * y, x * change, y * change)
+    )
+    determinant = xx * yy - xy * xy + 1e-3
+    off = np.hypot(yy * xt - xy * yt, xx * yt - xy * xt) / determinant
+    return float((off[seen] <= IN_PLACE).mean())

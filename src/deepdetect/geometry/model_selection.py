@@ -11,17 +11,18 @@ homography leaves, and these are at least a tenth of all that it explains. (On p
 some too, as a band is easily hit, but few of the rest.)"""
 
 
-def has_depth(by_homography: np.ndarray, by_fundamental: np.ndarray) -> bool:
-    """Tell whether a scene is more than a plane, from which matches the two models explain.
+def select_model(by_homography: np.ndarray, by_fundamental: np.ndarray) -> str:
+    """Return which model fits a scene: "homography" (no depth) or "fundamental".
 
     Args:
-        by_homography, by_fundamental: (M,) bool.
+        by_homography, by_fundamental: (M,) bool, the inliers of each model among the same matches.
 
     Example:
         >>> plane = np.arange(100) < 60
-        >>> has_depth(plane, plane), has_depth(plane, np.arange(100) < 95)
-        (False, True)
+        >>> select_model(plane, plane), select_model(plane, np.arange(100) < 95)
+        ('homography', 'fundamental')
     """
     rest = by_fundamental & ~by_homography
     left, all_of_it = np.count_nonzero(~by_homography), np.count_nonzero(by_fundamental)
-    return bool(rest.sum() >= max(DEPTH_OF_REST * left, DEPTH_OF_ALL * all_of_it, 1))
+    depth = rest.sum() >= max(DEPTH_OF_REST * left, DEPTH_OF_ALL * all_of_it, 1)
+    return "fundamental" if depth else "homography"

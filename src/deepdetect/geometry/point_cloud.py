@@ -12,7 +12,7 @@ from .._shared.errors import OptionError, unknown_name
 UNITS = ("mm", "baseline")
 """Millimetres, or the distance of the two cameras where that is not known."""
 
-TAIL = 1.0
+BOX_PERCENTILE = 1.0
 """Percent of the points that may lie beyond each side of the robust box."""
 
 SPARSEST = 0.02
@@ -116,7 +116,9 @@ def robust_box(cloud: PointCloud) -> RobustBox:
         ([1.0, 2.0, 0.0], [99.0, 198.0, 0.0], [50.0, 100.0, 0.0])
     """
     require_points(cloud)
-    low, high = np.percentile(cloud.points.astype(np.float64), (TAIL, 100 - TAIL), axis=0)
+    low, high = np.percentile(
+        cloud.points.astype(np.float64), (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0
+    )
     return RobustBox(low, high)
 
 
@@ -142,8 +144,10 @@ def angular_spacing(cloud: PointCloud) -> float:
     ahead = cloud.points[cloud.points[:, 2] > 0]
     if not len(ahead):
         return SPARSEST
-    seen = np.percentile(ahead[:, :2] / ahead[:, 2:], (TAIL, 100 - TAIL), axis=0)
-    width, height = ((seen[1] - seen[0]) / (1 - 2 * TAIL / 100)).tolist()
+    seen = np.percentile(
+        ahead[:, :2] / ahead[:, 2:], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0
+    )
+    width, height = ((seen[1] - seen[0]) / (1 - 2 * BOX_PERCENTILE / 100)).tolist()
     return min(SPARSEST, float(np.sqrt(width * height / len(ahead)))) or SPARSEST
 
 

@@ -35,14 +35,14 @@ class RelativePose:
         translation: (3,) float64 of length 1: only its direction can be known.
         inliers: (M,) bool, the matches nearer to their epipolar lines than the threshold.
         errors: (M,) float64 distances from them in pixels (Sampson's).
-        in_front: share of the inliers that lie before both cameras, in [0, 1].
+        cheirality_ratio: share of the inliers that lie in front of both cameras, in [0, 1].
     """
 
     rotation: np.ndarray
     translation: np.ndarray
     inliers: np.ndarray
     errors: np.ndarray
-    in_front: float
+    cheirality_ratio: float
 
     @property
     def angle(self) -> float:
@@ -110,7 +110,9 @@ def estimate_relative_pose(
     inliers = errors < inlier_threshold
     if not inliers.any():
         return None
-    share = _share_in_front(points0[inliers], points1[inliers], calibration, rotation, translation)
+    share = _cheirality_ratio(
+        points0[inliers], points1[inliers], calibration, rotation, translation
+    )
     return RelativePose(rotation, translation, inliers, errors, share)
 
 
@@ -199,14 +201,16 @@ def _best_of_four(
         for rotation in (rotation0, rotation1)
         for sign in (1, -1)
     ]
-    return max(poses, key=lambda pose: _share_in_front(points0, points1, calibration, *pose))
+    return max(poses, key=lambda pose: _cheirality_ratio(points0, points1, calibration, *pose))
 
 
-def _share_in_front(
+def _cheirality_ratio(
     points0: np.ndarray,
     points1: np.ndarray,
     calibration: Calibration,
     rotation: np.ndarray,
     translation: np.ndarray,
 ) -> float:
-    return float(triangulate(points0, points1, calibration, rotation, translation).in_front.mean())
+    return float(
+        triangulate(points0, points1, calibration, rotation, translation).cheirality.mean()
+    )

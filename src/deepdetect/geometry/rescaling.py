@@ -9,7 +9,7 @@ ALIAS = 0.5
 """Blur before an image is shrunk, in units of sqrt(1 / scale^2 - 1) pixels."""
 
 
-def shrunk(gray: np.ndarray, longest: int) -> tuple[np.ndarray, float]:
+def downscale(gray: np.ndarray, longest: int) -> tuple[np.ndarray, float]:
     """Shrink an image so that its longer side has at most so many pixels.
 
     Returns:

@@ -22,16 +22,16 @@ class Triangulation:
     Attributes:
         points: (N, 3) float64 in the frame of the first camera: x right, y down, z forward, in
             units of the translation's length. Not finite where the rays are parallel.
-        in_front: (N,) bool, whether it lies before both cameras.
+        cheirality: (N,) bool, whether it lies in front of both cameras.
         reprojection_errors: (N,) float64, how far the matched positions are from where the point
             is seen, in pixels: the root mean square of both images.
-        parallax: (N,) float64 angle between both rays in radians.
+        triangulation_angle: (N,) float64 angle between both rays in radians.
     """
 
     points: np.ndarray
-    in_front: np.ndarray
+    cheirality: np.ndarray
     reprojection_errors: np.ndarray
-    parallax: np.ndarray
+    triangulation_angle: np.ndarray
 
 
 def triangulate(
@@ -50,7 +50,7 @@ def triangulate(
             rotation @ X + translation in the second's.
 
     Example:
-        >>> from .calibration import Camera
+        >>> from .camera import Camera
         >>> camera = Camera((640, 480), 500.0)
         >>> pose = np.eye(3), np.array([-1.0, 0, 0])
         >>> found = triangulate([[319.5, 239.5]], [[269.5, 239.5]], Calibration(camera, camera),
@@ -63,7 +63,7 @@ def triangulate(
     rotation = np.asarray(rotation, np.float64)
     translation = np.asarray(translation, np.float64).reshape(3)
     fundamental = fundamental_matrix(calibration, rotation, translation)
-    moved0, moved1 = onto_epipolar_lines(points0, points1, fundamental)
+    moved0, moved1 = correct_matches(points0, points1, fundamental)
     camera0, camera1 = calibration.camera0, calibration.camera1
     rays0 = camera0.rays(moved0)
     rays1 = camera1.rays(moved1)
@@ -75,10 +75,10 @@ def triangulate(
         depth = -np.einsum("ij,ij->i", normals, np.cross(rays1, translation)) / squares
         points = rays0 * depth[:, None]
     depth1 = (points @ rotation.T + translation)[:, 2]
-    in_front = np.isfinite(depth) & (depth > 0) & (depth1 > 0)
+    cheirality = np.isfinite(depth) & (depth > 0) & (depth1 > 0)
     error = ((moved0 - points0) ** 2).sum(1) + ((moved1 - points1) ** 2).sum(1)
-    parallax = np.arctan2(np.sqrt(squares), np.einsum("ij,ij->i", rays1, turned))
-    return Triangulation(points, in_front, np.sqrt(error / 2), parallax)
+    angle = np.arctan2(np.sqrt(squares), np.einsum("ij,ij->i", rays1, turned))
+    return Triangulation(points, cheirality, np.sqrt(error / 2), angle)
 
 
 def fundamental_matrix(
@@ -98,7 +98,7 @@ def cross_matrix(vector: np.ndarray) -> np.ndarray:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-def onto_epipolar_lines(
+def correct_matches(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Move matches as little as possible so that x1^T F x0 = 0 holds (Lindstrom 2010, niter2).

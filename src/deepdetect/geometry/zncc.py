@@ -16,7 +16,7 @@ FLAT = 1.0
 """Grey levels; where both windows vary less than that there is nothing to compare."""
 
 
-def warp_back(
+def warp_to_reference(
     gray1: np.ndarray, homography: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Show the second image in the frame of the first.
@@ -36,7 +36,7 @@ def warp_back(
     return warped, cv2.warpPerspective(whole, homography, size, flags=nearest) > 0
 
 
-def local_correlation(
+def local_zncc(
     first: np.ndarray, second: np.ndarray, valid: np.ndarray, window: int = WINDOW
 ) -> np.ndarray:
     """Compute the zero-mean correlation of the windows around each pixel.
@@ -52,7 +52,7 @@ def local_correlation(
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (32, 32)).astype(np.uint8)
         >>> seen = np.ones((32, 32), bool)
-        >>> float(np.nanmedian(local_correlation(image, 255 - image, seen)).round(3))
+        >>> float(np.nanmedian(local_zncc(image, 255 - image, seen)).round(3))
         -1.0
     """
     a, b = first.astype(np.float64), second.astype(np.float64)
@@ -73,7 +73,7 @@ def local_correlation(
     return result
 
 
-def agreement(
+def median_local_zncc(
     gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray, smoothing: float = SMOOTHING
 ) -> float:
     """Return the median correlation of two images over their overlap, in [-1, 1].
@@ -87,26 +87,26 @@ def agreement(
         The median over the windows that count; -1 when there are none.
     """
     size = (gray0.shape[1], gray0.shape[0])
-    warped, seen = warp_back(gray1, homography, size)
-    first, second = (smoothed(gray, smoothing) for gray in (gray0, warped))
-    values = local_correlation(first, second, away_from_border(seen, smoothing))
+    warped, seen = warp_to_reference(gray1, homography, size)
+    first, second = (gaussian_blur(gray, smoothing) for gray in (gray0, warped))
+    values = local_zncc(first, second, erode_mask(seen, smoothing))
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else -1.0
 
 
-def smoothed(gray: np.ndarray, sigma: float) -> np.ndarray:
+def gaussian_blur(gray: np.ndarray, sigma: float) -> np.ndarray:
     """Blur an image; returns (H, W) float32."""
     return cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma)
 
 
-def away_from_border(valid: np.ndarray, sigma: float) -> np.ndarray:
+def erode_mask(valid: np.ndarray, sigma: float) -> np.ndarray:
     """Leave out the pixels that a blur of this sigma mixes with what is not valid; (H, W) bool."""
     reach = 2 * int(np.ceil(3 * sigma)) + 1
     kernel = np.ones((reach, reach), np.uint8)
     return cv2.erode(valid.astype(np.uint8), kernel, borderValue=0) > 0
 
 
-def locally_normalised(gray: np.ndarray, window: int = WINDOW) -> np.ndarray:
+def normalise_local_contrast(gray: np.ndarray, window: int = WINDOW) -> np.ndarray:
     """Take away the mean of the window around each pixel and divide by its spread.
 
     The correlation of two images made so is that of all their windows at once.

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.errors import DeepDetectError
-from .._shared.processes import map_in_processes
+from .._shared.parallel import map_in_processes
 from ..io.image import load_image, luma
 from ..io.masks import load_mask_settings, save_mask
 from ..viz.draw import save_picture

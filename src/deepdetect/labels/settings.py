@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
-from .._shared.options import is_path, look_up_word
+from .._shared.registry import resolve_name_or_path
 from .detectors import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
 from .visibility import Visibility
 
@@ -125,9 +125,8 @@ def find_label_settings(settings: str | Path) -> LabelSettings:
         >>> find_label_settings("paper").changes
         ()
     """
-    if is_path(settings):
-        return read_label_settings(settings)
-    return look_up_word("label settings", settings, LABEL_SETTINGS)
+    found = resolve_name_or_path("label settings", settings, LABEL_SETTINGS)
+    return read_label_settings(found) if isinstance(found, Path) else found
 
 
 def read_label_settings(path: str | Path) -> LabelSettings:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from .._shared.errors import OptionError, look_up, unknown_name
+from .._shared.errors import OptionError, unknown_name
+from .._shared.registry import look_up
 from ..detector.heatmap import HeatmapOptions
-from ..features.descriptors import get_descriptor
-from ..features.keypoints import SelectionOptions
 from ..features.matchers import get_matcher
+from ..features.selection import SelectionOptions
+from ..features.sift import get_descriptor
 from ..geometry import GeometryOptions
 
 GUIDES = ("auto", "homography", "fundamental")

@@ -11,13 +11,13 @@ from typing import Any, Literal
 import numpy as np
 
 from .._shared.errors import OptionError
-from .._shared.memory import free_memory
-from .._shared.options import changed, suggest_keywords
+from .._shared.options import replace_options, suggest_keywords
+from .._shared.parallel import available_memory
 from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
 from ..detector.heatmap import HeatmapOptions
-from ..features.descriptors import get_descriptor
-from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors, one_to_one
+from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors, unique_matches
 from ..features.matches import Guide, Matches
+from ..features.sift import get_descriptor
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.residuals import transfer_errors
 from ..io.image import load_image, luma
@@ -137,7 +137,9 @@ def match_images(
         "iterations": iterations,
         "seed": seed,
     }
-    chosen = changed(chosen, **{name: value for name, value in given.items() if value is not None})
+    chosen = replace_options(
+        chosen, **{name: value for name, value in given.items() if value is not None}
+    )
     seconds: dict[str, float] = {}
     rgb = load_image(image0), load_image(image1)
     detector = _configured(detector, chosen.heatmap)
@@ -157,7 +159,7 @@ def match_images(
     if found is None:
         found = unguided_matches(grays, [points.xy for points in keypoints], chosen, seconds)
     elif chosen.mutual:
-        found = one_to_one(found)
+        found = unique_matches(found)
     points0 = keypoints[0].xy[found.rows0]
     points1 = keypoints[1].xy[found.rows1]
     with _timed(seconds, "geometry"):
@@ -252,7 +254,7 @@ def check_memory(keypoints: Sequence[int]) -> None:
         OptionError: there are too many.
     """
     needed = sum(keypoints) * BYTES_PER_KEYPOINT
-    if needed > free_memory():
+    if needed > available_memory():
         raise OptionError(
             f"{' and '.join(f'{count:,}' for count in keypoints)} keypoints need about "
             f"{needed / 1e9:.0f} GB of memory to be matched: make them fewer with "

@@ -11,7 +11,7 @@ import numpy as np
 from .._shared.errors import DeepDetectError
 from .._shared.options import suggest_keywords
 from ..detector.detector import HeatmapDetector
-from ..geometry.zncc import agreement
+from ..geometry.zncc import median_local_zncc
 from ..io.image import load_image, luma
 from .pipeline import match_images
 
@@ -29,7 +29,7 @@ class Registration:
         warped: (H, W, 3) uint8 RGB, the second in its frame, black where it has nothing.
         seen: (H, W) bool, where it has something.
         matches: number of dense matches that hold.
-        agreement: median local correlation of the two over what both show, in [-1, 1].
+        zncc: median local ZNCC of the two over what both show, in [-1, 1].
     """
 
     homography: np.ndarray
@@ -37,7 +37,7 @@ class Registration:
     warped: np.ndarray
     seen: np.ndarray
     matches: int
-    agreement: float
+    zncc: float
 
     def checkerboard(self) -> np.ndarray:
         """Return both images in turn, in squares: edges go on where they fit; (H, W, 3) uint8."""
@@ -128,5 +128,5 @@ def register(
         warped,
         seen,
         len(found),
-        agreement(luma(first), luma(second), found.matrix),
+        median_local_zncc(luma(first), luma(second), found.matrix),
     )

@@ -13,10 +13,11 @@ import cv2
 import numpy as np
 
 from .._shared.errors import ReconstructionError
+from ..features.selection import grid_subsample
 from ..geometry import GeometryOptions, epipolar_errors, estimate_geometry, transfer_errors
-from ..geometry.acontrario import LARGEST, false_alarms
+from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
 from ..geometry.camera import Calibration, Camera
-from ..geometry.model_selection import has_depth
+from ..geometry.model_selection import select_model
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
 
 FEWEST = 30
@@ -84,14 +85,14 @@ class Evidence:
         fundamental: (3, 3) that explains them best.
         explained: (K,) bool, which of them it explains.
         by_homography: share of them that one homography explains.
-        log_false_alarms: decimal logarithm of the fundamental matrix's number of false alarms.
+        log10_nfa: decimal logarithm of the fundamental matrix's number of false alarms.
     """
 
     rows: np.ndarray
     fundamental: np.ndarray
     explained: np.ndarray
     by_homography: float
-    log_false_alarms: float
+    log10_nfa: float
 
 
 def check_images(gray0: np.ndarray, gray1: np.ndarray) -> None:
@@ -142,7 +143,7 @@ def check_matches(
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    rows = one_a_cell(points0, seed)
+    rows = grid_subsample(points0, CELL, seed)
     first, second = points0[rows], points1[rows]
     space, plane = (
         estimate_geometry(
@@ -153,13 +154,13 @@ def check_matches(
     if len(rows) < FEWEST or space.matrix is None:
         raise ReconstructionError(_no_overlap(len(points0)))
     alarms = [
-        false_alarms(errors, model, threshold, size1)
+        log10_nfa(errors, model, threshold, size1)
         for model, threshold, errors in (
             ("fundamental", THRESHOLD, epipolar_errors(first, second, space.matrix)),
             ("homography", PLANE_THRESHOLD, _plane_errors(first, second, plane.matrix)),
         )
     ]
-    if min(alarms) > LARGEST:
+    if min(alarms) > MAX_LOG10_NFA:
         raise ReconstructionError(_no_overlap(len(points0)))
     moved = np.linalg.norm(second - first, axis=1)[space.inliers | plane.inliers]
     if stands_still(moved):
@@ -195,9 +196,9 @@ def check_pose(pose: RelativePose | None, evidence: Evidence, calibration: Calib
             f"with this calibration only {explained:,} of {possible:,} matches fit one pose of "
             f"the cameras: {_wrong(calibration)}"
         )
-    if pose.in_front < IN_FRONT:
+    if pose.cheirality_ratio < IN_FRONT:
         raise ReconstructionError(
-            f"only {pose.in_front:.0%} of the points would lie before both cameras: "
+            f"only {pose.cheirality_ratio:.0%} of the points would lie before both cameras: "
             f"{_wrong(calibration)}"
         )
 
@@ -236,7 +237,7 @@ def check_focal(
             camera1=_with_focal(calibration.camera1, other),
         )
         found = estimate_relative_pose(points0[rows], points1[rows], scaled, THRESHOLD, seed)
-        if found is None or found.in_front < IN_FRONT:
+        if found is None or found.cheirality_ratio < IN_FRONT:
             continue
         error = float(np.median(found.errors))
         if error < best:
@@ -265,7 +266,7 @@ def is_flat(by_homography: np.ndarray, by_fundamental: np.ndarray) -> bool:
         by_homography, by_fundamental: (M,) bool, the matches that each explains.
     """
     nearly = np.count_nonzero(by_homography) >= FLAT * np.count_nonzero(by_fundamental)
-    return bool(nearly and not has_depth(by_homography, by_fundamental))
+    return bool(nearly and select_model(by_homography, by_fundamental) == "homography")
 
 
 def stands_still(moved: np.ndarray) -> bool:
@@ -277,24 +278,6 @@ def stands_still(moved: np.ndarray) -> bool:
     """
     moved = np.abs(moved)
     return bool(np.median(moved) < STILL and np.quantile(moved, NEARLY_ALL) < NOISE)
-
-
-def one_a_cell(points0: np.ndarray, seed: int = 0, cell: int = CELL) -> np.ndarray:
-    """Choose a random match of each cell of the first image, (K,) rows in rising order.
-
-    Args:
-        points0: (M, 2) positions in the first image.
-        seed: of the choice.
-        cell: side of the cells in pixels.
-
-    Example:
-        >>> len(one_a_cell(np.array([[0, 0], [5, 5], [40, 5]])))
-        2
-    """
-    place = np.floor(np.asarray(points0, np.float64) / cell).astype(np.int64)
-    order = np.random.default_rng(seed).permutation(len(place))
-    _, first = np.unique(place[order], axis=0, return_index=True)
-    return np.sort(order[first])
 
 
 def _wrong(calibration: Calibration) -> str:

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import ReconstructionError
-from .._shared.options import changed
+from .._shared.options import replace_options
 from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
-from ..features.keypoints import SelectionOptions
+from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
 from ..io.exif import calibration_from_exif
 from ..io.image import load_image, luma
@@ -117,7 +117,7 @@ def reconstruct(
         >>> bool(np.median(np.abs(found.disparity - shift)) < 0.1), found.unit
         (True, 'baseline')
     """
-    chosen = changed(options if options is not None else ReconstructionOptions(), **changes)
+    chosen = replace_options(options if options is not None else ReconstructionOptions(), **changes)
     seconds: dict[str, float] = {}
     images = load_image(left), load_image(right)
     sizes = tuple((image.shape[1], image.shape[0]) for image in images)
@@ -252,7 +252,9 @@ def _from_matches(pair: _Pair) -> Reconstruction:
         found = match_images(
             *images,
             pair.detector,
-            options=changed(get_preset("default"), selection=selection, matcher="patchmatch"),
+            options=replace_options(
+                get_preset("default"), selection=selection, matcher="patchmatch"
+            ),
             # A homography would keep the points of one plane, and drop all that stands before it.
             guide="fundamental",
             model="none",

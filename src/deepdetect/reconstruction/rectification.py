@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..features.selection import grid_subsample
 from ..geometry import GeometryOptions, estimate_geometry
-from ..geometry.acontrario import LARGEST, false_alarms
-from .checks import PLANE_THRESHOLD, is_flat, one_a_cell, stands_still
+from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
+from .checks import PLANE_THRESHOLD, is_flat, stands_still
 
 ROWS = 1.0
 """Rows by which a match of a rectified pair may be off."""
@@ -95,7 +96,7 @@ def judge_rectification(
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    rows = one_a_cell(points0, seed, CELL)
+    rows = grid_subsample(points0, CELL, seed)
     first, second = points0[rows], points1[rows]
     vertical = np.abs(second[:, 1] - first[:, 1])
     level = vertical <= ROWS
@@ -110,7 +111,7 @@ def judge_rectification(
         offset = float(np.median((second - first)[space.inliers, 1]))
     counts = tuple(int(np.count_nonzero(part)) for part in (level, space.inliers, other))
     # Rows are a line in every point; nothing was drawn, so this is on the safe side.
-    alarms = false_alarms(np.where(level, 0, np.inf), "fundamental", ROWS, size1)
+    alarms = log10_nfa(np.where(level, 0, np.inf), "fundamental", ROWS, size1)
     reason = _reason(size0, size1, alarms, counts, offset, spread)
     if not reason and stands_still(disparity):
         reason = "nothing moves between the images"
@@ -141,7 +142,7 @@ def _reason(
     on_rows, by_fundamental, by_other_rows = counts
     if size0 != size1:
         return "the images differ in size"
-    if alarms > LARGEST:
+    if alarms > MAX_LOG10_NFA:
         return "hardly any match is on the same row in both images"
     best = max(by_fundamental, by_other_rows)
     if on_rows < AS_MANY * best:

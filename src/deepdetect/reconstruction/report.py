@@ -78,7 +78,7 @@ def _pose(found: Reconstruction) -> dict[str, Any] | None:
         "rotation": found.pose.rotation.tolist(),
         "translation": found.pose.translation.tolist(),
         "angle_degrees": round(found.pose.angle, 4),
-        "in_front": round(found.pose.in_front, 4),
+        "in_front": round(found.pose.cheirality_ratio, 4),
     }
 
 

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from .._shared.errors import ReconstructionError
-from ..features.keypoints import SelectionOptions
+from ..features.selection import SelectionOptions, grid_subsample
 from ..geometry.camera import Calibration
-from .checks import IN_FRONT, one_a_cell, stands_still
+from .checks import CELL, IN_FRONT, stands_still
 
 FOCAL_DIFFERENCE = 0.01
 """Share by which the focal lengths of both views may differ. Rectified views have one; lengths
@@ -179,7 +179,7 @@ def check_turn(pixels: np.ndarray, disparity: np.ndarray, calibration: Calibrati
     rows = np.arange(len(pixels))
     if len(rows) > MANY:
         rows = np.random.default_rng(0).choice(len(rows), MANY, replace=False)
-    rows = rows[one_a_cell(pixels[rows])]
+    rows = rows[grid_subsample(pixels[rows], CELL)]
     if len(rows) < FEWEST:
         return
     pixels, disparity = np.asarray(pixels, np.float64)[rows], np.asarray(disparity)[rows]

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
-from .._shared.threads import in_threads
+from .._shared.parallel import parallel_for
 
 AROUND = 15
 """Side in pixels of the window whose matches give a patch its affinity."""
@@ -221,5 +221,5 @@ def _aligned(
         *(window.astype(np.float32), int(options.rounds), settled, float(options.farthest)),
         *(np.float32(options.least_correlation), refined, converged, correlation),
     )
-    in_threads(len(pixels0), lambda first, last: align(first, last, *arguments))
+    parallel_for(len(pixels0), lambda first, last: align(first, last, *arguments))
     return RefinedMatches(refined, converged, correlation)

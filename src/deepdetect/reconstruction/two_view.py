@@ -161,9 +161,9 @@ def reconstruct_two_view(
     kept = np.ones(len(rows), bool)
     for reason, passed in (
         ("far from its epipolar line", pose.inliers),
-        ("behind a camera", found.in_front),
+        ("behind a camera", found.cheirality),
         ("reprojection error", found.reprojection_errors < options.reprojection_threshold),
-        ("parallax", found.parallax * focal >= options.least_parallax_px),
+        ("parallax", found.triangulation_angle * focal >= options.least_parallax_px),
     ):
         dropped[reason] = int(np.count_nonzero(kept & ~passed))
         kept &= passed
@@ -186,7 +186,7 @@ def reconstruct_two_view(
         pose,
         posed,
         found.reprojection_errors[kept].astype(np.float32),
-        np.degrees(found.parallax[kept]).astype(np.float32),
+        np.degrees(found.triangulation_angle[kept]).astype(np.float32),
         dropped,
         seconds,
     )

@@ -17,8 +17,7 @@ import torch
 from torch import nn
 
 from .._shared.errors import OptionError, unknown_name
-from .._shared.memory import keep_freed_memory
-from .._shared.processes import processor_count
+from .._shared.parallel import disable_malloc_trim, processor_count
 from .batch_norm import synchronize_batch_norm
 from .cluster import DistributedContext, distributed_context
 
@@ -75,7 +74,7 @@ class Engine:
         if kind == "auto":
             kind = "cuda" if torch.cuda.is_available() else "cpu"
         if kind == "cpu":
-            keep_freed_memory()
+            disable_malloc_trim()
         self.bfloat16 = options.precision == "bfloat16" or (
             options.precision == "auto" and _computes_bfloat16(kind)
         )

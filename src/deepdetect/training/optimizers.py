@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from .._shared.errors import look_up
+from .._shared.registry import look_up
 
 if TYPE_CHECKING:
     from torch import Tensor, nn

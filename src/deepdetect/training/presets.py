@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .._shared.errors import look_up
+from .._shared.registry import look_up
 from ..labels import LABEL_SETTINGS
 from .recipe import Stage, TrainingOptions
 

@@ -6,7 +6,8 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 
-from .._shared.errors import OptionError, look_up
+from .._shared.errors import OptionError
+from .._shared.registry import look_up
 from ..labels import DETECTOR_NAMES, LabelOptions, SettingChange
 from .darkening import DarkeningRange
 from .optimizers import OPTIMIZERS

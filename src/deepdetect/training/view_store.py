@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.errors import ImageError
-from .._shared.memory import free_memory
+from .._shared.parallel import available_memory
 from .cluster import distributed_context
 from .label_cache import LabelCache
 from .photos import Photo
@@ -27,7 +27,7 @@ class ViewStore:
     def __init__(self, labels: LabelCache, memory: int | None = None) -> None:
         self.labels = labels
         if memory is None:
-            memory = free_memory() // (2 * distributed_context().local_processes)
+            memory = available_memory() // (2 * distributed_context().local_processes)
         self.memory = memory
         self._kept: dict[tuple[Path, View], tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()

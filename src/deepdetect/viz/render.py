@@ -9,7 +9,13 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
-from ..geometry.point_cloud import TAIL, PointCloud, angular_spacing, require_points, robust_box
+from ..geometry.point_cloud import (
+    BOX_PERCENTILE,
+    PointCloud,
+    angular_spacing,
+    require_points,
+    robust_box,
+)
 from .draw import add_caption, hstack, vstack
 
 SUPERSAMPLING = 2
@@ -107,7 +113,7 @@ def orbit_camera(
     # With a focal length of 1 and the axis at 0, to see what the cloud covers.
     plain = ViewCamera(position, axes, 1.0, np.zeros(2), size)
     xy, depth = plain.project(cloud.points)
-    low, high = np.percentile(xy[depth > 0], (TAIL, 100 - TAIL), axis=0)
+    low, high = np.percentile(xy[depth > 0], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
     wanted = FILLED * np.array(size) / np.maximum(high - low, 1e-6)
     focal = float(wanted.min())
     middle = (np.array(size) - 1) / 2 - focal * (low + high) / 2

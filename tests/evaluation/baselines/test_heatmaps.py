@@ -11,7 +11,6 @@ from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.evaluation.baselines import (
     CLASSICAL,
-    Features,
     Method,
     PointDescriptor,
     deepdetect_method,
@@ -19,6 +18,7 @@ from deepdetect.evaluation.baselines import (
     random_method,
 )
 from deepdetect.evaluation.metrics.spread import coverage
+from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.sift import root_sift_descriptors, sift_descriptors
 from deepdetect.io.image import luma
 
@@ -118,8 +118,8 @@ def test_random_points_of_nothing_are_nothing() -> None:
 
 
 def test_random_points_follow_the_version_of_their_method() -> None:
-    def nothing(rgb: np.ndarray) -> Features:
-        return Features(np.empty((0, 2)), np.empty(0), (1, 1))
+    def nothing(rgb: np.ndarray) -> Keypoints:
+        return Keypoints(np.empty((0, 2)), np.empty(0), (1, 1))
 
     def made(version: str, seed: int) -> str:
         like = Method("like", "Like", nothing, lambda rgb, features: rgb, version=version)

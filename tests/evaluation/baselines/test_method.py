@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.evaluation.baselines import CLASSICAL, Features
+from deepdetect.evaluation.baselines import CLASSICAL
 from deepdetect.evaluation.baselines.method import describe_with
+from deepdetect.features.keypoints import Keypoints
 from deepdetect.io.image import luma
 
 HOME = cv2 if hasattr(cv2, "BRISK_create") else cv2.xfeatures2d
@@ -31,7 +32,7 @@ def test_each_keypoint_keeps_its_row_also_near_the_border(crop: np.ndarray, name
     octaves = (np.arange(len(xy)) % 3).astype(np.int32) if name == "orb" else None
     sizes = np.full(len(xy), 12, np.float32)
     angles = (np.arange(len(xy)) * 7 % 360).astype(np.float32)
-    features = Features(xy, np.ones(len(xy)), (140, 120), sizes, angles, octaves)
+    features = Keypoints(xy, np.ones(len(xy)), (140, 120), sizes, angles, octaves)
     rows = describe_with(make, crop, features)
     assert len(rows) == len(features)
     kept, opened = 0, make()
@@ -47,7 +48,7 @@ def test_each_keypoint_keeps_its_row_also_near_the_border(crop: np.ndarray, name
 
 def test_orb_leaves_out_31_pixels_at_each_border(crop: np.ndarray) -> None:
     xy = grid((140, 120), 1)
-    features = Features(xy, np.ones(len(xy)), (140, 120))
+    features = Keypoints(xy, np.ones(len(xy)), (140, 120))
     described = describe_with(cv2.ORB_create, crop, features).any(1)
     inside = ((xy >= 31) & (xy < (140 - 31, 120 - 31))).all(1)
     np.testing.assert_array_equal(described, inside)
@@ -62,13 +63,13 @@ def test_orb_leaves_out_31_pixels_at_each_border(crop: np.ndarray) -> None:
     ],
 )
 def test_no_keypoints_have_no_descriptors(crop: np.ndarray, make, columns: int, dtype) -> None:
-    rows = describe_with(make, crop, Features(np.empty((0, 2)), np.empty(0), (140, 120)))
+    rows = describe_with(make, crop, Keypoints(np.empty((0, 2)), np.empty(0), (140, 120)))
     assert (rows.shape, rows.dtype) == ((0, columns), dtype)
 
 
 @pytest.mark.parametrize("make", [cv2.ORB_create, HOME.BRISK_create])
 def test_keypoints_at_the_border_only_get_zeros(crop: np.ndarray, make) -> None:
-    rows = describe_with(make, crop, Features([[0, 0], [139, 119]], [1, 1], (140, 120)))
+    rows = describe_with(make, crop, Keypoints([[0, 0], [139, 119]], [1, 1], (140, 120)))
     assert rows.shape[0] == 2
     assert not rows.any()
 

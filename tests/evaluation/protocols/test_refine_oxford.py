@@ -59,7 +59,7 @@ def test_true_homographies_are_left_alone(refined: tuple[list, Path]) -> None:
     written = {path.parent.name for path in refined[1].rglob("*.refined")}
     assert written == {"graf"}
     for result in refined[0]:
-        assert result.refinement.agreement >= result.published
+        assert result.refinement.zncc >= result.published
         assert (result.written is not None) == (result.pair.scene == "graf")
 
 

@@ -10,7 +10,7 @@ import pytest
 from deepdetect import DeepDetect
 from deepdetect.datasets.low_visibility import load_low_visibility
 from deepdetect.datasets.types import PlanarPair
-from deepdetect.evaluation.baselines import CLASSICAL, Features, Method
+from deepdetect.evaluation.baselines import CLASSICAL, Method
 from deepdetect.evaluation.cache import StageCache
 from deepdetect.evaluation.metrics import one_to_one
 from deepdetect.evaluation.metrics.one_to_one import one_to_one_repeatability
@@ -19,6 +19,7 @@ from deepdetect.evaluation.protocols import BenchmarkOptions, Report, run_benchm
 from deepdetect.evaluation.protocols.standard_measures import BUDGETS, measure
 from deepdetect.evaluation.protocols.standard_tables import homography_table, matching_table
 from deepdetect.evaluation.workspace import Workspace
+from deepdetect.features.keypoints import Keypoints
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +94,7 @@ def fails_on(pair: PlanarPair) -> Method:
 
     bad = load_image(pair.second)
 
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         if np.array_equal(rgb, bad):
             raise ValueError("not this one")
         return CLASSICAL["fast"].detect(rgb)
@@ -119,8 +120,8 @@ def test_a_pair_that_fails_is_left_out_and_the_others_count(
 def test_a_pair_without_keypoints_counts_as_wrong_and_is_no_error(
     pairs: list[PlanarPair], tmp_path: Path
 ) -> None:
-    def nothing(rgb: np.ndarray) -> Features:
-        return Features(np.empty((0, 2)), np.empty(0), (rgb.shape[1], rgb.shape[0]))
+    def nothing(rgb: np.ndarray) -> Keypoints:
+        return Keypoints(np.empty((0, 2)), np.empty(0), (rgb.shape[1], rgb.shape[0]))
 
     method = dataclasses.replace(common(CLASSICAL["fast"]), detect=nothing, detection="nothing")
     workspace = Workspace(tmp_path)

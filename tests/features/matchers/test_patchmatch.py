@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepdetect import OptionError
-from deepdetect._shared import threads
+from deepdetect._shared import parallel
 from deepdetect.features.dense_sift import dense_sift
 from deepdetect.features.matchers import match_descriptors
-from deepdetect.features.matchers.exact import exact_neighbours
+from deepdetect.features.matchers.brute_force import exact_neighbours
 from deepdetect.features.matchers.patchmatch import patchmatch_neighbours
 from deepdetect.io.image import luma
 
@@ -67,7 +67,7 @@ def test_the_result_does_not_depend_on_threads_and_is_the_seeds(
     (queries, base), positions = pair
     found = []
     for count in (1, 2, 5):
-        monkeypatch.setattr(threads, "processor_count", lambda count=count: count)
+        monkeypatch.setattr(parallel, "processor_count", lambda count=count: count)
         found.append(patchmatch_neighbours(queries, base, 2, 4, positions))
     for other in found[1:]:
         np.testing.assert_array_equal(found[0][0], other[0])

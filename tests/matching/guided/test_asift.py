@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.features.sift_detector import sparse_features
+from deepdetect.features.sift_detector import detect_sift
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.asift import TILTS, tilted, tilted_views
 
@@ -109,7 +109,7 @@ def test_no_view_has_more_keypoints_than_asked_for(photo: np.ndarray) -> None:
     found = [len(view) for view in tilted_views(gray, 2.0, 30)]
     assert max(found) <= 30
     assert min(found) > 10
-    assert len(sparse_features(gray)) > 30
+    assert len(detect_sift(gray)) > 30
 
 
 @pytest.mark.parametrize("tilt", TILTS)

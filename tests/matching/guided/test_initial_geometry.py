@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from deepdetect.geometry import epipolar_errors, transfer_errors, transform_points
-from deepdetect.geometry.acontrario import LARGEST
-from deepdetect.geometry.model_selection import has_depth
+from deepdetect.geometry.acontrario import MAX_LOG10_NFA
+from deepdetect.geometry.model_selection import select_model
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided.initial_geometry import (
     LONGEST,
@@ -85,7 +85,7 @@ def assert_nothing(found: FirstPass) -> None:
     assert found.kind == "none"
     assert found.matrix is None
     assert found.points0.shape == found.points1.shape == (0, 2)
-    assert found.log_false_alarms >= LARGEST
+    assert found.log10_nfa >= MAX_LOG10_NFA
 
 
 def check_agreeing(found: FirstPass) -> None:
@@ -94,7 +94,7 @@ def check_agreeing(found: FirstPass) -> None:
     measure = transfer_errors if found.kind == "homography" else epipolar_errors
     errors = measure(found.points0, found.points1, found.matrix)
     assert errors.max() < THRESHOLDS[found.kind]
-    assert found.log_false_alarms < LARGEST
+    assert found.log10_nfa < MAX_LOG10_NFA
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_matches_that_are_there_already_are_not_made_again(
     other = warped(gray, MILD, (256, 256))
     expected = first_pass(gray, other)
     initial = initial_matches(gray, other)
-    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.sparse_features", None)
+    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.detect_sift", None)
     found = first_pass(gray, other, initial=initial)
     np.testing.assert_array_equal(found.matrix, expected.matrix)
 
@@ -340,10 +340,10 @@ def test_a_scene_has_depth_by_what_the_homography_leaves(
 ) -> None:
     by_homography = np.repeat([True, False, False], [homography, rest, neither])
     by_fundamental = np.repeat([True, True, False], [homography, rest, neither])
-    assert has_depth(by_homography, by_fundamental) is expected
+    assert (select_model(by_homography, by_fundamental) == "fundamental") is expected
 
 
 def test_matches_that_the_homography_alone_explains_are_no_depth() -> None:
     by_homography = np.repeat([True, True, False], [50, 30, 20])
     by_fundamental = np.repeat([True, False, False], [50, 30, 20])
-    assert has_depth(by_homography, by_fundamental) is False
+    assert select_model(by_homography, by_fundamental) == "homography"

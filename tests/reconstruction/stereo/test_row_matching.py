@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect import ImageError, OptionError
-from deepdetect._shared import threads
+from deepdetect._shared import parallel
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.reconstruction.stereo import COMPLETE, RowMatches, RowMatchingOptions, match_rows
 
@@ -199,7 +199,7 @@ def test_the_result_does_not_depend_on_threads(
     xy = every_pixel(SHAPE)
     found = []
     for count in (1, 2, 5):
-        monkeypatch.setattr(threads, "processor_count", lambda count=count: count)
+        monkeypatch.setattr(parallel, "processor_count", lambda count=count: count)
         found.append(match_rows(left, right, xy, COMPLETE))
     for other in found[1:]:
         np.testing.assert_array_equal(found[0].rows, other.rows)

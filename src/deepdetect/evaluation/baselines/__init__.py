@@ -1,6 +1,5 @@
 """Methods: the detectors with their descriptors that the benchmarks compare."""
 
-from .features import Features
 from .heatmaps import (
     COMMON_DESCRIPTOR,
     PointDescriptor,
@@ -17,7 +16,6 @@ __all__ = [
     "CLASSICAL",
     "COMMON_DESCRIPTOR",
     "STANDARD",
-    "Features",
     "Method",
     "PointDescriptor",
     "deepdetect_method",

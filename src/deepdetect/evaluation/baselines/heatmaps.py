@@ -11,12 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...detector.detector import DeepDetect, find_keypoints
-from ...features.descriptors import get_descriptor
-from ...features.even_order import even_order
-from ...features.keypoints import SelectionOptions, select_keypoints
+from ...features.keypoints import Keypoints, bayer_order
+from ...features.selection import SelectionOptions, select_keypoints
+from ...features.sift import get_descriptor
 from ...io.image import luma
 from ..controls import RandomPoints
-from .features import Features
 from .method import Method
 
 
@@ -34,7 +33,7 @@ class PointDescriptor:
     size: float = 3.0
     angle: float = -1.0
 
-    def describe(self, rgb: np.ndarray, features: Features) -> np.ndarray:
+    def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         """Describe keypoints by their positions alone; (N, D) float32."""
         return get_descriptor(self.name)(luma(rgb), features.xy, self.size, self.angle)
 
@@ -62,9 +61,9 @@ def deepdetect_method(
         descriptor: of the points.
     """
 
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         points = find_keypoints(detector, rgb, selection)
-        return Features(points.xy, points.logits, points.image_size)
+        return Keypoints(points.xy, points.logits, points.image_size)
 
     digest = hashlib.sha256(detector.weights.read_bytes()).hexdigest()[:16]
     version = f"{digest} {detector.backend} {detector.heatmap_options} {selection} {descriptor}"
@@ -80,16 +79,16 @@ def random_method(like: Method, seed: int = 0, *, name: str = "random") -> Metho
         name: as of `Method`.
     """
 
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         # The image decides too, so that both images of a pair do not get the same pixels.
         own = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:4], "little")
         count = len(like.detect(rgb))
         size = (rgb.shape[1], rgb.shape[0])
         if not count:
-            return Features(np.empty((0, 2)), np.empty(0), size)
+            return Keypoints(np.empty((0, 2)), np.empty(0), size)
         options = SelectionOptions(threshold=0, max_keypoints=count, nms_radius=0, subpixel=False)
         points = select_keypoints(RandomPoints(seed + own).heatmap(rgb), options)
-        return Features(points.xy, points.scores, size)
+        return Keypoints(points.xy, points.scores, size)
 
     title = f"control: as many random points as {like.title}"
     version = f"{like.name} {like.version} {seed}"
@@ -99,11 +98,11 @@ def random_method(like: Method, seed: int = 0, *, name: str = "random") -> Metho
 def every_pixel_method() -> Method:
     """Make the control that takes every pixel; its best ones form an even grid, however many."""
 
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         height, width = rgb.shape[:2]
         row, column = (part.ravel() for part in np.indices((height, width)))
         xy = np.column_stack([column, row])
-        return Features(xy, 1 - even_order(xy, (width, height)), (width, height))
+        return Keypoints(xy, 1 - bayer_order(xy, (width, height)), (width, height))
 
     title = "control: every pixel (a grid, where there is a budget)"
     return Method("every-pixel", title, detect, PAPER_DESCRIPTOR.describe, control=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from ..._shared.errors import OptionError
-from .features import Features
+from ...features.keypoints import Keypoints
 from .heatmaps import COMMON_DESCRIPTOR
 from .method import Method
 
@@ -33,16 +33,16 @@ def importable_method(target: str) -> Method:
     """
     function = _find(target)
 
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         found = function(rgb)
         if not isinstance(found, Mapping) or not {"keypoints", "scores"} <= set(found):
             raise OptionError(f"{target} must return a dict with 'keypoints' and 'scores'")
         size = (rgb.shape[1], rgb.shape[0])
-        return Features(
+        return Keypoints(
             found["keypoints"], found["scores"], size, descriptors=found.get("descriptors")
         )
 
-    def describe(rgb: np.ndarray, features: Features) -> np.ndarray:
+    def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         if features.descriptors is None:
             return COMMON_DESCRIPTOR.describe(rgb, features)
         return features.descriptors

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ...features.keypoints import Keypoints
 from ...io.image import luma
-from .features import Features
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Method:
 
     name: str
     title: str
-    detect: Callable[[np.ndarray], Features]
-    describe: Callable[[np.ndarray, Features], np.ndarray]
+    detect: Callable[[np.ndarray], Keypoints]
+    describe: Callable[[np.ndarray, Keypoints], np.ndarray]
     binary: bool = False
     learned: bool = False
     control: bool = False
@@ -58,18 +58,18 @@ def opencv_method(
         make_descriptor: opens what describes its points; default SIFT, as in the paper.
     """
 
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         found = make_detector().detect(luma(rgb), None)
-        return Features.from_opencv(found, (rgb.shape[1], rgb.shape[0]))
+        return Keypoints.from_opencv(found, (rgb.shape[1], rgb.shape[0]))
 
-    def describe(rgb: np.ndarray, features: Features) -> np.ndarray:
+    def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         return describe_with(make_descriptor or cv2.SIFT_create, rgb, features)
 
     return Method(name, title, detect, describe, binary=make_descriptor is not None)
 
 
 def describe_with(
-    make_descriptor: Callable[[], cv2.Feature2D], rgb: np.ndarray, features: Features
+    make_descriptor: Callable[[], cv2.Feature2D], rgb: np.ndarray, features: Keypoints
 ) -> np.ndarray:
     """Compute OpenCV's descriptors, a row for each keypoint.
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..._shared.errors import WeightsError
 from ...detector.backends.without_telemetry import import_onnxruntime
-from .features import Features
+from ...features.keypoints import Keypoints
 from .heatmaps import COMMON_DESCRIPTOR
 from .method import Method
 
@@ -44,10 +44,10 @@ def onnx_method(path: str | Path, name: str | None = None) -> Method:
     if not {"keypoints", "scores"} <= set(outputs):
         raise WeightsError(f"{file} must have the outputs keypoints and scores, not {outputs}")
 
-    def detect(rgb: np.ndarray) -> Features:
+    def detect(rgb: np.ndarray) -> Keypoints:
         return _detect(session, outputs, rgb)
 
-    def describe(rgb: np.ndarray, features: Features) -> np.ndarray:
+    def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         if features.descriptors is None:
             return COMMON_DESCRIPTOR.describe(rgb, features)
         return features.descriptors
@@ -72,7 +72,7 @@ def _open(data: bytes, file: Path) -> Any:
         raise WeightsError(f"{file} is no ONNX file that can be run ({reason})") from None
 
 
-def _detect(session: Any, outputs: list[str], rgb: np.ndarray) -> Features:
+def _detect(session: Any, outputs: list[str], rgb: np.ndarray) -> Keypoints:
     height, width = rgb.shape[:2]
     entry = session.get_inputs()[0]
     wanted = [
@@ -93,4 +93,4 @@ def _detect(session: Any, outputs: list[str], rgb: np.ndarray) -> Features:
     # The borders of both frames are the same lines, half a pixel before the first centre.
     scale = np.array([width / wanted[1], height / wanted[0]])
     xy = (parts["keypoints"] + 0.5) * scale - 0.5
-    return Features(xy, parts["scores"], (width, height), descriptors=parts.get("descriptors"))
+    return Keypoints(xy, parts["scores"], (width, height), descriptors=parts.get("descriptors"))

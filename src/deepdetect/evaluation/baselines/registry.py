@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..._shared.errors import OptionError, look_up
+from ..._shared.errors import OptionError
+from ..._shared.registry import look_up
 from .agast import AGAST_DEFAULT, AGAST_LOW
 from .brisk import BRISK_DEFAULT, BRISK_LOW
 from .fast import FAST_DEFAULT, FAST_LOW

@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from ...features.dense_sift import dense_sift
-from ...features.descriptors import get_descriptor
+from ...features.sift import get_descriptor
 from ...io.image import load_image, luma
 from ..report import Cell, Column, Table
 from ..workspace import Workspace

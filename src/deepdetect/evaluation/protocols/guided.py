@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..._shared.options import changed
+from ..._shared.options import replace_options
 from ...datasets.types import PlanarPair
 from ...geometry import transform_points
 from ...geometry.residuals import transfer_errors
@@ -217,7 +217,7 @@ def find_guided(workspace: Workspace, method: Method, pair: PlanarPair, seed: in
         with metered() as meter:
             guide, found = guided_matches(*grays, *points, seed=seed)
         if found is None:
-            options = changed(get_preset("default"), seed=seed)
+            options = replace_options(get_preset("default"), seed=seed)
             found = unguided_matches(grays, points, options, {})
         return {
             "kind": np.array(guide.model),

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...detector.detector import DeepDetect
 from ...features.matchers import match_descriptors
-from ...features.matchers.flann import flann_neighbours
+from ...features.matchers.approximate import flann_neighbours
 from ...io.image import luma
 from ...matching.pipeline import check_memory
 from .published_pipeline import published_matches

@@ -81,7 +81,7 @@ def _refine(pair: PlanarPair, path: Path) -> RefinedPair:
     start = sift_homography(gray0, gray1)
     if start is not None:
         found.append(refine_homography(gray0, gray1, start))
-    best = max(found, key=lambda refinement: refinement.agreement)
+    best = max(found, key=lambda refinement: refinement.zncc)
     published = found[0].before
     size0, size1 = ((gray.shape[1], gray.shape[0]) for gray in (gray0, gray1))
     moved = displacement(best.homography, pair.homography, size0, size1)
@@ -89,7 +89,7 @@ def _refine(pair: PlanarPair, path: Path) -> RefinedPair:
     apart = None
     if there.exists():
         apart = displacement(best.homography, read_homography(there), size0, size1)
-    better = best.agreement > published + LEAST_GAIN
+    better = best.zncc > published + LEAST_GAIN
     if better:
         with atomic_path(path) as temporary:
             np.savetxt(temporary, best.homography, fmt="%.12e")
@@ -145,7 +145,7 @@ def refinement_table(results: list[RefinedPair]) -> Table:
         (
             result.pair.name,
             result.published,
-            result.refinement.agreement,
+            result.refinement.zncc,
             *result.moved,
             *(result.apart or (None, None)),
             "yes" if result.written else "no: the published one is as good",

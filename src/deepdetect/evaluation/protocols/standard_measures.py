@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ...datasets.types import PlanarPair
+from ...features.keypoints import Keypoints
 from ...geometry import GeometryOptions, estimate_geometry
-from ..baselines import Features, Method
+from ..baselines import Method
 from ..metrics.homography_accuracy import corner_error
 from ..metrics.match_accuracy import MatchAccuracy, match_accuracy
 from ..metrics.one_to_one import Repeatability, one_to_one_repeatability
@@ -161,7 +162,7 @@ def _repeatability(
     method: Method,
     pair: PlanarPair,
     sizes: Sizes,
-    places: Sequence[Features],
+    places: Sequence[Keypoints],
     budget: int | None,
 ) -> list[Repeatability]:
     images = (pair.first, pair.second)
@@ -186,7 +187,7 @@ def _coverage(
     method: Method,
     image: Path,
     size: tuple[int, int],
-    places: Features,
+    places: Keypoints,
     budget: int | None,
 ) -> float:
     def make() -> dict[str, np.ndarray]:
@@ -196,5 +197,5 @@ def _coverage(
     return float(found["value"])
 
 
-def _best(features: Features, budget: int | None) -> np.ndarray:
+def _best(features: Keypoints, budget: int | None) -> np.ndarray:
     return (features if budget is None else features.best(budget)).xy

@@ -1,7 +1,13 @@
 """Matchers: which descriptor of one image is like which of the other."""
 
-from .ratio import DescriptorMatches, match_descriptors, one_to_one
-from .registry import MATCHERS, Matcher, get_matcher
+from .matching import (
+    MATCHERS,
+    DescriptorMatches,
+    Matcher,
+    get_matcher,
+    match_descriptors,
+    unique_matches,
+)
 
 __all__ = [
     "MATCHERS",
@@ -9,5 +15,5 @@ __all__ = [
     "Matcher",
     "get_matcher",
     "match_descriptors",
-    "one_to_one",
+    "unique_matches",
 ]

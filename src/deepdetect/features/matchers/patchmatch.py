@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..._shared.errors import OptionError
-from ..._shared.threads import in_threads
+from ..._shared.parallel import parallel_for
 
 SWEEPS = 4
 OFFSETS = (1, 4, 12)
@@ -114,7 +114,7 @@ def _search(
                 first, last, queries, base, pixels[0], at1, matrix, TRIES, seed, rows, distances
             )
 
-    in_threads(len(queries), begin)
+    parallel_for(len(queries), begin)
     for turn in range(SWEEPS):
         before = rows.copy()
 
@@ -124,7 +124,7 @@ def _search(
                 *(seed, _radii(at1.shape), before, rows, distances, matrix, float(band)),
             )
 
-        in_threads(len(bands) - 1, work)
+        parallel_for(len(bands) - 1, work)
     gaps = np.sqrt(distances.astype(np.float32))
     gaps[distances == kernel.FAR] = np.inf
     if order is not None:

@@ -12,7 +12,8 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from ...features.sift_detector import SparseFeatures, sparse_features
+from ...features.keypoints import Keypoints
+from ...features.sift_detector import SiftOptions, detect_sift
 
 TILTS = (2.0, 2.0 * 2**0.5, 4.0)
 """How many times shorter one direction is seen."""
@@ -24,7 +25,7 @@ ALIAS = 0.8
 """Blur before an image is shortened, in units of sqrt(tilt^2 - 1)."""
 
 
-def tilted_views(gray: np.ndarray, tilt: float, most: int) -> Iterator[SparseFeatures]:
+def tilted_views(gray: np.ndarray, tilt: float, most: int) -> Iterator[Keypoints]:
     """Find the keypoints of an image as seen from the side, from directions all around.
 
     Args:
@@ -37,11 +38,14 @@ def tilted_views(gray: np.ndarray, tilt: float, most: int) -> Iterator[SparseFea
     """
     for turn in np.linspace(0, 180, round(180 * tilt / STEP), endpoint=False):
         view, to_view = tilted(gray, tilt, float(turn))
-        found = sparse_features(view, most)
+        found = detect_sift(view, SiftOptions(max_keypoints=most))
         back = cv2.invertAffineTransform(to_view)
         xy = found.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
         inside = ((xy > 0) & (xy < np.array(gray.shape[::-1]) - 1)).all(1)
-        yield SparseFeatures(xy[inside], found.descriptors[inside])
+        size = (gray.shape[1], gray.shape[0])
+        yield Keypoints(
+            *(xy[inside], found.scores[inside], size), descriptors=found.descriptors[inside]
+        )
 
 
 def tilted(gray: np.ndarray, tilt: float, turn: float) -> tuple[np.ndarray, np.ndarray]:

@@ -11,8 +11,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ...features.dense_sift import dense_sift, root
+from ...features.dense_sift import dense_sift
 from ...features.matchers.patchmatch import epipolar_neighbours
+from ...features.sift import to_root_sift
 
 SIZE = 2.0
 """Diameter of the keypoints for the search, in pixels: small, as depth jumps within a large one."""
@@ -68,7 +69,7 @@ def matches_by_epipolar_line(
     if len(xy0) < 2 or len(xy1) < 2:
         return nothing
     first, second = (
-        root(dense_sift(gray, xy, SIZE), overwrite=True)
+        to_root_sift(dense_sift(gray, xy, SIZE), overwrite=True)
         for gray, xy in ((gray0, xy0), (gray1, xy1))
     )
     there, distances = epipolar_neighbours(first, second, seed, (xy0, xy1), fundamental, BAND)

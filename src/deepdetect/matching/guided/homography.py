@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...geometry.residuals import transform_points
-from ...geometry.zncc import warp_back
+from ...geometry.zncc import warp_to_reference
 from .verification import unlikeness
 
 REACH = 1.0
@@ -37,7 +37,7 @@ def matches_by_homography(
     rows0 = np.flatnonzero(distances < REACH)
     if not len(rows0):
         return rows0, rows0, np.empty(0, np.float32)
-    warped, seen = warp_back(gray1, homography, (gray0.shape[1], gray0.shape[0]))
+    warped, seen = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
     scores = unlikeness(gray0, warped, seen, xy0[rows0], seed)
     kept = rows0[scores < 1]
     return kept, rows1[kept], scores[scores < 1]

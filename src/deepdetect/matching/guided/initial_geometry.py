@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..._shared.errors import unknown_name
+from ...features.keypoints import Keypoints
 from ...features.matchers import get_matcher, match_descriptors
-from ...features.sift_detector import MOST, SparseFeatures, sparse_features
+from ...features.sift_detector import SiftOptions, detect_sift
 from ...geometry import GeometryOptions, estimate_geometry
-from ...geometry.acontrario import LARGEST, false_alarms
-from ...geometry.model_selection import has_depth
-from ...geometry.rescaling import scaled_fundamental, scaled_homography, scaled_points, shrunk
+from ...geometry.acontrario import MAX_LOG10_NFA, log10_nfa
+from ...geometry.model_selection import select_model
+from ...geometry.rescaling import downscale, scaled_fundamental, scaled_homography, scaled_points
 from ...geometry.residuals import epipolar_errors, transfer_errors
 from .asift import TILTS, tilted_views
 
@@ -42,7 +43,7 @@ class FirstPass:
         matrix: (3, 3) float64 at the images' own size, or None.
         points0, points1: (M, 2) the sparse matches that agree with it, at the images' own size.
         matches: number of sparse matches it was estimated from.
-        log_false_alarms: decimal logarithm of its number of false alarms (`trust`).
+        log10_nfa: decimal logarithm of its number of false alarms (`trust`).
         simulated: number of simulated views that it took.
     """
 
@@ -51,7 +52,7 @@ class FirstPass:
     points0: np.ndarray
     points1: np.ndarray
     matches: int
-    log_false_alarms: float
+    log10_nfa: float
     simulated: int
 
 
@@ -68,7 +69,7 @@ class InitialMatches:
 
     views: tuple[np.ndarray, np.ndarray]
     scales: tuple[float, float]
-    features: tuple[SparseFeatures, SparseFeatures]
+    features: tuple[Keypoints, Keypoints]
     matched: tuple[np.ndarray, np.ndarray]
 
     @property
@@ -94,8 +95,8 @@ def initial_matches(gray0: np.ndarray, gray1: np.ndarray) -> InitialMatches:
         >>> bool((found.points0 == found.points1).all()), len(found.points0) > 50
         (True, True)
     """
-    (view0, scale0), (view1, scale1) = (shrunk(gray, LONGEST) for gray in (gray0, gray1))
-    features = sparse_features(view0), sparse_features(view1)
+    (view0, scale0), (view1, scale1) = (downscale(gray, LONGEST) for gray in (gray0, gray1))
+    features = detect_sift(view0), detect_sift(view1)
     return InitialMatches((view0, view1), (scale0, scale1), features, _matched(*features))
 
 
@@ -111,7 +112,7 @@ def first_pass(
     Args:
         gray0, gray1: (H, W) uint8 luma.
         model: "homography", "fundamental", or "auto": the homography, but for scenes with depth
-            (`has_depth`).
+            (`select_model`).
         seed: of the random samples.
         initial: of `initial_matches`, where they are there already; None: they are made.
 
@@ -131,13 +132,11 @@ def first_pass(
     for pairs, views in _looks(initial):
         simulated += views
         found = _estimate(*pairs, model, seed, (view1.shape[1], view1.shape[0]), simulated)
-        if found.log_false_alarms < best.log_false_alarms:
+        if found.log10_nfa < best.log10_nfa:
             best = found
-        if best.log_false_alarms < LARGEST:
+        if best.log10_nfa < MAX_LOG10_NFA:
             return _enlarged(best, *initial.scales)
-    return FirstPass(
-        "none", None, *np.empty((2, 0, 2)), best.matches, best.log_false_alarms, simulated
-    )
+    return FirstPass("none", None, *np.empty((2, 0, 2)), best.matches, best.log10_nfa, simulated)
 
 
 def _looks(initial: InitialMatches) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], int]]:
@@ -148,7 +147,7 @@ def _looks(initial: InitialMatches) -> Iterator[tuple[tuple[np.ndarray, np.ndarr
     for tilt in TILTS:
         views = 0
         for first, second, swapped in ((view0, plain1, False), (view1, plain0, True)):
-            for seen in tilted_views(first, tilt, MOST // 2):
+            for seen in tilted_views(first, tilt, SiftOptions.max_keypoints // 2):
                 pair = _matched(seen, second)
                 together = tuple(
                     np.concatenate([had, new])
@@ -159,7 +158,7 @@ def _looks(initial: InitialMatches) -> Iterator[tuple[tuple[np.ndarray, np.ndarr
         yield together, views
 
 
-def _matched(first: SparseFeatures, second: SparseFeatures) -> tuple[np.ndarray, np.ndarray]:
+def _matched(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, np.ndarray]:
     found = match_descriptors(
         first.descriptors, second.descriptors, get_matcher("exact"), ratio=RATIO, mutual=True
     )
@@ -195,7 +194,7 @@ def _estimate(
         errors_of = transfer_errors if kind == "homography" else epipolar_errors
         errors = errors_of(points0, points1, geometry.matrix)
         explained[kind] = geometry.inliers
-        alarms = false_alarms(errors, kind, THRESHOLDS[kind], size)
+        alarms = log10_nfa(errors, kind, THRESHOLDS[kind], size)
         found[kind] = FirstPass(
             kind,
             geometry.matrix,
@@ -205,11 +204,11 @@ def _estimate(
             alarms,
             simulated,
         )
-    trusted = {kind: one for kind, one in found.items() if one.log_false_alarms < LARGEST}
+    trusted = {kind: one for kind, one in found.items() if one.log10_nfa < MAX_LOG10_NFA}
     if len(trusted) == 2:
-        return trusted["fundamental" if has_depth(*explained.values()) else "homography"]
+        return trusted[select_model(*explained.values())]
     nothing = FirstPass("none", None, *np.empty((2, 0, 2)), len(points0), float("inf"), simulated)
-    return min((trusted or found).values(), key=lambda one: one.log_false_alarms, default=nothing)
+    return min((trusted or found).values(), key=lambda one: one.log10_nfa, default=nothing)
 
 
 def _enlarged(found: FirstPass, scale0: float, scale1: float) -> FirstPass:

@@ -14,9 +14,12 @@ from ..._shared.errors import unknown_name
 from ...features.matchers import DescriptorMatches
 from ...features.matches import Guide
 from ...geometry import GeometryOptions, estimate_geometry
-from ...geometry.homography_refinement import RefinementOptions, refine_homography
-from ...geometry.majority_fit import fit_to_majority
-from ...geometry.rescaling import scaled_homography, shrunk
+from ...geometry.homography_refinement import (
+    RefinementOptions,
+    refine_homography,
+    refine_homography_irls,
+)
+from ...geometry.rescaling import downscale, scaled_homography
 from .epipolar import matches_by_epipolar_line
 from .homography import matches_by_homography
 from .initial_geometry import FirstPass, InitialMatches, first_pass
@@ -117,10 +120,10 @@ def _by_lines(
 
 def sharpened(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Refine a homography by the images, shrunk to what that needs; (3, 3)."""
-    (small0, scale0), (small1, scale1) = (shrunk(gray, LONGEST) for gray in (gray0, gray1))
+    (small0, scale0), (small1, scale1) = (downscale(gray, LONGEST) for gray in (gray0, gray1))
     start = scaled_homography(homography, scale0, scale1)
     found = refine_homography(small0, small1, start, SHARPENING).homography
-    found = fit_to_majority(small0, small1, found)
+    found = refine_homography_irls(small0, small1, found)
     return scaled_homography(found, 1 / scale0, 1 / scale1)
 
 
@@ -130,6 +133,6 @@ def _guide(first: FirstPass, matrix: np.ndarray | None) -> Guide:
         matrix,
         first.matches,
         len(first.points0),
-        float(first.log_false_alarms),
+        float(first.log10_nfa),
         first.simulated,
     )

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from ...features.correlation import less_correlated
-from ...features.dense_sift import dense_sift, root
+from ...features.dense_sift import dense_sift
+from ...features.sift import correlation_distance, to_root_sift
 from .strangers import choose_strangers, numbered
 
 SIZES = (3.0, 8.0)
@@ -83,17 +83,19 @@ def unlikeness(
     unlike = np.zeros(len(described), np.float32)
     stranger = [np.zeros(len(move.rows), np.float32) for move in moves]
     for size in SIZES:
-        first = root(dense_sift(gray0, described, size), overwrite=True)
+        first = to_root_sift(dense_sift(gray0, described, size), overwrite=True)
         total = first.sum(axis=0, dtype=np.int64)  # whole: the order of the points has no say
         mean = (total / len(first) if len(first) >= FEW else 0 * total).astype(np.float32)
-        second = root(dense_sift(warped, places, size), overwrite=True)
-        unlike += less_correlated(first, np.arange(len(first)), second, own, mean)
+        second = to_root_sift(dense_sift(warped, places, size), overwrite=True)
+        unlike += correlation_distance(first, np.arange(len(first)), second, own, mean)
         for values, move in zip(stranger, moves, strict=True):
             x, y = move.places[move.whole].T
             rows, cut = move.rows[move.whole], move.rows[~move.whole]
-            values[move.whole] += less_correlated(first, rows, second, number[y, x], mean)
-            others = root(dense_sift(move.moved, described[cut], size), overwrite=True)
-            values[~move.whole] += less_correlated(first, cut, others, np.arange(len(cut)), mean)
+            values[move.whole] += correlation_distance(first, rows, second, number[y, x], mean)
+            others = to_root_sift(dense_sift(move.moved, described[cut], size), overwrite=True)
+            values[~move.whole] += correlation_distance(
+                first, cut, others, np.arange(len(cut)), mean
+            )
     means = [
         _together(described[move.rows], values, described[move.rows], gray0.shape)
         for move, values in zip(moves, stranger, strict=True)

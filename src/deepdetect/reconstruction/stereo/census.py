@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ..._shared.threads import in_threads
+from ..._shared.parallel import parallel_for
 
 REACH_X = 4
 REACH_Y = 3
@@ -35,7 +35,7 @@ def census(gray: np.ndarray) -> np.ndarray:
 
     framed = cv2.copyMakeBorder(gray, REACH_Y, REACH_Y, REACH_X, REACH_X, cv2.BORDER_REPLICATE)
     out = np.empty(gray.shape, np.uint64)
-    in_threads(len(gray), lambda first, last: kernel.census_rows(first, last, framed, out))
+    parallel_for(len(gray), lambda first, last: kernel.census_rows(first, last, framed, out))
     return out
 
 
@@ -63,7 +63,7 @@ def matching_cost(left: np.ndarray, right: np.ndarray, smallest: int, count: int
     # Mirrored, growing disparities lie at growing addresses.
     mirrored = np.ascontiguousarray(right[:, ::-1])
     outside = np.uint8(BITS // 2)
-    in_threads(
+    parallel_for(
         len(left),
         lambda first, last: kernel.cost_rows(first, last, left, mirrored, smallest, outside, cost),
     )

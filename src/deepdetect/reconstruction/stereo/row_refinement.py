@@ -16,7 +16,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ..._shared.threads import in_threads
+from ..._shared.parallel import parallel_for
 from .consistency import JUMP
 
 REACH = 2
@@ -72,7 +72,7 @@ def refine_along_rows(
         ) -> None:
             kernel.sample_rows(first, last, target, start, *into)
 
-        in_threads(len(start), sample)
+        parallel_for(len(start), sample)
         frames = (
             framed,
             _framed(values, REACH),
@@ -83,7 +83,7 @@ def refine_along_rows(
         def step(first: int, last: int, frames: tuple = frames, into: np.ndarray = refined) -> None:
             kernel.step_rows(first, last, *frames, REACH, np.float32(JUMP), np.float32(NOISE), into)
 
-        in_threads(len(start), step)
+        parallel_for(len(start), step)
     return np.where(known, _smoothed(refined, known, LAST_SMOOTHING), disparity)
 
 
@@ -92,7 +92,7 @@ def _smoothed(disparity: np.ndarray, known: np.ndarray, reach: int) -> np.ndarra
 
     out = np.empty_like(disparity)
     framed = _framed(disparity, reach, known)
-    in_threads(
+    parallel_for(
         len(out),
         lambda first, last: kernel.smooth_rows(first, last, framed, reach, np.float32(JUMP), out),
     )

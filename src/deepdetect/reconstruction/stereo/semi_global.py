@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..._shared.errors import OptionError
-from ..._shared.threads import in_threads
+from ..._shared.parallel import parallel_for
 from .census import UNITS, census, matching_cost
 
 SMALL_STEP = 20
@@ -132,14 +132,14 @@ def _volume(
     large = np.maximum(LARGE_STEP / (1 + np.arange(256) / EDGE), 1.25 * SMALL_STEP)
     steps = (small, (large * UNITS).astype(np.uint16))
     for direction in (1, -1):
-        in_threads(
+        parallel_for(
             height,
             lambda first, last, direction=direction: kernel.sum_along_rows(
                 first, last, gray, cost, total, direction, *steps
             ),
         )
         for slant in (-1, 0, 1):
-            in_threads(
+            parallel_for(
                 width,
                 lambda first, last, direction=direction, slant=slant: kernel.sum_along_columns(
                     first, last, gray, cost, total, direction, slant, *steps
@@ -153,7 +153,7 @@ def _choose(total: np.ndarray, search: SearchRange, rows: slice, found: Disparit
     from . import semi_global_kernel as kernel
 
     into = (found.disparity[rows], found.known[rows], found.unique[rows])
-    in_threads(
+    parallel_for(
         len(total),
         lambda first, last: kernel.best_of_rows(
             first, last, total, search.smallest, search.count, *into

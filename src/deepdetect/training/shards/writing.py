@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..._shared.atomic import atomic_path
 from ..._shared.errors import DeepDetectError, ImageError, OptionError
-from ..._shared.processes import map_in_processes
+from ..._shared.parallel import map_in_processes
 from ..._shared.progress import progress
 from ...io.image import load_image
 from ...io.masks import encode_mask

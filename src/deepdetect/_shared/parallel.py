@@ -1,20 +1,33 @@
-"""Parallel work over processes, one image a task."""
+"""Parallel work over processes and threads, and the memory for it."""
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
+import platform
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
 from typing import TypeVar
 
 from .errors import DeepDetectError, OptionError
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
+
+PARTS_A_THREAD = 4
+"""Parts are more than threads, so that a thread with easy ones takes more of them."""
+
+UNKNOWN = 4_000_000_000
+"""Bytes assumed where the system does not tell."""
+
+# Of malloc.h: no block of its own mapping, nothing given back at the end, room for more.
+_KEEP = ((-4, 0), (-1, -1), (-2, 2**28))
 
 
 def processor_count() -> int:
@@ -122,3 +135,85 @@ def _one_opencv_thread() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
+
+
+def parallel_for(count: int, work: Callable[[int, int], object]) -> None:
+    """Do a piece of work on parts of a range, in as many threads as there are processors.
+
+    The parts do not depend on the number of threads as far as the work is concerned: it must
+    give the same for a range as for its parts.
+
+    Args:
+        count: length of the range.
+        work: called with (start, stop) of each part; it should release Python's lock.
+
+    Example:
+        >>> done = []
+        >>> parallel_for(10, lambda start, stop: done.extend(range(start, stop)))
+        >>> sorted(done) == list(range(10))
+        True
+    """
+    threads = min(processor_count(), count)
+    if threads <= 1:
+        work(0, count)
+        return
+    parts = min(count, threads * PARTS_A_THREAD)
+    edges = [count * k // parts for k in range(parts + 1)]
+    with ThreadPoolExecutor(threads) as pool:
+        for future in [pool.submit(work, *edge) for edge in pairwise(edges)]:
+            future.result()
+
+
+def available_memory() -> int:
+    """Return the memory in bytes that can be had without swapping, within the container's limit.
+
+    Example:
+        >>> available_memory() > 0
+        True
+    """
+    return min(_system_memory(), _container_memory())
+
+
+def disable_malloc_trim() -> bool:
+    """Let this process keep what it frees, for its next arrays, as far as the system can do that.
+
+    The GNU library gives large blocks back at once, and the system clears each page of the
+    next ones anew: a training step on the CPU, which makes and frees gigabytes, spends a fifth
+    of its time on that. It holds for the whole process, whose memory stays at its peak.
+
+    Returns:
+        Whether it will be so.
+
+    Example:
+        >>> disable_malloc_trim() in (True, False)
+        True
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return False
+    mallopt = ctypes.CDLL(None).mallopt
+    return all(mallopt(option, value) for option, value in _KEEP)
+
+
+def _system_memory() -> int:
+    try:
+        # MemAvailable counts the caches that the system would give up; macOS lacks the file.
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except (OSError, ValueError, IndexError):
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    except (AttributeError, ValueError, OSError):
+        return UNKNOWN
+
+
+def _container_memory() -> int:
+    """Return what a control group (version 2) leaves to this process."""
+    group = Path("/sys/fs/cgroup")
+    try:
+        limit = (group / "memory.max").read_text().strip()
+        used = int((group / "memory.current").read_text())
+        return 2**62 if limit == "max" else max(int(limit) - used, 0)
+    except (OSError, ValueError):
+        return 2**62

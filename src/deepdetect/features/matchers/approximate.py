@@ -1,14 +1,19 @@
-"""faiss: an inverted file of quantised descriptors, for descriptors with no order in the image.
+"""Approximate search: FLANN's randomised kd-trees, as in the paper's code, and faiss.
 
-Johnson, Douze and Jégou, "Billion-scale similarity search with GPUs", 2017. On bytes its
-quantiser of eight bits loses nothing.
+faiss keeps an inverted file of quantised descriptors (Johnson, Douze and Jégou, "Billion-scale
+similarity search with GPUs", 2017); on bytes its quantiser of eight bits loses nothing.
 """
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from ..._shared.errors import OptionError
+from ..._shared.errors import MissingExtraError
+
+KD_TREE = 1
+TREES = 5
+CHECKS = 50
 
 LISTS_PER_ROOT = 4
 """Lists of the inverted file, in units of the square root of the number of descriptors."""
@@ -21,6 +26,37 @@ TRAINING = 40
 
 FEWEST = 4096
 """Descriptors under which all are compared: an inverted file would save nothing."""
+
+
+def flann_neighbours(
+    queries: np.ndarray,
+    base: np.ndarray,
+    count: int,
+    seed: int,
+    positions: object = None,
+    trees: int = TREES,
+    checks: int = CHECKS,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the nearest neighbours in kd-trees.
+
+    Args:
+        queries: (N, D) descriptors, uint8 or float32.
+        base: (M, D) descriptors, M >= count.
+        count: neighbours of each query.
+        seed: of the random trees; the result is the same for the same seed.
+        positions: not used; all matchers take the same arguments.
+        trees: number of trees.
+        checks: leaves that a query looks at.
+
+    Returns:
+        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances,
+        the nearest first. The search is approximate: it misses some neighbours.
+    """
+    queries, base = (np.asarray(part, np.float32) for part in (queries, base))
+    cv2.setRNGSeed(seed)
+    index = cv2.flann_Index(base, {"algorithm": KD_TREE, "trees": trees})
+    rows, squared = index.knnSearch(queries, count, params={"checks": checks})
+    return rows, np.sqrt(squared)
 
 
 def faiss_neighbours(
@@ -40,12 +76,12 @@ def faiss_neighbours(
         first. The search is approximate: it misses a neighbour in fifty.
 
     Raises:
-        OptionError: faiss is not installed.
+        MissingExtraError: faiss is not installed.
     """
     try:
         import faiss
     except ImportError:
-        raise OptionError(
+        raise MissingExtraError(
             "the matcher faiss needs faiss: pip install 'deepdetect[faiss]', or take flann"
         ) from None
     quantiser = faiss.ScalarQuantizer

@@ -1,12 +1,53 @@
-"""The ratio test: a match counts when the second-best one is clearly worse (Lowe, 2004)."""
+"""Matching of descriptors: nearest neighbours, the ratio test (Lowe, 2004), and the matchers.
+
+To add a matcher, write its module beside this one, with a function
+`(queries, base, count, seed, positions) -> (rows, distances)`, and add its line.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from .registry import Matcher
+from ..._shared.registry import look_up
+from .approximate import faiss_neighbours, flann_neighbours
+from .brute_force import exact_neighbours, hamming_neighbours
+from .patchmatch import patchmatch_neighbours
+
+
+class Matcher(Protocol):
+    """Finds the nearest neighbours of descriptors."""
+
+    def __call__(
+        self,
+        queries: np.ndarray,
+        base: np.ndarray,
+        count: int,
+        seed: int,
+        positions: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return (N, count) int32 rows of `base` and (N, count) float32 distances."""
+        ...
+
+
+MATCHERS: dict[str, Matcher] = {
+    "flann": flann_neighbours,
+    "exact": exact_neighbours,
+    "faiss": faiss_neighbours,
+    "patchmatch": patchmatch_neighbours,
+    "hamming": hamming_neighbours,
+}
+
+
+def get_matcher(name: str) -> Matcher:
+    """Look a matcher up.
+
+    Raises:
+        OptionError: the name is unknown.
+    """
+    return look_up("matcher", name, MATCHERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +114,7 @@ def match_descriptors(
     return DescriptorMatches(rows0, rows[rows0, 0].astype(np.int32), ratios[rows0])
 
 
-def one_to_one(found: DescriptorMatches) -> DescriptorMatches:
+def unique_matches(found: DescriptorMatches) -> DescriptorMatches:
     """Keep of the matches that share a row of the second set the one with the smallest ratio.
 
     Args:
@@ -83,7 +124,7 @@ def one_to_one(found: DescriptorMatches) -> DescriptorMatches:
     Example:
         >>> rows0, rows1 = np.array([0, 1, 2, 3]), np.array([5, 4, 5, 4])
         >>> found = DescriptorMatches(rows0, rows1, np.array([0.5, 0.2, 0.4, 0.2], np.float32))
-        >>> kept = one_to_one(found)
+        >>> kept = unique_matches(found)
         >>> kept.rows0.tolist(), kept.rows1.tolist()
         ([1, 2], [4, 5])
     """

@@ -2,16 +2,27 @@ from __future__ import annotations
 
 import math
 import os
+import platform
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from deepdetect._shared import parallel
 from deepdetect._shared.errors import DeepDetectError, ImageError, OptionError
-from deepdetect._shared.processes import map_in_processes, processor_count
+from deepdetect._shared.parallel import (
+    available_memory,
+    disable_malloc_trim,
+    map_in_processes,
+    parallel_for,
+    processor_count,
+)
 from deepdetect.io.image import load_image
 
 # The workers import functions by name, so these tests send functions of installed modules.
@@ -91,7 +102,7 @@ def test_workers_end_when_the_parent_is_killed(tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(
         "import time\n"
         "from pathlib import Path\n"
-        "from deepdetect._shared.processes import map_in_processes\n"
+        "from deepdetect._shared.parallel import map_in_processes\n"
         "def work(task):\n"
         "    import os\n"
         "    Path(f'pid{task}').write_text(str(os.getpid()))\n"
@@ -120,3 +131,90 @@ def _wait_until(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < deadline, "it did not happen within a minute"
         time.sleep(0.05)
+
+
+@given(count=st.integers(0, 200))
+def test_each_number_is_done_once(count: int) -> None:
+    done: list[int] = []
+    parallel_for(count, lambda start, stop: done.extend(range(start, stop)))
+    assert sorted(done) == list(range(count))
+
+
+def test_several_threads_work_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parallel, "processor_count", lambda: 3)
+    together = threading.Barrier(3, timeout=20)
+    waited: list[int] = []
+
+    def work(start: int, stop: int) -> None:
+        if start < 3:  # the first three parts of one number each
+            together.wait()
+            waited.append(start)
+
+    parallel_for(12, work)
+    assert sorted(waited) == [0, 1, 2]
+
+
+def test_an_error_in_a_part_is_the_callers() -> None:
+    def work(start: int, stop: int) -> None:
+        raise ZeroDivisionError("as it happens")
+
+    with pytest.raises(ZeroDivisionError, match="as it happens"):
+        parallel_for(5, work)
+
+
+def test_calls_from_several_threads_do_not_meet() -> None:
+    results: dict[int, list[int]] = {}
+
+    def call(number: int) -> Callable[[], None]:
+        def run() -> None:
+            done: list[int] = []
+            parallel_for(50, lambda start, stop: done.extend(range(start, stop)))
+            results[number] = sorted(done)
+
+        return run
+
+    callers = [threading.Thread(target=call(number)) for number in range(4)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert all(results[number] == list(range(50)) for number in range(4))
+
+
+ARRAYS = """
+import resource
+import sys
+from deepdetect._shared.parallel import disable_malloc_trim
+
+def make_and_free():
+    for _ in range(20):
+        blocks = [bytearray(3_000_000) for _ in range(10)]
+
+if sys.argv[1] == "keep":
+    disable_malloc_trim()
+make_and_free()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+make_and_free()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def page_faults(mode: str) -> int:
+    done = subprocess.run(
+        [sys.executable, "-c", ARRAYS, mode], check=True, capture_output=True, text=True
+    )
+    return int(done.stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_freed_memory_is_used_again_without_new_pages() -> None:
+    assert page_faults("keep") < 0.1 * page_faults("give")
+
+
+def test_on_another_c_library_nothing_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
+    assert not disable_malloc_trim()
+
+
+def test_there_is_memory_but_not_endlessly() -> None:
+    assert 0 < available_memory() < 2**50

@@ -14,6 +14,9 @@ from .._shared.kernels import compiled
 TILE_HEIGHT = 48
 TILE_WIDTH = 64
 
+LEAST = 1e-3
+"""Of the product of the squared lengths: below it descriptors are the mean, and tell nothing."""
+
 
 @compiled(nogil=True, fastmath=True)
 def describe_tiles(  # type: ignore[no-untyped-def]
@@ -114,3 +117,21 @@ def square_root(first, last, descriptors):  # type: ignore[no-untyped-def]
         for d in range(128):
             value = np.rint(scale * np.sqrt(np.float32(descriptors[k, d])))
             descriptors[k, d] = np.uint8(min(np.float32(255), value))
+
+
+# No full fastmath: its approximate division and root do not give 0 for equal descriptors.
+@compiled(nogil=True, fastmath={"reassoc", "nsz", "contract"})
+def correlation_distances(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]
+    """Write 1 - correlation of the pairs from `start` to before `stop` into `out`."""
+    for k in range(start, stop):
+        a, b = first[rows0[k]], second[rows1[k]]
+        both = np.float32(0)
+        one = np.float32(0)
+        other = np.float32(0)
+        for d in range(len(mean)):
+            x = np.float32(a[d]) - mean[d]
+            y = np.float32(b[d]) - mean[d]
+            both += x * y
+            one += x * x
+            other += y * y
+        out[k] = np.float32(1) - both / np.sqrt(max(one * other, np.float32(LEAST)))

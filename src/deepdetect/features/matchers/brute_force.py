@@ -1,4 +1,4 @@
-"""Exact search by Hamming's distance, for binary descriptors as ORB's and BRISK's."""
+"""Exact search: every descriptor is compared, by Euclidean or Hamming distance."""
 
 from __future__ import annotations
 
@@ -7,11 +7,58 @@ import numpy as np
 
 from ..._shared.errors import OptionError
 
+BLOCK = 32_000_000
+"""Numbers of four bytes held at a time, to bound the memory (128 MB and some)."""
+
 QUERIES = 20_000
 """At a time: OpenCV keeps an object for each of their neighbours."""
 
 BASE = 200_000
 """At a time: OpenCV's search takes fewer than 2^18."""
+
+
+def exact_neighbours(
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the true nearest neighbours.
+
+    The time grows with the product of the numbers: meant for tens of thousands.
+
+    Args:
+        queries: (N, D) descriptors, uint8 or float32.
+        base: (M, D) descriptors, M >= count.
+        count: neighbours of each query.
+        seed, positions: not used; all matchers take the same arguments.
+
+    Returns:
+        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances,
+        the nearest first, the lower row first among equals.
+    """
+    rows = np.empty((len(queries), count), np.int32)
+    distances = np.empty((len(queries), count), np.float32)
+    # Double precision: the expansion below loses digits where distances are small.
+    queries, base = (np.asarray(part, np.float32) for part in (queries, base))
+    wide = base.astype(np.float64)
+    lengths = np.einsum("ij,ij->i", wide, wide)
+    step = max(1, BLOCK // (2 * max(len(base), 2 * count * base.shape[1])))
+    for start in range(0, len(queries), step):
+        block = queries[start : start + step]
+        # |q - b|^2 less the constant |q|^2.
+        partial = block.astype(np.float64) @ wide.T
+        partial *= -2
+        partial += lengths
+        found = np.empty((len(block), count), np.intp)
+        every = np.arange(len(block))
+        for rank in range(count):  # argmin takes the lower row of equals
+            found[:, rank] = partial.argmin(1)
+            partial[every, found[:, rank]] = np.inf
+        found.sort(axis=1)
+        # The differences are taken anew, for distances that are exact near 0.
+        gaps = np.linalg.norm(block[:, None] - base[found], axis=2)
+        order = np.argsort(gaps, axis=1, kind="stable")
+        rows[start : start + step] = np.take_along_axis(found, order, 1)
+        distances[start : start + step] = np.take_along_axis(gaps, order, 1)
+    return rows, distances
 
 
 def hamming_neighbours(

@@ -1,0 +1,198 @@
+"""From a heat map to keypoints: threshold or density, suppression, a maximum number."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from .._shared.errors import OptionError
+from .keypoints import Keypoints, bayer_order
+
+LARGEST_OFFSET = 0.499
+"""In pixels: a refined keypoint is still nearest to the pixel that it was found at."""
+
+
+@dataclass(frozen=True, eq=False)
+class SelectionOptions:
+    """Which pixels of a heat map become keypoints.
+
+    Attributes:
+        threshold: tau: pixels with a probability above it (paper: 0.5).
+        density: wanted number of keypoints per pixel, in (0, 1]; takes the place of the
+            threshold: the most probable pixels are taken, as many as that.
+        max_keypoints: at most this many are kept, the most probable ones.
+        nms_radius: non-maximum suppression: only pixels are kept that rank highest among those
+            at most this many pixels away in x and in y (0 suppresses none). None: 1 (a window of
+            3x3) with `max_keypoints`, else 0.
+        subpixel: move each keypoint from its pixel's centre to the maximum of a parabola through
+            the pixel and its two neighbours, in x and in y, less than half a pixel. None: with
+            `max_keypoints` only.
+        ignore: (H, W) bool or number array, true where no keypoint is wanted.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    threshold: float = 0.5
+    density: float | None = None
+    max_keypoints: int | None = None
+    nms_radius: int | None = None
+    subpixel: bool | None = None
+    ignore: np.ndarray | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.threshold <= 1:
+            raise OptionError(f"the threshold must lie in [0, 1], not {self.threshold}")
+        if self.density is not None and not 0 < self.density <= 1:
+            raise OptionError(f"the density must lie in (0, 1], not {self.density}")
+        if self.max_keypoints is not None and self.max_keypoints < 1:
+            raise OptionError(f"max_keypoints must be at least 1, not {self.max_keypoints}")
+        if self.nms_radius is not None:
+            if self.nms_radius < 0:
+                raise OptionError(f"nms_radius must be 0 or more pixels, not {self.nms_radius}")
+            if self.nms_radius != int(self.nms_radius):
+                raise OptionError(
+                    f"nms_radius must be a whole number of pixels, not {self.nms_radius}"
+                )
+
+    @property
+    def suppression_radius(self) -> int:
+        """The radius of suppression in pixels, with the default filled in."""
+        if self.nms_radius is None:
+            return 0 if self.max_keypoints is None else 1
+        return int(self.nms_radius)
+
+    @property
+    def refines(self) -> bool:
+        """Whether positions are refined, with the default filled in."""
+        return self.max_keypoints is not None if self.subpixel is None else self.subpixel
+
+
+def select_keypoints(
+    heatmap: np.ndarray,
+    options: SelectionOptions = SelectionOptions(),
+    logits: np.ndarray | None = None,
+) -> Keypoints:
+    """Choose the keypoints of a heat map.
+
+    Args:
+        heatmap: (H, W) float32 probability.
+        options: what to choose. The order is: ignore mask, threshold, suppression,
+            density or maximum number, sub-pixel positions.
+        logits: (H, W) float32 logits of the map, by which keypoints are ranked; by default the
+            map itself, though float32 rounds its highest probabilities to 1. Equal ones come
+            in an order that spreads the keypoints evenly (`bayer_order`).
+
+    Returns:
+        Keypoints in the order of rows and columns, on pixel centres unless `subpixel`.
+
+    Raises:
+        OptionError: the ignore mask or the logits have another size than the map.
+
+    Example:
+        >>> heatmap = np.zeros((16, 16), np.float32)
+        >>> heatmap[4, 9] = 0.9
+        >>> select_keypoints(heatmap).xy.tolist()
+        [[9.0, 4.0]]
+    """
+    height, width = heatmap.shape
+    ranking = heatmap if logits is None else logits
+    if ranking.shape != heatmap.shape:
+        raise OptionError(
+            f"the logits have shape {ranking.shape}, the heat map {heatmap.shape}: "
+            "they must be equal"
+        )
+    # With a density wanted, all but the impossible pixels may be needed.
+    wanted = heatmap > (options.threshold if options.density is None else 0.0)
+    if options.ignore is not None:
+        ignore = np.asarray(options.ignore)
+        if ignore.shape != heatmap.shape:
+            raise OptionError(
+                f"the ignore mask has shape {ignore.shape}, the image (height, width) "
+                f"{heatmap.shape}: they must be equal"
+            )
+        wanted &= ~ignore.astype(bool)
+    pixels = np.flatnonzero(wanted)
+    ranks = ranking.ravel()
+    if options.suppression_radius and len(pixels):
+        pixels = pixels[_suppress(pixels, ranks[pixels], heatmap.shape, options.suppression_radius)]
+    count = _wanted_count(options, heatmap.size)
+    if count is not None and len(pixels) > count:
+        pixels = pixels[np.sort(_ranked(pixels, ranks[pixels], heatmap.shape)[:count])]
+    row, column = np.divmod(pixels, width)
+    xy = np.stack([column, row], 1).astype(np.float32)
+    if options.refines:
+        xy += np.stack([_peak_offset(ranking, row, column, axis) for axis in (1, 0)], 1)
+    found = None if logits is None else ranks[pixels]
+    return Keypoints(xy, heatmap.ravel()[pixels], (width, height), found)
+
+
+def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
+    """Return where the parabola through pixels and their neighbours along an axis peaks.
+
+    The offset stays under half a pixel, so that the nearest pixel is the keypoint's own. It is 0 on
+    the image's border, and where a pixel is no maximum along the axis.
+    """
+    position, last = (row, column)[axis], ranking.shape[axis] - 1
+    inner = (position > 0) & (position < last)
+    before, after = (
+        ranking[
+            np.clip(row + step * (axis == 0), 0, ranking.shape[0] - 1),
+            np.clip(column + step * (axis == 1), 0, ranking.shape[1] - 1),
+        ].astype(np.float64)
+        for step in (-1, 1)
+    )
+    middle = ranking[row, column].astype(np.float64)
+    bend = 2 * middle - before - after
+    peaked = inner & (middle >= before) & (middle >= after) & (bend > 0)
+    offset = np.where(peaked, (after - before) / np.where(peaked, 2 * bend, 1), 0)
+    return np.clip(offset, -LARGEST_OFFSET, LARGEST_OFFSET).astype(np.float32)
+
+
+def _ranked(pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the rows from the best to the worst; equals are spread evenly over the image."""
+    row, column = np.divmod(pixels, shape[1])
+    spread = bayer_order(np.column_stack([column, row]), (shape[1], shape[0]))
+    return np.lexsort((spread, -scores))
+
+
+def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
+    counts = []
+    if options.density is not None:
+        counts.append(round(options.density * pixels))
+    if options.max_keypoints is not None:
+        counts.append(options.max_keypoints)
+    return min(counts) if counts else None
+
+
+def _suppress(
+    pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...], radius: int
+) -> np.ndarray:
+    """Tell which pixels rank highest in the window around them.
+
+    Pixels are compared by rank, which has no ties: one of a plateau stays.
+    """
+    rank = np.zeros(shape, np.float32 if len(pixels) < 2**24 else np.float64)
+    rank.ravel()[pixels[_ranked(pixels, scores, shape)]] = np.arange(len(pixels), 0, -1)
+    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # a box is dilated in linear time
+    return (cv2.dilate(rank, window) == rank).ravel()[pixels]  # beyond the border is -infinity
+
+
+def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarray:
+    """Choose one random position of each cell of a grid; (K,) rows in rising order.
+
+    Args:
+        xy: (N, 2) positions.
+        grid_size_px: side of the square cells in pixels.
+        seed: of the choice.
+
+    Example:
+        >>> len(grid_subsample(np.array([[0, 0], [5, 5], [40, 5]]), 16))
+        2
+    """
+    cell = np.floor(np.asarray(xy, np.float64) / grid_size_px).astype(np.int64)
+    order = np.random.default_rng(seed).permutation(len(cell))
+    _, first = np.unique(cell[order], axis=0, return_index=True)
+    return np.sort(order[first])

@@ -1,0 +1,314 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from deepdetect import DeepDetect
+from deepdetect._shared.errors import OptionError
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.features.selection import SelectionOptions, select_keypoints
+
+
+def bayer(bits: int) -> np.ndarray:
+    """The dither matrix of 2^bits rows, from its definition by smaller ones."""
+    if bits == 0:
+        return np.zeros((1, 1), int)
+    smaller = 4 ** (bits - 1) * np.array([[0, 2], [3, 1]])
+    tiles = 2 ** (bits - 1)
+    return np.tile(smaller, (tiles, tiles)) + np.repeat(np.repeat(bayer(bits - 1), 2, 0), 2, 1)
+
+
+def ranked(
+    scores: list[tuple[float, int, int]], shape: tuple[int, ...]
+) -> list[tuple[float, int, int]]:
+    order = bayer(max(1, (max(shape) - 1).bit_length()))
+    return sorted(scores, key=lambda one: (-one[0], order[one[1], one[2]]))
+
+
+def reference(heatmap: np.ndarray, options: SelectionOptions) -> list[tuple[int, int]]:
+    """Select by plain loops: the (x, y) in the order of rows and columns."""
+    limit = options.threshold if options.density is None else 0
+    height, width = heatmap.shape
+    candidates = ranked(
+        [
+            (float(heatmap[row, column]), row, column)
+            for row in range(height)
+            for column in range(width)
+            if heatmap[row, column] > limit
+            and not (options.ignore is not None and options.ignore[row, column])
+        ],
+        heatmap.shape,
+    )
+    radius = options.suppression_radius
+    kept: list[tuple[float, int, int]] = []
+    for position, one in enumerate(candidates):
+        near = (
+            abs(one[1] - better[1]) <= radius and abs(one[2] - better[2]) <= radius
+            for better in candidates[:position]
+        )
+        if not radius or not any(near):
+            kept.append(one)
+    if options.density is not None:
+        kept = kept[: round(options.density * heatmap.size)]
+    if options.max_keypoints is not None:
+        kept = kept[: options.max_keypoints]
+    return [(column, row) for _, row, column in sorted(kept, key=lambda one: one[1:])]
+
+
+# Few levels, so that there are many ties, beside any probability.
+LEVELS = st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0]) | st.floats(0, 1, width=32)
+SHAPES = st.tuples(st.integers(1, 12), st.integers(1, 12))
+
+
+@settings(max_examples=300)
+@given(data=st.data(), shape=SHAPES)
+def test_equals_plain_loops(data: st.DataObject, shape: tuple[int, int]) -> None:
+    heatmap = data.draw(arrays(np.float32, shape, elements=LEVELS))
+    options = SelectionOptions(
+        threshold=data.draw(st.sampled_from([0.0, 0.25, 0.5, 0.6])),
+        density=data.draw(st.none() | st.floats(0.01, 1)),
+        max_keypoints=data.draw(st.none() | st.integers(1, 20)),
+        nms_radius=data.draw(st.none() | st.integers(0, 4)),
+        ignore=data.draw(st.none() | arrays(bool, shape)),
+    )
+    keypoints = select_keypoints(heatmap, options)
+    found = [(round(float(x)), round(float(y))) for x, y in keypoints]
+    assert found == reference(heatmap, options)
+    assert keypoints.image_size == (shape[1], shape[0])
+    assert keypoints.scores.tolist() == [float(heatmap[y, x]) for x, y in found]
+
+
+@given(
+    heatmap=arrays(np.float32, st.tuples(st.integers(1, 20), st.integers(1, 20)), elements=LEVELS),
+    radius=st.integers(1, 25),
+)
+def test_suppressed_keypoints_keep_their_distance(heatmap: np.ndarray, radius: int) -> None:
+    keypoints = select_keypoints(heatmap, SelectionOptions(0.25, nms_radius=radius))
+    xy = keypoints.xy
+    distance = np.abs(xy[:, None] - xy[None]).max(2)
+    np.fill_diagonal(distance, np.inf)
+    assert len(xy) == 0 or distance.min() > radius
+    # The most probable pixel is always kept.
+    if (heatmap > 0.25).any():
+        assert keypoints.scores.max() == heatmap.max()
+
+
+def test_a_ramp_keeps_its_top() -> None:
+    """Pixels that are suppressed suppress, too: the rest of a slope is no maximum."""
+    heatmap = np.zeros((16, 16), np.float32)
+    heatmap[4, 2:12] = np.linspace(0.6, 0.9, 10)
+    keypoints = select_keypoints(heatmap, SelectionOptions(nms_radius=1))
+    assert keypoints.xy.tolist() == [[11, 4]]
+
+
+def test_the_threshold_is_strict() -> None:
+    heatmap = np.zeros((16, 20), np.float32)
+    heatmap[3, 4] = 0.5
+    heatmap[7, 2] = np.nextafter(np.float32(0.5), np.float32(1))
+    assert select_keypoints(heatmap).xy.tolist() == [[2, 7]]
+    assert select_keypoints(heatmap, SelectionOptions(0.0)).xy.tolist() == [[4, 3], [2, 7]]
+    assert len(select_keypoints(np.ones((16, 20), np.float32), SelectionOptions(1.0))) == 0
+
+
+@pytest.mark.parametrize("density", [0.001, 0.1, 0.25, 0.333, 1.0])
+def test_the_density_is_exact(density: float) -> None:
+    heatmap = np.random.default_rng(0).uniform(0.01, 0.2, (37, 53)).astype(np.float32)
+    keypoints = select_keypoints(heatmap, SelectionOptions(threshold=0.9, density=density))
+    count = round(density * 37 * 53)
+    assert len(keypoints) == count
+    # They are the most probable ones.
+    assert keypoints.scores.min() == np.sort(heatmap.ravel())[-count]
+
+
+def test_a_density_takes_no_impossible_pixel() -> None:
+    heatmap = np.zeros((20, 20), np.float32)
+    heatmap[5, 5] = 0.1
+    assert len(select_keypoints(heatmap, SelectionOptions(density=0.5))) == 1
+
+
+@pytest.mark.parametrize("count", [1, 7, 100, 10_000])
+def test_the_most_probable_are_kept(count: int) -> None:
+    heatmap = np.random.default_rng(1).random((30, 40)).astype(np.float32)
+    keypoints = select_keypoints(heatmap, SelectionOptions(0.5, max_keypoints=count, nms_radius=0))
+    best = np.sort(heatmap[heatmap > 0.5])[::-1][:count]
+    np.testing.assert_array_equal(np.sort(keypoints.scores)[::-1], best)
+
+
+@pytest.mark.parametrize(
+    "options", [SelectionOptions(max_keypoints=3), SelectionOptions(density=3 / 400)]
+)
+def test_ties_do_not_go_before_better_ones(options: SelectionOptions) -> None:
+    heatmap = np.zeros((20, 20), np.float32)
+    for row, column in [(2, 9), (2, 15), (4, 0), (11, 3)]:
+        heatmap[row, column] = 0.75
+    heatmap[19, 19] = 0.9
+    found = select_keypoints(heatmap, options).xy.tolist()
+    assert len(found) == 3
+    assert [19, 19] in found
+
+
+@pytest.mark.parametrize("radius", [0, 1])
+@pytest.mark.parametrize("count", [16, 64, 500])
+def test_ties_are_spread_over_the_image(radius: int, count: int) -> None:
+    """The network's probabilities are 1 to the last bit on a tenth of an image."""
+    heatmap = np.ones((120, 200), np.float32)
+    options = SelectionOptions(max_keypoints=count, nms_radius=radius)
+    xy = select_keypoints(heatmap, options).xy
+    cells = (xy // (50, 60)).astype(int)
+    share = np.bincount(cells[:, 1] * 4 + cells[:, 0], minlength=8) / count
+    np.testing.assert_allclose(share, 1 / 8, atol=1.1 / count + 0.03)
+
+
+def test_the_network_s_best_keypoints_span_a_photograph(photo: np.ndarray) -> None:
+    keypoints = DeepDetect().detect(photo, max_keypoints=300)
+    cells = (keypoints.xy // 64).astype(int)
+    assert len(np.unique(cells[:, 1] * 4 + cells[:, 0])) >= 14
+
+
+def test_a_plateau_leaves_its_first_pixel() -> None:
+    heatmap = np.full((9, 9), 0.8, np.float32)
+    keypoints = select_keypoints(heatmap, SelectionOptions(nms_radius=20))
+    assert keypoints.xy.tolist() == [[0, 0]]
+
+
+def test_suppression_goes_before_the_number() -> None:
+    heatmap = np.zeros((16, 16), np.float32)
+    heatmap[4, 4], heatmap[4, 5], heatmap[10, 10] = 0.9, 0.8, 0.7
+    options = SelectionOptions(max_keypoints=2, nms_radius=1, subpixel=False)
+    assert select_keypoints(heatmap, options).xy.tolist() == [[4, 4], [10, 10]]
+
+
+def test_ignored_pixels_suppress_nothing() -> None:
+    heatmap = np.zeros((16, 16), np.float32)
+    heatmap[4, 4], heatmap[4, 5] = 0.9, 0.8
+    ignore = np.zeros((16, 16), bool)
+    ignore[4, 4] = True
+    options = SelectionOptions(nms_radius=3, ignore=ignore)
+    assert select_keypoints(heatmap, options).xy.tolist() == [[5, 4]]
+
+
+@pytest.mark.parametrize("kind", [bool, np.uint8, np.int32, np.float32])
+def test_an_ignore_mask_of_any_number_type(kind: type) -> None:
+    heatmap = np.random.default_rng(2).random((24, 31)).astype(np.float32)
+    ignore = np.zeros((24, 31), kind)
+    ignore[5:15, 10:20] = 1
+    ignore[0, 0] = 1
+    keypoints = select_keypoints(heatmap, SelectionOptions(0.5, ignore=ignore))
+    expected = (heatmap > 0.5) & (ignore == 0)
+    x, y = keypoints.xy.astype(int).T
+    np.testing.assert_array_equal(np.argwhere(expected), np.stack([y, x], 1))
+
+
+@pytest.mark.parametrize("shape", [(31, 24), (24, 30), (24, 31, 1), (24,), ()])
+def test_an_ignore_mask_of_another_size(shape: tuple[int, ...]) -> None:
+    heatmap = np.zeros((24, 31), np.float32)
+    with pytest.raises(OptionError, match="ignore mask has shape") as caught:
+        select_keypoints(heatmap, SelectionOptions(ignore=np.zeros(shape, bool)))
+    assert "(24, 31)" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"threshold": -0.1}, "threshold must lie in [0, 1], not -0.1"),
+        ({"threshold": 1.1}, "threshold must lie in [0, 1], not 1.1"),
+        ({"threshold": float("nan")}, "threshold must lie in [0, 1], not nan"),
+        ({"density": 0}, "density must lie in (0, 1], not 0"),
+        ({"density": 1.5}, "density must lie in (0, 1], not 1.5"),
+        ({"density": float("nan")}, "density must lie in (0, 1], not nan"),
+        ({"max_keypoints": 0}, "max_keypoints must be at least 1, not 0"),
+        ({"nms_radius": -1}, "nms_radius must be 0 or more pixels, not -1"),
+    ],
+)
+def test_options_out_of_range(changes: dict[str, float], words: str) -> None:
+    with pytest.raises(OptionError) as caught:
+        SelectionOptions(**changes)
+    assert words in str(caught.value)
+
+
+def test_the_heat_map_is_left_as_it_was() -> None:
+    heatmap = np.random.default_rng(5).random((20, 20)).astype(np.float32)
+    before = heatmap.copy()
+    select_keypoints(heatmap, SelectionOptions(0.2, max_keypoints=9, nms_radius=2))
+    np.testing.assert_array_equal(heatmap, before)
+
+
+# Ranking by logits, and positions between pixels.
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    return (1 / (1 + np.exp(-logits.astype(np.float64)))).astype(np.float32)
+
+
+def test_logits_rank_what_float32_rounds_to_one() -> None:
+    logits = np.full((24, 24), -5, np.float32)
+    places = [(3, 4), (20, 7), (11, 19), (5, 15)]  # (x, y), from the worst to the best
+    for level, (x, y) in zip((20, 30, 40, 50), places, strict=True):
+        logits[y, x] = level
+    heatmap = sigmoid(logits)
+    assert (heatmap[logits > 0] == 1).all()
+    for count in (1, 2, 3):
+        found = select_keypoints(heatmap, SelectionOptions(max_keypoints=count), logits)
+        assert {tuple(xy) for xy in found.xy.tolist()} == set(places[-count:])
+        assert found.logits is not None
+        assert sorted(found.logits.tolist()) == [20, 30, 40, 50][-count:]
+        assert found.best(1).xy.tolist() == [[5, 15]]
+
+
+def test_the_best_keypoints_of_a_photograph_are_no_lattice(photo: np.ndarray) -> None:
+    """Ranked by probabilities, many of which are 1, they lay on a grid of powers of two."""
+    detector = DeepDetect()
+    keypoints = detector.detect(photo, max_keypoints=100)
+    assert len(keypoints) == 100
+    xy = np.rint(keypoints.xy).astype(int)
+    offsets = np.bincount((xy[:, 1] % 4) * 4 + xy[:, 0] % 4, minlength=16) / len(xy)
+    ours = offsets.max()
+    heatmap, logits = detector.heatmap_and_logits(photo)
+    old = select_keypoints(heatmap, SelectionOptions(max_keypoints=100, nms_radius=0))
+    saturated = (heatmap == 1).sum()
+    assert saturated > 200  # else this photograph shows nothing
+    assert np.sort(logits[heatmap == 1])[-1] > np.sort(logits[heatmap == 1])[0]
+    xy = old.xy.astype(int)
+    offsets = np.bincount((xy[:, 1] % 4) * 4 + xy[:, 0] % 4, minlength=16) / len(xy)
+    # The network itself, which halves the image twice, prefers every other pixel a little.
+    assert ours < 0.4 < offsets.max() - 0.15
+
+
+@pytest.mark.parametrize(("x", "y"), [(12.0, 9.0), (12.3, 9.0), (11.6, 9.45), (12.25, 8.75)])
+def test_the_peak_of_a_paraboloid_is_found(x: float, y: float) -> None:
+    row, column = np.indices((20, 24))
+    heatmap = (0.9 - 0.01 * (column - x) ** 2 - 0.02 * (row - y) ** 2).clip(0).astype(np.float32)
+    found = select_keypoints(heatmap, SelectionOptions(max_keypoints=1))
+    np.testing.assert_allclose(found.xy, [[x, y]], atol=1e-4)
+    whole = select_keypoints(heatmap, SelectionOptions(max_keypoints=1, subpixel=False))
+    np.testing.assert_array_equal(whole.xy, [[round(x), round(y)]])
+    alone = select_keypoints(heatmap, SelectionOptions(nms_radius=30, subpixel=True))
+    np.testing.assert_allclose(alone.xy, [[x, y]], atol=1e-4)
+
+
+@given(heatmap=arrays(np.float32, SHAPES, elements=LEVELS))
+def test_a_refined_keypoint_stays_with_its_pixel(heatmap: np.ndarray) -> None:
+    whole = select_keypoints(heatmap, SelectionOptions(0.1))
+    refined = select_keypoints(heatmap, SelectionOptions(0.1, subpixel=True))
+    np.testing.assert_array_equal(np.rint(refined.xy), whole.xy)
+    height, width = heatmap.shape
+    assert (refined.xy >= 0).all()
+    assert (refined.xy <= (width - 1, height - 1)).all()
+
+
+def test_defaults_of_suppression_and_refinement() -> None:
+    dense, sparse = SelectionOptions(), SelectionOptions(max_keypoints=9)
+    assert (dense.suppression_radius, dense.refines) == (0, False)
+    assert (sparse.suppression_radius, sparse.refines) == (1, True)
+    own = SelectionOptions(max_keypoints=9, nms_radius=0, subpixel=False)
+    assert (own.suppression_radius, own.refines) == (0, False)
+
+
+def test_logits_of_another_size() -> None:
+    with pytest.raises(OptionError, match="must be equal"):
+        select_keypoints(np.zeros((4, 5), np.float32), logits=np.zeros((5, 4), np.float32))
+    with pytest.raises(OptionError, match="as many logits as scores"):
+        Keypoints([[1, 2]], [0.5], (8, 5), [1.0, 2.0])
