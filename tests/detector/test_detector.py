@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from deepdetect import (
     DeepDetect,
     HeatmapOptions,
     SelectionOptions,
+    load_image,
     match_images,
     select_keypoints,
 )
@@ -611,3 +613,51 @@ def test_logits_are_the_network_s_own(image: np.ndarray) -> None:
         np.testing.assert_allclose(onnx_maps[1], torch_maps[1], atol=2e-3)
         probability = 1 / (1 + np.exp(-onnx_maps[1].astype(np.float64)))
         np.testing.assert_allclose(onnx_maps[0], probability, atol=1e-6)
+
+
+def test_the_heat_map_that_keypoints_came_from(detector: DeepDetect, image: np.ndarray) -> None:
+    keypoints, heatmap = detector.detect(image, 0.7, max_keypoints=50, return_heatmap=True)
+    np.testing.assert_array_equal(heatmap, detector.heatmap(image))
+    np.testing.assert_array_equal(keypoints.xy, detector.detect(image, 0.7, max_keypoints=50).xy)
+
+
+def test_a_detector_says_what_it_is() -> None:
+    detector = DeepDetect("dense", resolution=480, backend="onnxruntime")
+    assert repr(detector) == (
+        "DeepDetect(dense.onnx, resolution=480, channels='rgb', backend='onnxruntime')"
+    )
+
+
+def test_a_network_is_loaded_once_until_its_file_changes(
+    tmp_path: Path, image: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = Path("own.onnx")
+    path.write_bytes(pretrained_weights("default").read_bytes())
+    first, again = (DeepDetect(path, backend="onnxruntime") for _ in range(2))
+    assert first._network is again._network
+    assert DeepDetect(path, backend="onnxruntime", threads=1)._network is not first._network
+    path.write_bytes(pretrained_weights("dense").read_bytes())
+    os.utime(path, ns=(1, 1))
+    changed = DeepDetect(path, backend="onnxruntime").heatmap(image)
+    np.testing.assert_array_equal(
+        changed, DeepDetect("dense", backend="onnxruntime").heatmap(image)
+    )
+    assert not np.array_equal(changed, first.heatmap(image))
+
+
+def test_images_are_read_once(photo_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from deepdetect.detector import detector as module
+    from deepdetect.matching import pipeline
+
+    read: list[Any] = []
+
+    def counted(source: Any) -> np.ndarray:
+        read.append(source)
+        return load_image(source)
+
+    monkeypatch.setattr(module, "load_image", counted)
+    monkeypatch.setattr(pipeline, "load_image", counted)
+    found = match_images(photo_path, photo_path, max_keypoints=100)
+    assert len(found) == 100
+    assert read == [photo_path, photo_path]

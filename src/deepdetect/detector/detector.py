@@ -217,8 +217,8 @@ def find_keypoints(
         OptionError: the detector's map has another size than the image, or is not finite.
     """
     if isinstance(detector, DeepDetect):
-        heatmap, logits = detector._run(rgb)
-        return select_keypoints(heatmap, options, logits)
+        own_map, own_logits = detector._run(rgb)
+        return select_keypoints(own_map, options, own_logits)
     logits = None
     if hasattr(detector, "heatmap_and_logits"):
         heatmap, logits = detector.heatmap_and_logits(rgb)

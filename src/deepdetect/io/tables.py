@@ -164,7 +164,7 @@ def _format(path: str | Path) -> str:
 def _save_npz(path: str | Path, **arrays: np.ndarray) -> None:
     # Compressed: coordinates of dense points shrink to a tenth.
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def _save_csv(path: str | Path, header: str, table: np.ndarray) -> None:

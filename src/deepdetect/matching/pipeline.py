@@ -150,8 +150,10 @@ def match_images(
     if chosen.guided:
         with _timed(seconds, "guided matching"):
             found_guide, found = guided_matches(
-                *grays,
-                *(np.rint(points.xy) for points in keypoints),
+                grays[0],
+                grays[1],
+                np.rint(keypoints[0].xy),
+                np.rint(keypoints[1].xy),
                 chosen.guiding_model,
                 chosen.geometry.seed,
                 initial,
@@ -204,7 +206,8 @@ def unguided_matches(
         ]
     with _timed(seconds, "matching"):
         return match_descriptors(
-            *descriptors,
+            descriptors[0],
+            descriptors[1],
             get_matcher(chosen.matcher),
             ratio=chosen.ratio,
             mutual=chosen.mutual,

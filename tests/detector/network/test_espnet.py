@@ -50,6 +50,7 @@ def test_published_weights_load(shared: Path, name: str) -> None:
     load_network(shared / "reference" / f"{name}.safetensors")
 
 
+@pytest.mark.slow
 def test_published_weights_score_as_published(shared: Path) -> None:
     weights = shared / "reference" / "published_matching.safetensors"
     scores = score_samples(DeepDetect(weights).heatmap, shared / "data" / "label-samples" / "val")
@@ -98,9 +99,9 @@ def test_onnx_gives_the_same_probabilities_at_any_size(tmp_path: Path) -> None:
         np.testing.assert_allclose(session.run(None, {"image": image})[0], expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("dilation", [1, 2, 4, 8, 16])
+@pytest.mark.parametrize("dilation", [1, 4, 16])
 @pytest.mark.parametrize("layout", [torch.channels_last, torch.contiguous_format])
-@pytest.mark.parametrize(("inputs", "outputs"), [(12, 12), (12, 16), (25, 25), (25, 28), (2, 2)])
+@pytest.mark.parametrize(("inputs", "outputs"), [(12, 16), (25, 28), (2, 2)])
 def test_dilated_gradients_in_bfloat16(
     dilation: int, layout: torch.memory_format, inputs: int, outputs: int
 ) -> None:

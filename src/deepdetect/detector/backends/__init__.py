@@ -1,5 +1,6 @@
 """Running the network: ONNX Runtime, OpenVINO or torch."""
 
-from .registry import BACKENDS, Network, RuntimeOptions, open_network
+from .options import BACKENDS, Network, RuntimeOptions
+from .registry import open_network
 
 __all__ = ["BACKENDS", "Network", "RuntimeOptions", "open_network"]

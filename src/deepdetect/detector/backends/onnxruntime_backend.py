@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError, WeightsError, unknown_name
+from .options import RuntimeOptions
 from .shapes import as_logits, check_network, output_to_read
 from .without_telemetry import import_onnxruntime
-
-if TYPE_CHECKING:
-    from .registry import RuntimeOptions
 
 
 class OnnxRuntimeNetwork:
@@ -63,7 +61,7 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
     except Exception as error:  # its exceptions share no base class
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({str(error).splitlines()[0]}): "
-            "get it anew"
+            "download it again"
         ) from None
     # It goes on with the CPU when a provider cannot start, and says so in a log only.
     session.disable_fallback()

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..._shared.errors import WeightsError
+from .options import RuntimeOptions
 from .shapes import as_logits, check_network, output_to_read
 from .without_telemetry import import_openvino
-
-if TYPE_CHECKING:
-    from .registry import RuntimeOptions
 
 
 class OpenVinoNetwork:
@@ -55,7 +53,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     except Exception as error:  # its exceptions share no base class
         reason = str(error).strip().splitlines()[-1]
         raise WeightsError(
-            f"{path} is not an ONNX file that can be read ({reason}): get it anew"
+            f"{path} is not an ONNX file that can be read ({reason}): download it again"
         ) from None
     check_network(
         path,
@@ -67,7 +65,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     return OpenVinoNetwork(model, output, path)
 
 
-def _shape(value: object) -> list[int | str]:
+def _shape(value: Any) -> list[int | str]:
     """Return a shape with the free dimensions as text, as ONNX Runtime gives it."""
     return [
         "free" if dimension.is_dynamic else dimension.get_length()

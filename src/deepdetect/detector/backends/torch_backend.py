@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
+from .options import RuntimeOptions
 from .shapes import LOGITS, as_logits
-
-if TYPE_CHECKING:
-    from .registry import RuntimeOptions
 
 
 class TorchNetwork:
     """A network run by torch on the CPU."""
 
-    def __init__(self, network: object, path: Path) -> None:
+    def __init__(self, network: Any, path: Path, threads: int | None) -> None:
         self._network = network
         self._path = path
+        self._threads = threads
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         import torch
 
+        if self._threads is not None and torch.get_num_threads() != self._threads:
+            torch.set_num_threads(self._threads)  # of the process: another detector may set it
         with torch.inference_mode():
             tensor = torch.from_numpy(np.ascontiguousarray(image))
             tensor = tensor.contiguous(memory_format=torch.channels_last)
@@ -40,6 +41,6 @@ def open_torch(path: Path, options: RuntimeOptions) -> TorchNetwork:
 
     from ..network.weights import load_network
 
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)
-    return TorchNetwork(load_network(path).to(memory_format=torch.channels_last), path)
+    network = load_network(path)
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return TorchNetwork(network, path, options.threads)

@@ -12,8 +12,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, pad
 
-from .norm_activation import join_and_activate, normalize_and_activate
-
 EPSILON = 1e-3  # of every batch normalisation, as published
 DILATIONS = (1, 2, 4, 8, 16)
 
@@ -78,12 +76,14 @@ class DilatedConvolution(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         if x.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
-            return _DilatedBfloat16.apply(x.bfloat16(), self.conv.weight, self.dilation)
+            return _DilatedBfloat16.apply(  # type: ignore[no-untyped-call]
+                x.bfloat16(), self.conv.weight, self.dilation
+            )
         return self.conv(x)
 
 
 class NormActivation(nn.Module):
-    """Batch normalisation, then PReLU with one slope a channel."""
+    """Batch normalisation, then PReLU with one slope per channel."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -91,11 +91,7 @@ class NormActivation(nn.Module):
         self.act = nn.PReLU(channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        return normalize_and_activate(x, self.bn, self.act)
-
-    def join(self, parts: list[Tensor]) -> Tensor:
-        """Join maps by their channels, normalise and activate."""
-        return join_and_activate(parts, self.bn, self.act)
+        return self.act(self.bn(x))
 
 
 class ConvolutionNormActivation(nn.Module):
@@ -110,7 +106,7 @@ class ConvolutionNormActivation(nn.Module):
         self.act = nn.PReLU(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        return normalize_and_activate(self.conv(x), self.bn, self.act)
+        return self.act(self.bn(self.conv(x)))
 
 
 class SpatialPyramid(nn.Module):
@@ -120,6 +116,9 @@ class SpatialPyramid(nn.Module):
         inputs, outputs: channels.
         reduce: kernel of the reducing convolution: 1, or 3 with stride 2 to halve the size.
     """
+
+    d1: DilatedConvolution
+    d2: DilatedConvolution
 
     def __init__(self, inputs: int, outputs: int, reduce: int) -> None:
         super().__init__()
@@ -151,7 +150,7 @@ class DownsamplingPyramid(SpatialPyramid):
         self.act = nn.PReLU(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        return normalize_and_activate(self.branches(x), self.bn, self.act)
+        return self.act(self.bn(self.branches(x)))
 
 
 class ResidualPyramid(SpatialPyramid):
@@ -186,15 +185,15 @@ class Encoder(nn.Module):
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         half = self.halve(image)
         quarter = self.halve(half)
-        level1 = self.b1.join([self.level1(image), half])
+        level1 = self.b1(torch.cat([self.level1(image), half], 1))
         start = level2 = self.level2_0(level1)
         for block in self.level2:
             level2 = block(level2)
-        level2 = self.b2.join([level2, start, quarter])
+        level2 = self.b2(torch.cat([level2, start, quarter], 1))
         start = level3 = self.level3_0(level2)
         for block in self.level3:
             level3 = block(level3)
-        level3 = self.b3.join([start, level3])
+        level3 = self.b3(torch.cat([start, level3], 1))
         return level1, level2, level3
 
 

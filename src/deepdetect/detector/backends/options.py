@@ -1,0 +1,64 @@
+"""What a loaded network is, and how it is run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ..._shared.errors import OptionError, unknown_name
+
+BACKENDS = ("onnxruntime", "openvino", "torch")
+
+
+class Network(Protocol):
+    """A loaded network."""
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """Map (1, 3, H, W) float32 in [0, 1] to (1, 1, H, W) float32 logits, all finite.
+
+        H and W are multiples of 8. The logits are those of the probability of a keypoint.
+
+        Raises:
+            WeightsError: the network returns a map of another size, or values that are not finite.
+        """
+
+
+@dataclass(frozen=True)
+class RuntimeOptions:
+    """How the network is run.
+
+    Attributes:
+        backend: "auto", "onnxruntime", "openvino" or "torch". "auto" takes torch for
+            safetensors weights, else OpenVINO when it is installed and no provider is
+            named, else ONNX Runtime.
+        providers: names of ONNX Runtime's execution providers, the preferred one first,
+            as ("CUDAExecutionProvider",); empty means its CPU provider.
+        threads: number of threads; None leaves the backend's choice.
+
+    Raises:
+        OptionError: the backend is unknown or a value is out of its range.
+    """
+
+    backend: str = "auto"
+    providers: tuple[str, ...] = ()
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        single = isinstance(self.providers, str)
+        providers = (self.providers,) if single else tuple(self.providers)
+        object.__setattr__(self, "providers", providers)
+        if self.backend not in ("auto", *BACKENDS):
+            raise unknown_name("backend", self.backend, ("auto", *BACKENDS))
+        if self.threads is not None and self.threads < 1:
+            raise OptionError(f"threads must be at least 1, not {self.threads}")
+        if self.backend != "auto":
+            self.check_providers(self.backend)
+
+    def check_providers(self, backend: str) -> None:
+        """Raise an OptionError if providers are named for a backend that has none."""
+        if self.providers and backend != "onnxruntime":
+            raise OptionError(
+                f"providers belong to onnxruntime, not to {backend}: leave one of them out"
+            )
