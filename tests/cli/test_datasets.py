@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-pytest.importorskip("pooch", reason="needs pooch (pip install '.[data]')")
+pytest.importorskip("requests", reason="needs requests (pip install '.[data]')")
 
 from deepdetect import datasets
 

@@ -48,7 +48,7 @@ def test_what_is_missing_or_wrong_is_named(folder: Path) -> None:
     with pytest.raises(ImageError, match="nine numbers"):
         load_oxford(folder)
     (folder / "ubc" / "img4.ppm").unlink()
-    with pytest.raises(ImageError, match="no img4 in"):
+    with pytest.raises(ImageError, match="no image img4 in"):
         load_oxford(folder)
 
 

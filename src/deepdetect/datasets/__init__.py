@@ -4,11 +4,10 @@ from collections.abc import Callable
 
 from .._shared.registry import look_up
 from .coco import COCO
-from .download import RemoteFile
-from .middlebury import load_motorcycle
-from .remote import RemoteDataset, get_dataset
-from .remote_middlebury import MIDDLEBURY
-from .remote_planar import HPATCHES, OXFORD
+from .download import RemoteDataset, RemoteFile, get_dataset
+from .hpatches import HPATCHES
+from .middlebury import MIDDLEBURY, load_motorcycle
+from .oxford import OXFORD
 from .types import StereoPair
 
 STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {

@@ -1,7 +1,6 @@
 """MS-COCO 2017, training part: the photographs that the paper trains on."""
 
-from .download import RemoteFile
-from .remote import RemoteDataset
+from .download import RemoteDataset, RemoteFile
 
 COCO = RemoteDataset(
     name="coco",

@@ -1,22 +1,40 @@
-"""Downloading one file: mirrors, checksum, resuming, through pooch."""
+"""Data sets on the web: downloaded with resuming and checksums, unpacked, and checked.
+
+The downloader is our own, on `requests`: pooch does not resume a download that broke off, which
+COCO with its 19 GB needs.
+"""
 
 from __future__ import annotations
 
-import importlib.util
+import gzip
+import hashlib
+import json
 import re
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources, util
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from .._shared.errors import DeepDetectError
-from .._shared.progress import progress
+import cv2
 
-CHUNK = 1 << 16  # bytes; so many are lost when a download is broken off
-TIMEOUT = 60  # seconds without a byte
-ARCHIVES = (".zip", ".tar.gz", ".tgz", ".tar")
+from .._shared.errors import DeepDetectError, MissingExtraError
+from .._shared.progress import progress
+from ..io.image import IMAGE_SUFFIXES, find_images
+
+CHUNK_BYTES = 1 << 16
+"""At most this much is lost when a download breaks off."""
+
+TIMEOUT_SECONDS = 60.0
+"""A host that sends nothing for this long has failed."""
+
+ARCHIVE_SUFFIXES = (".zip", ".tar.gz", ".tgz", ".tar")
+GZIP_SIGNATURE = b"\x1f\x8b"
 
 
 @dataclass(frozen=True)
@@ -24,8 +42,8 @@ class RemoteFile:
     """A file on the web.
 
     Attributes:
-        urls: its official host first, then mirrors; the next one is asked when one fails.
-        size: bytes, roughly.
+        urls: its official host first, then mirrors; the next one is tried when one fails.
+        size: in bytes, roughly.
         checksum: "md5:..." or "sha256:..."; None where none is known: then the SHA-256 that the
             host itself states is checked, if it does, and the contents of the data set.
         into: in the data set, the folder that an archive is unpacked into, or the path of a
@@ -44,144 +62,312 @@ class RemoteFile:
         """The file's name on its host."""
         return Path(urlsplit(self.urls[0]).path).name
 
+
+@dataclass(frozen=True)
+class RemoteDataset:
+    """A data set of images on the web.
+
+    Attributes:
+        name: the name users choose it by.
+        title: what it is.
+        files: archives, which are unpacked, and single files.
+        images: number of images.
+        licence: the terms of use.
+        contents: `content_digest` of files by their path in the data set, which does not depend
+            on the archive or the image format they came in; None for those that the package
+            has in `known/NAME.json`, if any.
+        texts: files that are written, not downloaded, by path in the data set.
+    """
+
+    name: str
+    title: str
+    files: tuple[RemoteFile, ...]
+    images: int
+    licence: str
+    contents: Mapping[str, str] | None = field(default=None, repr=False)
+    texts: Mapping[str, str] = field(default_factory=dict, repr=False)
+
     @property
-    def is_archive(self) -> bool:
-        """Whether it is unpacked."""
-        return self.name.endswith(ARCHIVES)
+    def size(self) -> int:
+        """Bytes of the download."""
+        return sum(file.size for file in self.files)
+
+    def known_contents(self) -> Mapping[str, str]:
+        """Return the digests that the contents must have, by path."""
+        if self.contents is not None:
+            return self.contents
+        file = resources.files(__package__).joinpath(f"known/{self.name}.json")
+        return json.loads(file.read_text("utf-8")) if file.is_file() else {}
 
 
-def have_pooch() -> bool:
-    """Tell whether pooch is installed."""
-    return importlib.util.find_spec("pooch") is not None
+def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = True) -> Path:
+    """Download and unpack a data set, unless it is there already.
 
+    A download that broke off is resumed. The folder appears when all images are in it and are
+    the right ones; then the archives are removed.
 
-def partial_size(path: Path) -> int:
-    """Return how many bytes of a file are there from a download that was broken off."""
-    part = _part(path)
-    return part.stat().st_size if part.exists() else 0
+    Args:
+        dataset: the data set.
+        folder: where its images go.
+        quiet: show no progress bar.
+
+    Returns:
+        The folder.
+
+    Raises:
+        MissingExtraError: requests is not installed.
+        DeepDetectError: the download fails, a checksum is wrong, the disk is full, or the
+            folder holds something else.
+    """
+    if util.find_spec("requests") is None:
+        raise MissingExtraError(
+            "downloading data sets needs the package requests, which is not installed: "
+            "run pip install requests"
+        )
+    final = Path(folder)
+    if final.is_dir() and any(final.iterdir()):
+        _check(dataset, final, f"{final} exists and")
+        return final
+    store = final.with_name(f"{final.name}.download")
+    try:
+        store.mkdir(parents=True, exist_ok=True)
+        paths = [store / f"{k:02d}-{file.name}" for k, file in enumerate(dataset.files)]
+        missing = [
+            (file, path)
+            for file, path in zip(dataset.files, paths, strict=True)
+            if not path.exists()
+        ]
+        # Twice the size: for the archives, and for what is unpacked.
+        done = sum(_size(_part(path)) for _, path in missing)
+        _require_space(store, dataset.size + sum(file.size for file, _ in missing) - done)
+        for file, path in missing:
+            download(file, path, quiet=quiet)
+        _assemble(dataset, paths, final, quiet)
+        shutil.rmtree(store)
+    except DeepDetectError:
+        if store.is_dir() and not any(store.iterdir()):
+            store.rmdir()
+        raise
+    except OSError as error:
+        raise DeepDetectError(
+            f"cannot write {final} ({error.strerror or error}): make room or choose another folder"
+        ) from None
+    return final
 
 
 def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
-    """Download a file; it appears when it is whole and its checksum right.
+    """Download a file; it appears when it is whole and its checksum is right.
+
+    Until then the bytes are in `path` with ".part" added, where the next call resumes.
 
     Args:
-        file: what, and from where.
+        file: the file.
         path: the final path.
         quiet: show no progress bar.
 
     Raises:
-        DeepDetectError: no host gives it; the last one's trouble is told.
+        DeepDetectError: every host failed; the message is that of the last one.
     """
-    failed: DeepDetectError | None = None
+    from requests import HTTPError, RequestException
+
+    part = _part(path)
+    failure = DeepDetectError(f"{path.name} has no address")
     for k, url in enumerate(file.urls):
         if k and file.checksum is None:
-            _part(path).unlink(missing_ok=True)  # nothing tells that the hosts' bytes are the same
+            part.unlink(missing_ok=True)  # another host may have other bytes
         try:
-            _download_from(url, file, path, quiet)
+            stated = _fetch(url, file, part, quiet)
+            for checksum in (file.checksum, stated):
+                if checksum is not None and not has_checksum(part, checksum):
+                    part.unlink()
+                    source = "" if checksum == file.checksum else ", which the host states"
+                    raise DeepDetectError(
+                        f"{url} does not have the checksum {checksum}{source}: it has changed or "
+                        "was damaged on the way; try again later"
+                    )
+            part.replace(path)
             return
         except DeepDetectError as error:
-            failed = error
-    assert failed is not None
-    raise failed
+            failure = error
+        except HTTPError as error:
+            failure = DeepDetectError(
+                f"{url} cannot be downloaded (the server answers "
+                f"{error.response.status_code}): try again later"
+            )
+        except RequestException as error:
+            failure = DeepDetectError(
+                f"{url} cannot be downloaded ({error.__class__.__name__}): "
+                "give the same command again to resume"
+            )
+    raise failure
+
+
+def has_checksum(path: Path, checksum: str) -> bool:
+    """Whether a file has a checksum such as "sha256:..." or "md5:..."."""
+    algorithm, _, digest = checksum.partition(":")
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, algorithm).hexdigest() == digest
+
+
+def content_digest(folder: Path, name: str) -> str | None:
+    """Return the SHA-256 of a file's content, whatever format it is stored in.
+
+    Args:
+        folder: the data set.
+        name: path in it. Of an image, which is named without its suffix, the pixels with their
+            shape and type are digested, so that a lossless copy in another format has the same
+            digest; of any other file the words, without white space.
+
+    Returns:
+        64 hexadecimal digits, or None when there is no such file.
+    """
+    path = folder / name
+    if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
+        words = path.read_text(encoding="utf-8", errors="replace").split()
+        return hashlib.sha256(" ".join(words).encode()).hexdigest()
+    for candidate in sorted(path.parent.glob(f"{path.name}.*")):
+        if candidate.suffix.lower() in IMAGE_SUFFIXES:
+            pixels = cv2.imread(str(candidate), cv2.IMREAD_UNCHANGED)
+            if pixels is None:
+                return None
+            head = f"{pixels.shape} {pixels.dtype}".encode()
+            return hashlib.sha256(head + pixels.tobytes()).hexdigest()
+    return None
 
 
 def _part(path: Path) -> Path:
     return path.with_name(f"{path.name}.part")
 
 
-def _download_from(url: str, file: RemoteFile, path: Path, quiet: bool) -> None:
-    import pooch
-    from requests import HTTPError, RequestException
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
 
-    part = _part(path)
-    pooch.get_logger().setLevel("WARNING")  # the progress bar says enough
-    try:
-        pooch.retrieve(
-            url,
-            file.checksum,
-            fname=path.name,
-            path=path.parent,
-            downloader=_resuming(part, file, quiet),
+
+def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> str | None:
+    """Append what is missing to a partial file; return the checksum that the host states."""
+    import requests
+
+    have = _size(part)
+    headers = {"Range": f"bytes={have}-"} if have else {}
+    with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT_SECONDS) as response:
+        if response.status_code == 416:  # nothing is missing, which the checksum confirms
+            if file.checksum is None:
+                part.unlink()
+                raise requests.ConnectionError("the partial file is of another file")
+            return None
+        response.raise_for_status()
+        if response.status_code != 206:  # the server sends all of it again
+            have = 0
+        length = response.headers.get("Content-Length")
+        total = have + int(length) if length else max(file.size, have)
+        with (
+            part.open("ab" if have else "wb") as target,
+            progress(total, file.name, "B", quiet, have) as bar,
+        ):
+            bar.unit_scale = True
+            for chunk in response.iter_content(CHUNK_BYTES):
+                target.write(chunk)
+                bar.update(len(chunk))
+    if length and _size(part) < total:
+        raise requests.ConnectionError("the connection broke off")
+    if file.checksum is None:
+        # Hugging Face's hub states that of a large file in a header of its redirection
+        # (`X-Linked-Etag` in huggingface_hub's file_download.py).
+        for answer in (*response.history, response):
+            stated = answer.headers.get("X-Linked-Etag", "").strip('"').lower()
+            if re.fullmatch("[0-9a-f]{64}", stated):
+                return f"sha256:{stated}"
+    return None
+
+
+def _require_space(folder: Path, needed: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise DeepDetectError(
+            f"{folder.parent} has {free / 1e9:.1f} GB free, {needed / 1e9:.1f} GB are needed: "
+            "make room or choose another folder"
         )
-    except HTTPError as error:
+
+
+def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:
+    """Make sure that a folder holds the data set."""
+    count = len(find_images(folder))
+    if count != dataset.images:
         raise DeepDetectError(
-            f"{url} cannot be downloaded (the server answers "
-            f"{error.response.status_code}): try again later"
-        ) from None
-    except RequestException as error:
-        raise DeepDetectError(
-            f"{url} cannot be downloaded ({error.__class__.__name__}): "
-            "give the same command again to go on where it stopped"
-        ) from None
-    except ValueError:  # pooch's word for a wrong checksum
-        part.unlink(missing_ok=True)
-        raise _wrong_bytes(url, str(file.checksum)) from None
-    part.unlink(missing_ok=True)
+            f"{subject} holds {count:,} images, not the {dataset.images:,} of {dataset.name}: "
+            "choose another folder"
+        )
+    for name, digest in dataset.known_contents().items():
+        found = content_digest(folder, name)
+        if found != digest:
+            state = "is missing" if found is None else "is not the one of the data set"
+            raise DeepDetectError(
+                f"{subject} holds another {dataset.name}: {name} {state}; "
+                "it has changed or was damaged on the way"
+            )
 
 
-def _wrong_bytes(url: str, checksum: str) -> DeepDetectError:
-    return DeepDetectError(
-        f"{url} has another checksum than {checksum}: "
-        "it has changed or was damaged on the way; try again later"
-    )
-
-
-def _resuming(part: Path, file: RemoteFile, quiet: bool) -> Callable[..., None]:
-    """Make a downloader for pooch that keeps what it has got when it is broken off."""
-
-    def fetch(url: str, output: str, _: Any) -> None:
-        import requests
-
-        have = part.stat().st_size if part.exists() else 0
-        headers = {"Range": f"bytes={have}-"} if have else {}
-        with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT) as response:
-            if response.status_code == 416:  # nothing is missing, as the checksum will tell
-                if file.checksum is None:
-                    part.unlink()
-                    raise requests.ConnectionError("what is there is of another file")
-                _second_name(part, Path(output))
-                return
-            response.raise_for_status()
-            if response.status_code != 206:  # the server sends all of it again
-                have = 0
-            length = response.headers.get("Content-Length")
-            total = have + int(length) if length else max(file.size, have)
-            with (
-                part.open("ab" if have else "wb") as target,
-                progress(total, file.name, "B", quiet, have) as bar,
-            ):
-                bar.unit_scale = True
-                for chunk in response.iter_content(CHUNK):
-                    target.write(chunk)
-                    bar.update(len(chunk))
-        if length and part.stat().st_size < total:
-            raise requests.ConnectionError("the connection broke off")
-        if file.checksum is None:
-            _check_stated(url, response, part)
-        _second_name(part, Path(output))
-
-    return fetch
-
-
-def _check_stated(url: str, response: Any, part: Path) -> None:
-    """Check a file against the SHA-256 that its host states on the way to it.
-
-    Hugging Face's hub names that of a large file in a header of its redirection (`X-Linked-Etag`
-    in huggingface_hub's file_download.py).
-    """
-    import pooch
-
-    for answer in (*response.history, response):
-        stated = answer.headers.get("X-Linked-Etag", "").strip('"').lower()
-        if re.fullmatch("[0-9a-f]{64}", stated) and pooch.file_hash(part, "sha256") != stated:
-            part.unlink()
-            raise _wrong_bytes(url, f"sha256:{stated}, which the host states")
-
-
-def _second_name(part: Path, output: Path) -> None:
-    """Give the file to pooch, which deletes it when it is stopped, and keep it."""
-    output.unlink(missing_ok=True)
+def _assemble(dataset: RemoteDataset, paths: Sequence[Path], final: Path, quiet: bool) -> None:
+    """Unpack into a folder beside the final one, and rename it when it is complete and right."""
+    unfinished = final.with_name(f".{final.name}.part")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
     try:
-        output.hardlink_to(part)
-    except OSError:  # a file system without links
-        shutil.copyfile(part, output)
+        for file, path in zip(dataset.files, paths, strict=True):
+            target = unfinished / file.into
+            if file.name.endswith(ARCHIVE_SUFFIXES):
+                _unpack(file, path, target, quiet)
+            else:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, target)
+        for name, text in dataset.texts.items():
+            (unfinished / name).parent.mkdir(parents=True, exist_ok=True)
+            (unfinished / name).write_text(text, encoding="utf-8")
+        _check(dataset, unfinished, "the download")
+    except DeepDetectError:
+        shutil.rmtree(unfinished)
+        for path in paths:  # or the same wrong files would be used again
+            path.unlink()
+        raise
+    if final.exists():
+        final.rmdir()
+    unfinished.rename(final)
+
+
+def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
+    """Unpack a zip or tar archive, whatever its name; the folder `inside` is moved up."""
+    target.mkdir(parents=True, exist_ok=True)
+    try:
+        if zipfile.is_zipfile(archive):
+            with zipfile.ZipFile(archive) as zipped:
+                _extract(zipped.infolist(), lambda one: zipped.extract(one, target), quiet)
+        else:
+            _check_gzip(archive)
+            with tarfile.open(archive) as tar:
+                members = tar.getmembers()
+                _extract(members, lambda one: tar.extract(one, target, filter="data"), quiet)
+    except (zipfile.BadZipFile, tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError):
+        raise DeepDetectError(
+            f"{file.urls[0]} is no archive that can be unpacked: try again"
+        ) from None
+    if file.inside and (target / file.inside).is_dir():
+        for entry in sorted((target / file.inside).iterdir()):
+            entry.rename(target / entry.name)
+        (target / file.inside).rmdir()
+
+
+def _check_gzip(archive: Path) -> None:
+    """Read a gzip file to its end, where its checksum is: unpacking a tar stops before it."""
+    with archive.open("rb") as start:
+        if start.read(2) != GZIP_SIGNATURE:
+            return
+    with gzip.open(archive) as file:
+        while file.read(1 << 20):
+            pass
+
+
+def _extract(members: Sequence[Any], extract: Callable[[Any], object], quiet: bool) -> None:
+    with progress(len(members), "unpacking", "file", quiet) as bar:
+        for member in members:
+            extract(member)
+            bar.update(1)

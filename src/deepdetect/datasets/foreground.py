@@ -8,12 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from .._shared.errors import ImageError
+from ..io.masks import load_mask
 
-ENDINGS = (".jpg", ".png")
+SUFFIXES = (".jpg", ".png")
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,7 @@ class MaskedPhotograph:
         Raises:
             ImageError: it cannot be read.
         """
-        stored = cv2.imread(str(self.mask), cv2.IMREAD_GRAYSCALE)
-        if stored is None:
-            raise ImageError(f"{self.mask} is no picture that can be read: check the file")
-        return stored > 127
+        return load_mask(self.mask)
 
 
 def load_foreground(folder: str | Path) -> list[MaskedPhotograph]:
@@ -44,7 +41,7 @@ def load_foreground(folder: str | Path) -> list[MaskedPhotograph]:
     found = []
     for mask in sorted(Path(folder).glob("*_mask.png")):
         stem = mask.name.removesuffix("_mask.png")
-        images = [p for e in ENDINGS if (p := mask.with_name(stem + e)).exists()]
+        images = [p for e in SUFFIXES if (p := mask.with_name(stem + e)).exists()]
         if images:
             found.append(MaskedPhotograph(images[0], mask))
     if not found:

@@ -8,9 +8,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from .._shared.errors import ImageError
-from .types import PlanarScene, read_homography
+from .download import RemoteDataset, RemoteFile
+from .types import PlanarScene, load_planar_scene
 
-ENDINGS = (".ppm", ".png")
+SUFFIXES = (".ppm", ".png")
 NOT_IN_D2NET_SUBSET = frozenset(
     (
         "i_contruction",
@@ -42,7 +43,10 @@ def load_hpatches(folder: str | Path) -> list[PlanarScene]:
         raise ImageError(
             f"there are no HPatches scenes in {folder}: it must hold folders i_NAME and v_NAME"
         )
-    return [_load_scene(scene) for scene in scenes]
+    images = [f"{number}" for number in range(1, 7)]
+    homographies = [f"H_1_{number}" for number in range(2, 7)]
+    layout = "a scene has images 1 to 6"
+    return [load_planar_scene(path, images, homographies, SUFFIXES, layout) for path in scenes]
 
 
 def is_illumination(scene: PlanarScene) -> bool:
@@ -55,15 +59,20 @@ def in_d2net_subset(scene: PlanarScene) -> bool:
     return scene.name not in NOT_IN_D2NET_SUBSET
 
 
-def _load_scene(folder: Path) -> PlanarScene:
-    images = tuple(_image(folder, number) for number in range(1, 7))
-    homographies = tuple(read_homography(folder / f"H_1_{number}") for number in range(2, 7))
-    return PlanarScene(folder.name, images, homographies)
-
-
-def _image(folder: Path, number: int) -> Path:
-    for ending in ENDINGS:
-        path = folder / f"{number}{ending}"
-        if path.exists():
-            return path
-    raise ImageError(f"there is no image {number} in {folder}: a scene has images 1 to 6")
+HPATCHES = RemoteDataset(
+    name="hpatches",
+    title="HPatches sequences, 116 scenes of six images with homographies",
+    files=(
+        RemoteFile(
+            (
+                "https://huggingface.co/datasets/vbalnt/hpatches/resolve/main/"
+                "hpatches-sequences-release.zip",
+                "http://icvl.ee.ic.ac.uk/vbalnt/hpatches/hpatches-sequences-release.tar.gz",
+            ),
+            size=1_400_000_000,
+            inside="hpatches-sequences-release",
+        ),
+    ),
+    images=696,
+    licence="MIT; Balntas et al., 2017",
+)

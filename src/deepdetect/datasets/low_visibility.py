@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .._shared.errors import ImageError
-from .types import PlanarScene, read_homography
+from .types import PlanarScene, load_planar_scene
 
 SCENES = ("dusty", "smoky")
-ENDINGS = (".png", ".bmp")
+SUFFIXES = (".png", ".bmp")
 
 
 def load_low_visibility(folder: str | Path) -> list[PlanarScene]:
@@ -17,16 +16,6 @@ def load_low_visibility(folder: str | Path) -> list[PlanarScene]:
     Raises:
         ImageError: a file is missing.
     """
-    scenes = []
-    for name in SCENES:
-        root = Path(folder) / name
-        images = []
-        for number in (1, 2):
-            found = [p for e in ENDINGS if (p := root / f"img{number}{e}").exists()]
-            if not found:
-                raise ImageError(
-                    f"there is no img{number} in {root}: the folder must hold dusty and smoky"
-                )
-            images.append(found[0])
-        scenes.append(PlanarScene(name, tuple(images), (read_homography(root / "H1to2p"),)))
-    return scenes
+    layout = "the folder must hold dusty and smoky"
+    folders = [Path(folder) / name for name in SCENES]
+    return [load_planar_scene(p, ("img1", "img2"), ("H1to2p",), SUFFIXES, layout) for p in folders]

@@ -8,11 +8,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from .._shared.errors import ImageError, OptionError, unknown_name
-from .types import PlanarScene, read_homography
+from .._shared.errors import OptionError, unknown_name
+from .download import RemoteDataset, RemoteFile
+from .types import PlanarScene, load_planar_scene
 
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
-ENDINGS = (".png", ".ppm", ".pgm")
+SUFFIXES = (".png", ".ppm", ".pgm")
 
 
 def load_oxford(
@@ -47,23 +48,40 @@ def find_scene(scenes: list[PlanarScene], name: str) -> PlanarScene:
 
 
 def _load_scene(folder: Path, truth: str) -> PlanarScene:
-    images = tuple(_image(folder, number) for number in range(1, 7))
-    homographies = []
-    for number in range(2, 7):
-        path = folder / f"H1to{number}p"
-        refined = path.with_name(f"{path.name}.refined")
-        homographies.append(
-            read_homography(refined if truth == "refined" and refined.exists() else path)
+    homographies = [f"H1to{number}p" for number in range(2, 7)]
+    if truth == "refined":
+        refined = [f"{name}.refined" for name in homographies]
+        homographies = [
+            new if (folder / new).exists() else name
+            for name, new in zip(homographies, refined, strict=True)
+        ]
+    images = [f"img{number}" for number in range(1, 7)]
+    layout = f"the data set has the scenes {', '.join(SCENES)} with img1 to img6 each"
+    return load_planar_scene(folder, images, homographies, SUFFIXES, layout)
+
+
+_HOST = "https://www.robots.ox.ac.uk/~vgg/research/affine/det_eval_files"
+_CHECKSUMS = {
+    "graf": "sha256:999871b945ee968a00a0d5f9af957d1382fb9dae1511cdee9553366817b53b5b",
+    "boat": "sha256:6e5721f37fbf9c3e974fd05935a42c1670f3e71aa3e5b218807ea046a068c603",
+}
+"""Of the archives; what is in all of them is checked too."""
+
+OXFORD = RemoteDataset(
+    name="oxford",
+    title="Oxford Affine Covariant Regions, eight scenes of six images with homographies",
+    files=tuple(
+        RemoteFile(
+            (
+                f"{_HOST}/{scene}.tar.gz",
+                f"{_HOST.replace('https:', 'http:')}/{scene}.tar.gz",
+            ),
+            size=8_000_000,
+            checksum=_CHECKSUMS.get(scene),
+            into=scene,
         )
-    return PlanarScene(folder.name, images, tuple(homographies))
-
-
-def _image(folder: Path, number: int) -> Path:
-    for ending in ENDINGS:
-        path = folder / f"img{number}{ending}"
-        if path.exists():
-            return path
-    raise ImageError(
-        f"there is no img{number} in {folder}: the folder must hold the eight Oxford scenes "
-        f"({', '.join(SCENES)}) with img1 to img6 each"
-    )
+        for scene in SCENES
+    ),
+    images=48,
+    licence="research use; Mikolajczyk et al., 2005",
+)

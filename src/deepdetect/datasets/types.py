@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,15 +64,20 @@ class StereoPair:
         name: the scene's name.
         left, right: (H, W, 3) uint8 RGB.
         disparity: (H, W) float32 true disparity of the left view in pixels, NaN where it is
-            unknown; None when the ground truth was not loaded.
-        calibration: of both cameras; None when it was not loaded.
+            unknown.
     """
 
     name: str
     left: np.ndarray
     right: np.ndarray
-    disparity: np.ndarray | None = None
-    calibration: Calibration | None = None
+    disparity: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedStereoPair(StereoPair):
+    """A rectified pair with the calibration of its cameras."""
+
+    calibration: Calibration
 
 
 def read_homography(path: Path) -> np.ndarray:
@@ -90,3 +95,32 @@ def read_homography(path: Path) -> np.ndarray:
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
         raise ImageError(f"{path} holds no homography: the matrix cannot be inverted")
     return matrix
+
+
+def load_planar_scene(
+    folder: Path,
+    images: Sequence[str],
+    homographies: Sequence[str],
+    suffixes: Sequence[str],
+    layout: str,
+) -> PlanarScene:
+    """Load a scene from a folder.
+
+    Args:
+        folder: the scene.
+        images: names of the images without their suffixes, the first image first.
+        homographies: names of the text files of the others' homographies.
+        suffixes: the image formats that are looked for, in this order.
+        layout: what the folder must hold, for the error.
+
+    Raises:
+        ImageError: a file is missing, or a homography is wrong.
+    """
+    files = []
+    for name in images:
+        found = [path for end in suffixes if (path := folder / f"{name}{end}").exists()]
+        if not found:
+            raise ImageError(f"there is no image {name} in {folder}: {layout}")
+        files.append(found[0])
+    matrices = tuple(read_homography(folder / name) for name in homographies)
+    return PlanarScene(folder.name, tuple(files), matrices)

@@ -13,7 +13,7 @@ from PIL import Image
 
 from deepdetect import DeepDetect, OptionError
 from deepdetect.datasets.middlebury import load_calibrated_pair
-from deepdetect.datasets.types import StereoPair
+from deepdetect.datasets.types import CalibratedStereoPair
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.evaluation.cache import StageCache
 from deepdetect.evaluation.protocols import BenchmarkOptions
@@ -189,7 +189,11 @@ def test_sgbm_finds_a_shift() -> None:
     left, right = texture[:, :180], texture[:, 9:189]
     camera = Camera((180, 80), 100.0)
 
-    found = sgbm(StereoPair("shift", left, right, calibration=Calibration(camera, camera)))
+    found = sgbm(
+        CalibratedStereoPair(
+            "shift", left, right, np.full(left.shape[:2], np.nan), Calibration(camera, camera)
+        )
+    )
     assert (np.abs(found.disparity - 9) < 0.5).mean() > 0.98
     assert len(found.pixels) > 0.9 * 80 * 171
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..._shared.errors import ImageError
 from ...datasets.middlebury import load_calibrated_pair
-from ...datasets.types import StereoPair
+from ...datasets.types import CalibratedStereoPair
 from ...geometry.camera import Calibration
 from ...geometry.point_cloud import PointCloud
 from ...viz.render import draw_clouds
@@ -88,7 +88,9 @@ def _scenes(workspace: Workspace) -> list[Path]:
     return scenes
 
 
-def _points(workspace: Workspace, way: Pipeline, scene: StereoPair, folder: Path) -> StereoPoints:
+def _points(
+    workspace: Workspace, way: Pipeline, scene: CalibratedStereoPair, folder: Path
+) -> StereoPoints:
     """Reconstruct a scene, or read its points from the cache."""
 
     def make() -> dict[str, np.ndarray]:
@@ -121,7 +123,7 @@ def _points(workspace: Workspace, way: Pipeline, scene: StereoPair, folder: Path
 
 
 def _table(
-    scene: StereoPair,
+    scene: CalibratedStereoPair,
     ways: list[Pipeline],
     found: dict[str, StereoPoints],
     name: str,
@@ -231,7 +233,7 @@ def _space(
 
 
 def _figure(
-    scene: StereoPair, ways: list[Pipeline], found: dict[str, StereoPoints]
+    scene: CalibratedStereoPair, ways: list[Pipeline], found: dict[str, StereoPoints]
 ) -> Figure | None:
     clouds = {}
     unit = "mm" if scene.calibration.baseline_mm else "baseline"

@@ -13,7 +13,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from ...datasets.types import StereoPair
+from ...datasets.types import CalibratedStereoPair
 from ...detector.detector import DeepDetect, HeatmapDetector
 from ...detector.heatmap import HeatmapOptions
 from ...reconstruction.pipeline import reconstruct
@@ -80,7 +80,7 @@ class Pipeline:
     """
 
     title: str
-    run: Callable[[StereoPair], StereoPoints]
+    run: Callable[[CalibratedStereoPair], StereoPoints]
     version: str = ""
     rounds: int = ROUNDS
     drawn: str = ""
@@ -119,8 +119,8 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
 
 def _ours(
     detector: HeatmapDetector, density: float | None = None
-) -> Callable[[StereoPair], StereoPoints]:
-    def run(scene: StereoPair) -> StereoPoints:
+) -> Callable[[CalibratedStereoPair], StereoPoints]:
+    def run(scene: CalibratedStereoPair) -> StereoPoints:
         _compiled()
         return _reconstructed(scene, detector, density)
 
@@ -128,7 +128,7 @@ def _ours(
 
 
 def _reconstructed(
-    scene: StereoPair, detector: HeatmapDetector, density: float | None
+    scene: CalibratedStereoPair, detector: HeatmapDetector, density: float | None
 ) -> StereoPoints:
     meters = StageMeters()
 
@@ -150,8 +150,8 @@ def _reconstructed(
     return StereoPoints(found.pixels, found.disparity, filled, meters.stages, meters.memory)
 
 
-def _random(like: DeepDetect) -> Callable[[StereoPair], StereoPoints]:
-    def run(scene: StereoPair) -> StereoPoints:
+def _random(like: DeepDetect) -> Callable[[CalibratedStereoPair], StereoPoints]:
+    def run(scene: CalibratedStereoPair) -> StereoPoints:
         _compiled()
         density = float((like.heatmap(scene.left) > 0.5).mean())
         generator = np.random.default_rng(0)
@@ -165,8 +165,8 @@ def _random(like: DeepDetect) -> Callable[[StereoPair], StereoPoints]:
     return run
 
 
-def _published(detector: DeepDetect) -> Callable[[StereoPair], StereoPoints]:
-    def run(scene: StereoPair) -> StereoPoints:
+def _published(detector: DeepDetect) -> Callable[[CalibratedStereoPair], StereoPoints]:
+    def run(scene: CalibratedStereoPair) -> StereoPoints:
         network = published_detector(detector)
         network.heatmap(scene.left)  # the first run of a size takes longer
         meters = StageMeters()
@@ -176,8 +176,8 @@ def _published(detector: DeepDetect) -> Callable[[StereoPair], StereoPoints]:
     return run
 
 
-def _sift(make: Callable[[], cv2.SIFT]) -> Callable[[StereoPair], StereoPoints]:
-    def run(scene: StereoPair) -> StereoPoints:
+def _sift(make: Callable[[], cv2.SIFT]) -> Callable[[CalibratedStereoPair], StereoPoints]:
+    def run(scene: CalibratedStereoPair) -> StereoPoints:
         meters = StageMeters()
         found = sift_points((scene.left, scene.right), make(), _settings(scene), meters.lap)
         return _from_matches(*found, meters)
@@ -185,11 +185,11 @@ def _sift(make: Callable[[], cv2.SIFT]) -> Callable[[StereoPair], StereoPoints]:
     return run
 
 
-def _settings(scene: StereoPair) -> StereoSettings:
+def _settings(scene: CalibratedStereoPair) -> StereoSettings:
     return stereo_settings(scene.name, scene.calibration.camera0.matrix)
 
 
-def sgbm(scene: StereoPair) -> StereoPoints:
+def sgbm(scene: CalibratedStereoPair) -> StereoPoints:
     """Run OpenCV's semi-global matching on every pixel.
 
     With the range that ours finds, made a multiple of 16. Both views are continued on the left by
