@@ -31,7 +31,8 @@ class FieldOptions:
         path: module and class, as "features.selection:SelectionOptions", within the package.
         names: the fields, in the order of the help; empty for all that are initialised.
         skip: fields that are left out.
-        flags: flags of fields whose flag is not their name, as {"short_sides": "--short-side"}.
+        flags: flags of fields whose flag is not their name, as {"short_sides": "--short-side"}, or
+            {"guided": "--guided/--unguided"}.
         types: click's types of fields whose annotation does not say it.
         defaults: what is used unless the option is given, where it is not the field's default; for
             the help.
@@ -58,7 +59,7 @@ class FieldOptions:
         settings = _type_settings(hint, flag) | {"help": text}
         if field.name in self.types:
             settings["type"] = self.types[field.name]
-        if settings.pop("switch", False):
+        if settings.pop("switch", False) and "/" not in flag:
             flag = f"{flag}/--no-{flag.removeprefix('--')}"
         if shown := self.defaults.get(field.name, _default_text(field)):
             settings["help"] += f"  [default: {shown}]"

@@ -8,8 +8,10 @@ from typing import Any
 
 import click
 
+from ._generated import generated_command, given_only
 from .shared import (
     PATH,
+    SELECTION,
     detector_options,
     expand_images,
     format_option,
@@ -19,14 +21,12 @@ from .shared import (
     pictures_option,
     print_json,
     report_failures,
-    selection_options,
 )
 
 
-@click.command(short_help="Keypoints of photographs.")
+@generated_command(SELECTION, short_help="Keypoints of photographs.")
 @click.argument("images", type=PATH, nargs=-1, required=True)
 @output_option
-@selection_options
 @click.option(
     "--ignore",
     type=PATH,
@@ -39,11 +39,6 @@ from .shared import (
 def detect(
     images: tuple[Path, ...],
     output: Path,
-    threshold: float,
-    density: float | None,
-    max_keypoints: int | None,
-    nms_radius: int | None,
-    subpixel: bool | None,
     ignore: Path | None,
     file_format: str,
     pictures: bool,
@@ -66,15 +61,8 @@ def detect(
 
     paths = expand_images(images, output)
     mask = load_mask(ignore) if ignore is not None else None
-    selection = {
-        "threshold": threshold,
-        "density": density,
-        "max_keypoints": max_keypoints,
-        "nms_radius": nms_radius,
-        "subpixel": subpixel,
-        "ignore": mask,
-    }
     detector = make_detector(values)
+    selection = {**given_only(values), "ignore": mask}
     results: list[dict[str, Any]] = []
     failures = []
     with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:

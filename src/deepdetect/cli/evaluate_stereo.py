@@ -18,14 +18,14 @@ from .shared import PATH, json_option, print_json
     "--weights",
     multiple=True,
     metavar="NAME|FILE",
-    help="matching or geometry, the bundled weights, or a file; may be repeated.",
+    help="default or dense, the bundled weights, or a file; may be repeated.",
 )
 @click.option(
     "--label-settings",
     "labels",
     multiple=True,
     metavar="NAME|FILE.toml",
-    help="Label settings whose labels are the keypoints, without a network: paper or geometry, "
+    help="Label settings whose labels are the keypoints, without a network: paper or dense, "
     "or a file; may be repeated.",
 )
 @json_option

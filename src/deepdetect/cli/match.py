@@ -8,8 +8,10 @@ from typing import Any
 
 import click
 
+from ._generated import FieldOptions, generated_command, given_only
 from .shared import (
     PATH,
+    SELECTION,
     detector_options,
     format_option,
     json_option,
@@ -19,11 +21,21 @@ from .shared import (
     print_json,
     print_table,
     seconds_rows,
-    selection_options,
+)
+
+MATCHING = FieldOptions(
+    "matching.options:MatchingOptions",
+    skip=("heatmap", "selection", "guided_options", "geometry"),
+    flags={"guided": "--guided/--unguided"},
+)
+GEOMETRY = FieldOptions(
+    "geometry.estimation:GeometryOptions",
+    names=("model", "estimator", "inlier_threshold", "confidence", "iterations", "seed"),
+    defaults={"model": "auto"},
 )
 
 
-@click.command(short_help="Matches between two photographs.")
+@generated_command(SELECTION, MATCHING, GEOMETRY, short_help="Matches between two photographs.")
 @click.argument("image0", type=PATH)
 @click.argument("image1", type=PATH)
 @output_option
@@ -33,51 +45,11 @@ from .shared import (
     show_default=True,
     help="Options to start from: default, or published (exactly the paper's code).",
 )
-@selection_options
-@click.option("--descriptor", help="Unguided only: sift, rootsift or sift-opencv.  [default: sift]")
-@click.option(
-    "--keypoint-size",
-    type=float,
-    help="Unguided only: size for the descriptor, pixels.  [default: 3]",
-)
-@click.option(
-    "--matcher", help="Unguided only: flann, exact, faiss or patchmatch.  [default: flann]"
-)
-@click.option(
-    "--ratio",
-    type=float,
-    help="Unguided only: the ratio test keeps matches under it.  [default: 0.99]",
-)
-@click.option(
-    "--mutual/--no-mutual",
-    default=None,
-    help="Keep mutual nearest neighbours only; guided: the best match of each keypoint.",
-)
-@click.option(
-    "--guided/--unguided",
-    default=None,
-    help="A geometry from a few matches guides the matching, or all descriptors are compared with "
-    "all others.  [default: guided]",
-)
-@click.option(
-    "--model",
-    help="The geometry, which also guides: fundamental (any static scene), essential (the same "
-    "with known cameras), homography (planes, pure rotation), none, or auto: homography or "
-    "fundamental.  [default: auto]",
-)
-@click.option(
-    "--guide",
-    help="Which geometry guides with the models auto and none: homography, fundamental or auto.  "
-    "[default: auto]",
-)
-@click.option("--estimator", help="magsac or ransac.  [default: magsac]")
-@click.option("--inlier-threshold", type=float, help="Pixels.  [default: 1]")
 @click.option(
     "--homography", type=PATH, help="Text file of a known 3x3 homography to judge matches by."
 )
 @click.option("--camera0", type=PATH, help="Text file of the 3x3 camera matrix, for essential.")
 @click.option("--camera1", type=PATH, help="The same of the second image.  [default: camera0]")
-@click.option("--seed", type=int, help="Of the random choices.  [default: 0]")
 @detector_options
 @format_option
 @pictures_option
@@ -100,8 +72,9 @@ def match(
     """Match the keypoints of IMAGE0 and IMAGE1.
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores,
-    the estimated geometry and which matches agree with it, and a picture of them. Options that
-    are "unguided only" apply with --unguided, and where no geometry can be trusted.
+    the estimated geometry and which matches agree with it, and a picture of them. The options
+    --descriptor, --keypoint-size, --angle, --matcher and --ratio apply with --unguided, and
+    where no geometry can be trusted.
 
     \b
     deepdetect match left.jpg right.jpg
@@ -116,8 +89,7 @@ def match(
 
     rgb0, rgb1 = load_image(image0), load_image(image1)
     detector = make_detector(values)
-    # Only what was given on the command line changes the preset.
-    given = {name: value for name, value in values.items() if _was_given(context, name)}
+    given = given_only(values)
     for name, path in (
         ("homography", homography),
         ("camera0", camera0),

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ._generated import generated_command, given_only
 from .shared import (
     PATH,
+    SELECTION,
     check_inputs_survive,
     detector_options_with,
     json_option,
@@ -18,7 +20,6 @@ from .shared import (
     print_json,
     print_table,
     seconds_rows,
-    selection_options,
 )
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ STAGES = 5
 """Of a reconstruction at most; the files are one more."""
 
 
-@click.command(short_help="Two photographs to a model in space.")
+@generated_command(SELECTION, short_help="Two photographs to a 3D reconstruction.")
 @click.argument("left", type=PATH)
 @click.argument("right", type=PATH)
 @click.option("--calib", type=PATH, help="JSON file of the cameras, as docs/reconstruction.md.")
@@ -52,7 +53,6 @@ STAGES = 5
     show_default=True,
     help="The model, .ply, .glb or .html; the other files get its name and stand beside it.",
 )
-@selection_options
 @detector_options_with("dense")
 @json_option
 def reconstruct(
@@ -83,7 +83,7 @@ def reconstruct(
     find_writer(output)
     files = _files(output, [path for path in (left, right, calib) if path is not None])
     detector = make_detector(values)
-    chosen = {name: value for name, value in values.items() if value is not None}
+    chosen = given_only(values)
     # On a terminal only: what is logged stays readable.
     with progress(STAGES + 1, "reconstructing", "stage", not sys.stderr.isatty()) as bar:
 

@@ -1,4 +1,4 @@
-"""`deepdetect register`: one photograph laid onto another."""
+"""`deepdetect register`: one photograph registered to another."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from typing import Any
 
 import click
 
+from ._generated import generated_command, given_only
 from .shared import (
     PATH,
+    SELECTION,
     detector_options,
     json_option,
     make_detector,
     output_option,
     print_json,
     print_table,
-    selection_options,
 )
 
 
-@click.command(short_help="One photograph laid onto another.")
+@generated_command(SELECTION, short_help="One photograph registered to another.")
 @click.argument("image0", type=PATH)
 @click.argument("image1", type=PATH)
 @output_option
-@selection_options
 @detector_options
 @json_option
 def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: Any) -> None:
-    """Lay IMAGE1 onto IMAGE0: for planes, and for photographs from one place.
+    """Register IMAGE1 to IMAGE0: for planes, and for photographs from one place.
 
     Writes STEM1_on_STEM0.png (the second image in the frame of the first), the same as
     _checkerboard.png and _difference.png with the first, and _homography.txt (3x3, from the
@@ -43,9 +43,7 @@ def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: 
     from ..viz.draw import save_picture
 
     detector = make_detector(values)
-    names = ("threshold", "density", "max_keypoints", "nms_radius", "subpixel")
-    chosen = {name: values[name] for name in names if values.get(name) is not None}
-    found = register_images(image0, image1, detector, **chosen)
+    found = register_images(image0, image1, detector, **given_only(values))
     stem = f"{image1.stem}_on_{image0.stem}"
     pictures = {
         "": found.warped,

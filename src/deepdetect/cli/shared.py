@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .._shared.errors import DeepDetectError, OptionError
+from ._generated import FieldOptions
 
 if TYPE_CHECKING:
     from ..detector.detector import DeepDetect
@@ -53,7 +54,7 @@ def detector_options_with(weights: str) -> Decorator:
             "--weights",
             default=weights,
             show_default=True,
-            help="matching or geometry, the bundled weights; or an ONNX or safetensors file.",
+            help="default or dense, the bundled weights; or an ONNX or safetensors file.",
         ),
         click.option(
             "--resolution",
@@ -83,31 +84,13 @@ def detector_options_with(weights: str) -> Decorator:
 
 detector_options = detector_options_with("default")
 
-selection_options = combined(
-    click.option(
-        "--threshold",
-        type=float,
-        default=0.5,
-        show_default=True,
-        help="Probability above which a pixel is a keypoint (tau).",
-    ),
-    click.option(
-        "--density",
-        type=float,
-        help="Wanted keypoints per pixel, from 0 to 1, instead of the threshold.",
-    ),
-    click.option("--max-keypoints", type=int, help="Keep at most this many, the most probable."),
-    click.option(
-        "--nms-radius",
-        type=int,
-        help="Radius of non-maximum suppression in pixels.  [default: 1 with --max-keypoints, "
-        "else 0]",
-    ),
-    click.option(
-        "--subpixel/--no-subpixel",
-        default=None,
-        help="Refine positions to a fraction of a pixel.  [default: with --max-keypoints only]",
-    ),
+SELECTION = FieldOptions(
+    "features.selection:SelectionOptions",
+    skip=("ignore",),
+    defaults={
+        "nms_radius": "1 with --max-keypoints, else 0",
+        "subpixel": "with --max-keypoints only",
+    },
 )
 
 output_option = click.option(
@@ -137,7 +120,7 @@ workers_option = click.option(
 label_settings_option = click.option(
     "--label-settings",
     metavar="NAME|FILE.toml",
-    help="Detectors and their settings: paper or geometry, or a file.  [default: paper]",
+    help="Detectors and their settings: paper or dense, or a file.  [default: paper]",
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 
