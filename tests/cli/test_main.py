@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from deepdetect.cli import main
+from deepdetect.cli.main import with_flags
 
 
 def commands(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -45,3 +46,17 @@ def test_every_option_says_what_it_is(words: tuple[str, ...]) -> None:
     for parameter in command_of(words).params:
         if isinstance(parameter, click.Option) and parameter.name not in ("help", "version"):
             assert parameter.help, parameter.name
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ("give `focal_px` or `calibration`", "give --focal or --calibration"),
+        ("give `rectified=False`", "give --not-rectified"),
+        ("give `rectified=True`", "give --rectified"),
+        ('use `backend="torch"`', "use --backend torch"),
+        ("use `no_such_option`, `LEFT`", "use no_such_option, LEFT"),
+    ],
+)
+def test_errors_name_flags_instead_of_parameters(message: str, expected: str) -> None:
+    assert with_flags(message, main.commands["reconstruct"]) == expected

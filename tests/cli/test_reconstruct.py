@@ -82,7 +82,7 @@ def ply_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
     result = run(
         *("reconstruct", folder / "left.png", folder / "right.png"),
-        *("--calib", folder / "calib.json", "-o", "out/m.ply", "--json"),
+        *("--calibration", folder / "calib.json", "-o", "out/m.ply", "--json"),
     )
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in Path("out").iterdir()) == FILES
@@ -144,7 +144,7 @@ def test_the_depth_is_true(run, folder: Path) -> None:
 
     true = load_stereo_pair("motorcycle").disparity[60:360, 250:650]
     true = FOCAL * BASELINE / (true + OFFSET)
-    arguments = folder / "left.png", folder / "right.png", "--calib", folder / "calib.json"
+    arguments = folder / "left.png", folder / "right.png", "--calibration", folder / "calib.json"
     for more, least, share in ((["--density", 1], 0.85, 0.85), ([], 0.3, 0.96)):
         result = run("reconstruct", *arguments, "-o", "m.glb", "--json", *more)
         told = json.loads(result.stdout)
@@ -209,34 +209,43 @@ CASES = {
     "turned, said to be rectified": ("turned0 turned1 --focal 995 --rectified", "is not rectified"),
     "a focal length far too short": ("turned0 turned1 --focal 250", "is probably wrong"),
     "a calibration of another size": (
-        "left right --calib {}/other-size.json",
+        "left right --calibration {}/other-size.json",
         "images of 800x",
     ),
     "a wrong offset": (
-        "left right --calib {}/other-offset.json",
+        "left right --calibration {}/other-offset.json",
         "or the disparity offset of -60 px is wrong",
     ),
     "a wrong offset, said to be rectified": (
-        "left right --calib {}/other-offset.json --rectified",
+        "left right --calibration {}/other-offset.json --rectified",
         "would lie behind the cameras",
     ),
     "two focal lengths": (
-        "left right --calib {}/two-focals.json",
+        "left right --calibration {}/two-focals.json",
         "those of a rectified pair are one",
     ),
     "two centres, said to be rectified": (
-        "left right --calib {}/two-rows.json --rectified",
+        "left right --calibration {}/two-rows.json --rectified",
         "cy of the left and the right view are 194.877 and 100 px",
     ),
-    "a baseline of zero": ("left right --calib {}/zero.json", "the baseline must be above 0 mm"),
-    "a calibration without focal length": ("left right --calib {}/no-focal.json", 'no "focal_px"'),
-    "no calibration there": ("left right --calib {}/nothing.json", "cannot be read"),
-    "a calibration that is no JSON": ("left right --calib {}/left.png", "no JSON file"),
-    "no EXIF": ("left right", "carries no focal length (EXIF): give --focal or --calib"),
+    "a baseline of zero": (
+        "left right --calibration {}/zero.json",
+        "the baseline must be above 0 mm",
+    ),
+    "a calibration without focal length": (
+        "left right --calibration {}/no-focal.json",
+        'no "focal_px"',
+    ),
+    "no calibration there": ("left right --calibration {}/nothing.json", "cannot be read"),
+    "a calibration that is no JSON": ("left right --calibration {}/left.png", "no JSON file"),
+    "no EXIF": ("left right", "carries no focal length (EXIF): give --focal or --calibration"),
     "a focal length of zero": ("left right --focal 0", "focal length must be above 0"),
     "a focal length that is no number": ("left right --focal nan", "must be finite"),
-    "two calibrations": ("left right --focal 995 --calib {}/calib.json", "not both"),
-    "left and right exchanged": ("right left --calib {}/calib.json", "left and right exchanged"),
+    "two calibrations": ("left right --focal 995 --calibration {}/calib.json", "not both"),
+    "left and right exchanged": (
+        "right left --calibration {}/calib.json",
+        "left and right exchanged",
+    ),
     "exchanged, said to be rectified": (
         "right left --focal 995 --rectified",
         "left and right are exchanged",
@@ -272,7 +281,7 @@ def test_inputs_are_not_written_over(run, folder: Path) -> None:
     content = (folder / "calib.json").read_bytes()
     Path("calib.json").write_bytes(content)
     pair = folder / "left.png", folder / "right.png"
-    result = run("reconstruct", *pair, "--calib", "calib.json", "-o", "calib.ply")
+    result = run("reconstruct", *pair, "--calibration", "calib.json", "-o", "calib.ply")
     assert result.exit_code == 2
     assert "calib.json would be written over" in result.stderr
     assert Path("calib.json").read_bytes() == content

@@ -98,7 +98,7 @@ def test_what_carries_no_focal_length_says_what_to_give(one_line, tmp_path: Path
         photograph({FOCAL: 5.0, PLANE_X: 0.0}),
         b"no image",
     ):
-        with pytest.raises(ReconstructionError, match="--focal or --calib") as error:
+        with pytest.raises(ReconstructionError, match="give `focal_px` or `calibration`") as error:
             camera_from_exif(image, (300, 200))
         one_line(error.value)
     cropped = photograph({FILM: 24, WIDTH: 400, HEIGHT: 200})

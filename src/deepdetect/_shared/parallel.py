@@ -83,7 +83,7 @@ def map_in_processes(
     except BrokenProcessPool:
         raise DeepDetectError(
             "a worker process died, most likely for lack of memory: "
-            "use fewer --workers, or smaller images"
+            "use fewer `workers`, or smaller images"
         ) from None
     finally:
         pool.shutdown(cancel_futures=True)

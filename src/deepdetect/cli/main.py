@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import sys
 from typing import Any
 
@@ -40,7 +41,8 @@ class Commands(click.Group):
         try:
             return super().invoke(context)
         except DeepDetectError as error:
-            click.echo(f"deepdetect: {error}", err=True)
+            command = self.get_command(context, context.invoked_subcommand or "")
+            click.echo(f"deepdetect: {with_flags(str(error), command)}", err=True)
             context.exit(2)
         except KeyboardInterrupt:
             click.echo("deepdetect: stopped; what was written stays", err=True)
@@ -48,6 +50,30 @@ class Commands(click.Group):
         except BrokenPipeError:
             sys.stderr.close()
             context.exit(1)
+
+
+def with_flags(message: str, command: click.Command | None) -> str:
+    """Name a command's options where a message of the library names parameters, as `focal_px`.
+
+    The library puts parameters between backticks, alone or with a value: `rectified=False`.
+
+    Example:
+        >>> option = click.Option(["--rectified/--not-rectified"])
+        >>> with_flags("give `rectified=False`", click.Command("reconstruct", params=[option]))
+        'give --not-rectified'
+    """
+    options = {option.name: option for option in command.params} if command else {}
+
+    def flag(match: re.Match[str]) -> str:
+        name, value = match.groups()
+        option = options.get(name)
+        if not isinstance(option, click.Option):
+            return match[0].strip("`")
+        if option.is_flag:
+            return (option.secondary_opts if value == "False" else option.opts)[-1]
+        return option.opts[-1] if value is None else f"{option.opts[-1]} {value.strip(chr(34))}"
+
+    return re.sub(r"`(\w+)(?:=([^`]+))?`", flag, message)
 
 
 @click.group(

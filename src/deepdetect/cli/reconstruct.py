@@ -33,9 +33,12 @@ STAGES = 5
 @generated_command(SELECTION, short_help="Two photographs to a 3D reconstruction.")
 @click.argument("left", type=PATH)
 @click.argument("right", type=PATH)
-@click.option("--calib", type=PATH, help="JSON file of the cameras, as docs/reconstruction.md.")
+@click.option(
+    "--calibration", type=PATH, help="JSON file of the cameras, as in docs/reconstruction.md."
+)
 @click.option(
     "--focal",
+    "focal_px",
     type=float,
     metavar="PX",
     help="Focal length in pixels of these images.  [default: from EXIF]",
@@ -58,8 +61,8 @@ STAGES = 5
 def reconstruct(
     left: Path,
     right: Path,
-    calib: Path | None,
-    focal: float | None,
+    calibration: Path | None,
+    focal_px: float | None,
     rectified: bool | None,
     output: Path,
     as_json: bool,
@@ -72,7 +75,7 @@ def reconstruct(
     for rectified pairs), and STEM.json (counts, times and quality).
 
     \b
-    deepdetect reconstruct left.png right.png --calib calib.json -o model.ply
+    deepdetect reconstruct left.png right.png --calibration calib.json -o model.ply
     deepdetect reconstruct left.jpg right.jpg --focal 1250 -o model.ply
     deepdetect reconstruct phone1.jpg phone2.jpg
     """
@@ -81,7 +84,7 @@ def reconstruct(
     from ..reconstruction.pipeline import reconstruct as reconstruct_pair
 
     find_writer(output)
-    files = _files(output, [path for path in (left, right, calib) if path is not None])
+    files = _files(output, [path for path in (left, right, calibration) if path is not None])
     detector = make_detector(values)
     chosen = given_only(values)
     # On a terminal only: what is logged stays readable.
@@ -95,8 +98,8 @@ def reconstruct(
             left,
             right,
             detector,
-            calibration=calib,
-            focal_px=focal,
+            calibration=calibration,
+            focal_px=focal_px,
             rectified=rectified,
             done=done,
             **chosen,

@@ -30,7 +30,7 @@ AGREEMENT = 0.1
 """Share by which the focal length by the resolution of the sensor may differ from that by the 35 mm
 equivalent: the one is finer, but often wrong."""
 
-ADVICE = "give --focal or --calib"
+ADVICE = "give `focal_px` or `calibration`"
 
 SAME_SHAPE = 0.01
 """Share by which the ratio of the sides may differ from that of the photograph as it was taken."""
