@@ -169,7 +169,7 @@ def test_a_turned_pair_has_no_scale_and_says_so(run, folder: Path) -> None:
     assert "on the same row" in told["rectified_why"]
     assert told["rectification"]["rectified"] is False
     assert told["unit"] == "baseline"
-    assert told["calibration"]["source"] == "--focal"
+    assert told["calibration"]["source"] == "focal_px"
     assert 0 < told["median_reprojection_error_px"] < 0.2
     assert told["pose"]["angle_degrees"] == pytest.approx(5.9, abs=0.3)
     with np.load("m_depth.npz", allow_pickle=False) as file:
@@ -237,7 +237,7 @@ CASES = {
         'no "focal_px"',
     ),
     "no calibration there": ("left right --calibration {}/nothing.json", "cannot be read"),
-    "a calibration that is no JSON": ("left right --calibration {}/left.png", "no JSON file"),
+    "a calibration that is no JSON": ("left right --calibration {}/left.png", "not valid JSON"),
     "no EXIF": ("left right", "carries no focal length (EXIF): give --focal or --calibration"),
     "a focal length of zero": ("left right --focal 0", "focal length must be above 0"),
     "a focal length that is no number": ("left right --focal nan", "must be finite"),

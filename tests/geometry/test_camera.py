@@ -77,8 +77,8 @@ def test_views_may_differ(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ("{", "no JSON file"),
-        ("\ufeff nonsense \n more", "no JSON file"),
+        ("{", "not valid JSON"),
+        ("\ufeff nonsense \n more", "not valid JSON"),
         ("[1]", "must hold one object"),
         ({}, 'no "focal_px"'),
         ({"focal_px": None}, 'no "focal_px"'),

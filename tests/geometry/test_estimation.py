@@ -96,7 +96,7 @@ def assert_consistent(geometry: Geometry, count: int) -> None:
 def test_finds_the_model_among_outliers(model: str, estimator: str, seed: int) -> None:
     scene = make_scene(model, seed)
     geometry = estimate_geometry(scene.points0, scene.points1, make_options(model, estimator))
-    assert geometry.kind == model
+    assert geometry.model == model
     assert_consistent(geometry, len(scene.true))
     assert geometry.inliers[scene.true].mean() > 0.9
     # A random point falls near a line of 480 pixels far more often than near a point.
@@ -240,7 +240,7 @@ def test_a_failure_of_opencv_is_no_crash(answer: Any, monkeypatch: pytest.Monkey
     monkeypatch.setattr(cv2, "findHomography", fail)
     scene = make_scene("homography")
     geometry = estimate_geometry(scene.points0, scene.points1, make_options("homography"))
-    assert geometry.kind == "homography"
+    assert geometry.model == "homography"
     assert geometry.matrix is None
     assert_consistent(geometry, len(scene.true))
 
@@ -280,7 +280,7 @@ def test_four_corners_make_a_homography(estimator: str) -> None:
 def test_too_few_matches_give_no_matrix(model: str, estimator: str, count: int) -> None:
     points = np.random.default_rng(0).uniform(0, 100, (count, 2)).astype(np.float32)
     geometry = estimate_geometry(points, points + 1, make_options(model, estimator))
-    assert geometry.kind == model
+    assert geometry.model == model
     assert geometry.matrix is None
     assert_consistent(geometry, count)
 
@@ -358,7 +358,7 @@ def test_a_given_homography_is_judged_and_not_estimated(model: str) -> None:
     given_matrix = np.array([[1, 0, 7], [0, 1, 0], [0, 0, 1]])
     options = make_options(model, homography=given_matrix)
     geometry = estimate_geometry(points, moved, options)
-    assert geometry.kind == "homography"
+    assert geometry.model == "homography"
     np.testing.assert_array_equal(geometry.matrix, given_matrix)
     np.testing.assert_array_equal(geometry.inliers, np.arange(30) < 10)
 
@@ -385,7 +385,7 @@ def test_a_given_homography_needs_no_matches() -> None:
 def test_the_model_none_agrees_with_all() -> None:
     scene = make_scene("homography")
     geometry = estimate_geometry(scene.points0, scene.points1, GeometryOptions(model="none"))
-    assert geometry.kind == "none"
+    assert geometry.model == "none"
     assert geometry.matrix is None
     assert geometry.inliers.dtype == bool
     assert geometry.inliers.all()

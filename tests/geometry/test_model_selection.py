@@ -27,7 +27,7 @@ def matches(depth: float, outliers: float = 0.3) -> tuple[np.ndarray, np.ndarray
 def test_auto_takes_what_fits(depth: float, kind: str) -> None:
     options = GeometryOptions(model="auto", inlier_threshold=1.5)
     found = estimate_geometry(*matches(depth), options)
-    assert found.kind == kind
+    assert found.model == kind
     assert found.inliers.sum() > 300
 
 

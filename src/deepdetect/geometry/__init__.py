@@ -1,4 +1,4 @@
-"""Geometry between two images: homography, fundamental and essential matrix."""
+"""Geometry of one and two views: models, residuals, cameras, refinement, triangulation."""
 
 from .estimation import Geometry, GeometryOptions, estimate_geometry
 from .residuals import disparity_errors, epipolar_errors, transfer_errors, transform_points

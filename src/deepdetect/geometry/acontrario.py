@@ -1,8 +1,8 @@
-"""Whether a geometry is more than chance: the number of false alarms of its inliers.
+"""A contrario validation: whether a geometry has more inliers than chance explains.
 
 Moisan and Stival, "A probabilistic criterion to detect rigid point matches between two images and
-estimate the fundamental matrix", 2004. Were all matches random, so many of them would agree so
-well with the best of all models that can be drawn from them in so many such pairs of images.
+estimate the fundamental matrix", 2004. The number of false alarms (NFA) of a geometry is how many
+models with as many inliers at this threshold are expected among random matches.
 """
 
 from __future__ import annotations
@@ -12,23 +12,25 @@ from math import lgamma, log, pi
 import numpy as np
 
 MAX_LOG10_NFA = -6.0
-"""A geometry is trusted when fewer than 10 to this many random pairs would give its like."""
+"""A geometry is accepted below this decimal logarithm of its number of false alarms."""
 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7}
-"""Matches that a model is drawn from."""
+"""Matches that determine a model."""
 
 
-def log10_nfa(errors: np.ndarray, model: str, threshold: float, size: tuple[int, int]) -> float:
+def log10_nfa(
+    errors: np.ndarray, model: str, inlier_threshold: float, image_size: tuple[int, int]
+) -> float:
     """Return the decimal logarithm of the number of false alarms.
 
     Args:
         errors: (M,) distances of all matches from the model, in pixels of the second image.
         model: "homography" or "fundamental".
-        threshold: the matches nearer than this are its inliers.
-        size: (width, height) of the second image.
+        inlier_threshold: in pixels; matches nearer than this are the inliers.
+        image_size: (width, height) of the second image.
 
     Returns:
-        Below 0 for what chance does not do; infinite when there are too few inliers.
+        Below 0 for what chance does not explain; infinite when there are too few inliers.
 
     Example:
         >>> near, far = np.zeros(30), np.full(70, 50.0)
@@ -37,19 +39,18 @@ def log10_nfa(errors: np.ndarray, model: str, threshold: float, size: tuple[int,
         >>> log10_nfa(np.concatenate([near[:6], far]), "homography", 3, (640, 480)) > -6
         True
     """
-    drawn = MINIMAL_SAMPLE_SIZE[model]
-    count, inliers = len(errors), int(np.count_nonzero(errors < threshold))
-    if inliers <= drawn:
+    sample = MINIMAL_SAMPLE_SIZE[model]
+    count, inliers = len(errors), int(np.count_nonzero(errors < inlier_threshold))
+    if inliers <= sample:
         return float("inf")
-    width, height = size
+    width, height = image_size
     if model == "homography":
-        chance = pi * threshold**2 / (width * height)
+        chance = pi * inlier_threshold**2 / (width * height)
     else:  # a band along a line through the image
-        chance = 2 * threshold * float(np.hypot(width, height)) / (width * height)
-    tests = log(count - drawn) + _choices(count, inliers) + _choices(inliers, drawn)
-    return (tests + (inliers - drawn) * log(min(chance, 1.0))) / log(10)
+        chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
+    tests = log(count - sample) + _log_binomial(count, inliers) + _log_binomial(inliers, sample)
+    return (tests + (inliers - sample) * log(min(chance, 1.0))) / log(10)
 
 
-def _choices(count: int, chosen: int) -> float:
-    """Return the natural logarithm of the number of ways to choose."""
+def _log_binomial(count: int, chosen: int) -> float:
     return lgamma(count + 1) - lgamma(chosen + 1) - lgamma(count - chosen + 1)

@@ -1,18 +1,18 @@
-"""What is known of the two cameras: focal lengths, principal points, and perhaps the baseline.
+"""Calibration of two cameras: focal lengths, principal points and, where known, the baseline.
 
-A calibration comes from a calib.json, from a focal length in pixels, or from EXIF (`exif`).
+A calibration comes from a calib.json, from a focal length in pixels, or from EXIF (`io.exif`).
 
-The file is one JSON object. Only `focal_px` must be there; all lengths are of the images at the
-size `width` x `height`, pixel convention as everywhere (centre of the first pixel (0, 0))::
+The file is one JSON object. Only `focal_px` is required; lengths are in pixels of images of
+`width` x `height`, with the centre of the first pixel at (0, 0)::
 
     {"focal_px": 1246.7,            one number, or [fx, fy]
-     "cx": 231.0, "cy": 184.5,      principal point; left out: the middle of the image
-     "width": 463, "height": 370,   left out: not checked
-     "baseline_mm": 160.0,          distance of the cameras; left out: lengths are in baselines
-     "disparity_offset_px": 66.7,   cx of the right camera less that of the left; left out: 0
+     "cx": 231.0, "cy": 184.5,      principal point; default: the middle of the image
+     "width": 463, "height": 370,   default: not checked
+     "baseline_mm": 160.0,          distance of the cameras; default: lengths are in baselines
+     "disparity_offset_px": 66.7,   cx of the right camera minus cx of the left; default: 0
      "left": {...}, "right": {...}} what differs in one view: focal_px, cx, cy, width, height
 
-Other keys are left alone. The names follow the calib.txt of Middlebury 2014 (Scharstein et al.,
+Other keys are ignored. The names follow the calib.txt of Middlebury 2014 (Scharstein et al.,
 "High-resolution stereo datasets with subpixel-accurate ground truth"), where the offset is `doffs`.
 """
 
@@ -30,18 +30,21 @@ from .._shared.errors import ReconstructionError
 
 Size = tuple[int, int]
 
-AGREEMENT = 0.5
-"""Pixels by which cx of both views and the disparity offset may contradict each other."""
+MAX_OFFSET_ERROR_PX = 0.5
+"""By how much cx of both views and the disparity offset may contradict each other."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Camera:
     """A pinhole camera.
 
-    Attributes:
+    Args:
         size: (width, height) of its image in pixels.
-        focal_px: (fx, fy) in pixels; a single number is taken for both.
+        focal_px: focal length in pixels, one number or (fx, fy).
         centre: (cx, cy), the principal point; None is the middle of the image.
+
+    Attributes:
+        size, focal_px, centre: the same, all as pairs.
 
     Raises:
         ReconstructionError: a value is not finite or not positive.
@@ -53,37 +56,38 @@ class Camera:
 
     size: Size
     focal_px: tuple[float, float]
-    centre: tuple[float, float] | None = None
+    centre: tuple[float, float]
 
-    def __post_init__(self) -> None:
-        size = _pair("the image size", self.size)
-        if min(size) < 1:
-            raise ReconstructionError(f"an image size must be positive, not {self.size}")
-        focal = self.focal_px
-        if np.ndim(focal) == 0:
-            focal = (focal, focal)  # type: ignore[assignment]
-        focal = _pair("the focal length", focal)
+    def __init__(
+        self,
+        size: Sequence[float],
+        focal_px: float | Sequence[float],
+        centre: Sequence[float] | None = None,
+    ) -> None:
+        width, height = _pair("the image size", size)
+        if min(width, height) < 1:
+            raise ReconstructionError(f"an image size must be positive, not {size}")
+        focal = _pair("the focal length", (focal_px,) * 2 if np.ndim(focal_px) == 0 else focal_px)
         if min(focal) <= 0:
             raise ReconstructionError(
                 f"the focal length must be above 0 pixels, not {min(focal):g}: give it in pixels "
                 "of this image"
             )
-        centre = self.centre
-        if centre is None:
-            centre = ((size[0] - 1) / 2, (size[1] - 1) / 2)
-        object.__setattr__(self, "size", (int(size[0]), int(size[1])))
+        middle = ((width - 1) / 2, (height - 1) / 2)
+        object.__setattr__(self, "size", (int(width), int(height)))
         object.__setattr__(self, "focal_px", focal)
-        object.__setattr__(self, "centre", _pair("the principal point", centre))
+        object.__setattr__(
+            self, "centre", middle if centre is None else _pair("the principal point", centre)
+        )
 
     @property
     def matrix(self) -> np.ndarray:
         """The (3, 3) camera matrix."""
-        assert self.centre is not None
         (fx, fy), (cx, cy) = self.focal_px, self.centre
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     def rays(self, points: np.ndarray) -> np.ndarray:
-        """Return the directions (x, y, 1) in the camera's frame in which pixels look.
+        """Return the viewing directions (x, y, 1) of pixels in the camera's frame.
 
         Args:
             points: (N, 2) positions in its image.
@@ -96,7 +100,7 @@ class Camera:
         return directions
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Return where points in the camera's frame are seen, (N, 2) float64 in pixels.
+        """Project points from the camera's frame to the image, (N, 2) float64 in pixels.
 
         Args:
             points: (N, 3), x right, y down, z forward.
@@ -108,12 +112,12 @@ class Camera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Both cameras, and perhaps how far they are apart.
+    """Both cameras and, where it is known, their distance.
 
     Attributes:
         camera0, camera1: of the left (first) and the right (second) image.
         baseline_mm: distance of their centres, or None: then depths are in baselines.
-        source: where it comes from, as "calib.json", "--focal" or "EXIF".
+        source: where it comes from, as "calib.json", "focal_px" or "EXIF".
 
     Raises:
         ReconstructionError: the baseline is not above 0.
@@ -143,19 +147,17 @@ class Calibration:
 
     @property
     def disparity_offset_px(self) -> float:
-        """What is added to a disparity before it tells the depth: cx of the right less the left."""
-        assert self.camera0.centre is not None
-        assert self.camera1.centre is not None
+        """What is added to a disparity to get depth: cx of the right minus cx of the left."""
         return self.camera1.centre[0] - self.camera0.centre[0]
 
     def depth_mm(self, disparity_px: np.ndarray) -> np.ndarray:
         """Return the depth of a rectified pair's disparities.
 
-        depth = focal * baseline / (disparity + offset), in mm; in baselines when that is not
-        known.
+        depth = focal length * baseline / (disparity + offset), in mm, or in baselines where the
+        baseline is not known.
 
         Args:
-            disparity_px: x in the left less x in the right image, any shape.
+            disparity_px: x in the left minus x in the right image, any shape.
 
         Returns:
             float64 of the same shape; infinite where disparity and offset cancel or are negative.
@@ -177,9 +179,9 @@ class Calibration:
 
 
 def calibration_from_focal(
-    focal_px: float | Sequence[float], size0: Size, size1: Size, source: str = "--focal"
+    focal_px: float | Sequence[float], size0: Size, size1: Size, source: str = "focal_px"
 ) -> Calibration:
-    """Return the calibration of two images of one camera, its principal point in the middle.
+    """Return the calibration of two images of one camera with its principal point in the middle.
 
     Args:
         focal_px: focal length in pixels, or (fx, fy).
@@ -189,7 +191,7 @@ def calibration_from_focal(
     Raises:
         ReconstructionError: the focal length is not a number above 0.
     """
-    return Calibration(*(Camera(size, focal_px) for size in (size0, size1)), source=source)  # type: ignore[arg-type]
+    return Calibration(Camera(size0, focal_px), Camera(size1, focal_px), source=source)
 
 
 def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
@@ -200,8 +202,8 @@ def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
         size0, size1: (width, height) of the left and the right image.
 
     Raises:
-        ReconstructionError: the file is missing, damaged, for images of another size, or says
-            what cannot be.
+        ReconstructionError: the file is missing, damaged, contradictory, or for images of
+            another size.
     """
     try:
         values = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -210,7 +212,8 @@ def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
         raise ReconstructionError(f"{path} cannot be read ({reason}): check the path") from None
     except ValueError as error:
         raise ReconstructionError(
-            f"{path} is no JSON file ({_first_line(error)}): mend it, or give the focal length"
+            f"{path} is not valid JSON ({str(error).splitlines()[0]}): "
+            "correct it, or give the focal length"
         ) from None
     try:
         return _from_values(values, size0, size1, str(path))
@@ -233,16 +236,14 @@ def _from_values(values: Any, size0: Size, size1: Size, source: str) -> Calibrat
     offset = None if offset is None else _number("disparity_offset_px", offset)
     left, right = views
     camera0 = _camera(left, size0)
-    assert camera0.centre is not None
     if offset is not None and "cx" not in values.get("right", {}):
-        # The offset is how much further right the right principal point is.
         right = {**right, "cx": camera0.centre[0] + offset}
     camera1 = _camera(right, size1)
     baseline = values.get("baseline_mm")
     found = Calibration(camera0, camera1, baseline, source)
-    if offset is not None and abs(found.disparity_offset_px - offset) > AGREEMENT:
+    if offset is not None and abs(found.disparity_offset_px - offset) > MAX_OFFSET_ERROR_PX:
         raise ReconstructionError(
-            f"disparity_offset_px is {offset:g}, but cx of the right view less that of the left "
+            f"disparity_offset_px is {offset:g}, but cx of the right view minus cx of the left "
             f"is {found.disparity_offset_px:g}: leave one of them out"
         )
     found.check_sizes(size0, size1)
@@ -250,7 +251,7 @@ def _from_values(values: Any, size0: Size, size1: Size, source: str) -> Calibrat
 
 
 def _camera(view: dict[str, Any], size: Size) -> Camera:
-    """Return one view's camera; what the file leaves out is taken from the image."""
+    """Return one view's camera; defaults come from the image."""
     width, height = (
         side if view.get(name) is None else _number(name, view[name])
         for name, side in zip(("width", "height"), size, strict=True)
@@ -259,7 +260,7 @@ def _camera(view: dict[str, Any], size: Size) -> Camera:
         (side - 1) / 2 if view.get(name) is None else _number(name, view[name])
         for name, side in (("cx", width), ("cy", height))
     )
-    return Camera((width, height), view["focal_px"], (cx, cy))  # type: ignore[arg-type]
+    return Camera((width, height), view["focal_px"], (cx, cy))
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
@@ -280,7 +281,3 @@ def _number(name: str, value: Any) -> float:
 
 def _text(size: Sequence[float]) -> str:
     return "x".join(f"{side:g}" for side in size)
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0]

@@ -23,17 +23,16 @@ class GeometryOptions:
 
     Attributes:
         model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto"
-            (one of these two: the homography, but for scenes with depth; `select_model`),
-            "essential" (known cameras), or "none".
+            (one of these two; `select_model`), "essential" (known cameras), or "none".
         estimator: "magsac" or "ransac".
-        inlier_threshold: a match is an inlier when it is nearer to the model than this, in
-            pixels: the transfer error of a homography, else Sampson's distance (in a
-            rectified pair an error of d rows counts d / sqrt(2)).
-        homography: a given (3, 3) homography: nothing is estimated, the inliers are
-            the matches that it takes to less than the threshold.
+        inlier_threshold: a match is an inlier when its error is below this, in pixels: the
+            transfer error of a homography, else the Sampson distance (in a rectified pair an
+            error of d rows counts as d / sqrt(2)).
+        homography: a given (3, 3) homography: nothing is estimated, the inliers are the matches
+            whose transfer error is below the threshold.
         camera0, camera1: (3, 3) camera matrices, for "essential".
-        confidence: wanted probability that the model is the best one.
-        iterations: at the most.
+        confidence: desired probability that the model is the best one.
+        iterations: maximum number.
         seed: of the random samples.
 
     Raises:
@@ -68,15 +67,12 @@ class GeometryOptions:
         for name in ("homography", "camera0", "camera1"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _matrix(name, getattr(self, name)))
-        if self.model == "essential" and (self.camera0 is None or self.camera1 is None):
-            raise OptionError(
-                "an essential matrix needs both cameras: give camera0 and camera1, "
-                "or choose the fundamental matrix"
-            )
+        if self.model == "essential":
+            _cameras(self)
 
 
 def _matrix(name: str, value: Any) -> np.ndarray:
-    """Return a copy of a (3, 3) matrix, or raise the error that says what is wrong with it."""
+    """Return a copy of a (3, 3) matrix, validated."""
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError):
@@ -85,7 +81,7 @@ def _matrix(name: str, value: Any) -> np.ndarray:
         raise OptionError(f"{name} must be a (3, 3) matrix of finite numbers")
     if name != "homography" and (np.linalg.matrix_rank(matrix) < 3 or matrix[0, 0] <= 0):
         raise OptionError(
-            f"{name} is no camera matrix: it must be invertible, with a focal length above 0"
+            f"{name} is not a camera matrix: it must be invertible, with a focal length above 0"
         )
     return matrix
 
@@ -95,23 +91,23 @@ class Geometry:
     """An estimated geometry.
 
     Attributes:
-        kind: "homography", "fundamental", "essential" or "none".
+        model: "homography", "fundamental", "essential" or "none".
         matrix: (3, 3) float64, or None when nothing could be estimated. A homography
             maps the first image to the second; for the others x1^T M x0 = 0 (essential:
             in normalised coordinates).
         inliers: (M,) bool, the matches that agree with it.
     """
 
-    kind: str
+    model: str
     matrix: np.ndarray | None
     inliers: np.ndarray
 
 
 @dataclass(frozen=True)
-class Model:
-    """A kind of geometry: fewest matches, function that fits it, and its error in pixels."""
+class _Model:
+    """How a model is fitted, from how many matches, and how its errors are measured in pixels."""
 
-    fewest: int
+    min_matches: int
     fit: Callable[[np.ndarray, np.ndarray, GeometryOptions, int], np.ndarray | None]
     errors: Callable[[np.ndarray, np.ndarray, np.ndarray, GeometryOptions], np.ndarray]
 
@@ -126,8 +122,8 @@ def estimate_geometry(
         options: what to estimate and how.
 
     Returns:
-        The geometry; its inliers are the matches nearer to it than the threshold. With
-        too few matches, or when estimation fails, the matrix is None and nothing an inlier.
+        The geometry; its inliers are the matches with an error below the threshold. With too few
+        matches, or when estimation fails, the matrix is None and no match is an inlier.
 
     Example:
         >>> a = np.array([[0, 0], [9, 0], [9, 9], [0, 9], [4, 5]], float)
@@ -152,9 +148,9 @@ def estimate_geometry(
         return plane
     model = MODELS[options.model]
     nothing = Geometry(options.model, None, np.zeros(len(points0), bool))
-    if len(points0) < model.fewest:
+    if len(points0) < model.min_matches:
         return nothing
-    # OpenCV draws the same samples every time; another order of the matches is another draw.
+    # OpenCV draws the same samples every time; another order of the matches draws others.
     order = np.random.default_rng(options.seed).permutation(len(points0))
     method = cv2.USAC_MAGSAC if options.estimator == "magsac" else cv2.RANSAC
     try:
@@ -192,10 +188,11 @@ def _fit_essential(
     points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, method: int
 ) -> np.ndarray | None:
     # Both images in normalised coordinates; the threshold shrinks with the focal length.
-    focal = (options.camera0[0, 0] + options.camera1[0, 0]) / 2
+    camera0, camera1 = _cameras(options)
+    focal = (camera0[0, 0] + camera1[0, 0]) / 2
     matrix, _ = cv2.findEssentialMat(
-        _normalised(points0, options.camera0),
-        _normalised(points1, options.camera1),
+        _normalised(points0, camera0),
+        _normalised(points1, camera1),
         np.eye(3),
         method=method,
         prob=options.confidence,
@@ -208,8 +205,18 @@ def _fit_essential(
 def _essential_errors(
     points0: np.ndarray, points1: np.ndarray, matrix: np.ndarray, options: GeometryOptions
 ) -> np.ndarray:
-    fundamental = np.linalg.inv(options.camera1).T @ matrix @ np.linalg.inv(options.camera0)
+    camera0, camera1 = _cameras(options)
+    fundamental = np.linalg.inv(camera1).T @ matrix @ np.linalg.inv(camera0)
     return epipolar_errors(points0, points1, fundamental)
+
+
+def _cameras(options: GeometryOptions) -> tuple[np.ndarray, np.ndarray]:
+    if options.camera0 is None or options.camera1 is None:
+        raise OptionError(
+            "an essential matrix needs both cameras: give camera0 and camera1, "
+            "or choose the fundamental matrix"
+        )
+    return options.camera0, options.camera1
 
 
 def _normalised(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
@@ -217,9 +224,9 @@ def _normalised(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray((homogeneous @ np.linalg.inv(camera).T)[:, :2])
 
 
-# With fewer than 15 matches OpenCV's RANSAC leaves the threshold out of account.
-MODELS: dict[str, Model] = {
-    "homography": Model(4, _fit_homography, lambda a, b, m, _: transfer_errors(a, b, m)),
-    "fundamental": Model(15, _fit_fundamental, lambda a, b, m, _: epipolar_errors(a, b, m)),
-    "essential": Model(6, _fit_essential, _essential_errors),
+# With fewer than 15 matches OpenCV's RANSAC ignores the threshold.
+MODELS: dict[str, _Model] = {
+    "homography": _Model(4, _fit_homography, lambda a, b, m, _: transfer_errors(a, b, m)),
+    "fundamental": _Model(15, _fit_fundamental, lambda a, b, m, _: epipolar_errors(a, b, m)),
+    "essential": _Model(6, _fit_essential, _essential_errors),
 }

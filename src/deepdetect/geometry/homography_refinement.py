@@ -1,11 +1,17 @@
-"""Sharpening a homography by the images themselves: Lucas-Kanade on the warped image, then ECC.
+"""Refinement of a homography by the images themselves.
 
-Each step warps the second image back by what is known. Some track thousands of corners over the
-few pixels that are left, there and back, and fit a homography to the tracks: blur and foliage want
-larger windows than sharp walls, so several are tried in turn. The others take all pixels at once:
-they raise the correlation of the locally normalised images (Evangelidis and Psarakis, "Parametric
-image alignment using enhanced correlation coefficient maximization", 2008; OpenCV's). A step is
-kept only when the images then correlate better, so it cannot make things worse by that measure.
+`refine_homography` repeats two kinds of steps on the second image, warped by the current estimate.
+One tracks thousands of corners over the few pixels that are left, forth and back (Lucas-Kanade),
+and fits a homography to the tracks: blur and foliage need larger windows than sharp walls, so
+several sizes are tried in turn. The other uses all pixels: it maximises the correlation of the
+images after local contrast normalisation (Evangelidis and Psarakis, "Parametric image alignment
+using enhanced correlation coefficient maximization", 2008; OpenCV's). A step is kept only when the
+median local ZNCC rises, so by this measure it cannot make things worse.
+
+What uses all pixels is the best compromise. A lens that bends lines, or a wall that is not quite
+flat, can make that wrong by a pixel nearly everywhere. `refine_homography_irls` is a robust fit to
+tracked corners, which is right on most of the image and further off on the rest; the better of the
+two is measured by the fraction of aligned pixels.
 """
 
 from __future__ import annotations
@@ -19,7 +25,7 @@ import numpy as np
 from .._shared.errors import OptionError
 from .residuals import transform_points
 from .zncc import (
-    WINDOW,
+    WINDOW_PX,
     erode_mask,
     gaussian_blur,
     local_zncc,
@@ -28,73 +34,80 @@ from .zncc import (
     warp_to_reference,
 )
 
-FEWEST = 30
-"""Tracks that a homography is fitted to, at least."""
-
-
-LEFT_OUT = 0.2
-"""Share of the pixels, those that are least alike, that has no say: what moved or is not plane."""
-
-LEAST_GAIN = 0.001
-"""Of correlation, by a step by corners that is kept: less is noise, and moves the borders about."""
-
-LEAST_GAIN_OF_ALL = 0.0001
-"""The same by a step that takes all pixels, which has less noise."""
-
-IN_PLACE = 0.5
-"""A pixel is in place when what is around it lies at most so far off, in pixels."""
-
-MORE = 1.1
-"""The fit to the majority is taken when it puts so many times as many pixels in place."""
-
-TRACK_WINDOW = 31
-"""Side of the tracked windows in pixels."""
-
-SURROUNDINGS = 41
-"""Side in pixels of the window around a pixel that says how far off it lies."""
-
-SCALE = 1.0
-"""Of Cauchy's weights in pixels: corners so far off have half the say."""
-
-IRLS_ROUNDS = 30
-
 
 @dataclass(frozen=True)
 class RefinementOptions:
     """How a homography is refined.
 
     Attributes:
-        rounds: at the most; each takes one step with every window.
-        corners: tracked in each step.
-        windows: sides of the tracked windows in pixels.
-        blurs: sigmas of the blur in pixels before the steps that take all pixels.
-        levels: of the pyramid above the image; each doubles what a track can move.
-        round_trip: a track counts when there and back it ends so near, in pixels.
+        max_rounds: each takes one step with every window and every blur.
+        max_corners: tracked in each step.
+        min_tracks: that a homography is fitted to.
+        windows_px: sides of the tracked windows in pixels.
+        blur_sigmas_px: of the blur before the steps that use all pixels.
+        pyramid_levels: above the image; each doubles how far a track can move.
+        max_round_trip_px: a track counts when it ends this near to its start, forth and back.
         inlier_threshold: of MAGSAC, in pixels.
-        seed: of its random samples.
+        ignored_fraction: of the pixels, those that agree least, are ignored by the steps that use
+            all pixels: they moved, or are not in the plane.
+        min_track_gain: of ZNCC, for a step by tracks that is kept; less is noise.
+        min_pixel_gain: the same for a step that uses all pixels, which has less noise.
 
     Raises:
         OptionError: a value is out of its range.
     """
 
-    rounds: int = 4
-    corners: int = 4000
-    windows: tuple[int, ...] = (21, 31, 41)
-    blurs: tuple[float, ...] = (2.0, 1.0)
-    levels: int = 3
-    round_trip: float = 0.3
+    max_rounds: int = 4
+    max_corners: int = 4000
+    min_tracks: int = 30
+    windows_px: tuple[int, ...] = (21, 31, 41)
+    blur_sigmas_px: tuple[float, ...] = (2.0, 1.0)
+    pyramid_levels: int = 3
+    max_round_trip_px: float = 0.3
     inlier_threshold: float = 1.0
-    seed: int = 0
+    ignored_fraction: float = 0.2
+    min_track_gain: float = 0.001
+    min_pixel_gain: float = 0.0001
 
     def __post_init__(self) -> None:
-        if self.rounds < 1 or self.corners < FEWEST or self.levels < 0:
-            raise OptionError(f"a refinement needs a round and {FEWEST} corners at least")
-        if not self.windows or min(self.windows) < 5:
-            raise OptionError("a refinement needs windows of 5 pixels at least")
-        if self.blurs and min(self.blurs) <= 0:
-            raise OptionError("the blurs of a refinement must be above 0 pixels")
-        if not (self.round_trip > 0 and self.inlier_threshold > 0):
-            raise OptionError("the distances of a refinement must be above 0 pixels")
+        if self.max_rounds < 1:
+            raise OptionError(f"max_rounds must be at least 1, not {self.max_rounds}")
+        if self.min_tracks < 4 or self.max_corners < self.min_tracks:
+            raise OptionError(
+                f"min_tracks must be at least 4, and max_corners at least min_tracks, not "
+                f"{self.min_tracks} and {self.max_corners}"
+            )
+        if self.pyramid_levels < 0:
+            raise OptionError(f"pyramid_levels must be 0 or more, not {self.pyramid_levels}")
+        if not self.windows_px or min(self.windows_px) < 5:
+            raise OptionError(f"windows_px must be 5 pixels or more, not {self.windows_px}")
+        if self.blur_sigmas_px and min(self.blur_sigmas_px) <= 0:
+            raise OptionError(f"blur_sigmas_px must be above 0 pixels, not {self.blur_sigmas_px}")
+        if not (self.max_round_trip_px > 0 and self.inlier_threshold > 0):
+            raise OptionError("max_round_trip_px and inlier_threshold must be above 0 pixels")
+        if not 0 <= self.ignored_fraction < 1:
+            raise OptionError(f"ignored_fraction must lie in [0, 1), not {self.ignored_fraction}")
+
+
+@dataclass(frozen=True)
+class IrlsOptions:
+    """How a homography is fitted to most of the image.
+
+    Attributes:
+        window_px: side of the tracked windows in pixels.
+        cauchy_scale_px: a track with this residual has half the weight of an exact one.
+        max_iterations: of reweighted least squares.
+        max_alignment_error_px: up to which a pixel counts as aligned.
+        alignment_window_px: side of the window around a pixel by which its error is measured.
+        min_gain: the fit is taken when it aligns this many times as many pixels.
+    """
+
+    window_px: int = 31
+    cauchy_scale_px: float = 1.0
+    max_iterations: int = 30
+    max_alignment_error_px: float = 0.5
+    alignment_window_px: int = 41
+    min_gain: float = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +117,7 @@ class Refinement:
     Attributes:
         homography: (3, 3) from the first image to the second, its last element 1.
         zncc: median local ZNCC of the images under it.
-        initial_zncc: the same under the homography that it began with.
+        initial_zncc: the same under the initial homography.
         steps: number of steps that were kept.
     """
 
@@ -128,49 +141,58 @@ def refine_homography(
         options: how.
 
     Returns:
-        The best homography found; the one given when no step made it better.
+        The best homography found; the initial one when no step improved it.
     """
     current = np.asarray(homography, np.float64)
-    before = best = median_local_zncc(gray0, gray1, current)
-    track = [partial(_track, gray0, window=side, options=options) for side in options.windows]
-    align = [partial(_align, gray0, blur=blur) for blur in options.blurs]
+    initial = best = median_local_zncc(gray0, gray1, current)
     steps = [
-        *((step, LEAST_GAIN) for step in track),
-        *((step, LEAST_GAIN_OF_ALL) for step in align),
+        *(
+            (partial(_track, gray0, window_px=side, options=options), options.min_track_gain)
+            for side in options.windows_px
+        ),
+        *(
+            (partial(_align, gray0, sigma_px=sigma, options=options), options.min_pixel_gain)
+            for sigma in options.blur_sigmas_px
+        ),
     ]
     kept = 0
-    for _ in range(options.rounds):
+    for _ in range(options.max_rounds):
         kept_before = kept
-        for step, least_gain in steps:
+        for step, min_gain in steps:
             correction = step(*warp_to_reference(gray1, current, (gray0.shape[1], gray0.shape[0])))
             if correction is None:
                 continue
             candidate = current @ correction
-            reached = median_local_zncc(gray0, gray1, candidate)
-            if reached > best + least_gain:
-                current, best, kept = candidate, reached, kept + 1
+            zncc = median_local_zncc(gray0, gray1, candidate)
+            if zncc > best + min_gain:
+                current, best, kept = candidate, zncc, kept + 1
         if kept == kept_before:
             break
-    return Refinement(current / current[2, 2], best, before, kept)
+    return Refinement(current / current[2, 2], best, initial, kept)
 
 
 def _align(
-    gray0: np.ndarray, warped: np.ndarray, seen: np.ndarray, *, blur: float
+    gray0: np.ndarray,
+    warped: np.ndarray,
+    valid_mask: np.ndarray,
+    *,
+    sigma_px: float,
+    options: RefinementOptions,
 ) -> np.ndarray | None:
-    """Return the homography from the first image to the warped second one, by all pixels."""
+    """Return the homography from the first image to the warped second one, by all pixels (ECC)."""
     # Blur first, then windows reach over the border.
-    inside = erode_mask(erode_mask(seen, blur), WINDOW / 6)
-    images = [gaussian_blur(gray, blur) for gray in (gray0, warped)]
-    alike = local_zncc(*images, inside)
-    if not np.isfinite(alike).any():
+    inside = erode_mask(erode_mask(valid_mask, sigma_px), WINDOW_PX / 6)
+    first, second = (gaussian_blur(gray, sigma_px) for gray in (gray0, warped))
+    zncc = local_zncc(first, second, inside)
+    if not np.isfinite(zncc).any():
         return None
-    inside = alike > np.nanquantile(alike, LEFT_OUT)
+    inside = zncc > np.nanquantile(zncc, options.ignored_fraction)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-6)
-    start = np.eye(3, dtype=np.float32)
     try:
         _, correction = cv2.findTransformECC(
-            *map(normalise_local_contrast, images),
-            start,
+            normalise_local_contrast(first),
+            normalise_local_contrast(second),
+            np.eye(3, dtype=np.float32),
             cv2.MOTION_HOMOGRAPHY,
             criteria,
             inside.astype(np.uint8),
@@ -184,98 +206,101 @@ def _align(
 def _track(
     gray0: np.ndarray,
     warped: np.ndarray,
-    seen: np.ndarray,
+    valid_mask: np.ndarray,
     *,
-    window: int,
+    window_px: int,
     options: RefinementOptions,
 ) -> np.ndarray | None:
     """Return the homography from the first image to the warped second one, by corners."""
-    corners = tracked_corners(gray0, warped, seen, window, options)
+    corners = track_corners(gray0, warped, valid_mask, window_px, options)
     if corners is None:
         return None
-    cv2.setRNGSeed(options.seed)
-    correction, _ = cv2.findHomography(
+    return cv2.findHomography(
         *corners,
         cv2.USAC_MAGSAC,
         options.inlier_threshold,
         maxIters=5000,
         confidence=0.9999,
-    )
-    return correction
+    )[0]
 
 
-def tracked_corners(
+def track_corners(
     gray0: np.ndarray,
     warped: np.ndarray,
-    seen: np.ndarray,
-    window: int,
-    options: RefinementOptions,
+    valid_mask: np.ndarray,
+    window_px: int,
+    options: RefinementOptions = RefinementOptions(),
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Track corners from the first image to the warped second one and back.
 
     Args:
         gray0: (H, W) uint8.
         warped: (H, W) uint8, the second image in the frame of the first.
-        seen: (H, W) bool, where that has content.
-        window: side of the tracked windows in pixels.
+        valid_mask: (H, W) bool, where that has content.
+        window_px: side of the tracked windows in pixels.
         options: number of corners, levels of the pyramid and round trip.
 
     Returns:
-        (N, 2) float32 positions in both; None with fewer than `FEWEST`.
+        (N, 2) float32 positions in both; None with fewer than `min_tracks`.
     """
-    # Equalised, so that light and shade do not pass for motion.
-    equalise = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply
-    first, second = equalise(gray0), equalise(warped)
-    margin = np.ones((window, window), np.uint8)
-    inside = cv2.erode(seen.astype(np.uint8), margin, borderValue=0)
-    corners = cv2.goodFeaturesToTrack(first, options.corners, 0.001, 5, mask=inside)
-    if corners is None or len(corners) < FEWEST:
+    first, second = _equalise(gray0), _equalise(warped)
+    margin = np.ones((window_px, window_px), np.uint8)
+    inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
+    corners = cv2.goodFeaturesToTrack(first, options.max_corners, 0.001, 5, mask=inside)
+    if corners is None or len(corners) < options.min_tracks:
         return None
     parameters = {
-        "winSize": (window, window),
-        "maxLevel": options.levels,
+        "winSize": (window_px, window_px),
+        "maxLevel": options.pyramid_levels,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 0.005),
     }
     there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, **parameters)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, **parameters)
     gap = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
-    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (gap < options.round_trip)
-    if good.sum() < FEWEST:
+    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (gap < options.max_round_trip_px)
+    if good.sum() < options.min_tracks:
         return None
     return corners.reshape(-1, 2)[good], there.reshape(-1, 2)[good]
 
 
 def refine_homography_irls(
-    gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    homography: np.ndarray,
+    options: IrlsOptions = IrlsOptions(),
 ) -> np.ndarray:
-    """Return the homography given, or one that puts clearly more pixels in place.
+    """Return a homography that aligns clearly more pixels, or the initial one.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
         homography: (3, 3) from the first image to the second, right within some pixels.
+        options: how.
 
     Returns:
         (3, 3), its last element 1.
     """
     size = (gray0.shape[1], gray0.shape[0])
-    warped, seen = warp_to_reference(gray1, homography, size)
-    corners = tracked_corners(gray0, warped, seen, TRACK_WINDOW, RefinementOptions())
+    warped, valid_mask = warp_to_reference(gray1, homography, size)
+    corners = track_corners(gray0, warped, valid_mask, options.window_px)
     if corners is None:
         return homography
-    correction = fit_homography_irls(*corners)
+    correction = fit_homography_irls(*corners, options)
     if correction is None:
         return homography
     candidate = homography @ correction
-    before = aligned_fraction(gray0, warped, seen)
-    after = aligned_fraction(gray0, *warp_to_reference(gray1, candidate, size))
-    return candidate / candidate[2, 2] if after > MORE * before else homography
+    before = aligned_fraction(gray0, warped, valid_mask, options)
+    after = aligned_fraction(gray0, *warp_to_reference(gray1, candidate, size), options)
+    return candidate / candidate[2, 2] if after > options.min_gain * before else homography
 
 
-def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
-    """Fit a homography by iteratively reweighted least squares with Cauchy's weights.
+def fit_homography_irls(
+    points0: np.ndarray, points1: np.ndarray, options: IrlsOptions = IrlsOptions()
+) -> np.ndarray | None:
+    """Fit a homography by iteratively reweighted least squares with Cauchy weights.
 
     Args:
         points0, points1: (N, 2), most of them at most some pixels from where they were.
+        options: scale of the weights, and iterations.
 
     Returns:
         (3, 3), its last element 1; None when the points do not determine it.
@@ -294,11 +319,11 @@ def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray 
     inwards = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, spread]]) / spread
     first, second = ((points - middle) / spread for points in (points0, points1))
     homography = np.eye(3)
-    for _ in range(IRLS_ROUNDS):
+    for _ in range(options.max_iterations):
         depth = first @ homography[2, :2] + 1
         mapped = transform_points(first, homography)
         gaps = second - mapped
-        weight = 1 / (1 + (gaps**2).sum(axis=1) * (spread / SCALE) ** 2)
+        weight = 1 / (1 + (gaps**2).sum(axis=1) * (spread / options.cauchy_scale_px) ** 2)
         place = np.column_stack([first, np.ones(len(first))]) / depth[:, None]
         none = np.zeros_like(place)
         across = np.column_stack([place, none, -mapped[:, :1] * place[:, :2]])
@@ -318,29 +343,37 @@ def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray 
     return found / found[2, 2]
 
 
-def aligned_fraction(gray0: np.ndarray, warped: np.ndarray, seen: np.ndarray) -> float:
-    """Return the share of the seen pixels that lie at most `IN_PLACE` px off.
+def aligned_fraction(
+    gray0: np.ndarray,
+    warped: np.ndarray,
+    valid_mask: np.ndarray,
+    options: IrlsOptions = IrlsOptions(),
+) -> float:
+    """Return the fraction of the valid pixels that are aligned, in [0, 1].
 
-    How far is one step of Lucas-Kanade's at each pixel, over a window, after both images are
-    equalised.
+    The error of a pixel is the length of one Lucas-Kanade step over the window around it, after
+    both images are equalised.
 
     Args:
         gray0, warped: (H, W) uint8.
-        seen: (H, W) bool, where the second has content.
+        valid_mask: (H, W) bool, where the second has content.
+        options: the largest error of an aligned pixel, and the window.
     """
-    if not seen.any():
+    if not valid_mask.any():
         return 0.0
-    equalise = cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply
-    first, second = (
-        cv2.GaussianBlur(equalise(gray).astype(np.float32), (0, 0), 1) for gray in (gray0, warped)
-    )
+    first, second = (gaussian_blur(_equalise(gray), 1) for gray in (gray0, warped))
     x, y = (cv2.Scharr(first, cv2.CV_32F, *order) / 32 for order in ((1, 0), (0, 1)))
-    window = (SURROUNDINGS, SURROUNDINGS)
+    window = (options.alignment_window_px, options.alignment_window_px)
     change = second - first
     change -= cv2.blur(change, window)
     xx, xy, yy, xt, yt = (
         cv2.blur(product, window) for product in (x * x, x * y, y * y, x * change, y * change)
     )
     determinant = xx * yy - xy * xy + 1e-3
-    off = np.hypot(yy * xt - xy * yt, xx * yt - xy * xt) / determinant
-    return float((off[seen] <= IN_PLACE).mean())
+    error_px = np.hypot(yy * xt - xy * yt, xx * yt - xy * xt) / determinant
+    return float((error_px[valid_mask] <= options.max_alignment_error_px).mean())
+
+
+def _equalise(gray: np.ndarray) -> np.ndarray:
+    """Equalise an image locally, so that changes of light are not taken for motion."""
+    return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)

@@ -1,28 +1,50 @@
-"""Which geometry two images have: that of a plane (or of a turning camera), or that of depth."""
+"""Homography or fundamental matrix: whether the matches of a scene show depth."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-DEPTH_OF_REST = 0.5
-DEPTH_OF_ALL = 0.1
-"""A scene has depth when the fundamental matrix explains at least half of the matches that the
-homography leaves, and these are at least a tenth of all that it explains. (On planes it explains
-some too, as a band is easily hit, but few of the rest.)"""
+
+@dataclass(frozen=True)
+class ModelSelectionOptions:
+    """When a scene has depth.
+
+    A fundamental matrix explains some matches of a plane, too, as its band is easily hit, but few
+    of those that the homography does not explain.
+
+    Attributes:
+        min_share_of_rest: of the matches that the homography leaves, the fundamental matrix must
+            explain at least this share.
+        min_share_of_all: these must be at least this share of all that it explains.
+    """
+
+    min_share_of_rest: float = 0.5
+    min_share_of_all: float = 0.1
 
 
-def select_model(by_homography: np.ndarray, by_fundamental: np.ndarray) -> str:
-    """Return which model fits a scene: "homography" (no depth) or "fundamental".
+def select_model(
+    homography_inliers: np.ndarray,
+    fundamental_inliers: np.ndarray,
+    options: ModelSelectionOptions = ModelSelectionOptions(),
+) -> str:
+    """Return the model of a scene: "homography" (no depth) or "fundamental".
 
     Args:
-        by_homography, by_fundamental: (M,) bool, the inliers of each model among the same matches.
+        homography_inliers, fundamental_inliers: (M,) bool, which of the same matches each model
+            explains.
+        options: when a scene has depth.
 
     Example:
         >>> plane = np.arange(100) < 60
         >>> select_model(plane, plane), select_model(plane, np.arange(100) < 95)
         ('homography', 'fundamental')
     """
-    rest = by_fundamental & ~by_homography
-    left, all_of_it = np.count_nonzero(~by_homography), np.count_nonzero(by_fundamental)
-    depth = rest.sum() >= max(DEPTH_OF_REST * left, DEPTH_OF_ALL * all_of_it, 1)
-    return "fundamental" if depth else "homography"
+    gained = np.count_nonzero(fundamental_inliers & ~homography_inliers)
+    needed = max(
+        options.min_share_of_rest * np.count_nonzero(~homography_inliers),
+        options.min_share_of_all * np.count_nonzero(fundamental_inliers),
+        1,
+    )
+    return "fundamental" if gained >= needed else "homography"

@@ -1,4 +1,4 @@
-"""Coloured points in space, and the box that most of them lie in."""
+"""Coloured 3D points, and the box that most of them lie in."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from .._shared.errors import OptionError, unknown_name
 
 UNITS = ("mm", "baseline")
-"""Millimetres, or the distance of the two cameras where that is not known."""
+"""Millimetres, or the distance of the two cameras where it is not known."""
 
 BOX_PERCENTILE = 1.0
-"""Percent of the points that may lie beyond each side of the robust box."""
+"""Percent of the points that lie beyond each side of the robust box."""
 
-SPARSEST = 0.02
-"""No point is drawn wider than this times its depth (1 degree)."""
+MAX_ANGULAR_SPACING = 0.02
+"""In radians: no point is drawn wider than this (1 degree)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class PointCloud:
             points, colors = np.empty((0, 3)), np.empty((0, 3), np.uint8)
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
             raise OptionError(
-                f"a point cloud needs (N, 3) points and as many (N, 3) colours, "
+                f"a point cloud needs (N, 3) points and as many (N, 3) colors, "
                 f"not {points.shape} and {colors.shape}"
             )
         if points.dtype not in (np.float32, np.float64):
@@ -60,12 +60,12 @@ class PointCloud:
         if colors.dtype != np.uint8:
             if colors.dtype.kind not in "iu" or colors.min() < 0 or colors.max() > 255:
                 raise OptionError(
-                    f"colours must be whole numbers from 0 to 255 (uint8), not {colors.dtype}"
+                    f"colors must be whole numbers from 0 to 255 (uint8), not {colors.dtype}"
                 )
             colors = colors.astype(np.uint8)
         # Written so that NaN fails too.
         if not (np.abs(points) < np.finfo(np.float32).max).all():
-            raise OptionError("every coordinate of a point cloud must be finite: drop the others")
+            raise OptionError("every coordinate of a point cloud must be finite: remove the others")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "colors", colors)
 
@@ -80,7 +80,7 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class RobustBox:
-    """The box along the axes that holds all but the outermost points.
+    """The axis-aligned box that holds all but the outermost points.
 
     Attributes:
         low, high: (3,) float64 corners, in the cloud's unit.
@@ -103,7 +103,7 @@ class RobustBox:
 def robust_box(cloud: PointCloud) -> RobustBox:
     """Find the box from the 1st to the 99th percentile of each coordinate.
 
-    A few points very far away, as wrong matches make, do not change it much.
+    A few outliers very far away do not change it much.
 
     Raises:
         OptionError: the cloud is empty.
@@ -123,13 +123,12 @@ def robust_box(cloud: PointCloud) -> RobustBox:
 
 
 def angular_spacing(cloud: PointCloud) -> float:
-    """Tell how far neighbouring points lie apart as the left camera sees them.
+    """Return the angle between neighbouring points as the left camera sees them, in radians.
 
-    A point drawn so large covers its share of what the photograph shows, so that the points
-    of a dense cloud close a surface.
+    Points drawn at this size make a closed surface of a dense cloud.
 
     Returns:
-        Width of a point over its depth, at most 0.02, were all points spread evenly.
+        Width of a point over its depth, at most 0.02, as if all points were spread evenly.
 
     Raises:
         OptionError: the cloud is empty.
@@ -143,16 +142,18 @@ def angular_spacing(cloud: PointCloud) -> float:
     require_points(cloud)
     ahead = cloud.points[cloud.points[:, 2] > 0]
     if not len(ahead):
-        return SPARSEST
+        return MAX_ANGULAR_SPACING
     seen = np.percentile(
         ahead[:, :2] / ahead[:, 2:], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0
     )
     width, height = ((seen[1] - seen[0]) / (1 - 2 * BOX_PERCENTILE / 100)).tolist()
-    return min(SPARSEST, float(np.sqrt(width * height / len(ahead)))) or SPARSEST
+    return (
+        min(MAX_ANGULAR_SPACING, float(np.sqrt(width * height / len(ahead)))) or MAX_ANGULAR_SPACING
+    )
 
 
 def require_points(cloud: PointCloud) -> None:
-    """Refuse an empty cloud.
+    """Raise an error for an empty cloud.
 
     Raises:
         OptionError: it is empty.

@@ -1,4 +1,4 @@
-"""Where the second camera stands and how it is turned, from matches of calibrated images."""
+"""Relative pose of two calibrated cameras, from matches."""
 
 from __future__ import annotations
 
@@ -7,23 +7,31 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from . import GeometryOptions, epipolar_errors, estimate_geometry
 from .camera import Calibration
+from .estimation import GeometryOptions, estimate_geometry
+from .residuals import epipolar_errors
 from .triangulation import fundamental_matrix, triangulate
 
-ROUNDS = 10
-STEP = 1e-6
-"""Radians by which the pose is varied for its derivatives."""
 
-SETTLED = 1e-9
-"""A smaller change of the pose, in radians, ends the refinement."""
+@dataclass(frozen=True)
+class PoseRefinementOptions:
+    """How a pose is refined.
 
-REPEATS = 4
-LEAST_MORE = 0.01
-"""How often the pose is fitted anew to its own inliers, while that gives so many more of them."""
+    Attributes:
+        max_iterations: of Gauss-Newton.
+        derivative_step: by which the pose is varied for its derivatives, in radians.
+        min_change: a smaller change of the pose, in radians, ends the refinement.
+        max_refits: how often the pose is fitted to its own inliers again ...
+        min_inlier_gain: ... while that gives this share of further inliers.
+        max_matches: that are used, sampled evenly: more do not improve the pose.
+    """
 
-MOST = 50_000
-"""Matches that the refinement takes, evenly from all: more do not make the pose any better."""
+    max_iterations: int = 10
+    derivative_step: float = 1e-6
+    min_change: float = 1e-9
+    max_refits: int = 4
+    min_inlier_gain: float = 0.01
+    max_matches: int = 50_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +41,8 @@ class RelativePose:
     Attributes:
         rotation: (3, 3) float64.
         translation: (3,) float64 of length 1: only its direction can be known.
-        inliers: (M,) bool, the matches nearer to their epipolar lines than the threshold.
-        errors: (M,) float64 distances from them in pixels (Sampson's).
+        inliers: (M,) bool, the matches with an error below the threshold.
+        errors: (M,) float64 Sampson distances in pixels.
         cheirality_ratio: share of the inliers that lie in front of both cameras, in [0, 1].
     """
 
@@ -46,12 +54,12 @@ class RelativePose:
 
     @property
     def angle(self) -> float:
-        """The angle by which the second camera is turned, in degrees."""
+        """The angle of the rotation in degrees."""
         return rotation_angle(self.rotation)
 
 
 def rotation_angle(rotation: np.ndarray) -> float:
-    """Return the angle of a rotation in degrees, exact for small ones too.
+    """Return the angle of a rotation in degrees, accurate for small angles, too.
 
     Example:
         >>> round(rotation_angle(np.eye(3)), 6)
@@ -68,23 +76,25 @@ def estimate_relative_pose(
     inlier_threshold: float = 1.0,
     seed: int = 0,
     refine: bool = True,
+    options: PoseRefinementOptions = PoseRefinementOptions(),
 ) -> RelativePose | None:
-    """Estimate the pose: essential matrix by MAGSAC, the one of its four poses that sees most.
+    """Estimate the pose: essential matrix by MAGSAC, then the best of its four poses (cheirality).
 
     Args:
         points0, points1: (M, 2) matched positions in pixels.
         calibration: of both cameras.
-        inlier_threshold: in pixels, Sampson's distance.
+        inlier_threshold: Sampson distance in pixels.
         seed: of the random samples.
         refine: fit the pose to all inliers afterwards (`refine_pose`).
+        options: of the refinement.
 
     Returns:
-        The pose, or None where there are too few matches or none can be estimated.
+        The pose, or None when there are too few matches or it cannot be estimated.
 
     Raises:
         OptionError: the threshold or the seed is out of its range.
     """
-    options = GeometryOptions(
+    essential = GeometryOptions(
         model="essential",
         inlier_threshold=inlier_threshold,
         camera0=calibration.camera0.matrix,
@@ -93,27 +103,26 @@ def estimate_relative_pose(
     )
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    geometry = estimate_geometry(points0, points1, options)
+    geometry = estimate_geometry(points0, points1, essential)
     if geometry.matrix is None or not geometry.inliers.any():
         return None
     kept = geometry.inliers
-    pose = _best_of_four(geometry.matrix, points0[kept], points1[kept], calibration)
-    for _ in range(REPEATS if refine else 0):
-        pose = refine_pose(points0[kept], points1[kept], calibration, *pose, inlier_threshold)
+    inliers = points0[kept], points1[kept]
+    pose = _best_of_four(geometry.matrix, *inliers, calibration, options.max_matches)
+    for _ in range(options.max_refits if refine else 0):
+        inliers = points0[kept], points1[kept]
+        pose = refine_pose(*inliers, calibration, *pose, scale_px=inlier_threshold, options=options)
         before = np.count_nonzero(kept)
         errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
         kept = errors < inlier_threshold
-        if np.count_nonzero(kept) <= before * (1 + LEAST_MORE):
+        if np.count_nonzero(kept) <= before * (1 + options.min_inlier_gain):
             break
-    rotation, translation = pose
     errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
-    inliers = errors < inlier_threshold
-    if not inliers.any():
+    kept = errors < inlier_threshold
+    if not kept.any():
         return None
-    share = _cheirality_ratio(
-        points0[inliers], points1[inliers], calibration, rotation, translation
-    )
-    return RelativePose(rotation, translation, inliers, errors, share)
+    ratio = _cheirality_ratio(points0[kept], points1[kept], calibration, *pose)
+    return RelativePose(*pose, inliers=kept, errors=errors, cheirality_ratio=ratio)
 
 
 def refine_pose(
@@ -122,41 +131,43 @@ def refine_pose(
     calibration: Calibration,
     rotation: np.ndarray,
     translation: np.ndarray,
-    scale: float = 1.0,
+    scale_px: float = 1.0,
+    options: PoseRefinementOptions = PoseRefinementOptions(),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit a pose to matches: least sum of squares of Sampson's distances, far ones weighed less.
+    """Fit a pose to matches: Sampson distances with a Cauchy loss, by Gauss-Newton.
 
-    Gauss-Newton on three angles of the rotation and two of the direction of the translation, with
-    Cauchy's weights.
+    The parameters are three angles of the rotation and two of the direction of the translation.
 
     Args:
         points0, points1: (M, 2) matched positions in pixels, mostly right.
         calibration: of both cameras.
-        rotation, translation: where to begin.
-        scale: at half of this distance in pixels a match weighs half.
+        rotation, translation: initial pose.
+        scale_px: a match with half this error has half the weight of an exact one.
+        options: of the refinement.
 
     Returns:
-        (3, 3) rotation and (3,) translation of length 1; never worse than at the beginning.
+        (3, 3) rotation and (3,) translation of length 1; never worse than the initial pose.
     """
-    every = -(-len(points0) // MOST)
+    every = -(-len(points0) // options.max_matches)
     points0, points1 = points0[::every], points1[::every]
 
     def residuals(pose: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         return _signed_errors(points0, points1, fundamental_matrix(calibration, *pose))
 
     def cost(values: np.ndarray) -> float:
-        return float(np.log1p((values / (scale / 2)) ** 2).sum())
+        return float(np.log1p((values / (scale_px / 2)) ** 2).sum())
 
     pose = rotation, translation / np.linalg.norm(translation)
     here = residuals(pose)
     best = cost(here)
-    for _ in range(ROUNDS):
-        steps = np.eye(5) * STEP
-        slopes = np.column_stack([(residuals(_moved(pose, s)) - here) / STEP for s in steps])
-        weights = 1 / (1 + (here / (scale / 2)) ** 2)
+    for _ in range(options.max_iterations):
+        step = options.derivative_step
+        varied = (residuals(_moved(pose, axis)) for axis in np.eye(5) * step)
+        slopes = np.column_stack([(there - here) / step for there in varied])
+        weights = 1 / (1 + (here / (scale_px / 2)) ** 2)
         normal = slopes.T @ (slopes * weights[:, None])
         change = -np.linalg.lstsq(normal, slopes.T @ (weights * here), rcond=None)[0]
-        while np.abs(change).max() > SETTLED:
+        while np.abs(change).max() > options.min_change:
             there = _moved(pose, change)
             values = residuals(there)
             if cost(values) < best:
@@ -171,14 +182,14 @@ def refine_pose(
 def _moved(
     pose: tuple[np.ndarray, np.ndarray], change: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Turn the rotation by three small angles, and the translation by two across itself."""
+    """Rotate the rotation by three small angles, and the translation by two across itself."""
     rotation, translation = pose
-    turn = cv2.Rodrigues(np.asarray(change[:3], np.float64))[0]
+    small = cv2.Rodrigues(np.asarray(change[:3], np.float64))[0]
     least = np.eye(3)[np.abs(translation).argmin()]
     across = np.cross(translation, least)
     across /= np.linalg.norm(across)
     moved = translation + change[3] * across + change[4] * np.cross(translation, across)
-    return turn @ rotation, moved / np.linalg.norm(moved)
+    return small @ rotation, moved / np.linalg.norm(moved)
 
 
 def _signed_errors(points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray) -> np.ndarray:
@@ -190,11 +201,15 @@ def _signed_errors(points0: np.ndarray, points1: np.ndarray, fundamental: np.nda
 
 
 def _best_of_four(
-    essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
+    essential: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    calibration: Calibration,
+    max_matches: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of an essential matrix that has most points before both cameras."""
+    """Return the pose of an essential matrix with most points in front of both cameras."""
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
-    every = -(-len(points0) // MOST)
+    every = -(-len(points0) // max_matches)
     points0, points1 = points0[::every], points1[::every]
     poses = [
         (rotation, sign * translation.ravel())

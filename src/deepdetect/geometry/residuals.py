@@ -13,7 +13,7 @@ def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
         homography: (3, 3), acting on columns (x, y, 1).
 
     Returns:
-        (N, 2) float64. Points that go to infinity become infinite.
+        (N, 2) float64; infinite for points that are mapped to infinity.
 
     Example:
         >>> transform_points([[1, 2]], np.diag([2, 2, 1])).tolist()
@@ -27,9 +27,9 @@ def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
 
 
 def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Return how far a homography takes each point from its match, (N,) float64 in pixels.
+    """Return the transfer error of each match under a homography, (N,) float64 in pixels.
 
-    This is the paper's measure: one way only, from the first image to the second.
+    It is one-way, from the first image to the second, as in the paper.
     """
     return np.linalg.norm(transform_points(points0, homography) - points1, axis=1)
 
@@ -37,7 +37,7 @@ def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.nda
 def epipolar_errors(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> np.ndarray:
-    """Return Sampson's distance of each match from a fundamental matrix, in pixels.
+    """Return the Sampson distance of each match from a fundamental matrix, in pixels.
 
     Args:
         points0, points1: (N, 2) matched positions.
@@ -56,7 +56,7 @@ def epipolar_errors(
 
 
 def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-    """Return how far matches of a rectified pair are from the true disparity.
+    """Return the distances of a rectified pair's matches from the true disparity.
 
     Args:
         points0: (N, 2) positions in the left image; the disparity is read at the
@@ -66,7 +66,7 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
             (x, y) is (x - d, y). Not finite where it is unknown.
 
     Returns:
-        (N,) float64 distances in pixels, NaN where the truth is unknown.
+        (N,) float64 distances in pixels, NaN where the true disparity is unknown.
     """
     points0 = np.asarray(points0, np.float64)
     column, row = np.rint(points0).astype(int).T

@@ -1,9 +1,9 @@
-"""Points in space from matches and the pose of two cameras, all at once.
+"""Triangulation of matches from the pose of two cameras.
 
 Both positions are first moved onto a pair of epipolar lines, as little as possible (Lindstrom,
 "Triangulation made easy", 2010, algorithm niter2): this is the maximum likelihood for errors of
 the same size in both images. The rays then meet, and the depth is a quotient. Unlike a linear
-system of equations this holds at small angles.
+system of equations this is accurate at small angles, too.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from .camera import Calibration
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """Points in space.
+    """Triangulated points.
 
     Attributes:
         points: (N, 3) float64 in the frame of the first camera: x right, y down, z forward, in
             units of the translation's length. Not finite where the rays are parallel.
-        cheirality: (N,) bool, whether it lies in front of both cameras.
-        reprojection_errors: (N,) float64, how far the matched positions are from where the point
-            is seen, in pixels: the root mean square of both images.
+        cheirality: (N,) bool, whether the point lies in front of both cameras.
+        reprojection_errors: (N,) float64 distances of the matched positions from the projected
+            point, in pixels: the root mean square of both images.
         triangulation_angle: (N,) float64 angle between both rays in radians.
     """
 
@@ -67,9 +67,9 @@ def triangulate(
     camera0, camera1 = calibration.camera0, calibration.camera1
     rays0 = camera0.rays(moved0)
     rays1 = camera1.rays(moved1)
-    turned = rays0 @ rotation.T
-    # ray1 x (depth * turned + translation) = 0
-    normals = np.cross(rays1, turned)
+    rotated = rays0 @ rotation.T
+    # ray1 x (depth * rotated + translation) = 0
+    normals = np.cross(rays1, rotated)
     squares = np.einsum("ij,ij->i", normals, normals)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = -np.einsum("ij,ij->i", normals, np.cross(rays1, translation)) / squares
@@ -77,7 +77,7 @@ def triangulate(
     depth1 = (points @ rotation.T + translation)[:, 2]
     cheirality = np.isfinite(depth) & (depth > 0) & (depth1 > 0)
     error = ((moved0 - points0) ** 2).sum(1) + ((moved1 - points1) ** 2).sum(1)
-    angle = np.arctan2(np.sqrt(squares), np.einsum("ij,ij->i", rays1, turned))
+    angle = np.arctan2(np.sqrt(squares), np.einsum("ij,ij->i", rays1, rotated))
     return Triangulation(points, cheirality, np.sqrt(error / 2), angle)
 
 
@@ -86,10 +86,8 @@ def fundamental_matrix(
 ) -> np.ndarray:
     """Return the fundamental matrix of two cameras in pixels, (3, 3) with x1^T F x0 = 0."""
     essential = cross_matrix(translation) @ rotation
-    inverse0, inverse1 = (
-        np.linalg.inv(camera.matrix) for camera in (calibration.camera0, calibration.camera1)
-    )
-    return inverse1.T @ essential @ inverse0
+    inverse0 = np.linalg.inv(calibration.camera0.matrix)
+    return np.linalg.inv(calibration.camera1.matrix).T @ essential @ inverse0
 
 
 def cross_matrix(vector: np.ndarray) -> np.ndarray:
@@ -125,6 +123,6 @@ def correct_matches(
         step = step * 2 * b / ((next0**2).sum(1) + (next1**2).sum(1))
         moved0 = points0 - step[:, None] * next0
         moved1 = points1 - step[:, None] * next1
-    # On an epipole every line will do: such a match stays where it is.
+    # On an epipole every line is right: such a match stays where it is.
     known = np.isfinite(moved0).all(1) & np.isfinite(moved1).all(1)
     return np.where(known[:, None], moved0, points0), np.where(known[:, None], moved1, points1)

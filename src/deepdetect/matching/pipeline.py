@@ -171,7 +171,7 @@ def match_images(
         points1,
         np.clip(1 - found.ratios, 0, 1),
         geometry.inliers,
-        geometry.kind,
+        geometry.model,
         geometry.matrix,
         keypoints[0],
         keypoints[1],

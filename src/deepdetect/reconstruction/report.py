@@ -93,7 +93,6 @@ def _calibration(calibration: Calibration) -> dict[str, Any]:
 
 
 def _camera(camera: Camera) -> dict[str, Any]:
-    assert camera.centre is not None
     return {
         "width": camera.size[0],
         "height": camera.size[1],

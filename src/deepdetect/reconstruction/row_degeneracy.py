@@ -77,8 +77,6 @@ are 500 and 600 px, those of a rectified pair are one: mend the calibration (giv
                 f"the focal lengths of the left and the right view are {focal0:g} and {focal1:g} "
                 f"px, those of a rectified pair are one: {advice}"
             )
-    assert camera0.centre is not None
-    assert camera1.centre is not None
     cy0, cy1 = camera0.centre[1], camera1.centre[1]
     if abs(cy1 - cy0) > CENTRE_DIFFERENCE:
         raise ReconstructionError(
@@ -219,7 +217,6 @@ def _turn_errors(pixels: np.ndarray, disparity: np.ndarray, calibration: Calibra
     there is none that leaves the matches on their rows.
     """
     camera = calibration.camera1
-    assert camera.centre is not None
     rays = calibration.camera0.rays(pixels)
     wanted = (pixels[:, 0] - disparity - camera.centre[0]) / camera.focal_px[0]
     # The turn about the vertical that most pixels ask for is near enough to begin with.

@@ -30,7 +30,7 @@ MODELS = ("auto", "homography", "fundamental")
 LONGEST = 1600
 """Longer sides are shrunk to so many pixels where the geometry is sharpened."""
 
-SHARPENING = RefinementOptions(rounds=2, windows=(15, 21, 41), inlier_threshold=0.5)
+SHARPENING = RefinementOptions(max_rounds=2, windows_px=(15, 21, 41), inlier_threshold=0.5)
 
 ROUNDS = 2
 LEAST_MORE = 0.01

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ...geometry.rescaling import ALIAS
+from ...geometry.rescaling import ANTIALIASING_SIGMA
 from .homography import nearest_pixel
 
 TURN = 0.15
@@ -167,4 +167,4 @@ def _as_coarse(gray: np.ndarray, scale: float) -> np.ndarray:
     """Blur an image as one that is so many times smaller."""
     if scale <= 1:
         return gray
-    return cv2.GaussianBlur(gray, (0, 0), ALIAS * float(np.sqrt(scale**2 - 1)))
+    return cv2.GaussianBlur(gray, (0, 0), ANTIALIASING_SIGMA * float(np.sqrt(scale**2 - 1)))
