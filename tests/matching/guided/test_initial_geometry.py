@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.geometry import epipolar_errors, transfer_errors, transform_points
 from deepdetect.geometry.acontrario import MAX_LOG10_NFA
 from deepdetect.geometry.model_selection import select_model
@@ -17,6 +18,7 @@ from deepdetect.matching.guided.initial_geometry import (
     FirstPass,
     first_pass,
     initial_matches,
+    plain_first_pass,
 )
 
 MILD = np.array([[0.9, -0.12, 25.0], [0.15, 0.95, -8.0], [2e-4, -1e-4, 1.0]])
@@ -347,3 +349,27 @@ def test_matches_that_the_homography_alone_explains_are_no_depth() -> None:
     by_homography = np.repeat([True, True, False], [50, 30, 20])
     by_fundamental = np.repeat([True, False, False], [50, 30, 20])
     assert select_model(by_homography, by_fundamental) == "homography"
+
+
+def test_the_plain_first_pass_takes_features_that_are_there(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    second = warped(gray, MILD, (256, 240))
+    features = detect_sift(gray), detect_sift(second)
+    found = plain_first_pass(initial_matches(gray, second, features), "homography")
+    whole = first_pass(gray, second, "homography")
+    assert (found.kind, whole.kind, whole.simulated) == ("homography", "homography", 0)
+    np.testing.assert_allclose(found.matrix, whole.matrix)
+    np.testing.assert_array_equal(found.points1, whole.points1)
+    assert found.log10_nfa == whole.log10_nfa
+    fewest = detect_sift(second, SiftOptions(max_keypoints=100))
+    fewer = initial_matches(gray, second, (features[0], fewest))
+    assert 0 < len(fewer.points0) <= 100
+
+
+def test_the_plain_first_pass_simulates_no_views(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    noise = np.random.default_rng(0).integers(0, 256, (240, 256)).astype(np.uint8)
+    for other in (noise, np.zeros((64, 64), np.uint8)):
+        found = plain_first_pass(initial_matches(gray, other), "homography")
+        assert_nothing(found)
+        assert found.simulated == 0

@@ -83,11 +83,17 @@ class InitialMatches:
         return scaled_points(self.matched[1], 1 / self.scales[1])
 
 
-def initial_matches(gray0: np.ndarray, gray1: np.ndarray) -> InitialMatches:
+def initial_matches(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    features: tuple[Keypoints, Keypoints] | None = None,
+) -> InitialMatches:
     """Match sparse SIFT features of two images, exactly, mutually and by the ratio test.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
+        features: of both images, shrunk where they are large, where they are there already; None:
+            they are detected.
 
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
@@ -96,7 +102,8 @@ def initial_matches(gray0: np.ndarray, gray1: np.ndarray) -> InitialMatches:
         (True, True)
     """
     (view0, scale0), (view1, scale1) = (downscale(gray, LONGEST) for gray in (gray0, gray1))
-    features = detect_sift(view0), detect_sift(view1)
+    if features is None:
+        features = detect_sift(view0), detect_sift(view1)
     return InitialMatches((view0, view1), (scale0, scale1), features, _matched(*features))
 
 
@@ -137,6 +144,25 @@ def first_pass(
         if best.log10_nfa < MAX_LOG10_NFA:
             return _enlarged(best, *initial.scales)
     return FirstPass("none", None, *np.empty((2, 0, 2)), best.matches, best.log10_nfa, simulated)
+
+
+def plain_first_pass(initial: InitialMatches, model: str = "auto", seed: int = 0) -> FirstPass:
+    """Estimate the geometry of a pair from its initial matches alone, without simulated views.
+
+    Args:
+        initial: of `initial_matches`.
+        model, seed: as of `first_pass`.
+
+    Returns:
+        The geometry, or the kind "none".
+    """
+    height, width = initial.views[1].shape
+    found = _estimate(*initial.matched, model, seed, (width, height), 0)
+    if found.log10_nfa < MAX_LOG10_NFA:
+        return _enlarged(found, *initial.scales)
+    return replace(
+        found, kind="none", matrix=None, points0=np.empty((0, 2)), points1=np.empty((0, 2))
+    )
 
 
 def _looks(initial: InitialMatches) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], int]]:

@@ -2,17 +2,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from deepdetect import DeepDetectError, OptionError
 from deepdetect.cli import main
-from deepdetect.matching.stitching import stitch
 
 
 @pytest.fixture(scope="module")
@@ -27,37 +23,26 @@ def views(whole: np.ndarray) -> list[np.ndarray]:
     return [np.ascontiguousarray(whole[:, left : left + 300]) for left in (0, 150, 300)]
 
 
-def test_the_parts_become_the_whole(views: list[np.ndarray], whole: np.ndarray) -> None:
-    panorama = stitch([views[2], views[0], views[1]])
-    assert panorama.used == (0, 1, 2)
-    assert panorama.picture.dtype == np.uint8
-    height, width = panorama.picture.shape[:2]
-    assert abs(height - 400) < 20
-    assert abs(width - 600) < 20
-    found = cv2.resize(panorama.picture, (600, 400), interpolation=cv2.INTER_AREA)
-    inside = (slice(20, -20), slice(20, -20))
-    assert np.abs(found.astype(int) - whole)[inside].mean() < 25  # left is left, red is red
-
-
 def test_what_cannot_be_connected_is_told(views: list[np.ndarray], tmp_path: Path) -> None:
     data = pytest.importorskip("skimage.data")
     strange = np.ascontiguousarray(data.rocket()[:300, :300])
-    assert stitch([views[0], strange, views[1]]).used == (0, 2)
     for name, view in zip("abc", (views[0], strange, views[1]), strict=True):
         Image.fromarray(view).save(tmp_path / f"{name}.png")
     files = [str(tmp_path / f"{name}.png") for name in "abc"]
-    result = CliRunner().invoke(main, ["stitch", *files, "-o", str(tmp_path / "p.png"), "--json"])
+    words = ["stitch", *files, "-o", str(tmp_path / "p.png"), "--reference", files[2]]
+    result = CliRunner().invoke(main, [*words, "--json"])
+    assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
-    assert report["left_out"] == [files[1]]
+    assert report["left_out"] == [{"image": files[1], "reason": "it overlaps with no other image"}]
     assert report["images"] == [files[0], files[2]]
-
-
-def test_what_makes_no_panorama_is_refused(views: list[np.ndarray]) -> None:
-    with pytest.raises(OptionError, match="two photographs"):
-        stitch(views[:1])
-    noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3)).astype(np.uint8)
-    with pytest.raises(DeepDetectError, match="these 2 photographs make no panorama"):
-        stitch([views[0], noise])
+    assert report["reference"] == files[2]
+    assert (report["width"], report["height"]) == (450, 400)
+    np.testing.assert_allclose(report["homographies"][1], [[1, 0, 150], [0, 1, 0], [0, 0, 1]])
+    assert report["pairs"][0]["images"] == [files[0], files[2]]
+    assert report["pairs"][0]["matches"] > 1000
+    told = CliRunner().invoke(main, words)
+    assert f"left out: {files[1]}, as it overlaps with no other image" in told.stderr
+    assert "2 of 3" in told.stdout
 
 
 def test_the_command_writes_the_file(views: list[np.ndarray], tmp_path: Path) -> None:
@@ -113,21 +98,24 @@ def test_an_unknown_ending_ends_before_the_work(
     files: list[Path], output: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "deepdetect.matching.stitching.stitch", lambda images: pytest.fail("it worked")
+        "deepdetect.matching.stitching.stitch", lambda *_, **__: pytest.fail("it worked")
     )
     assert "must end in .png, .jpg or .jpeg" in refused(*files, "-o", output)
 
 
-def test_an_error_of_opencv_is_one_sentence(
-    views: list[np.ndarray], monkeypatch: pytest.MonkeyPatch, one_line: Any
+def test_errors_speak_of_files_and_flags(
+    files: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Failing:
-        def stitch(self, images: list[np.ndarray]) -> None:
-            cv2.resize(np.empty((0, 0), np.uint8), (3, 3))  # an error of OpenCV itself
-
-    monkeypatch.setattr(cv2.Stitcher, "create", lambda mode: Failing())
-    with pytest.raises(
-        DeepDetectError, match="make no panorama: OpenCV's stitcher failed"
-    ) as error:
-        stitch(views)
-    one_line(error.value)
+    assert "more than --max-canvas-megapixels (0.1): raise it, or make --scale smaller" in refused(
+        *files, "--max-canvas-megapixels", "0.1"
+    )
+    assert "--reference c.png must be one of the photographs" in refused(
+        *files, "--reference", "c.png"
+    )
+    data = pytest.importorskip("skimage.data")
+    Image.fromarray(data.rocket()[:300, :300]).save("scale.png")
+    assert "the reference, scale.png, overlaps with no other image" in refused(
+        *files, "scale.png", "--reference", "scale.png"
+    )
+    assert "there is no file my-scale.png:" in refused(*files, "my-scale.png")
+    assert not Path("panorama.jpg").exists()

@@ -1,0 +1,219 @@
+"""Homographies of many photographs into the frame of one.
+
+Which photographs overlap is found with few points. The pairs that do are registered by guided
+matching, whose test by dense keypoints they must pass. The pairs with the most matches make a
+spanning tree; homographies composed along it are the start of a fit to all pairs at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from ..._shared.errors import DeepDetectError
+from ...detector.detector import HeatmapDetector, find_keypoints
+from ...features.keypoints import Keypoints, bayer_order
+from ...features.selection import SelectionOptions
+from ...features.sift_detector import SiftOptions, detect_sift
+from ...geometry.residuals import transform_points
+from ...io.image import luma
+from ..guided import guided_matches
+from ..guided.initial_geometry import InitialMatches, initial_matches, plain_first_pass
+from .joint_fit import Correspondences, fit_jointly
+
+SIFT = SiftOptions(max_keypoints=2000)
+"""Sparse keypoints by which overlaps are found."""
+
+KEYPOINTS = 30_000
+"""Dense keypoints of an image, at the most, which must confirm a homography."""
+
+PARTNERS = 3
+"""Pairs that each image takes part in, where it has so many, beyond those that connect all."""
+
+SAMPLES = 400
+"""Matches of a pair, spread out, that the joint fit is made to."""
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredPair:
+    """Two images that a homography lays onto each other, confirmed by dense keypoints.
+
+    Attributes:
+        first, second: numbers of the images.
+        homography: (3, 3) from the first to the second.
+        points: (M, 2) keypoints of the first that have a match in the second.
+    """
+
+    first: int
+    second: int
+    homography: np.ndarray
+    points: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class JointRegistration:
+    """Images in a common frame.
+
+    Attributes:
+        homographies: (3, 3) each to the frame of the first one, by number of the image; in the
+            order in which they were connected.
+        matches: number of dense matches of each pair that was registered among these.
+        residual_px: root mean square of the distances between where a pair's own homography
+            takes its matches and where the joint fit does, in pixels; 0 without closed loops.
+        left_out: why each other image is not among them.
+    """
+
+    homographies: dict[int, np.ndarray]
+    matches: dict[tuple[int, int], int]
+    residual_px: float
+    left_out: dict[int, str]
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    gray: np.ndarray
+    features: Keypoints
+    keypoints: np.ndarray
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.gray.shape[1], self.gray.shape[0]
+
+
+def register_jointly(
+    images: Sequence[np.ndarray],
+    detector: HeatmapDetector,
+    *,
+    reference: int | None = None,
+    seed: int = 0,
+) -> JointRegistration:
+    """Find the homographies of overlapping images to a common frame.
+
+    Args:
+        images: two or more, (H, W, 3) uint8 RGB each, their longer sides at most 1200 pixels.
+        detector: gives the heat maps.
+        reference: number of an image that must be among them; None for the most images.
+        seed: of all random choices.
+
+    Raises:
+        DeepDetectError: no two images overlap, or the reference with none.
+    """
+    views = [_view(image, detector) for image in images]
+    pairs = _registered_pairs(views, seed)
+    groups = sorted({tuple(sorted(_reached(k, pairs))) for k in range(len(images))})
+    if reference is not None:
+        group = next(group for group in groups if reference in group)
+    else:
+        group = max(groups, key=lambda group: (len(group), _matches_within(group, pairs)))
+    if len(group) == 1:
+        what = f"no two of these {len(images)} images overlap"
+        if reference is not None:
+            what = f"the reference, images[{reference}], overlaps with no other image"
+        raise DeepDetectError(
+            f"{what} so that a homography can be trusted: they must show common detail, and be "
+            "taken from one place or show a plane"
+        )
+    left_out = {
+        number: "it overlaps with no other image"
+        if len(other) == 1
+        else "it overlaps only with images that are left out"
+        for other in groups
+        if other != group
+        for number in other
+    }
+    pairs = [pair for pair in pairs if pair.first in group]
+    homographies, residual_px = fit_jointly(
+        _composed(group, pairs),
+        [_correspondences(pair, views) for pair in pairs],
+        {number: views[number].size for number in group},
+    )
+    matches = {(pair.first, pair.second): len(pair.points) for pair in pairs}
+    return JointRegistration(homographies, matches, residual_px, left_out)
+
+
+def _view(image: np.ndarray, detector: HeatmapDetector) -> _View:
+    gray = luma(image)
+    # Without suppression: neighbouring pixels are what the verification compares.
+    options = SelectionOptions(max_keypoints=KEYPOINTS, nms_radius=0, subpixel=False)
+    keypoints = find_keypoints(detector, image, options)
+    return _View(gray, detect_sift(gray, SIFT), keypoints.xy)
+
+
+def _registered_pairs(views: Sequence[_View], seed: int) -> list[RegisteredPair]:
+    """Register the pairs that overlap most, until all are connected and have enough partners."""
+    overlaps: list[tuple[int, int, int, InitialMatches]] = []
+    for first, second in combinations(range(len(views)), 2):
+        a, b = views[first], views[second]
+        initial = initial_matches(a.gray, b.gray, (a.features, b.features))
+        found = plain_first_pass(initial, "homography", seed)
+        if found.kind != "none":
+            overlaps.append((len(found.points0), first, second, initial))
+    overlaps.sort(key=lambda overlap: -overlap[0])
+    pairs: list[RegisteredPair] = []
+    partners = [0] * len(views)
+    for _, first, second, initial in overlaps:
+        enough = min(partners[first], partners[second]) >= PARTNERS
+        if enough and second in _reached(first, pairs):
+            continue
+        a, b = views[first], views[second]
+        guidance, matches = guided_matches(
+            a.gray, b.gray, a.keypoints, b.keypoints, "homography", seed, initial
+        )
+        if guidance.matrix is not None and matches is not None and len(matches):
+            points = a.keypoints[matches.rows0]
+            pairs.append(RegisteredPair(first, second, guidance.matrix, points))
+            partners[first] += 1
+            partners[second] += 1
+    return pairs
+
+
+def _correspondences(pair: RegisteredPair, views: Sequence[_View]) -> Correspondences:
+    """Choose matches of a pair, spread out."""
+    order = np.argsort(bayer_order(pair.points, views[pair.first].size), kind="stable")
+    points = pair.points[order[:SAMPLES]]
+    # The homography is sharper than keypoints on whole pixels.
+    return Correspondences(
+        pair.first, pair.second, points, transform_points(points, pair.homography)
+    )
+
+
+def _reached(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
+    """Return the images that pairs connect with one of them, itself included."""
+    reached = {number}
+    while True:
+        touching = [pair for pair in pairs if pair.first in reached or pair.second in reached]
+        more = {end for pair in touching for end in (pair.first, pair.second)}
+        if more <= reached:
+            return reached
+        reached |= more
+
+
+def _matches_within(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> int:
+    return sum(len(pair.points) for pair in pairs if pair.first in group)
+
+
+def _composed(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
+    """Compose homographies to the image with most matches, along the tree of the surest pairs."""
+    tree: list[RegisteredPair] = []
+    matches = dict.fromkeys(group, 0)
+    for pair in sorted(pairs, key=lambda pair: -len(pair.points)):
+        if pair.second not in _reached(pair.first, tree):
+            tree.append(pair)
+        matches[pair.first] += len(pair.points)
+        matches[pair.second] += len(pair.points)
+    homographies = {max(group, key=lambda number: matches[number]): np.eye(3)}
+    queue = list(homographies)
+    for number in queue:
+        for pair in tree:
+            if pair.first == number and pair.second not in homographies:
+                other, step = pair.second, np.linalg.inv(pair.homography)
+            elif pair.second == number and pair.first not in homographies:
+                other, step = pair.first, pair.homography
+            else:
+                continue
+            homographies[other] = homographies[number] @ step
+            queue.append(other)
+    return homographies

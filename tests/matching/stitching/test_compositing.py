@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetectError, OptionError
+from deepdetect.geometry.rescaling import downscale
+from deepdetect.matching.stitching import compositing
+from deepdetect.matching.stitching.compositing import (
+    Canvas,
+    composite,
+    drawn_in_box,
+    least_stretched,
+    plan_canvas,
+)
+
+CAMERA = np.array([[400.0, 0, 199.5], [0, 400, 149.5], [0, 0, 1]])
+SIZE = (400, 300)
+
+
+def moved(x: float, y: float = 0) -> np.ndarray:
+    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
+
+
+def turned(degrees: float) -> np.ndarray:
+    """To the frame of a camera that did not turn, from one that turned to the right."""
+    rotation = cv2.Rodrigues(np.radians([0, degrees, 0]))[0]
+    return CAMERA @ rotation @ np.linalg.inv(CAMERA)
+
+
+def planned(homographies: dict[int, np.ndarray], reference: int = 0, **options) -> Canvas:
+    sizes = dict.fromkeys(homographies, SIZE)
+    options = {"scale": 1.0, "max_canvas_megapixels": 50.0, **options}
+    return plan_canvas(sizes, homographies, reference, **options)
+
+
+def put_together(images: dict[int, np.ndarray], canvas: Canvas):
+    small = {number: downscale(image, 200) for number, image in images.items()}
+    return composite(lambda number: images[number], small, canvas)
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    data = pytest.importorskip("skimage.data")
+    return np.ascontiguousarray(data.coffee())
+
+
+def test_the_canvas_holds_all_corners() -> None:
+    canvas = planned({0: moved(0), 3: moved(-120.4, 60.2)})
+    assert canvas.size == (520, 360)
+    assert canvas.boxes == {0: (120, 0, 520, 300), 3: (0, 60, 400, 360)}
+    np.testing.assert_allclose(canvas.homographies[0], moved(120))
+    np.testing.assert_allclose(canvas.homographies[3], moved(-0.4, 60.2))
+    # In the frame of the other, and half as large, it is the same but for that.
+    other = planned({0: moved(0), 3: moved(-120, 60)}, reference=3, scale=0.5)
+    assert other.size == (260, 180)
+    # The middle of two pixels is that of the half-size pixel which they become.
+    np.testing.assert_allclose(
+        other.homographies[3] @ [0.5, 0.5, 1], other.homographies[0] @ [-119.5, 60.5, 1]
+    )
+
+
+@pytest.mark.parametrize("factor", [1, -2])
+def test_what_reaches_the_horizon_is_refused(factor: int, one_line) -> None:
+    # The corner of a camera with a field of view of 53 degrees.
+    assert planned({0: np.eye(3), 1: factor * turned(40)}).size[0] > 1000
+    for degrees in (60, 64, 90, 170):  # at 63 the corner is on the horizon; at 170 all is behind
+        with pytest.raises(DeepDetectError, match=r"images\[1\] is seen too much") as error:
+            planned({0: np.eye(3), 1: factor * turned(degrees)})
+        one_line(error.value)
+
+
+def test_a_canvas_too_large_is_refused(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
+    far = {0: np.eye(3), 1: moved(10_000)}
+    with pytest.raises(OptionError, match=r"would be 10400x300 pixels, .*max_canvas_mega") as error:
+        planned(far, max_canvas_megapixels=3.1)
+    one_line(error.value)
+    assert planned(far, max_canvas_megapixels=3.13).size == (10_400, 300)
+    needed = planned(far).memory_bytes
+    monkeypatch.setattr(compositing, "available_memory", lambda: needed - 1)
+    with pytest.raises(OptionError, match="GB of memory, more than is free") as error:
+        planned(far)
+    one_line(error.value)
+
+
+def test_the_one_in_the_middle_is_least_stretched() -> None:
+    angles = {4: -35, 1: 20, 7: 2, 2: 38}
+    for frame in (0, 25):
+        homographies = {number: turned(-frame) @ turned(a) for number, a in angles.items()}
+        assert least_stretched(dict.fromkeys(angles, SIZE), homographies) == 7
+    assert least_stretched({2: SIZE, 1: SIZE}, {2: moved(0), 1: moved(50)}) == 2
+
+
+def test_an_image_is_drawn_where_it_belongs(scene: np.ndarray) -> None:
+    drawn, mask = drawn_in_box(scene, moved(40, 10), (30, 0, 700, 405))
+    assert drawn.shape == (405, 670, 3)
+    np.testing.assert_array_equal(drawn[10:, 10:610], scene[:395])
+    assert (mask[10:, 10:610] == 255).all()
+    assert mask.sum() == 255 * 395 * 600
+    # Stripes of one pixel are grey when made smaller, not what sampling hits.
+    stripes = np.zeros((200, 200, 3), np.uint8)
+    stripes[:, ::2] = 255
+    small, _ = drawn_in_box(stripes, np.diag([0.25, 0.25, 1]), (0, 0, 50, 50))
+    assert np.abs(small[5:-5, 5:-5].astype(int) - 127.5).max() < 30
+
+
+def test_parts_become_the_whole(scene: np.ndarray) -> None:
+    images = {0: scene[:300, :400], 1: scene[:300, 150:550], 2: scene[90:390, 60:460]}
+    canvas = planned({0: moved(0), 1: moved(150), 2: moved(60, 90)})
+    assert canvas.size == (550, 390)
+    panorama, valid, gains = put_together(images, canvas)
+    assert max(abs(gain - 1) for gain in gains.values()) < 1e-3
+    expected = np.zeros((390, 550), bool)
+    expected[:300] = True
+    expected[90:, 60:460] = True
+    np.testing.assert_array_equal(valid, expected)
+    differences = np.abs(panorama.astype(int) - scene[:390, :550])[valid]
+    assert differences.mean() < 0.4
+    assert np.quantile(differences, 0.999) < 10
+    assert differences.max() < 50
+    assert not panorama[~valid].any()
+
+
+def test_equal_images_are_kept_to_the_last_bit(scene: np.ndarray) -> None:
+    images = {0: scene[:300, :400], 1: scene[:300, :400]}
+    panorama, valid, _ = put_together(images, planned({0: moved(0), 1: moved(0)}))
+    np.testing.assert_array_equal(panorama, scene[:300, :400])
+    assert valid.all()
+
+
+def test_brightness_becomes_equal(scene: np.ndarray) -> None:
+    scene = scene // 2
+    dark = (scene[:300, 150:550] * 0.7).astype(np.uint8)
+    canvas = planned({0: moved(0), 1: moved(150)})
+    panorama, _, gains = put_together({0: scene[:300, :400], 1: dark}, canvas)
+    assert gains[1] / gains[0] == pytest.approx(1 / 0.7, rel=0.03)
+    factor = panorama.astype(float).mean((0, 2)) / scene[:300, :550].mean((0, 2))
+    assert factor[:150].mean() / factor[-150:].mean() == pytest.approx(1, abs=0.03)
+
+
+def test_the_same_every_time(scene: np.ndarray) -> None:
+    images = {0: scene[:300, :400], 1: scene[50:350, 120:520]}
+    canvas = planned({0: moved(0), 1: turned(3) @ moved(120, 50)})
+    first, second = put_together(images, canvas), put_together(images, canvas)
+    np.testing.assert_array_equal(first[0], second[0])

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, DeepDetectError
+from deepdetect.evaluation.metrics.homography_accuracy import corner_error
+from deepdetect.matching.stitching.joint_registration import register_jointly
+
+
+@pytest.fixture(scope="module")
+def detector() -> DeepDetect:
+    return DeepDetect(threads=1)
+
+
+@pytest.fixture(scope="module")
+def strange() -> np.ndarray:
+    data = pytest.importorskip("skimage.data")
+    return np.ascontiguousarray(data.rocket()[:300, :300])
+
+
+def test_views_of_one_photograph(views, detector: DeepDetect) -> None:
+    found = register_jointly(views.images, detector)
+    assert sorted(found.homographies) == [0, 1, 2]
+    assert found.left_out == {}
+    assert (0, 1) in found.matches
+    assert (1, 2) in found.matches
+    assert min(found.matches.values()) > 1000
+    assert found.residual_px < 0.5
+    frame = next(iter(found.homographies))
+    assert frame == 1  # it has the most matches
+    for number, matrix in found.homographies.items():
+        true = views.homographies[frame] @ np.linalg.inv(views.homographies[number])
+        assert corner_error(matrix, true, (300, 280)) < 0.5, number
+
+
+@pytest.mark.slow
+def test_the_larger_group_stays_and_the_others_are_told_why(
+    views, detector: DeepDetect, strange: np.ndarray
+) -> None:
+    apart = [strange[:200, :200], strange[20:220, 40:240]]  # overlap, but only each other
+    noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3)).astype(np.uint8)
+    found = register_jointly([apart[0], *views.images, noise, apart[1]], detector)
+    assert sorted(found.homographies) == [1, 2, 3]
+    assert found.left_out == {
+        0: "it overlaps only with images that are left out",
+        4: "it overlaps with no other image",
+        5: "it overlaps only with images that are left out",
+    }
+    chosen = register_jointly([apart[0], *views.images, noise, apart[1]], detector, reference=5)
+    assert sorted(chosen.homographies) == [0, 5]
+    assert chosen.left_out[1] == "it overlaps only with images that are left out"
+
+
+def test_what_overlaps_with_nothing_is_refused(views, detector: DeepDetect, strange, one_line):
+    with pytest.raises(DeepDetectError, match="no two of these 2 images overlap") as error:
+        register_jointly([views.images[0], strange], detector)
+    one_line(error.value)
+    with pytest.raises(DeepDetectError, match=r"the reference, images\[1\], overlaps with no"):
+        register_jointly([views.images[0], strange, views.images[1]], detector, reference=1)
+    flat = np.full((100, 120, 3), 90, np.uint8)
+    with pytest.raises(DeepDetectError, match="no two of these 2 images overlap"):
+        register_jointly([flat, flat], detector)

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetectError, ImageError, OptionError
+from deepdetect.evaluation.metrics.homography_accuracy import corner_error
+from deepdetect.geometry import transform_points
+from deepdetect.matching.stitching import Panorama, stitch
+
+
+@pytest.fixture(scope="module")
+def panorama(views) -> Panorama:
+    return stitch([views.images[2], views.images[0], views.images[1]])
+
+
+def test_the_homographies_are_known_to_a_pixel(panorama: Panorama, views) -> None:
+    assert panorama.reference == 2
+    true = [views.homographies[k] for k in (2, 0, 1)]
+    height, width = panorama.valid.shape
+    assert sorted(panorama.homographies) == [0, 1, 2]
+    for number, matrix in panorama.homographies.items():
+        expected = panorama.homographies[2] @ true[2] @ np.linalg.inv(true[number])
+        assert corner_error(matrix, expected, (300, 280)) < 1, number
+    x, y = panorama.homographies[2][:2, 2]  # the reference is moved only
+    moved = [[1, 0, x], [0, 1, y], [0, 0, 1]]
+    np.testing.assert_allclose(panorama.homographies[2], moved, atol=1e-9)
+    corners = np.array([[0, 0], [299, 0], [299, 279], [0, 279]], float)
+    ends = [transform_points(corners, true[2] @ np.linalg.inv(matrix)) for matrix in true]
+    extent = np.ptp(np.concatenate(ends), axis=0) + 1
+    np.testing.assert_allclose([width, height], extent, atol=2)
+
+
+def test_the_panorama_is_the_photograph(panorama: Panorama, views) -> None:
+    assert panorama.image.dtype == np.uint8
+    assert panorama.valid.dtype == bool
+    height, width = panorama.valid.shape
+    assert panorama.image.shape == (height, width, 3)
+    to_canvas = panorama.homographies[2] @ views.homographies[1]
+    whole = cv2.warpPerspective(views.scene, to_canvas, (width, height), flags=cv2.INTER_CUBIC)
+    seen = np.zeros((height, width), np.uint8)
+    for number, matrix in panorama.homographies.items():
+        view = np.full(views.images[number].shape[:2], 255, np.uint8)
+        seen |= cv2.warpPerspective(view, matrix, (width, height), flags=cv2.INTER_NEAREST)
+    assert (panorama.valid == (seen > 0)).mean() > 0.9999
+    inside = cv2.erode(seen, np.ones((7, 7)), borderValue=0) > 0
+    assert inside.mean() > 0.6
+    assert np.abs(panorama.image.astype(int) - whole)[inside].mean() < 2
+    assert not panorama.image[~panorama.valid].any()
+    assert panorama.left_out == {}
+    assert set(panorama.seconds) == {"reading", "registration", "compositing"}
+
+
+def test_it_is_the_same_again_and_from_files(panorama: Panorama, views, tmp_path: Path) -> None:
+    paths = []
+    for name in (2, 0, 1):
+        paths.append(tmp_path / f"{name}.png")
+        Image.fromarray(views.images[name]).save(paths[-1])
+    again = stitch(paths)
+    np.testing.assert_array_equal(again.image, panorama.image)
+    assert again.matches == panorama.matches
+
+
+@pytest.mark.slow
+def test_reference_scale_and_left_out(views) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3)).astype(np.uint8)
+    found = stitch([views.images[0], noise, views.images[1]], reference=0, scale=0.5)
+    assert found.reference == 0
+    assert found.left_out == {1: "it overlaps with no other image"}
+    assert sorted(found.homographies) == [0, 2]
+    np.testing.assert_allclose(found.homographies[0][:2, :2], np.eye(2) / 2)
+    between = np.linalg.inv(found.homographies[2]) @ found.homographies[0]
+    true = views.homographies[1] @ np.linalg.inv(views.homographies[0])
+    assert corner_error(between, true, (300, 280)) < 1
+
+
+@pytest.mark.slow
+def test_registration_at_reduced_size(views) -> None:
+    large = [cv2.resize(image, None, fx=2, fy=2) for image in views.images[:2]]
+    found = stitch(large, registration_side=300)
+    between = np.linalg.inv(found.homographies[1]) @ found.homographies[0]
+    double = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1]])
+    true = views.homographies[1] @ np.linalg.inv(views.homographies[0])
+    assert corner_error(between, double @ true @ np.linalg.inv(double), (600, 560)) < 1
+
+
+def test_what_makes_no_panorama_is_refused(views, one_line) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3)).astype(np.uint8)
+    with pytest.raises(DeepDetectError, match="no two of these 2 images overlap") as error:
+        stitch([views.images[0], noise])
+    one_line(error.value)
+    with pytest.raises(OptionError, match="max_canvas_megapixels") as error:
+        stitch(views.images[:2], max_canvas_megapixels=0.1)
+    one_line(error.value)
+    with pytest.raises(ImageError, match="no file"):
+        stitch([views.images[0], "missing.png"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"reference": 2}, "reference must be the number of an image, from 0 to 1, not 2"),
+        ({"reference": -1}, "reference must be"),
+        ({"scale": 0}, "scale must be above 0"),
+        ({"scale": float("nan")}, "scale must be above 0"),
+        ({"max_canvas_megapixels": 0}, "max_canvas_megapixels must be above 0"),
+        ({"registration_side": 5000}, r"registration_side must lie in \[100, 1200\]"),
+        ({"seed": -1}, "seed must lie in"),
+    ],
+)
+def test_options_out_of_range_are_refused(views, options: dict, message: str, one_line) -> None:
+    with pytest.raises(OptionError, match=message) as error:
+        stitch(views.images[:2], **options)
+    one_line(error.value)
+
+
+def test_one_photograph_is_no_panorama(views) -> None:
+    with pytest.raises(OptionError, match="two photographs"):
+        stitch(views.images[:1])
+
+
+MEASURED = """
+import resource, sys
+import numpy as np
+from deepdetect.matching.stitching import stitch
+found = stitch(sys.argv[1:])
+between = np.linalg.inv(found.homographies[1]) @ found.homographies[0]
+print(*between.ravel())
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss has other units elsewhere")
+def test_the_oxford_boat_takes_little_memory(shared: Path) -> None:
+    """OpenCV's own stitcher asked for 30 GB here."""
+    folder = shared / "data" / "oxford" / "boat"
+    if not folder.is_dir():
+        pytest.skip("needs the boat of the Oxford set in ../shared")
+    words = [sys.executable, "-c", MEASURED, folder / "img1.png", folder / "img2.png"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    matrix, peak_bytes = done.stdout.splitlines()
+    between = np.array(matrix.split(), float).reshape(3, 3)
+    assert corner_error(between, np.loadtxt(folder / "H1to2p"), (850, 680)) < 2
+    assert int(peak_bytes) < 2.5e9
