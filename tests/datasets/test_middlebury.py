@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import ImageError
-from deepdetect.datasets.middlebury import load_middlebury
+from deepdetect import ImageError, OptionError, ReconstructionError
+from deepdetect.datasets import load_stereo_pair
+from deepdetect.datasets.middlebury import load_calibrated_pair, load_middlebury
 
 
 @pytest.fixture
@@ -33,10 +34,14 @@ def test_a_small_map_is_read_at_each_pixel(scene: Path) -> None:
     assert disparity[-1, -1] == 127 / 4
 
 
-@pytest.mark.parametrize("name", ["cones", "teddy", "dolls", "moebius", "art"])
+LARGE = [pytest.param(name, marks=pytest.mark.slow) for name in ("dolls", "moebius")]
+
+
+@pytest.mark.parametrize("name", ["cones", "teddy", "art", "motorcycle", *LARGE])
 def test_the_truth_fits_the_photographs(shared: Path, name: str) -> None:
     """The right view, sampled at x - disparity, looks like the left view; at x + it does not."""
-    pair = load_middlebury(shared / "data" / "middlebury" / name)
+    scene = shared / "data" / "middlebury" / name
+    pair = load_stereo_pair(name) if name == "motorcycle" else load_middlebury(scene)
     height, width = pair.disparity.shape
     assert pair.left.shape == pair.right.shape == (height, width, 3)
     known = np.isfinite(pair.disparity)
@@ -91,3 +96,21 @@ def test_what_is_missing_or_wrong_is_named(scene: Path, one_line) -> None:
     Image.fromarray(np.zeros((16, 30, 3), np.uint8)).save(scene / "right.png")
     with pytest.raises(ImageError, match="differ in size"):
         load_middlebury(scene)
+
+
+def test_an_unknown_pair_names_the_nearest() -> None:
+    with pytest.raises(OptionError, match="did you mean 'motorcycle'"):
+        load_stereo_pair("motorcicle")
+
+
+def test_a_calibrated_pair_may_lack_the_ground_truth(scene: Path) -> None:
+    (scene / "calib.json").write_text('{"focal_px": 30.0, "baseline_mm": 160.0}')
+    pair = load_calibrated_pair(scene)
+    assert pair.name == scene.name
+    assert pair.calibration.camera0.focal_px == (30.0, 30.0)
+    assert pair.calibration.baseline_mm == 160.0
+    assert np.isnan(pair.disparity).all()
+    assert pair.disparity.shape == pair.left.shape[:2]
+    (scene / "calib.json").unlink()
+    with pytest.raises(ReconstructionError, match=r"calib\.json cannot be read"):
+        load_calibrated_pair(scene)

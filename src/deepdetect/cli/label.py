@@ -22,6 +22,7 @@ from .shared import (
 
 if TYPE_CHECKING:
     from ..labels.batch import LabelTask
+    from ..labels.visibility import VisibilityChoice
 
 
 @click.command(short_help="Training masks from nine classical detectors.")
@@ -49,7 +50,7 @@ def label(
     output: Path,
     detectors: str | None,
     label_settings: str | None,
-    visibility: str,
+    visibility: VisibilityChoice,
     visualize: bool,
     overwrite: bool,
     workers: int | None,

@@ -84,10 +84,10 @@ def stitch(
     deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
     """
     from ..matching.stitching import stitch as stitch_images
-    from ..viz.draw import picture_ending, save_picture
+    from ..viz.draw import picture_suffix, save_picture
 
     # Before the work, which would else be lost.
-    picture_ending(output)
+    picture_suffix(output)
     check_inputs_survive([output], images, "give the panorama another name by -o")
     if reference is not None and reference not in images:
         raise OptionError(f"--reference {reference} must be one of the photographs: name it there")

@@ -190,9 +190,9 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
         except DeepDetectError as error:
             failure = error
         except HTTPError as error:
+            status = error.response.status_code if error.response is not None else "an error"
             failure = DeepDetectError(
-                f"{url} cannot be downloaded (the server answers "
-                f"{error.response.status_code}): try again later"
+                f"{url} cannot be downloaded (the server answers {status}): try again later"
             )
         except RequestException as error:
             failure = DeepDetectError(

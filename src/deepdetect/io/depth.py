@@ -1,4 +1,4 @@
-"""Depth maps: 16-bit PNG with its scale written inside, and npz with floats."""
+"""Depth maps in files: 16-bit PNG that carries its scale, and npz with floats."""
 
 from __future__ import annotations
 
@@ -13,23 +13,22 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import ImageError, OptionError, unknown_name
 from ..geometry.point_cloud import UNITS
 
-LARGEST = 65535
-"""Of 16 bits."""
+MAX_UINT16 = 65535
 
-FAR = 4.0
-"""A chosen scale leaves room for all depths up to so many times the 99th percentile."""
+HEADROOM = 4.0
+"""The default scale holds all depths up to this many times their 99th percentile."""
 
 
 @dataclass(frozen=True)
 class DepthPng:
-    """What became of a depth map in 16 bits.
+    """How a depth map was stored in 16 bits.
 
     Attributes:
         unit: "mm" or "baseline".
         value_per_unit: depth = value / value_per_unit; a value of 0 is unknown.
         known: pixels with a value.
-        out_of_range: pixels with a depth that 16 bits at this scale cannot hold; they are
-            written as unknown, never as another depth.
+        out_of_range: pixels whose depth 16 bits at this scale cannot hold; they are written
+            as unknown, never as another depth.
     """
 
     unit: str
@@ -50,15 +49,15 @@ def save_depth_png(
         depth: (H, W) depths; not finite, 0 or less: unknown.
         path: ending in .png.
         unit: "mm" or "baseline" (multiples of the distance of the two cameras).
-        value_per_unit: the scale; without one, the finest of 1, 2 or 5 times a power of ten
+        value_per_unit: the scale; by default the finest of 1, 2 or 5 times a power of ten
             that holds all depths up to 4 times the 99th percentile.
 
     Returns:
-        The scale, and what did not fit.
+        The scale, and the numbers of pixels.
 
     Raises:
         OptionError: the map is no (H, W) array, the unit is unknown, the scale is not above 0
-            or the ending is another.
+            or the suffix is wrong.
         DeepDetectError: the file cannot be written.
 
     Example:
@@ -77,13 +76,13 @@ def save_depth_png(
     known = np.isfinite(depth) & (depth > 0)
     scale = float(value_per_unit or _scale(depth[known]))
     values = np.rint(np.where(known, depth, 0).astype(np.float64) * scale)
-    fits = known & (values >= 1) & (values <= LARGEST)
+    fits = known & (values >= 1) & (values <= MAX_UINT16)
     stored = np.where(fits, values, 0).astype(np.uint16)
-    told = PngImagePlugin.PngInfo()
-    told.add_text("unit", unit)
-    told.add_text("value_per_unit", repr(scale))
+    chunks = PngImagePlugin.PngInfo()
+    chunks.add_text("unit", unit)
+    chunks.add_text("value_per_unit", repr(scale))
     with atomic_path(path) as temporary:
-        Image.fromarray(stored).save(temporary, format="PNG", pnginfo=told)
+        Image.fromarray(stored).save(temporary, format="PNG", pnginfo=chunks)
     return DepthPng(unit, scale, int(fits.sum()), int((known & ~fits).sum()))
 
 
@@ -94,16 +93,16 @@ def load_depth_png(path: str | Path) -> tuple[np.ndarray, str]:
         (H, W) float32 depths, NaN where unknown, and their unit.
 
     Raises:
-        ImageError: the file is missing or is no such file.
+        ImageError: the file is missing, or is no such depth map.
     """
     try:
         with Image.open(path) as image:
-            values, told = np.asarray(image), image.info
-        scale, unit = float(told["value_per_unit"]), str(told["unit"])
+            values, info = np.asarray(image), image.info
+        scale, unit = float(info["value_per_unit"]), str(info["unit"])
     except FileNotFoundError:
         raise ImageError(f"there is no file {path}: check the path") from None
     except (OSError, ValueError, KeyError) as error:
-        raise ImageError(f"{path} is no depth map with its scale ({error})") from None
+        raise ImageError(f"{path} is no depth map that carries its scale ({error})") from None
     return np.where(values == 0, np.nan, values / scale).astype(np.float32), unit
 
 
@@ -117,7 +116,7 @@ def save_depth_npz(depth: np.ndarray, path: str | Path, unit: str, **arrays: np.
         **arrays: further arrays, as `disparity`.
 
     Raises:
-        OptionError: the map is no (H, W) array, the unit is unknown, or the ending is another.
+        OptionError: the map is no (H, W) array, the unit is unknown, or the suffix is wrong.
         DeepDetectError: the file cannot be written.
     """
     depth = _checked(depth, unit)
@@ -126,7 +125,7 @@ def save_depth_npz(depth: np.ndarray, path: str | Path, unit: str, **arrays: np.
     known = np.isfinite(depth) & (depth > 0)
     stored = np.where(known, depth, np.nan).astype(np.float32)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, depth=stored, unit=np.array(unit), **arrays)
+        np.savez_compressed(file, depth=stored, unit=np.array(unit), **arrays)  # type: ignore[arg-type]
 
 
 def _checked(depth: Any, unit: str) -> np.ndarray:
@@ -141,10 +140,10 @@ def _checked(depth: Any, unit: str) -> np.ndarray:
 
 
 def _scale(depths: np.ndarray) -> float:
-    """Choose the finest round scale that holds all depths but those very far away."""
+    """Choose the finest round scale that holds all depths but outliers."""
     if not len(depths):
         return 1.0
-    furthest = min(float(depths.max()), FAR * float(np.percentile(depths, 99)))
-    finest = LARGEST / furthest
+    furthest = min(float(depths.max()), HEADROOM * float(np.percentile(depths, 99)))
+    finest = MAX_UINT16 / furthest
     power = 10.0 ** np.floor(np.log10(finest))
     return float(max(step * power for step in (1, 2, 5) if step * power <= finest * (1 + 1e-12)))

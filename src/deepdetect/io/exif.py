@@ -1,4 +1,4 @@
-"""The focal length that a camera has written into its photograph."""
+"""Focal lengths from the EXIF tags of photographs."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ import numpy as np
 from .._shared.errors import ReconstructionError
 from ..geometry.camera import Calibration, Camera, Size
 
-DIAGONAL_35MM = float(np.hypot(36, 24))
-"""Diagonal of a 35 mm film's picture in mm, which the equivalent focal length refers to (CIPA)."""
+DIAGONAL_35MM_MM = float(np.hypot(36, 24))
+"""Diagonal of a frame of 35 mm film, which the equivalent focal length refers to (CIPA)."""
 
-MM_A_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """Of FocalPlaneResolutionUnit: inch, centimetre, and by custom millimetre and micrometre."""
 
 ORIENTATION, EXIF_BLOCK = 0x0112, 0x8769
 FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
-PLANE_X, PLANE_Y, PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
+FOCAL_PLANE_X, FOCAL_PLANE_Y, FOCAL_PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
 WIDTH, HEIGHT = 0xA002, 0xA003
 
-TURNED = (5, 6, 7, 8)
-"""Orientations that change width and height."""
+TRANSPOSED = (5, 6, 7, 8)
+"""Orientations that exchange width and height."""
 
-AGREEMENT = 0.1
-"""Share by which the focal length by the resolution of the sensor may differ from that by the 35 mm
-equivalent: the one is finer, but often wrong."""
+MAX_FOCAL_DIFFERENCE = 0.1
+"""Relative difference up to which the focal length by the resolution of the sensor, which is finer
+but often wrong, is preferred to the one by the 35 mm equivalent."""
+
+MAX_ASPECT_DIFFERENCE = 0.01
+"""Relative difference of the aspect ratios above which a photograph counts as cropped."""
 
 ADVICE = "give `focal_px` or `calibration`"
 
-SAME_SHAPE = 0.01
-"""Share by which the ratio of the sides may differ from that of the photograph as it was taken."""
-
 
 def calibration_from_exif(image0: Any, image1: Any, size0: Size, size1: Size) -> Calibration:
-    """Return the calibration that two photographs carry; principal points in the middle.
+    """Read a calibration from two photographs; the principal points are in the middle.
 
     Args:
-        image0, image1: paths, file contents as bytes, or PIL images, as of `load_image`.
-        size0, size1: (width, height) in pixels as `load_image` gives them: files are turned
+        image0, image1: paths, file contents as bytes, or PIL images, as for `load_image`.
+        size0, size1: (width, height) in pixels as `load_image` returns them: files are turned
             upright, PIL images are not.
 
     Raises:
@@ -52,33 +52,33 @@ def calibration_from_exif(image0: Any, image1: Any, size0: Size, size1: Size) ->
 
 
 def camera_from_exif(image: Any, size: Size) -> Camera:
-    """Return the camera that a photograph carries.
+    """Read the camera of a photograph.
 
-    From FocalLength and the resolution of the sensor where these agree with
-    FocalLengthIn35mmFilm or stand alone, else from FocalLengthIn35mmFilm by the diagonal.
+    Its focal length is that of FocalLength and the resolution of the sensor, where these agree
+    with FocalLengthIn35mmFilm or it is missing; else that of FocalLengthIn35mmFilm.
 
     Args:
         image: a path, a file's content as bytes, or a PIL image.
-        size: (width, height) in pixels, as `load_image` gives it.
+        size: (width, height) in pixels, as `load_image` returns it.
 
     Raises:
         ReconstructionError: it carries no usable focal length, or has been cropped since.
     """
     name = f"{image}" if isinstance(image, (str, Path)) else "the image"
     tags, orientation = _tags(image)
-    turned = orientation in TURNED and not hasattr(image, "getexif")
+    turned = orientation in TRANSPOSED and not hasattr(image, "getexif")
     own = (size[1], size[0]) if turned else size
     taken = (_number(tags.get(WIDTH)), _number(tags.get(HEIGHT)))
     if not min(taken) > 0:
         taken = (float(own[0]), float(own[1]))
-    if abs(own[0] * taken[1] / (own[1] * taken[0]) - 1) > SAME_SHAPE:
+    if abs(own[0] * taken[1] / (own[1] * taken[0]) - 1) > MAX_ASPECT_DIFFERENCE:
         raise ReconstructionError(
             f"{name} was cropped after it was taken ({taken[0]:.0f}x{taken[1]:.0f} by its EXIF), "
-            f"which its focal length does not tell: {ADVICE}"
+            f"so its focal length does not apply: {ADVICE}"
         )
-    film = _number(tags.get(FOCAL_LENGTH_35MM)) * float(np.hypot(*own)) / DIAGONAL_35MM
+    film = _number(tags.get(FOCAL_LENGTH_35MM)) * float(np.hypot(*own)) / DIAGONAL_35MM_MM
     focal = _by_sensor(tags, own[0] / taken[0])
-    if focal is None or (film > 0 and abs(focal[0] / film - 1) > AGREEMENT):
+    if focal is None or (film > 0 and abs(focal[0] / film - 1) > MAX_FOCAL_DIFFERENCE):
         focal = (film, film)
     if not min(focal) > 0:
         raise ReconstructionError(f"{name} carries no focal length (EXIF): {ADVICE}")
@@ -88,16 +88,16 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
 def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None:
     """Return (fx, fy) in pixels from the resolution of the sensor, or None."""
     length = _number(tags.get(FOCAL_LENGTH))
-    unit = MM_A_UNIT.get(int(_number(tags.get(PLANE_UNIT))) or 2, 0.0)
-    across = _number(tags.get(PLANE_X))
-    down = _number(tags.get(PLANE_Y)) or across
+    unit = MM_PER_UNIT.get(int(_number(tags.get(FOCAL_PLANE_UNIT))) or 2, 0.0)
+    across = _number(tags.get(FOCAL_PLANE_X))
+    down = _number(tags.get(FOCAL_PLANE_Y)) or across
     if not (length > 0 and unit > 0 and across > 0 and down > 0):
         return None
     return length * across / unit * scale, length * down / unit * scale
 
 
 def _tags(image: Any) -> tuple[dict[int, Any], int]:
-    """Read the EXIF tags and the orientation; what cannot be read is not there."""
+    """Read the EXIF tags and the orientation; unreadable tags count as missing."""
     from PIL import Image
 
     try:
@@ -110,7 +110,7 @@ def _tags(image: Any) -> tuple[dict[int, Any], int]:
         else:
             return {}, 1
         return dict(exif.get_ifd(EXIF_BLOCK)), int(exif.get(ORIENTATION, 1))
-    except Exception:  # Pillow's readers raise many kinds; a broken tag is no tag
+    except Exception:  # Pillow's readers raise many kinds; broken tags are ignored
         return {}, 1
 
 

@@ -17,10 +17,10 @@ import numpy as np
 
 from ..geometry.point_cloud import PointCloud
 
-METRES = {"mm": 1e-3, "baseline": 1.0}
-"""A unit in metres; of an unknown baseline we make one metre, and say so."""
+METRES_PER_UNIT = {"mm": 1e-3, "baseline": 1.0}
+"""A baseline of unknown length becomes one metre, and the file says so."""
 
-SCALE_WORDS = {
+SCALE_NOTES = {
     "mm": "metres",
     "baseline": "the scale is not known: 1 stands for the distance of the two cameras",
 }
@@ -28,22 +28,22 @@ SCALE_WORDS = {
 FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
 
 
-def write_glb(cloud: PointCloud, path: Path, notes: Mapping[str, str]) -> None:
+def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
     """Write the points in glTF's frame, x right, y up, z backward, with their colours.
 
     (x, y, z) becomes (x, -y, -z), which is a half turn about the x axis: nothing is mirrored.
-    Colours become linear as glTF wants them, with 16 bits, which keep each of the 256 sRGB
-    levels apart. 20 bytes a point.
+    Colours become linear as glTF requires, with 16 bits, which keep each of the 256 sRGB
+    levels apart. 20 bytes per point.
 
     Args:
         cloud: the cloud; millimetres become metres, a baseline becomes 1 metre.
         path: the file.
-        notes: go into the asset's extras, with unit and frame.
+        metadata: stored in the asset's extras, with unit and frame.
     """
     positions = to_gltf_frame(cloud).astype("<f4")
     colors = np.full((len(cloud), 4), 65535, "<u2")
     colors[:, :3] = _linear_levels()[cloud.colors]
-    text = json.dumps(_tree(cloud, positions, notes), separators=(",", ":")).encode("ascii")
+    text = json.dumps(_tree(cloud, positions, metadata), separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)
     size = positions.nbytes + colors.nbytes  # a multiple of 4
     with path.open("wb") as file:
@@ -56,14 +56,14 @@ def write_glb(cloud: PointCloud, path: Path, notes: Mapping[str, str]) -> None:
 
 
 def to_gltf_frame(cloud: PointCloud) -> np.ndarray:
-    """Return the points as glTF wants them: x right, y up, z backward, in metres.
+    """Return the points in glTF's frame: x right, y up, z backward, in metres.
 
     Example:
         >>> cloud = PointCloud([[10.0, 20.0, 3000.0]], [[0, 0, 0]], "mm")
         >>> to_gltf_frame(cloud).tolist()
         [[0.01, -0.02, -3.0]]
     """
-    return cloud.points * (np.array([1, -1, -1]) * METRES[cloud.unit])
+    return cloud.points * (np.array([1, -1, -1]) * METRES_PER_UNIT[cloud.unit])
 
 
 def _linear_levels() -> np.ndarray:
@@ -73,16 +73,16 @@ def _linear_levels() -> np.ndarray:
     return np.rint(linear * 65535).astype("<u2")
 
 
-def _tree(cloud: PointCloud, positions: np.ndarray, notes: Mapping[str, str]) -> dict[str, Any]:
+def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str]) -> dict[str, Any]:
     count = len(cloud)
     return {
         "asset": {
             "version": "2.0",
             "generator": "deepdetect",
             "extras": {
-                "unit": SCALE_WORDS[cloud.unit],
+                "unit": SCALE_NOTES[cloud.unit],
                 "frame": "origin at the left camera, x right, y up, z backward",
-                "notes": dict(notes),
+                "notes": dict(metadata),
             },
         },
         "scene": 0,

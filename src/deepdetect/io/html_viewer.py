@@ -1,6 +1,6 @@
-"""One HTML page in which a cloud can be turned, with all points inside and no network.
+"""An interactive viewer of a point cloud as one self-contained HTML page.
 
-The page itself is `viewer.html` beside this module: plain JavaScript and WebGL 1.
+The page is `viewer.html` beside this module: plain JavaScript and WebGL 1.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import numpy as np
 
 from ..geometry.point_cloud import PointCloud, angular_spacing, robust_box
 
-LEVELS = 65535
-"""Steps of 16 bits, along each axis."""
+MAX_LEVEL = 65535
+"""Positions are stored in 16 bits per axis."""
 
 MARGIN = 1.0
-"""The page holds what lies at most so many sizes of the robust box outside it."""
+"""Points further outside the robust box than this many times its size are left out."""
 
-UNIT_WORDS = {"mm": "mm", "baseline": "baselines (distance of the two cameras; no scale)"}
+UNIT_NAMES = {"mm": "mm", "baseline": "baselines (distance of the two cameras; no scale)"}
 SHORT_UNITS = {"mm": "mm", "baseline": "baselines"}
 
 
@@ -36,7 +36,7 @@ class PagePoints:
         levels: (N, 3) uint16.
         colors: (N, 3) uint8.
         offset, step: (3,) float64, in the cloud's unit.
-        left_out: points too far away for the page.
+        left_out: number of points too far away for the page.
     """
 
     levels: np.ndarray
@@ -46,25 +46,25 @@ class PagePoints:
     left_out: int
 
 
-def write_html_page(cloud: PointCloud, path: Path, notes: Mapping[str, str]) -> None:
-    """Write the page: 12 bytes a point, as 16-bit positions and 8-bit colours in base64.
+def write_html_page(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
+    """Write the page: 12 bytes per point, as 16-bit positions and 8-bit colours in base64.
 
     Args:
         cloud: the cloud.
         path: the file.
-        notes: the caption, beside the counts, the unit and the step of the positions; one
-            named "title" becomes the heading.
+        metadata: added to the caption, which has the counts, the unit and the precision; the
+            entry "title" becomes the heading.
     """
     stored = page_points(cloud)
     caption = {
         "Points": f"{len(stored.levels):,}",
         **({"Left out, far away": f"{stored.left_out:,}"} if stored.left_out else {}),
-        "Unit": UNIT_WORDS[cloud.unit],
+        "Unit": UNIT_NAMES[cloud.unit],
         "Positions to": f"{stored.step.max() / 2:.2g} {SHORT_UNITS[cloud.unit]} (16 bits an axis)",
-        **{name: text for name, text in notes.items() if name != "title"},
+        **{name: text for name, text in metadata.items() if name != "title"},
     }
     values = {
-        "title": escape(notes.get("title", "Point cloud")),
+        "title": escape(metadata.get("title", "Point cloud")),
         "caption": "\n".join(
             f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in caption.items()
         ),
@@ -73,15 +73,15 @@ def write_html_page(cloud: PointCloud, path: Path, notes: Mapping[str, str]) -> 
         "colors": _base64(stored.colors),
     }
     template = resources.files(__package__).joinpath("viewer.html").read_text("utf-8")
-    # In one pass: a note that holds such a mark stays as it is.
+    # In one pass, so that metadata with such a mark stays as it is.
     page = re.sub(r"\{\{(\w+)\}\}", lambda mark: values[mark[1]], template)
     path.write_text(page, encoding="utf-8")
 
 
 def page_points(cloud: PointCloud) -> PagePoints:
-    """Round positions to 16 bits an axis, and leave out those far outside the robust box.
+    """Quantise positions to 16 bits per axis, without those far outside the robust box.
 
-    Without the latter, a few points very far away would make the steps coarse for all.
+    A few points very far away would make the steps coarse for all.
 
     Example:
         >>> points = np.array([[0.0, 0.0, 1.0]] * 99 + [[1.0, 1.0, 2.0]] * 99 + [[0, 0, 1e6]])
@@ -95,14 +95,14 @@ def page_points(cloud: PointCloud) -> PagePoints:
     near = ((cloud.points >= box.low - margin) & (cloud.points <= box.high + margin)).all(1)
     points = cloud.points[near].astype(np.float64)
     low, high = points.min(0), points.max(0)
-    step = np.where(high > low, (high - low) / LEVELS, 1.0)
+    step = np.where(high > low, (high - low) / MAX_LEVEL, 1.0)
     levels = np.rint((points - low) / step).astype(np.uint16)
     return PagePoints(levels, cloud.colors[near], low, step, int((~near).sum()))
 
 
 def _description(cloud: PointCloud, stored: PagePoints) -> dict[str, object]:
     box = robust_box(cloud)
-    corners = np.stack([stored.offset, stored.offset + LEVELS * stored.step])
+    corners = np.stack([stored.offset, stored.offset + MAX_LEVEL * stored.step])
     reach = np.linalg.norm(np.abs(corners - box.centre).max(0))
     return {
         "count": len(stored.levels),

@@ -1,4 +1,4 @@
-"""Reading images: whatever the user has, as 8-bit RGB or as luma.
+"""Reading images of any usual kind as 8-bit RGB or as luma.
 
 Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 """
@@ -22,7 +22,7 @@ MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
-"""File name endings that are taken for images when a folder is searched."""
+"""File name suffixes of the images that `find_images` lists."""
 
 FORMATS = (
     *("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "AVIF"),
@@ -97,7 +97,7 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
 
     Args:
         folder: the folder.
-        exclude: folders below it that are left out, as those of one's own results.
+        exclude: folders below it that are left out, such as the output folder.
 
     Raises:
         ImageError: the folder is missing, or holds no image.
@@ -161,7 +161,7 @@ def _decode(file: BinaryIO, name: str) -> np.ndarray:
 
 
 def _check_png(file: BinaryIO, name: str) -> None:
-    """Check the checksums of a PNG file, if it is one: Pillow leaves out those of the pixels."""
+    """Check the checksums of a PNG file, if it is one: Pillow skips those of the pixels."""
     if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
         kind = b""
         while kind != b"IEND":
@@ -188,7 +188,7 @@ def _hide_warning_of_large_images() -> None:
 
 
 def _upright(image: Any) -> Any:
-    """Turn a loaded picture by its EXIF tag; a broken tag is no broken picture."""
+    """Turn a loaded picture upright by its EXIF tag; a broken tag is ignored."""
     from PIL import Image
 
     if image.format == "TIFF":  # Pillow has turned it when it loaded it
@@ -210,7 +210,7 @@ def _upright(image: Any) -> Any:
 
 
 def _damaged(name: str, error: Exception | str) -> ImageError:
-    return ImageError(f"{name} is damaged or truncated ({error}): get it anew")
+    return ImageError(f"{name} is damaged or truncated ({error}): get it again")
 
 
 def _from_pil(image: Any, name: str = "the image", *, upright: bool = False) -> np.ndarray:

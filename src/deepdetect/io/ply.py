@@ -1,7 +1,7 @@
 """Binary PLY, which MeshLab, CloudCompare, Blender, Open3D and COLMAP read.
 
 Source: G. Turk, The PLY polygon file format, 1994. Our own writer, since those of libraries
-write no comments, without which neither the unit nor the frame is told.
+write no comments, which hold the unit and the frame.
 """
 
 from __future__ import annotations
@@ -15,34 +15,34 @@ from ..geometry.point_cloud import PointCloud
 
 VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
 
-UNIT_WORDS = {
+UNIT_NAMES = {
     "mm": "millimetres",
     "baseline": "baselines (1 = the distance of the two cameras)",
 }
 
 
-def write_ply(cloud: PointCloud, path: Path, notes: Mapping[str, str]) -> None:
-    """Write float x y z and uchar red green blue, little-endian, 15 bytes a point.
+def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
+    """Write float x y z and uchar red green blue, little-endian, 15 bytes per point.
 
     Args:
-        cloud: the cloud; frame and unit are kept and told in comments.
+        cloud: the cloud; its frame and unit are kept, and written as comments.
         path: the file.
-        notes: further comments; what is not ASCII becomes "?".
+        metadata: further comments; what is not ASCII becomes "?".
     """
     vertices = np.empty(len(cloud), VERTEX)
     vertices["xyz"] = cloud.points
     vertices["rgb"] = cloud.colors
     with path.open("wb") as file:
-        file.write(_header(cloud, notes).encode("ascii", "replace"))
+        file.write(_header(cloud, metadata).encode("ascii", "replace"))
         vertices.tofile(file)
 
 
-def _header(cloud: PointCloud, notes: Mapping[str, str]) -> str:
+def _header(cloud: PointCloud, metadata: Mapping[str, str]) -> str:
     comments = [
         "written by deepdetect",
-        f"unit: {UNIT_WORDS[cloud.unit]}",
+        f"unit: {UNIT_NAMES[cloud.unit]}",
         "frame: left camera, x right, y down, z forward, origin at its centre",
-        *(f"{name}: {text}" for name, text in notes.items()),
+        *(f"{name}: {text}" for name, text in metadata.items()),
     ]
     return "\n".join(
         [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -66,14 +67,14 @@ class LabelReport:
         image: the image file.
         mask: the mask file.
         visibility: the settings that were used, "normal" or "low"; None when it failed.
-        density: fraction of the pixels that are marked; None when it failed.
+        density: fraction of the pixels that are marked; NaN when it failed.
         error: what went wrong, or None.
     """
 
     image: Path
     mask: Path
     visibility: str | None = None
-    density: float | None = None
+    density: float = math.nan
     error: str | None = None
 
 

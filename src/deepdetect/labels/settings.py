@@ -23,12 +23,12 @@ SECTIONS: dict[str, Visibility] = {"normal": "normal", "low_visibility": "low"}
 
 @dataclass(frozen=True)
 class SettingChange:
-    """One setting of one label detector, changed.
+    """A changed setting of a label detector.
 
     Attributes:
-        detector: the detector's name, as "fast".
-        visibility: which of its two settings is changed, "normal" or "low".
-        name: the setting's name, as "threshold".
+        detector: the detector's name, such as "fast".
+        visibility: which of its two sets of settings is changed, "normal" or "low".
+        name: the setting's name, such as "threshold".
         value: its new value.
 
     Raises:
@@ -73,7 +73,7 @@ class SettingChange:
 def settings_for(
     detector: LabelDetector, visibility: Visibility, changes: Iterable[SettingChange]
 ) -> Any:
-    """Return a detector's settings for a visibility, with the changes that concern them."""
+    """Return a detector's settings for a visibility, with the changes that apply."""
     settings = detector.normal if visibility == "normal" else detector.low_visibility
     values = {
         change.name: change.value
@@ -85,7 +85,7 @@ def settings_for(
 
 @dataclass(frozen=True)
 class LabelSettings:
-    """What a settings file says.
+    """The label detectors and their settings, as a settings file holds them.
 
     Attributes:
         detectors: names of the detectors to fuse.
@@ -101,7 +101,7 @@ class LabelSettings:
         if idle:
             raise OptionError(
                 f"settings of {idle[0]} are given, but it is not among the detectors: "
-                "add it to them, or take its settings away"
+                "add it to them, or remove its settings"
             )
 
 
@@ -132,7 +132,7 @@ def find_label_settings(settings: str | Path) -> LabelSettings:
 def read_label_settings(path: str | Path) -> LabelSettings:
     """Read detectors and their settings from a TOML file.
 
-    The file may name the detectors, and changes some of their settings::
+    The file may name the detectors, and change some of their settings::
 
         detectors = ["fast", "harris", "sobel"]  # default: all nine
 
@@ -162,16 +162,17 @@ def _parsed(content: dict[str, Any]) -> LabelSettings:
     changes = []
     for detector, sections in content.items():
         changes += _changes(detector, sections)
-    # The order in the file says nothing, so it must not make other options of the same.
+    # The order in the file has no meaning: the same settings must give equal options.
     changes.sort(key=lambda change: (change.detector, change.visibility, change.name))
-    for detector in select_detectors({change.detector for change in changes}) if changes else ():
-        for visibility in SECTIONS.values():
-            _try(detector, visibility, changes)
+    for entry in DETECTORS:
+        if any(change.detector == entry.name for change in changes):
+            for visibility in SECTIONS.values():
+                _try(entry, visibility, changes)
     return LabelSettings(tuple(detectors), tuple(changes))
 
 
 def _try(detector: LabelDetector, visibility: Visibility, changes: list[SettingChange]) -> None:
-    """Run a detector once, so that values OpenCV refuses are told at once."""
+    """Run a detector once, so that values which OpenCV refuses are reported at once."""
     pattern = (np.indices((64, 64)).sum(0) // 8 % 2 * 200).astype(np.uint8)
     try:
         detector.mask(pattern, settings_for(detector, visibility, changes))

@@ -12,12 +12,12 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError
 from ..features.keypoints import Keypoints
 
-SPARSE = 5000
-"""Up to so many keypoints are drawn as circles, more as single pixels."""
+MAX_CIRCLES = 5000
+"""More keypoints than this are drawn as single pixels."""
 
-ENDINGS = (".png", ".jpg", ".jpeg")
-JPEG_SIDE = 65_500
-"""Pixels of width and height that libjpeg writes at most."""
+SUFFIXES = (".png", ".jpg", ".jpeg")
+MAX_JPEG_SIDE_PX = 65_500
+"""The largest width and height that libjpeg writes."""
 
 CAPTION_HEIGHT = 28
 GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
@@ -34,39 +34,39 @@ def save_picture(rgb: np.ndarray, path: str | Path) -> None:
         OptionError: the ending is another.
         DeepDetectError: the file cannot be written, or its format holds no picture of this size.
     """
-    ending = picture_ending(path)
-    data = _encoded(rgb, ending)
+    suffix = picture_suffix(path)
+    data = _encode(rgb, suffix)
     if data is None:
         size = f"{rgb.shape[1]}x{rgb.shape[0]}"
-        advice = "make it smaller" if ending == ".png" else "give it a name that ends in .png"
+        advice = "make it smaller" if suffix == ".png" else "give it a name that ends in .png"
         raise DeepDetectError(f"{path} cannot hold a picture of {size} pixels: {advice}")
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
-def picture_ending(path: str | Path) -> str:
-    """Return the ending of a picture's file, in small letters, before any work is done for it.
+def picture_suffix(path: str | Path) -> str:
+    """Return the suffix of a picture's file in lower case; call it before any expensive work.
 
     Raises:
         OptionError: `save_picture` does not write such files.
 
     Example:
-        >>> picture_ending("panorama.JPG")
+        >>> picture_suffix("panorama.JPG")
         '.jpg'
     """
-    ending = Path(path).suffix.lower()
-    if ending not in ENDINGS:
-        raise OptionError(f"{path} must end in {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}")
-    return ending
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise OptionError(f"{path} must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+    return suffix
 
 
-def _encoded(rgb: np.ndarray, ending: str) -> bytes | None:
+def _encode(rgb: np.ndarray, suffix: str) -> bytes | None:
     """Return the file's content, or None where the format does not hold such a picture."""
-    # Asked before OpenCV is, which would also log it.
-    if ending != ".png" and max(rgb.shape[:2]) > JPEG_SIDE:
+    # Checked before OpenCV is asked, which would also log it.
+    if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
         return None
     try:
-        done, data = cv2.imencode(ending, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        done, data = cv2.imencode(suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
     except cv2.error:
         return None
     return data.tobytes() if done else None
@@ -83,7 +83,7 @@ def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
 
 
 def draw_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw keypoints over a dimmed image: circles when they are few, else pixels.
+    """Draw keypoints over a dimmed image: as circles when they are few, else as pixels.
 
     Args:
         rgb: (H, W, 3) uint8 RGB.
@@ -94,7 +94,7 @@ def draw_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     """
     canvas = rgb // 2
     pixels = np.rint(keypoints.xy).astype(int)
-    if len(keypoints) <= SPARSE:
+    if len(keypoints) <= MAX_CIRCLES:
         for x, y in pixels.tolist():
             cv2.circle(canvas, (x, y), 3, GREEN, 1, cv2.LINE_AA)
         return canvas
@@ -118,11 +118,11 @@ def draw_matches(
         rgb0, rgb1: the images, (H, W, 3) uint8 RGB.
         points0, points1: (M, 2) matched positions.
         good: (M,) bool: green lines, the others red.
-        lines: number of lines; the sample is random with a fixed seed, so the shares
-            of green and red are those of all matches.
+        lines: number of lines; the sample is random with a fixed seed, so green and red
+            have the proportions of all matches.
 
     Returns:
-        (H, W0 + W1, 3) uint8 RGB, H of the higher image.
+        (H, W0 + W1, 3) uint8 RGB, H that of the taller image.
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
     canvas = np.zeros((height, rgb0.shape[1] + rgb1.shape[1], 3), np.uint8)
@@ -158,7 +158,7 @@ def draw_masks(rgb: np.ndarray, masks: Mapping[str, np.ndarray], title: str) -> 
 
 
 def add_caption(rgb: np.ndarray, text: str) -> np.ndarray:
-    """Put a line of text under a picture, shrunk to its width where needed."""
+    """Add a line of text below a picture, scaled down to fit its width."""
     strip = np.zeros((CAPTION_HEIGHT, rgb.shape[1], 3), np.uint8)
     scale = 0.5
     (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
@@ -168,24 +168,23 @@ def add_caption(rgb: np.ndarray, text: str) -> np.ndarray:
 
 
 def hstack(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
-    """Join pictures of one height in a row, with a white gap."""
+    """Join pictures from left to right, with a white gap, and black below lower ones."""
     height = max(panel.shape[0] for panel in panels)
-    joined = []
+    joined: list[np.ndarray] = []
     for panel in panels:
         if joined:
             joined.append(np.full((height, gap, 3), 255, np.uint8))
-        below = height - panel.shape[0]
-        joined.append(np.pad(panel, ((0, below), (0, 0), (0, 0))))
+        joined.append(np.pad(panel, ((0, height - panel.shape[0]), (0, 0), (0, 0))))
     return np.concatenate(joined, axis=1)
 
 
 def vstack(rows: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
     """Join pictures from top to bottom, with a white gap, and white beside narrower ones."""
     width = max(row.shape[1] for row in rows)
-    joined = []
+    joined: list[np.ndarray] = []
     for row in rows:
         if joined:
             joined.append(np.full((gap, width, 3), 255, np.uint8))
-        beside = width - row.shape[1]
-        joined.append(np.pad(row, ((0, 0), (0, beside), (0, 0)), constant_values=255))
+        padding = ((0, 0), (0, width - row.shape[1]), (0, 0))
+        joined.append(np.pad(row, padding, constant_values=255))
     return np.concatenate(joined)

@@ -19,18 +19,16 @@ from ..geometry.point_cloud import (
 from .draw import add_caption, hstack, vstack
 
 SUPERSAMPLING = 2
-"""A pixel is the mean of so many by so many: edges are smooth."""
+"""Each pixel is the mean of this many by this many, which makes edges smooth."""
 
-FILLED = 0.95
-"""Share of the picture's width or height that the cloud takes."""
+FILL_RATIO = 0.95
+"""Fraction of the picture's width or height that the cloud takes."""
 
-OVERLAP = 1.4
-"""Points are drawn so much wider than they lie apart: gaps close, also seen from the side."""
+POINT_OVERLAP = 1.4
+"""Points are drawn this much wider than their spacing, to close gaps also in side views."""
 
-WIDEST = 5
-"""Pixels: no point is drawn wider by itself, so that few points look like few."""
-
-EMPTY = np.iinfo(np.uint64).max
+MAX_POINT_WIDTH_PX = 5
+"""No point is drawn wider by default, so that a sparse cloud looks sparse."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +39,14 @@ class ViewCamera:
         position: (3,) float64 centre, in the cloud's frame.
         axes: (3, 3) float64, whose rows are its right, down and forward.
         focal: in pixels.
-        middle: (2,) float64, the pixel position of its axis.
+        principal_point: (2,) float64 pixel position of its axis.
         size: (width, height) of the picture in pixels.
     """
 
     position: np.ndarray
     axes: np.ndarray
     focal: float
-    middle: np.ndarray
+    principal_point: np.ndarray
     size: tuple[int, int]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -59,12 +57,12 @@ class ViewCamera:
 
         Returns:
             (N, 2) float64 pixel positions, and (N,) float64 depths along the axis; the positions
-            of points whose depth is not above 0 mean nothing.
+            of points whose depth is not above 0 are undefined.
         """
         seen = (points - self.position) @ self.axes.T
         depth = seen[:, 2]
         scale = self.focal / np.where(depth > 0, depth, np.inf)
-        return seen[:, :2] * scale[:, None] + self.middle, depth
+        return seen[:, :2] * scale[:, None] + self.principal_point, depth
 
 
 def orbit_camera(
@@ -75,8 +73,8 @@ def orbit_camera(
 ) -> ViewCamera:
     """Place a camera that looks at the robust centre of a cloud, which fills its picture.
 
-    It stands as far from the centre as the left camera does, so that the picture looks as the
-    photograph does when the angles are small.
+    Its distance from the centre is that of the left camera, so that small angles give a picture
+    like the photograph.
 
     Args:
         cloud: the cloud.
@@ -85,8 +83,8 @@ def orbit_camera(
         size: (width, height) of the picture in pixels.
 
     Returns:
-        The camera; 98 % of the points lie between its left and right border, and as many
-        between its upper and lower one.
+        The camera; 98 % of the points lie between its left and right border, and 98 % between
+        its upper and lower one.
 
     Raises:
         OptionError: the cloud is empty, or a value is out of its range.
@@ -114,20 +112,20 @@ def orbit_camera(
     plain = ViewCamera(position, axes, 1.0, np.zeros(2), size)
     xy, depth = plain.project(cloud.points)
     low, high = np.percentile(xy[depth > 0], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
-    wanted = FILLED * np.array(size) / np.maximum(high - low, 1e-6)
+    wanted = FILL_RATIO * np.array(size) / np.maximum(high - low, 1e-6)
     focal = float(wanted.min())
-    middle = (np.array(size) - 1) / 2 - focal * (low + high) / 2
-    return ViewCamera(position, axes, focal, middle, size)
+    principal_point = (np.array(size) - 1) / 2 - focal * (low + high) / 2
+    return ViewCamera(position, axes, focal, principal_point, size)
 
 
 def render(cloud: PointCloud, camera: ViewCamera, point_width: float | None = None) -> np.ndarray:
-    """Draw a cloud as squares that hide what lies behind them, on white.
+    """Draw a cloud on white, each point as a square that hides what lies behind it.
 
     Args:
         cloud: the cloud.
         camera: the viewer.
-        point_width: of a point in pixels; without one, as wide as the points of this cloud
-            must be for a closed surface, which differs from point to point.
+        point_width: width of the points in pixels; by default each is as wide as its spacing
+            and depth need for a closed surface.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -206,9 +204,9 @@ def draw_clouds(
 def _finer(camera: ViewCamera) -> ViewCamera:
     times = SUPERSAMPLING
     # The centre of the first fine pixel lies before that of the first pixel.
-    middle = camera.middle * times + (times - 1) / 2
+    principal_point = camera.principal_point * times + (times - 1) / 2
     size = (camera.size[0] * times, camera.size[1] * times)
-    return replace(camera, focal=camera.focal * times, middle=middle, size=size)
+    return replace(camera, focal=camera.focal * times, principal_point=principal_point, size=size)
 
 
 def _nearest_points(cloud: PointCloud, camera: ViewCamera, point_width: float | None) -> np.ndarray:
@@ -216,28 +214,22 @@ def _nearest_points(cloud: PointCloud, camera: ViewCamera, point_width: float | 
     width, height = camera.size
     xy, depth = camera.project(cloud.points)
     if point_width is None:
-        spread = camera.focal * OVERLAP * angular_spacing(cloud)
+        spread = camera.focal * POINT_OVERLAP * angular_spacing(cloud)
         sides = spread * np.maximum(cloud.points[:, 2], 0) / np.where(depth > 0, depth, np.inf)
-        sides = np.minimum(sides, WIDEST * SUPERSAMPLING)
+        sides = np.minimum(sides, MAX_POINT_WIDTH_PX * SUPERSAMPLING)
     else:
         sides = np.full(len(cloud), point_width * SUPERSAMPLING)
     sides = np.maximum(np.rint(sides), 1).astype(np.int64)
     corners = np.rint(xy - (sides[:, None] - 1) / 2)
-    shown = (depth > 0) & (corners > -sides[:, None]).all(1) & (corners < camera.size).all(1)
-    # Nearer is smaller: the bits of a float above 0 are in its order. The index decides ties.
-    index = np.flatnonzero(shown)
-    index = index[np.argsort(-sides[index], kind="stable")]  # the widest first
-    keys = depth[index].astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
-    keys |= index.astype(np.uint64)
-    x, y = corners[index].astype(np.int64).T
-    sides = sides[index]
-    buffer = np.full(width * height, EMPTY)
-    for across in range(int(sides.max(initial=0))):
-        for down in range(int(sides.max(initial=0))):
-            count = int(np.searchsorted(-sides, -max(across, down), side="left"))
-            column, row = x[:count] + across, y[:count] + down
-            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            place = row[inside] * width + column[inside]
-            np.minimum.at(buffer, place, keys[:count][inside])
-    buffer = buffer.reshape(height, width)
-    return np.where(buffer == EMPTY, -1, (buffer & np.uint64(0xFFFFFFFF)).astype(np.int64))
+    visible = (depth > 0) & (corners > -sides[:, None]).all(1) & (corners < camera.size).all(1)
+    # From here on a point is its rank by depth, and the smallest rank is what a pixel shows.
+    order = np.flatnonzero(visible)
+    order = order[np.argsort(depth[order].astype(np.float32), kind="stable")]
+    sides, corners = sides[order], corners[order].astype(np.int64)
+    nearest = np.full(width * height, len(order))
+    for across, down in np.ndindex(2 * (int(sides.max(initial=0)),)):
+        rank = np.flatnonzero(sides > max(across, down))
+        column, row = (corners[rank] + (across, down)).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        np.minimum.at(nearest, row[inside] * width + column[inside], rank[inside])
+    return np.append(order, -1)[nearest].reshape(height, width)
