@@ -14,7 +14,7 @@ def datasets() -> None:
     """Download data sets for training and for the benchmarks."""
 
 
-@datasets.command("list", short_help="Show the data sets that can be had.")
+@datasets.command("list", short_help="Show the available data sets.")
 @json_option
 def list_datasets(as_json: bool) -> None:
     """Show the data sets that can be downloaded."""
@@ -51,7 +51,7 @@ def list_datasets(as_json: bool) -> None:
 def get(name: str, output: Path | None, as_json: bool) -> None:
     """Download the data set NAME and unpack it.
 
-    Given again, the command goes on where it was broken off.
+    Run it again to resume a download that broke off.
 
     \b
     deepdetect datasets get coco

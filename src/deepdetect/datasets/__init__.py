@@ -1,4 +1,4 @@
-"""Data sets: real images with a known truth. A new one is a module here and a line below."""
+"""Data sets with ground truth. To add one, write a module here and add a line below."""
 
 from collections.abc import Callable
 

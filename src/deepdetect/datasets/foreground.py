@@ -1,4 +1,4 @@
-"""Photographs with a mask of their foreground, as of ECSSD (Yan et al., 2013).
+"""Photographs with a mask of their foreground, for example ECSSD (Yan et al., 2013).
 
 NAME.jpg (or .png) and NAME_mask.png lie side by side; the mask is white on the foreground.
 """

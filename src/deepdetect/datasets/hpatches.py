@@ -50,12 +50,12 @@ def load_hpatches(folder: str | Path) -> list[PlanarScene]:
 
 
 def is_illumination(scene: PlanarScene) -> bool:
-    """Tell scenes that change the light from those that change the viewpoint."""
+    """Whether a scene changes the light; the others change the viewpoint."""
     return scene.name.startswith("i_")
 
 
 def in_d2net_subset(scene: PlanarScene) -> bool:
-    """Tell whether a scene is one of the 108 that papers usually measure."""
+    """Whether a scene is one of the 108 of the D2-Net subset, on which most papers report."""
     return scene.name not in NOT_IN_D2NET_SUBSET
 
 

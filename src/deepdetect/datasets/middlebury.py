@@ -1,4 +1,4 @@
-"""Rectified stereo with ground truth, as of Middlebury 2003 to 2014 (Scharstein and Szeliski).
+"""Rectified stereo with ground truth: Middlebury 2003 to 2014 (Scharstein and Szeliski).
 
 A scene is a folder with left.png, right.png, disparity.png (of the left view) and a calib.json,
 which says how the grey values of the disparity become pixels::

@@ -68,8 +68,8 @@ def to_gltf_frame(cloud: PointCloud) -> np.ndarray:
 
 def _linear_levels() -> np.ndarray:
     """Return the 16-bit linear level of each of the 256 levels of sRGB (IEC 61966-2-1)."""
-    share = np.arange(256) / 255
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    srgb = np.arange(256) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     return np.rint(linear * 65535).astype("<u2")
 
 

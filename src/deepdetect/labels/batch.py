@@ -128,7 +128,7 @@ def label_file(task: LabelTask) -> list[LabelReport]:
 
 
 def unfinished_tasks(tasks: Iterable[LabelTask]) -> list[LabelTask]:
-    """Leave out what is done; whether with the same options, `LabelTarget.is_stale` tells."""
+    """Leave out the targets that are done; `LabelTarget.is_stale` checks their options."""
     left = []
     for task in tasks:
         targets = tuple(target for target in task.targets if not target.is_done)

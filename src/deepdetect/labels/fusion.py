@@ -9,7 +9,7 @@ import numpy as np
 from ..viz.draw import draw_masks
 from .detectors import DETECTOR_NAMES, select_detectors
 from .settings import SettingChange, settings_for
-from .visibility import Visibility, VisibilityChoice, visibility_of
+from .visibility import Visibility, VisibilityChoice, check_visibility, visibility_of
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class LabelOptions:
         names = (self.detectors,) if isinstance(self.detectors, str) else self.detectors
         chosen = select_detectors(names)
         object.__setattr__(self, "detectors", tuple(detector.name for detector in chosen))
-        visibility_of(np.zeros((1, 1), np.uint8), self.visibility)
+        check_visibility(self.visibility)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Label:
 
     @property
     def density(self) -> float:
-        """Share of the pixels that are marked."""
+        """Fraction of the pixels that are marked."""
         return float(self.mask.mean())
 
 

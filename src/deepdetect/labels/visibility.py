@@ -1,4 +1,4 @@
-"""The rule that tells a low-visibility image from a normal one."""
+"""Which images are of low visibility."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ def luma_range(gray: np.ndarray) -> float:
         gray: (H, W) uint8 luma.
     """
     histogram = np.bincount(gray.ravel(), minlength=256)
-    share = np.cumsum(histogram) / gray.size
-    darkest, brightest = np.searchsorted(share, [0.01, 0.99])
+    cumulative = np.cumsum(histogram) / gray.size
+    darkest, brightest = np.searchsorted(cumulative, [0.01, 0.99])
     return float(brightest - darkest)
 
 
 def visibility_of(gray: np.ndarray, choice: VisibilityChoice = "auto") -> Visibility:
     """Decide which detector settings an image gets.
 
-    The rule: an image is of low visibility when its luma spans fewer than 64
+    An image is of low visibility when its luma spans fewer than 64
     grey levels between the 1st and the 99th percentile. (The paper's darkened
     images span at most 32; its normal ones at least 146.)
 
@@ -48,8 +48,17 @@ def visibility_of(gray: np.ndarray, choice: VisibilityChoice = "auto") -> Visibi
         >>> visibility_of(np.full((16, 16), 20, np.uint8))
         'low'
     """
-    if choice not in get_args(VisibilityChoice):
-        raise unknown_name("visibility", choice, get_args(VisibilityChoice))
+    check_visibility(choice)
     if choice != "auto":
         return choice
     return "low" if luma_range(gray) < LOW_VISIBILITY_RANGE else "normal"
+
+
+def check_visibility(choice: VisibilityChoice) -> None:
+    """Check the name of a choice.
+
+    Raises:
+        OptionError: it is unknown (the nearest right one is named).
+    """
+    if choice not in get_args(VisibilityChoice):
+        raise unknown_name("visibility", choice, get_args(VisibilityChoice))

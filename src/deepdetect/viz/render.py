@@ -167,7 +167,7 @@ def draw_clouds(
         left: (H, W, 3) uint8 RGB, the left image.
         clouds: by title; the one with the most points decides where the camera stands. All
             are in the frame of the left camera and in one unit.
-        azimuth, elevation: degrees, as of `orbit_camera`.
+        azimuth, elevation: degrees, as for `orbit_camera`.
         width: of a panel in pixels.
         columns: panels a row.
 
