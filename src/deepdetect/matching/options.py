@@ -11,6 +11,7 @@ from ..features.matchers import get_matcher
 from ..features.selection import SelectionOptions
 from ..features.sift import get_descriptor
 from ..geometry import GeometryOptions
+from .guided import GuidedOptions
 
 GUIDES = ("auto", "homography", "fundamental")
 
@@ -48,6 +49,7 @@ class MatchingOptions:
         guide: which one: "homography", "fundamental", or "auto": the one that fits
             `geometry.model`, and for the models "auto" and "none" the one that fits the images.
         geometry: which geometry is estimated in the end, and how.
+        guided_options: all tuned numbers of guided matching.
 
     Raises:
         OptionError: a name is unknown, a value out of its range, or the guide contradicts the
@@ -65,6 +67,7 @@ class MatchingOptions:
     guided: bool = True
     guide: str = "auto"
     geometry: GeometryOptions = field(default_factory=lambda: GeometryOptions(model="auto"))
+    guided_options: GuidedOptions = field(default_factory=GuidedOptions)
 
     def __post_init__(self) -> None:
         get_descriptor(self.descriptor)

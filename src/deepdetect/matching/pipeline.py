@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -13,6 +11,7 @@ import numpy as np
 from .._shared.errors import OptionError
 from .._shared.options import replace_options, suggest_keywords
 from .._shared.parallel import available_memory
+from .._shared.timing import StageTimer
 from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
 from ..detector.heatmap import HeatmapOptions
 from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors, unique_matches
@@ -21,8 +20,7 @@ from ..features.sift import get_descriptor
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.residuals import transfer_errors
 from ..io.image import load_image, luma
-from .guided import guided_matches
-from .guided.initial_geometry import InitialMatches
+from .guided import GuidedOptions, InitialMatches, guided_matches
 from .options import MatchingOptions, get_preset
 
 BYTES_PER_KEYPOINT = 1500
@@ -63,6 +61,7 @@ def match_images(
     confidence: float | None = None,
     iterations: int | None = None,
     seed: int | None = None,
+    guided_options: GuidedOptions | None = None,
 ) -> Matches:
     """Detect and match the keypoints of two images.
 
@@ -91,6 +90,7 @@ def match_images(
             not apply to guided ones (`MatchingOptions`).
         estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations, seed:
             how the geometry is estimated (`GeometryOptions`).
+        guided_options: all tuned numbers of guided matching.
 
     Returns:
         The matches, the geometry, and which agree with it.
@@ -136,19 +136,20 @@ def match_images(
         "confidence": confidence,
         "iterations": iterations,
         "seed": seed,
+        "guided_options": guided_options,
     }
     chosen = replace_options(
         chosen, **{name: value for name, value in given.items() if value is not None}
     )
-    seconds: dict[str, float] = {}
+    timer = StageTimer()
     rgb = load_image(image0), load_image(image1)
     detector = _configured(detector, chosen.heatmap)
-    with _timed(seconds, "keypoints"):
+    with timer.stage("keypoints"):
         keypoints = [find_keypoints(detector, image, chosen.selection) for image in rgb]
     grays = luma(rgb[0]), luma(rgb[1])
     found_guide, found = None, None
     if chosen.guided:
-        with _timed(seconds, "guided matching"):
+        with timer.stage("guided matching"):
             found_guide, found = guided_matches(
                 grays[0],
                 grays[1],
@@ -157,14 +158,15 @@ def match_images(
                 chosen.guiding_model,
                 chosen.geometry.seed,
                 initial,
+                chosen.guided_options,
             )
     if found is None:
-        found = unguided_matches(grays, [points.xy for points in keypoints], chosen, seconds)
+        found = unguided_matches(grays, [points.xy for points in keypoints], chosen, timer)
     elif chosen.mutual:
         found = unique_matches(found)
     points0 = keypoints[0].xy[found.rows0]
     points1 = keypoints[1].xy[found.rows1]
-    with _timed(seconds, "geometry"):
+    with timer.stage("geometry"):
         geometry = _final_geometry(points0, points1, chosen.geometry, found_guide)
     return Matches(
         points0,
@@ -175,7 +177,7 @@ def match_images(
         geometry.matrix,
         keypoints[0],
         keypoints[1],
-        seconds,
+        timer.seconds,
         found_guide,
     )
 
@@ -183,35 +185,36 @@ def match_images(
 def unguided_matches(
     grays: Sequence[np.ndarray],
     points: Sequence[np.ndarray],
-    chosen: MatchingOptions,
-    seconds: dict[str, float],
+    options: MatchingOptions,
+    timer: StageTimer | None = None,
 ) -> DescriptorMatches:
     """Match all descriptors with all others.
 
     Args:
         grays: (H, W) uint8 luma of both images.
         points: (N, 2) float32 keypoints of both.
-        chosen: the options; whether they ask for guided matching does not matter.
-        seconds: takes the time of each stage.
+        options: whether they ask for guided matching does not matter.
+        timer: measures the stages.
 
     Raises:
         OptionError: there are too many keypoints for the memory.
     """
+    timer = timer or StageTimer()
     check_memory([len(xy) for xy in points])
-    with _timed(seconds, "descriptors"):
-        describe = get_descriptor(chosen.descriptor)
+    with timer.stage("descriptors"):
+        describe = get_descriptor(options.descriptor)
         descriptors = [
-            describe(gray, xy, chosen.keypoint_size, chosen.angle)
+            describe(gray, xy, options.keypoint_size, options.angle)
             for gray, xy in zip(grays, points, strict=True)
         ]
-    with _timed(seconds, "matching"):
+    with timer.stage("matching"):
         return match_descriptors(
             descriptors[0],
             descriptors[1],
-            get_matcher(chosen.matcher),
-            ratio=chosen.ratio,
-            mutual=chosen.mutual,
-            seed=chosen.geometry.seed,
+            get_matcher(options.matcher),
+            ratio=options.ratio,
+            mutual=options.mutual,
+            seed=options.geometry.seed,
             positions=(np.rint(points[0]), np.rint(points[1])),
         )
 
@@ -263,10 +266,3 @@ def check_memory(keypoints: Sequence[int]) -> None:
             f"{needed / 1e9:.0f} GB of memory to be matched: make them fewer with "
             "max_keypoints, density, or a smaller resolution"
         )
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    started = time.perf_counter()
-    yield
-    seconds[stage] = time.perf_counter() - started

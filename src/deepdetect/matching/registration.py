@@ -13,6 +13,7 @@ from .._shared.options import suggest_keywords
 from ..detector.detector import HeatmapDetector
 from ..geometry.zncc import median_local_zncc
 from ..io.image import load_image, luma
+from .guided import GuidedOptions
 from .pipeline import match_images
 
 SQUARES = 8
@@ -68,6 +69,7 @@ def register(
     channels: Literal["rgb", "bgr"] | None = None,
     mutual: bool | None = None,
     seed: int | None = None,
+    guided_options: GuidedOptions | None = None,
 ) -> Registration:
     """Find the homography between two images and warp the second into the frame of the first.
 
@@ -78,7 +80,7 @@ def register(
         image0, image1: anything `load_image` takes.
         detector: as for `match_images`.
         threshold, density, max_keypoints, nms_radius, subpixel, ignore, resolution, channels,
-            mutual, seed: as for `match_images`.
+            mutual, seed, guided_options: as for `match_images`.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
@@ -110,6 +112,7 @@ def register(
         channels=channels,
         mutual=mutual,
         seed=seed,
+        guided_options=guided_options,
     )
     if not found.guided or found.matrix is None:
         raise DeepDetectError(

@@ -23,7 +23,7 @@ from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
 from ..io.exif import calibration_from_exif
 from ..io.image import load_image, luma
-from ..matching.guided.initial_geometry import InitialMatches, initial_matches
+from ..matching.guided import InitialMatches, initial_matches
 from ..matching.options import get_preset
 from ..matching.pipeline import match_images
 from .checks import check_images

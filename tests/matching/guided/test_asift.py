@@ -1,12 +1,22 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 import pytest
 
-from deepdetect.features.sift_detector import detect_sift
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.io.image import luma
-from deepdetect.matching.guided.asift import TILTS, tilted, tilted_views
+from deepdetect.matching.guided.asift import simulate_view, simulated_views
+from deepdetect.matching.guided.options import InitialGeometryOptions
+
+TILTS = InitialGeometryOptions().tilts
+
+
+def views(gray: np.ndarray, tilt: float, max_keypoints: int) -> Iterator[Keypoints]:
+    return simulated_views(gray, tilt, 72, SiftOptions(max_keypoints=max_keypoints))
 
 
 def blob(x: float, y: float, across: float, down: float) -> np.ndarray:
@@ -18,28 +28,28 @@ def blob(x: float, y: float, across: float, down: float) -> np.ndarray:
 
 def test_without_tilt_and_turn_it_is_the_image_itself(photo: np.ndarray) -> None:
     gray = luma(photo)[:100]
-    view, affine = tilted(gray, 1.0, 0.0)
+    view, affine = simulate_view(gray, 1.0, 0.0)
     np.testing.assert_array_equal(view, gray)
     np.testing.assert_allclose(affine, np.eye(2, 3), atol=1e-12)
 
 
 def test_a_tilt_shortens_the_width_only(photo: np.ndarray) -> None:
     gray = luma(photo)[:100]
-    view, affine = tilted(gray, 2.0, 0.0)
+    view, affine = simulate_view(gray, 2.0, 0.0)
     assert view.shape == (100, 128)
     np.testing.assert_allclose(affine, [[0.5, 0, 0], [0, 1, 0]], atol=1e-12)
 
 
 def test_a_quarter_turn_shortens_the_height(photo: np.ndarray) -> None:
     gray = luma(photo)[:100]
-    view, _ = tilted(gray, 2.0, 90.0)
+    view, _ = simulate_view(gray, 2.0, 90.0)
     assert view.shape == pytest.approx((256, 50), abs=1)
 
 
 @pytest.mark.parametrize("tilt", [1.0, *TILTS])
-@pytest.mark.parametrize("turn", [0.0, 25.0, 90.0, 144.0, 178.0])
+@pytest.mark.parametrize("turn", [0.0, 25.0, 144.0])
 def test_a_spot_lies_where_the_map_says(tilt: float, turn: float) -> None:
-    view, affine = tilted(blob(130, 60, 6, 6), tilt, turn)
+    view, affine = simulate_view(blob(130, 60, 6, 6), tilt, turn)
     bright = np.maximum(view.astype(float) - 140, 0)  # above the grey outside
     row, column = np.indices(view.shape)
     centre = np.array([(bright * column).sum(), (bright * row).sum()]) / bright.sum()
@@ -47,9 +57,9 @@ def test_a_spot_lies_where_the_map_says(tilt: float, turn: float) -> None:
 
 
 @pytest.mark.parametrize("tilt", TILTS)
-@pytest.mark.parametrize("turn", [0.0, 40.0, 110.0, 170.0])
+@pytest.mark.parametrize("turn", [0.0, 40.0, 110.0])
 def test_the_whole_image_is_within_the_view_and_grey_outside(tilt: float, turn: float) -> None:
-    view, affine = tilted(np.full((90, 140), 250, np.uint8), tilt, turn)
+    view, affine = simulate_view(np.full((90, 140), 250, np.uint8), tilt, turn)
     height, width = view.shape
     corners = np.array([[0, 0, 1], [139, 0, 1], [139, 89, 1], [0, 89, 1]]) @ affine.T
     assert (corners > -1).all()
@@ -70,9 +80,9 @@ def test_fine_stripes_are_blurred_before_they_are_shortened(tilt: float) -> None
     """Else they would come back as coarse ones."""
     stripes = np.zeros((80, 160), np.uint8)
     stripes[:, ::2] = 255
-    view, _ = tilted(stripes, tilt, 0.0)
+    view, _ = simulate_view(stripes, tilt, 0.0)
     assert np.ptp(view[10:-10, 5:-5].astype(int)) < 30
-    upright, _ = tilted(stripes.T.copy(), tilt, 0.0)
+    upright, _ = simulate_view(stripes.T.copy(), tilt, 0.0)
     assert np.ptp(upright[10:-10, 5:-5].astype(int)) == 255  # the height is not touched
 
 
@@ -80,7 +90,7 @@ def test_fine_stripes_are_blurred_before_they_are_shortened(tilt: float) -> None
 def test_keypoints_lie_at_their_positions_in_the_image_itself(tilt: float) -> None:
     """A spot as many times wider than high is round in the view without a turn."""
     gray = blob(110, 70, 3 * tilt, 3)
-    found = next(tilted_views(gray, tilt, 100))
+    found = next(views(gray, tilt, 100))
     gaps = found.xy - [110, 70]
     near = gaps[np.argmin(np.linalg.norm(gaps, axis=1))]
     assert abs(near[0]) < 0.15 * tilt
@@ -90,7 +100,7 @@ def test_keypoints_lie_at_their_positions_in_the_image_itself(tilt: float) -> No
 @pytest.mark.parametrize("tilt", TILTS)
 def test_keypoints_are_within_the_image_and_described(photo: np.ndarray, tilt: float) -> None:
     gray = luma(photo)[:100]
-    for found in tilted_views(gray, tilt, 100):
+    for found in views(gray, tilt, 100):
         assert (found.xy > 0).all()
         assert (found.xy < (255, 99)).all()
         assert found.descriptors.shape == (len(found.xy), 128)
@@ -98,7 +108,7 @@ def test_keypoints_are_within_the_image_and_described(photo: np.ndarray, tilt: f
 
 def test_larger_tilts_are_seen_from_more_directions(photo: np.ndarray) -> None:
     gray = luma(photo)[:64, :64]
-    counts = [len(list(tilted_views(gray, tilt, 10))) for tilt in TILTS]
+    counts = [len(list(views(gray, tilt, 10))) for tilt in TILTS]
     assert counts == sorted(counts)
     assert counts[0] == 5  # every 36 degrees of 180
     assert counts[-1] == 10
@@ -106,7 +116,7 @@ def test_larger_tilts_are_seen_from_more_directions(photo: np.ndarray) -> None:
 
 def test_no_view_has_more_keypoints_than_asked_for(photo: np.ndarray) -> None:
     gray = luma(photo)
-    found = [len(view) for view in tilted_views(gray, 2.0, 30)]
+    found = [len(view) for view in views(gray, 2.0, 30)]
     assert max(found) <= 30
     assert min(found) > 10
     assert len(detect_sift(gray)) > 30
@@ -116,6 +126,6 @@ def test_no_view_has_more_keypoints_than_asked_for(photo: np.ndarray) -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (5, 5), (1, 40), (40, 1)])
 def test_tiny_images_have_views_without_keypoints(shape: tuple[int, int], tilt: float) -> None:
     gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    for found in tilted_views(gray, tilt, 50):
+    for found in views(gray, tilt, 50):
         assert found.xy.shape == (len(found), 2)
         assert found.descriptors.shape == (len(found), 128)

@@ -10,11 +10,12 @@ from deepdetect import DeepDetect, match_images
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.epipolar import (
-    BAND,
-    in_crowd,
-    matches_by_epipolar_line,
-    move_alike,
+    densely_matched,
+    match_along_epipolar_lines,
+    motion_consistent,
 )
+from deepdetect.matching.guided.homography import ImagePair
+from deepdetect.matching.guided.options import EpipolarMatchingOptions
 
 ROWS = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 """The fundamental matrix of a rectified pair: y1 = y0."""
@@ -37,14 +38,14 @@ def pair(photo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def test_each_depth_finds_its_shift(pair: tuple[np.ndarray, np.ndarray]) -> None:
     xy = every_pixel(pair[0].shape)
-    rows0, rows1, ratios = matches_by_epipolar_line(*pair, xy, xy, ROWS)
-    shift = xy[rows0] - xy[rows1]
-    expected = np.where(xy[rows0][:, 1] < 128, 9, 20)
-    assert (np.abs(shift[:, 1]) <= BAND).all()
+    found = match_along_epipolar_lines(ImagePair(*pair, xy, xy), ROWS)
+    shift = xy[found.rows0] - xy[found.rows1]
+    expected = np.where(xy[found.rows0][:, 1] < 128, 9, 20)
+    assert (np.abs(shift[:, 1]) <= EpipolarMatchingOptions().max_epipolar_distance_px).all()
     right = np.abs(shift[:, 0] - expected) <= 1
     assert right.mean() > 0.97
-    assert len(rows0) > 0.6 * len(xy)
-    assert (ratios < 1).all()
+    assert len(found) > 0.6 * len(xy)
+    assert (found.ratios < 1).all()
 
 
 @pytest.mark.parametrize(
@@ -79,28 +80,27 @@ def test_what_a_photograph_hides_is_not_matched(name: str, photograph: str, shar
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_very_few_keypoints_are_taken(pair: tuple[np.ndarray, np.ndarray], count: int) -> None:
     xy = every_pixel(pair[0].shape)[5000 : 5000 + count]
-    rows0, rows1, ratios = matches_by_epipolar_line(*pair, xy, xy, ROWS)
-    assert len(rows0) == len(rows1) == len(ratios) <= count
+    assert len(match_along_epipolar_lines(ImagePair(*pair, xy, xy), ROWS)) <= count
 
 
 def test_a_pair_that_moves_otherwise_is_told() -> None:
     points0 = every_pixel((20, 20))
     points1 = points0 + np.array([5, 0])
     points1[210] += (7, 0)
-    moving = move_alike(points0, points1, (20, 20))
+    moving = motion_consistent(points0, points1, (20, 20))
     assert not moving[210]
     assert moving[np.arange(400) != 210].all()
 
 
 def test_a_pair_alone_is_not_trusted() -> None:
-    assert move_alike(np.array([[3, 3]]), np.array([[5, 3]]), (9, 9)).tolist() == [False]
+    assert motion_consistent(np.array([[3, 3]]), np.array([[5, 3]]), (9, 9)).tolist() == [False]
 
 
 def test_few_matches_among_many_keypoints_are_dropped() -> None:
     keypoints = every_pixel((80, 160))
     left = keypoints[keypoints[:, 0] < 80]
     some = keypoints[(keypoints[:, 0] >= 110) & (keypoints.sum(axis=1) % 7 == 0)]
-    kept = in_crowd(np.concatenate([left, some]), keypoints, (80, 160))
+    kept = densely_matched(np.concatenate([left, some]), keypoints, (80, 160))
     assert kept[: len(left)].all()
     assert not kept[len(left) :].any()
 
@@ -108,5 +108,5 @@ def test_few_matches_among_many_keypoints_are_dropped() -> None:
 def test_where_all_match_seldom_seldom_is_enough() -> None:
     keypoints = every_pixel((80, 160))
     some = keypoints[keypoints.sum(axis=1) % 7 == 0]
-    assert in_crowd(some, keypoints, (80, 160)).all()
-    assert in_crowd(some[:0], keypoints, (80, 160)).tolist() == []
+    assert densely_matched(some, keypoints, (80, 160)).all()
+    assert densely_matched(some[:0], keypoints, (80, 160)).tolist() == []

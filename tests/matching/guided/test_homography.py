@@ -9,10 +9,24 @@ from scipy.spatial import KDTree
 
 from deepdetect.geometry import transfer_errors
 from deepdetect.io.image import luma
-from deepdetect.matching.guided.homography import REACH, matches_by_homography, nearest_pixel
+from deepdetect.matching.guided.homography import (
+    ImagePair,
+    match_by_homography,
+    nearest_keypoint,
+)
+from deepdetect.matching.guided.options import HomographyMatchingOptions
+
+REACH = HomographyMatchingOptions().max_distance_px
 
 SHIFT = np.array([[1.0, 0, 9], [0, 1, -6], [0, 0, 1]])
 MILD = np.array([[0.95, -0.06, 15.0], [0.08, 0.97, -5.0], [1e-4, -1e-4, 1.0]])
+
+
+def matched(
+    gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray, xy1: np.ndarray, homography: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    found = match_by_homography(ImagePair(gray0, gray1, xy0, xy1), homography)
+    return found.rows0, found.rows1, found.ratios
 
 
 def every_pixel(gray: np.ndarray) -> np.ndarray:
@@ -32,7 +46,7 @@ def warped(gray: np.ndarray, homography: np.ndarray) -> np.ndarray:
     places=st.integers(0, 30),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_the_nearest_pixel_is_that_of_a_tree(
+def test_the_nearest_keypoint_is_that_of_a_tree(
     width: int, height: int, count: int, places: int, seed: int
 ) -> None:
     generator = np.random.default_rng(seed)
@@ -40,7 +54,7 @@ def test_the_nearest_pixel_is_that_of_a_tree(
     xy = np.column_stack([order % width, order // width]).astype(np.float32)
     where = generator.uniform(-4, [width + 4, height + 4], (places, 2))
     where[::5] = np.rint(where[::5] * 2) / 2  # also halfway, where several are as near
-    rows, distances = nearest_pixel(where, xy, (width, height))
+    rows, distances = nearest_keypoint(where, xy, (width, height))
     assert rows.shape == distances.shape == (places,)
     found = rows >= 0
     np.testing.assert_array_equal(found, np.isfinite(distances))
@@ -63,15 +77,15 @@ def test_all_within_reach_are_found_wherever_they_lie(seed: int) -> None:
     xy = np.column_stack([order % 10, order // 10])
     where = np.rint(generator.uniform(-2, [12, 9], (60, 2)) * 4) / 4
     nearest = KDTree(xy).query(where)[0]
-    distances = nearest_pixel(where, xy, (10, 7))[1]
+    distances = nearest_keypoint(where, xy, (10, 7))[1]
     within = nearest < REACH
     np.testing.assert_allclose(distances[within], nearest[within], atol=1e-9)
     assert (distances[~within] >= REACH).all()
 
 
-def test_places_that_are_nowhere_have_no_nearest_pixel() -> None:
+def test_places_that_are_nowhere_have_no_nearest_keypoint() -> None:
     where = np.array([[np.nan, 2], [np.inf, 2], [2, -np.inf], [1e300, 2], [-1e18, 2], [2, 1e10]])
-    rows, distances = nearest_pixel(where, np.array([[2, 2]]), (5, 5))
+    rows, distances = nearest_keypoint(where, np.array([[2, 2]]), (5, 5))
     assert (rows == -1).all()
     assert np.isinf(distances).all()
 
@@ -79,7 +93,7 @@ def test_places_that_are_nowhere_have_no_nearest_pixel() -> None:
 def test_the_corners_of_the_image_are_reached_from_outside() -> None:
     xy = np.array([[0, 0], [9, 6]])
     where = np.array([[-0.5, -0.5], [9.6, 6.6], [-0.9, 0], [9, 6.9]])
-    rows, distances = nearest_pixel(where, xy, (10, 7))
+    rows, distances = nearest_keypoint(where, xy, (10, 7))
     assert rows.tolist() == [0, 1, 0, 1]
     np.testing.assert_allclose(distances, [0.5**0.5, 0.72**0.5, 0.9, 0.9])
 
@@ -87,7 +101,7 @@ def test_the_corners_of_the_image_are_reached_from_outside() -> None:
 def test_a_shift_by_whole_pixels_matches_each_pixel_with_its_own(photo: np.ndarray) -> None:
     gray = luma(photo)[:120, :160]
     xy = every_pixel(gray)
-    rows0, rows1, _ = matches_by_homography(gray, warped(gray, SHIFT), xy, xy, SHIFT)
+    rows0, rows1, _ = matched(gray, warped(gray, SHIFT), xy, xy, SHIFT)
     np.testing.assert_array_equal(xy[rows1], xy[rows0] + [9, -6])
     assert len(rows0) > 0.85 * (160 - 9) * (120 - 6)
     assert len(np.unique(rows0)) == len(rows0)
@@ -99,7 +113,7 @@ def test_matches_lie_within_reach_of_where_the_homography_takes_them(photo: np.n
     xy0, xy1 = (
         every_pixel(gray)[np.sort(generator.permutation(gray.size)[:20_000])] for _ in range(2)
     )
-    rows0, rows1, _ = matches_by_homography(gray, warped(gray, MILD), xy0, xy1, MILD)
+    rows0, rows1, _ = matched(gray, warped(gray, MILD), xy0, xy1, MILD)
     errors = transfer_errors(xy0[rows0], xy1[rows1], MILD)
     assert errors.max() < REACH
     assert len(np.unique(rows0)) == len(rows0)
@@ -115,7 +129,7 @@ def test_scores_are_under_one_and_smaller_where_both_look_more_alike(photo: np.n
     xy = every_pixel(gray)
     second = warped(gray, MILD)
     blurred = cv2.GaussianBlur(second, (0, 0), 1.5)
-    sharp, dull = (matches_by_homography(gray, one, xy, xy, MILD) for one in (second, blurred))
+    sharp, dull = (matched(gray, one, xy, xy, MILD) for one in (second, blurred))
     for rows0, rows1, scores in (sharp, dull):
         assert len(rows0) == len(rows1) == len(scores)
         assert (scores >= 0).all()
@@ -127,9 +141,7 @@ def test_several_may_share_a_partner(photo: np.ndarray) -> None:
     gray = luma(photo)
     half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
     small = cv2.resize(gray, (128, 128), interpolation=cv2.INTER_AREA)
-    rows0, rows1, _ = matches_by_homography(
-        gray, small, every_pixel(gray), every_pixel(small), half
-    )
+    rows0, rows1, _ = matched(gray, small, every_pixel(gray), every_pixel(small), half)
     counts = np.bincount(rows1)
     assert counts.max() == 4
     assert len(rows0) > 0.9 * gray.size
@@ -141,7 +153,7 @@ def test_what_is_covered_in_the_second_image_is_not_matched(photo: np.ndarray) -
     second = warped(gray, MILD)
     second[:, 128:] = cv2.resize(camera, (128, 256), interpolation=cv2.INTER_AREA)
     xy = every_pixel(gray)
-    _, rows1, _ = matches_by_homography(gray, second, xy, xy, MILD)
+    _, rows1, _ = matched(gray, second, xy, xy, MILD)
     column = xy[rows1, 0]
     assert np.count_nonzero(column > 145) < 0.05 * np.count_nonzero(column < 111)
 
@@ -151,8 +163,8 @@ def test_a_wrong_homography_matches_next_to_nothing(photo: np.ndarray) -> None:
     xy = every_pixel(gray)
     wrong = SHIFT @ np.array([[0.0, -1, 255], [1, 0, 0], [0, 0, 1]])
     second = warped(gray, SHIFT)
-    right = matches_by_homography(gray, second, xy, xy, SHIFT)[0]
-    assert len(matches_by_homography(gray, second, xy, xy, wrong)[0]) < 0.05 * len(right)
+    right = matched(gray, second, xy, xy, SHIFT)[0]
+    assert len(matched(gray, second, xy, xy, wrong)[0]) < 0.05 * len(right)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +179,7 @@ def test_a_wrong_homography_matches_next_to_nothing(photo: np.ndarray) -> None:
 def test_a_homography_to_nowhere_is_taken(photo: np.ndarray, homography: np.ndarray) -> None:
     gray = luma(photo)[:100, :100]
     xy = every_pixel(gray)
-    rows0, rows1, _ = matches_by_homography(gray, gray, xy, xy, homography)
+    rows0, rows1, _ = matched(gray, gray, xy, xy, homography)
     assert len(rows0) == len(rows1) < 0.5 * len(xy)
     assert (transfer_errors(xy[rows0], xy[rows1], homography) < REACH).all()
 
@@ -176,7 +188,7 @@ def test_without_keypoints_nothing_matches(photo: np.ndarray) -> None:
     gray = luma(photo)[:60, :80]
     xy, none = every_pixel(gray), np.empty((0, 2), np.float32)
     for first, second in ((none, xy), (xy, none), (none, none)):
-        rows0, rows1, _ = matches_by_homography(gray, gray, first, second, np.eye(3))
+        rows0, rows1, _ = matched(gray, gray, first, second, np.eye(3))
         assert rows0.shape == rows1.shape == (0,)
         assert np.issubdtype(rows0.dtype, np.integer)
 
@@ -184,7 +196,7 @@ def test_without_keypoints_nothing_matches(photo: np.ndarray) -> None:
 def test_one_keypoint_matches_itself(photo: np.ndarray) -> None:
     gray = luma(photo)[:60, :80]
     one = np.array([[40, 30]], np.float32)
-    rows0, rows1, _ = matches_by_homography(gray, gray, one, one, np.eye(3))
+    rows0, rows1, _ = matched(gray, gray, one, one, np.eye(3))
     assert rows0.tolist() == rows1.tolist() == [0]
 
 
@@ -193,6 +205,6 @@ def test_flat_and_tiny_images_are_taken(shape: tuple[int, int]) -> None:
     flat = np.full(shape, 90, np.uint8)
     noise = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
     xy = every_pixel(flat)
-    assert len(matches_by_homography(flat, flat, xy, xy, np.eye(3))[0]) == 0
-    rows0, rows1, _ = matches_by_homography(noise, noise, xy, xy, np.eye(3))
+    assert len(matched(flat, flat, xy, xy, np.eye(3))[0]) == 0
+    rows0, rows1, _ = matched(noise, noise, xy, xy, np.eye(3))
     np.testing.assert_array_equal(rows0, rows1)

@@ -13,13 +13,15 @@ from deepdetect.geometry.acontrario import MAX_LOG10_NFA
 from deepdetect.geometry.model_selection import select_model
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided.initial_geometry import (
-    LONGEST,
-    THRESHOLDS,
-    FirstPass,
-    first_pass,
+    InitialGeometry,
+    estimate_initial_geometry,
     initial_matches,
     plain_first_pass,
 )
+from deepdetect.matching.guided.options import InitialGeometryOptions
+
+OPTIONS = InitialGeometryOptions()
+LONGEST = OPTIONS.max_side_px
 
 MILD = np.array([[0.9, -0.12, 25.0], [0.15, 0.95, -8.0], [2e-4, -1e-4, 1.0]])
 ODD = [
@@ -55,6 +57,12 @@ def art(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return left, right, points0, points1
 
 
+def initial_geometry(
+    gray0: np.ndarray, gray1: np.ndarray, model: str = "auto", seed: int = 0
+) -> InitialGeometry:
+    return estimate_initial_geometry(initial_matches(gray0, gray1), model, seed)
+
+
 def corners(gray: np.ndarray) -> np.ndarray:
     height, width = gray.shape
     last = np.array([width - 1, height - 1])
@@ -83,19 +91,19 @@ def from_the_side(gray: np.ndarray, tilt: int, turn: float) -> tuple[np.ndarray,
     return view, narrow @ rotation
 
 
-def assert_nothing(found: FirstPass) -> None:
-    assert found.kind == "none"
+def assert_nothing(found: InitialGeometry) -> None:
+    assert found.model == "none"
     assert found.matrix is None
     assert found.points0.shape == found.points1.shape == (0, 2)
     assert found.log10_nfa >= MAX_LOG10_NFA
 
 
-def check_agreeing(found: FirstPass) -> None:
+def check_agreeing(found: InitialGeometry) -> None:
     """Its points agree with the matrix."""
-    assert 0 < len(found.points0) == len(found.points1) <= found.matches
-    measure = transfer_errors if found.kind == "homography" else epipolar_errors
+    assert 0 < len(found.points0) == len(found.points1) <= found.num_matches
+    measure = transfer_errors if found.model == "homography" else epipolar_errors
     errors = measure(found.points0, found.points1, found.matrix)
-    assert errors.max() < THRESHOLDS[found.kind]
+    assert errors.max() < OPTIONS.threshold_px(found.model)
     assert found.log10_nfa < MAX_LOG10_NFA
 
 
@@ -117,8 +125,8 @@ def test_a_plane_is_found_within_a_pixel_at_its_corners(
     gray = luma(photo)
     second = warped(gray, homography, (256, 256))
     second = np.clip(second * 0.7 + 20, 0, 255).astype(np.uint8)  # in other light
-    found = first_pass(gray, second, model)
-    assert found.kind == "homography"
+    found = initial_geometry(gray, second, model)
+    assert found.model == "homography"
     assert found.matrix[2, 2] == pytest.approx(1)
     assert (
         transfer_errors(
@@ -126,7 +134,7 @@ def test_a_plane_is_found_within_a_pixel_at_its_corners(
         ).max()
         < 1
     )
-    assert found.simulated == 0
+    assert found.num_views == 0
     check_agreeing(found)
 
 
@@ -137,7 +145,7 @@ def test_the_centre_of_the_first_pixel_is_the_origin(
     """Pixels that are the mean of several lie in their middle, not on their first."""
     gray = picture("astronaut", (512, 512))
     small, to_small = resized(gray, 512 // factor, 512 // factor)
-    found = first_pass(gray, small)
+    found = initial_geometry(gray, small)
     column, row = np.meshgrid(np.arange(64, 512, 64), np.arange(64, 512, 64))
     places = np.column_stack([column.ravel(), row.ravel()])
     gaps = transform_points(places, found.matrix) - transform_points(places, to_small)
@@ -146,7 +154,7 @@ def test_the_centre_of_the_first_pixel_is_the_origin(
 
 def test_points_are_the_matches_and_lie_in_the_images(photo: np.ndarray) -> None:
     gray = luma(photo)
-    found = first_pass(gray, warped(gray, MILD, (300, 240)))
+    found = initial_geometry(gray, warped(gray, MILD, (300, 240)))
     for points, size in ((found.points0, (256, 256)), (found.points1, (300, 240))):
         assert (points >= 0).all()
         assert (points < size).all()
@@ -161,12 +169,12 @@ def test_a_strong_tilt_needs_simulated_views(
 ) -> None:
     gray = picture("astronaut", (360, 360))
     side, true = from_the_side(gray, 4, turn)
-    # The first look counts in pixels of the second image, so the truth is asked for there.
+    # The initial geometry counts in pixels of the second image, so the truth is asked for there.
     pair = (side, gray) if swapped else (gray, side)
     true = np.linalg.inv(true) if swapped else true
-    found = first_pass(*pair)
-    assert found.kind == "homography"
-    assert found.simulated > 0
+    found = initial_geometry(*pair)
+    assert found.model == "homography"
+    assert found.num_views > 0
     assert len(found.points0) >= 20
     check_agreeing(found)
     tilt = 4 if swapped else 1  # pixels of the long side for one of the short
@@ -180,10 +188,10 @@ def test_matches_that_are_there_already_are_not_made_again(
 ) -> None:
     gray = luma(photo)
     other = warped(gray, MILD, (256, 256))
-    expected = first_pass(gray, other)
+    expected = initial_geometry(gray, other)
     initial = initial_matches(gray, other)
     monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.detect_sift", None)
-    found = first_pass(gray, other, initial=initial)
+    found = estimate_initial_geometry(initial)
     np.testing.assert_array_equal(found.matrix, expected.matrix)
 
 
@@ -203,9 +211,9 @@ def test_a_pair_that_needs_none_has_no_simulated_views(
     def refused(*_: object) -> None:
         raise AssertionError("a view was simulated")
 
-    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.tilted_views", refused)
+    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.simulated_views", refused)
     gray = luma(photo)
-    assert first_pass(gray, warped(gray, MILD, (256, 256))).simulated == 0
+    assert initial_geometry(gray, warped(gray, MILD, (256, 256))).num_views == 0
 
 
 @pytest.mark.parametrize(
@@ -218,22 +226,22 @@ def test_a_pair_that_needs_none_has_no_simulated_views(
 def test_two_images_of_different_things_have_no_geometry(
     picture: Callable[..., np.ndarray], first: str, second: str
 ) -> None:
-    found = first_pass(picture(first, (200, 150)), picture(second, (200, 150)))
+    found = initial_geometry(picture(first, (200, 150)), picture(second, (200, 150)))
     assert_nothing(found)
-    assert found.simulated > 20  # all were tried
+    assert found.num_views > 20  # all were tried
 
 
 def test_noise_has_no_geometry() -> None:
     generator = np.random.default_rng(0)
     first, second = (generator.integers(0, 256, (90, 120)).astype(np.uint8) for _ in range(2))
-    assert_nothing(first_pass(first, second))
+    assert_nothing(initial_geometry(first, second))
 
 
 def test_a_scene_with_depth_has_a_fundamental_matrix(art: tuple) -> None:
     left, right, points0, points1 = art
-    found = first_pass(left, right)
-    assert found.kind == "fundamental"
-    assert found.simulated == 0
+    found = initial_geometry(left, right)
+    assert found.model == "fundamental"
+    assert found.num_views == 0
     check_agreeing(found)
     errors = epipolar_errors(points0, points1, found.matrix)
     assert np.quantile(errors, 0.95) < 1
@@ -242,16 +250,16 @@ def test_a_scene_with_depth_has_a_fundamental_matrix(art: tuple) -> None:
 
 
 def test_the_homography_of_a_scene_with_depth_is_given_when_asked_for(art: tuple) -> None:
-    found = first_pass(*art[:2], "homography")
-    assert found.kind == "homography"
+    found = initial_geometry(*art[:2], "homography")
+    assert found.model == "homography"
     check_agreeing(found)
-    assert len(found.points0) < len(first_pass(*art[:2], "fundamental").points0)
+    assert len(found.points0) < len(initial_geometry(*art[:2], "fundamental").points0)
 
 
 def test_the_fundamental_matrix_of_a_plane_is_given_when_asked_for(photo: np.ndarray) -> None:
     gray = luma(photo)
-    found = first_pass(gray, warped(gray, MILD, (256, 256)), "fundamental")
-    assert found.kind == "fundamental"
+    found = initial_geometry(gray, warped(gray, MILD, (256, 256)), "fundamental")
+    assert found.model == "fundamental"
     check_agreeing(found)
 
 
@@ -262,8 +270,8 @@ def test_a_large_image_is_shrunk_and_its_matrix_comes_back_at_its_own_size(
     second = warped(gray, MILD, (420, 336))
     (large0, up0), (large1, up1) = resized(gray, 2000, 1600), resized(second, 1500, 1200)
     assert min(large0.shape[1], large1.shape[1]) > LONGEST
-    own, found = first_pass(gray, second), first_pass(large0, large1)
-    assert own.kind == found.kind == "homography"
+    own, found = initial_geometry(gray, second), initial_geometry(large0, large1)
+    assert own.model == found.model == "homography"
     expected = up1 @ MILD @ np.linalg.inv(up0)
     for matrix in (up1 @ own.matrix @ np.linalg.inv(up0), found.matrix):
         true = transform_points(corners(large0), expected)
@@ -272,27 +280,27 @@ def test_a_large_image_is_shrunk_and_its_matrix_comes_back_at_its_own_size(
     assert found.matrix[2, 2] == pytest.approx(1)
     assert found.points0.max() > LONGEST
     errors = transfer_errors(found.points0, found.points1, found.matrix)
-    assert errors.max() < THRESHOLDS["homography"] * 1500 / LONGEST + 1e-6
+    assert errors.max() < OPTIONS.homography_threshold_px * 1500 / LONGEST + 1e-6
 
 
 def test_the_fundamental_matrix_of_large_images_comes_back_at_their_own_size(art: tuple) -> None:
     left, right, points0, points1 = art
     (large, up), (other, also_up) = resized(left, 1389, 1110), resized(right, 926, 740)
-    found = first_pass(large, other)
-    assert found.kind == "fundamental"
+    found = initial_geometry(large, other)
+    assert found.model == "fundamental"
     errors = epipolar_errors(
         transform_points(points0, up), transform_points(points1, also_up), found.matrix
     )
     assert np.quantile(errors, 0.95) < 2
     errors = epipolar_errors(found.points0, found.points1, found.matrix)
-    assert errors.max() < THRESHOLDS["fundamental"] * 1389 / LONGEST + 1e-6
+    assert errors.max() < OPTIONS.fundamental_threshold_px * 1389 / LONGEST + 1e-6
 
 
 def test_is_the_same_on_repetition_and_leaves_its_input_alone(photo: np.ndarray) -> None:
     gray = luma(photo)
     second = warped(gray, MILD, (256, 256))
     before = gray.copy(), second.copy()
-    first, again = (first_pass(gray, second, seed=3) for _ in range(2))
+    first, again = (initial_geometry(gray, second, seed=3) for _ in range(2))
     np.testing.assert_array_equal(first.matrix, again.matrix)
     np.testing.assert_array_equal(first.points1, again.points1)
     np.testing.assert_array_equal(before[0], gray)
@@ -303,23 +311,23 @@ def test_is_the_same_on_repetition_and_leaves_its_input_alone(photo: np.ndarray)
 def test_images_without_keypoints_have_no_geometry(model: str, photo: np.ndarray) -> None:
     small = luma(photo)[60:140, 60:140]
     for odd in ODD:
-        assert_nothing(first_pass(odd, odd, model))
-        assert_nothing(first_pass(odd, small, model))
-        assert_nothing(first_pass(small, odd, model))
+        assert_nothing(initial_geometry(odd, odd, model))
+        assert_nothing(initial_geometry(odd, small, model))
+        assert_nothing(initial_geometry(small, odd, model))
 
 
 def test_one_keypoint_makes_no_geometry() -> None:
     row, column = np.indices((60, 70))
     spot = np.exp(-((column - 30) ** 2 + (row - 28) ** 2) / 18)
     gray = np.rint(40 + 180 * spot).astype(np.uint8)
-    assert_nothing(first_pass(gray, gray))
+    assert_nothing(initial_geometry(gray, gray))
 
 
 def test_few_matches_on_a_line_make_no_geometry() -> None:
     row, column = np.indices((60, 160))
     spots = sum(np.exp(-((column - x) ** 2 + (row - 30) ** 2) / 18) for x in (20, 55, 90, 140))
     gray = np.rint(40 + 180 * spots).astype(np.uint8)
-    assert_nothing(first_pass(gray, gray))
+    assert_nothing(initial_geometry(gray, gray))
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,11 @@ import pytest
 from deepdetect import DeepDetect, match_images
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.datasets.types import StereoPair
+from deepdetect.features.matches import Matches
 from deepdetect.io.image import luma
-from deepdetect.matching.guided.prewarp import MARGIN, affinity_between, straightened
-from deepdetect.matching.pipeline import Matches
+from deepdetect.matching.guided.homography import ImagePair
+from deepdetect.matching.guided.options import PrewarpOptions
+from deepdetect.matching.guided.prewarp import estimate_affinity, prewarp
 
 
 def turned(image: np.ndarray, degrees: float, scale: float) -> tuple[np.ndarray, np.ndarray]:
@@ -91,12 +93,12 @@ def test_a_turned_view_under_a_photograph_is_not_matched(
     assert len(matches) > 20_000
 
 
-def test_pairs_that_stand_alike_are_left_as_they_are() -> None:
+def test_aligned_pairs_are_left_as_they_are() -> None:
     points = np.random.default_rng(0).random((60, 2)) * 300
     parallax = np.column_stack([np.linspace(5, 40, 60), np.zeros(60)])
-    assert affinity_between(points, points - parallax) is None
+    assert estimate_affinity(points, points - parallax) is None
     floor = points - np.column_stack([0.1 * points[:, 1], np.zeros(60)])
-    assert affinity_between(points, floor) is None
+    assert estimate_affinity(points, floor) is None
 
 
 def test_the_affinity_of_most_matches_is_found_whatever_the_others_do() -> None:
@@ -105,7 +107,7 @@ def test_the_affinity_of_most_matches_is_found_whatever_the_others_do() -> None:
     true = np.array([[1.1, -0.5, 20], [0.4, 1.2, -9]])
     there = points @ true[:, :2].T + true[:, 2]
     there[:35] += generator.random((35, 2)) * 80 + 20
-    first, second = (affinity_between(points, there) for _ in range(2))
+    first, second = (estimate_affinity(points, there) for _ in range(2))
     np.testing.assert_allclose(first[:2], true, atol=1e-6)
     np.testing.assert_array_equal(first, second)
 
@@ -114,15 +116,15 @@ def test_the_affinity_of_most_matches_is_found_whatever_the_others_do() -> None:
     "linear",
     [np.diag([-1.0, 1.0]), np.diag([1.0, 0.1]), np.diag([9.0, 9.0]), np.diag([0.1, 0.1])],
 )
-def test_an_affinity_that_no_camera_makes_is_not_believed(linear: np.ndarray) -> None:
+def test_an_affinity_that_no_camera_makes_is_not_trusted(linear: np.ndarray) -> None:
     points = np.random.default_rng(0).random((40, 2)) * 100
-    assert affinity_between(points, points @ linear.T) is None
+    assert estimate_affinity(points, points @ linear.T) is None
 
 
 @pytest.mark.parametrize("count", [0, 2, 20])
 def test_too_few_matches_and_matches_on_a_line_give_none(count: int) -> None:
     line = np.column_stack([np.arange(count), np.arange(count)]).astype(float)
-    assert affinity_between(line, line[:, ::-1] * (1, -1)) is None
+    assert estimate_affinity(line, line[:, ::-1] * (1, -1)) is None
 
 
 def test_the_warped_image_is_the_first_and_its_pixels_stand_for_keypoints(
@@ -132,18 +134,18 @@ def test_the_warped_image_is_the_first_and_its_pixels_stand_for_keypoints(
     second, to_turned = turned(gray, 30, 1.2)
     row, column = np.indices(second.shape)
     xy1 = np.column_stack([column.ravel(), row.ravel()])[::3]
-    found = straightened(gray, second, xy1, to_turned)
+    found = prewarp(ImagePair(gray, second, xy1, xy1), to_turned)
     back = np.linalg.inv(to_turned) @ found.to_second  # from the warped image to the first
     np.testing.assert_allclose(back[:2, :2], np.eye(2), atol=1e-9)
     left, top = np.rint(back[:2, 2]).astype(int)
-    same = found.gray1[-top : 256 - top, -left : 256 - left][8:-8, 8:-8]
+    same = found.pair.gray1[-top : 256 - top, -left : 256 - left][8:-8, 8:-8]
     errors = np.abs(same.astype(float) - gray[8:-8, 8:-8])
     assert errors.mean() < 4
-    places = found.xy1 @ found.to_second[:2, :2].T + found.to_second[:2, 2]
+    places = found.pair.xy1 @ found.to_second[:2, :2].T + found.to_second[:2, 2]
     assert (np.linalg.norm(places - xy1[found.rows1], axis=1) < 1).all()
-    assert found.gray1.shape[0] <= (1 + 2 * MARGIN) * 256 + 2
-    assert (found.xy1 >= 0).all()
-    assert (found.xy1 < found.gray1.shape[::-1]).all()
+    assert found.pair.gray1.shape[0] <= (1 + 2 * PrewarpOptions().frame_margin) * 256 + 2
+    assert (found.pair.xy1 >= 0).all()
+    assert (found.pair.xy1 < found.pair.gray1.shape[::-1]).all()
 
 
 def test_the_fundamental_matrix_goes_with_the_image() -> None:
@@ -151,7 +153,8 @@ def test_the_fundamental_matrix_goes_with_the_image() -> None:
     fundamental = generator.normal(size=(3, 3))
     affinity = np.array([[0, 1.1, 3], [-1.1, 0, 90], [0, 0, 1]])
     gray = generator.integers(0, 256, (90, 80)).astype(np.uint8)
-    found = straightened(gray, gray, np.array([[5, 5], [9, 40]]), affinity)
+    xy = np.array([[5, 5], [9, 40]])
+    found = prewarp(ImagePair(gray, gray, xy, xy), affinity)
     x0, x = generator.random((2, 3))
     np.testing.assert_allclose(
         x @ found.fundamental(fundamental) @ x0, (found.to_second @ x) @ fundamental @ x0

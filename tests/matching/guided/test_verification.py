@@ -6,14 +6,19 @@ import cv2
 import numpy as np
 import pytest
 
+from deepdetect.features.dense_sift import dense_sift
 from deepdetect.io.image import load_image, luma
-from deepdetect.matching.guided import strangers
-from deepdetect.matching.guided.strangers import BLOCK, BLOCKS
+from deepdetect.matching.guided import verification
+from deepdetect.matching.guided.options import VerificationOptions
 from deepdetect.matching.guided.verification import (
-    STRANGERS,
-    alike,
-    unlikeness,
+    dissimilarity,
+    index_map,
+    sample_null_pairs,
+    verify_matches,
 )
+
+OPTIONS = VerificationOptions()
+BLOCK, BLOCKS = OPTIONS.null_block_px, OPTIONS.max_null_blocks
 
 HALF = 128
 REACH = 16
@@ -56,8 +61,8 @@ def everywhere(gray: np.ndarray) -> np.ndarray:
 def test_the_same_image_agrees_nearly_everywhere(photo: np.ndarray) -> None:
     gray = luma(photo)
     pixels = every_pixel(gray)
-    assert alike(gray, gray, everywhere(gray), pixels).mean() > 0.99
-    assert alike(gray, seen_again(gray), everywhere(gray), pixels).mean() > 0.95
+    assert verify_matches(gray, gray, everywhere(gray), pixels).mean() > 0.99
+    assert verify_matches(gray, seen_again(gray), everywhere(gray), pixels).mean() > 0.95
 
 
 @pytest.mark.parametrize("other", ["rocket", "coffee", "astronaut", "chelsea", "brick"])
@@ -74,7 +79,7 @@ def test_under_another_photograph_next_to_nothing_agrees(
     for top, left in ((0, 0), (0, HALF), (HALF, 0), (HALF, HALF)):
         second = seen_again(gray)
         second[top : top + HALF, left : left + HALF] = strange
-        agreed = alike(gray, second, everywhere(gray), pixels)
+        agreed = verify_matches(gray, second, everywhere(gray), pixels)
         pasted = np.zeros(gray.shape, np.uint8)
         pasted[top : top + HALF, left : left + HALF] = 1
         kernel = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
@@ -83,27 +88,27 @@ def test_under_another_photograph_next_to_nothing_agrees(
         under_it.append(agreed[inner[row, column] > 0])
         others.append(agreed[outer[row, column] == 0])
     assert np.concatenate(others).mean() > 0.95
-    assert np.concatenate(under_it).mean() < STRANGERS
+    assert np.concatenate(under_it).mean() < OPTIONS.false_positive_rate
 
 
 @pytest.mark.parametrize("name", ["astronaut", "camera", "coffee"])
-def test_a_fiftieth_of_strangers_passes(picture: Callable[..., np.ndarray], name: str) -> None:
-    """Of an image moved by other shares of its size than those that strangers are taken at."""
+def test_few_null_pairs_pass(picture: Callable[..., np.ndarray], name: str) -> None:
+    """Of an image shifted by other shares of its size than those of the null pairs."""
     gray = picture(name, 2 * HALF)
     shares = []
     for across, down in ((0.25, 0.4), (0.4, 0.75), (0.6, 0.2), (0.75, 0.6)):
         moved = np.roll(seen_again(gray), (round(256 * down), round(256 * across)), (0, 1))
-        shares.append(alike(gray, moved, everywhere(gray), edges(gray)).mean())
-    assert np.mean(shares) < 2 * STRANGERS
+        shares.append(verify_matches(gray, moved, everywhere(gray), edges(gray)).mean())
+    assert np.mean(shares) < 2 * OPTIONS.false_positive_rate
 
 
 def test_an_image_moved_by_more_than_a_descriptor_does_not_agree(photo: np.ndarray) -> None:
     gray = luma(photo)
     moved = np.roll(gray, (25, 20), (0, 1))
     pixels = edges(gray)
-    assert alike(gray, moved, everywhere(gray), pixels).mean() < 0.1
+    assert verify_matches(gray, moved, everywhere(gray), pixels).mean() < 0.1
     nearly = np.roll(gray, 1, 1)
-    assert alike(gray, nearly, everywhere(gray), pixels).mean() > 0.95
+    assert verify_matches(gray, nearly, everywhere(gray), pixels).mean() > 0.95
 
 
 def test_what_is_not_seen_does_not_agree(photo: np.ndarray) -> None:
@@ -111,24 +116,24 @@ def test_what_is_not_seen_does_not_agree(photo: np.ndarray) -> None:
     pixels = every_pixel(gray)
     seen = everywhere(gray)
     seen[:, 150:] = False
-    agreed = alike(gray, gray, seen, pixels).reshape(gray.shape)
+    agreed = verify_matches(gray, gray, seen, pixels).reshape(gray.shape)
     assert not agreed[:, 150:].any()
     assert agreed[:, :150].mean() > 0.98
-    assert not alike(gray, gray, np.zeros(gray.shape, bool), pixels).any()
+    assert not verify_matches(gray, gray, np.zeros(gray.shape, bool), pixels).any()
 
 
-def test_unlikeness_is_one_at_the_bound_and_infinite_where_nothing_is_seen(
+def test_dissimilarity_is_one_at_the_bound_and_infinite_where_nothing_is_seen(
     photo: np.ndarray,
 ) -> None:
     gray = luma(photo)
     pixels, seen = edges(gray), everywhere(gray)
     seen[:, 150:] = False
-    found = unlikeness(gray, seen_again(gray), seen, pixels)
+    found = dissimilarity(gray, seen_again(gray), seen, pixels)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(np.isinf(found), pixels[:, 0] >= 150)
-    np.testing.assert_array_equal(found < 1, alike(gray, seen_again(gray), seen, pixels))
+    np.testing.assert_array_equal(found < 1, verify_matches(gray, seen_again(gray), seen, pixels))
     assert np.median(found[pixels[:, 0] < 150]) < np.median(
-        unlikeness(gray, np.roll(gray, 25, 1), seen, pixels)[pixels[:, 0] < 150]
+        dissimilarity(gray, np.roll(gray, 25, 1), seen, pixels)[pixels[:, 0] < 150]
     )
 
 
@@ -138,10 +143,10 @@ def test_follows_the_order_of_the_points(photo: np.ndarray) -> None:
     order = np.random.default_rng(0).permutation(len(pixels))
     second = seen_again(gray)
     second[:HALF, :HALF] = gray[HALF:, HALF:]
-    agreed = alike(gray, second, everywhere(gray), pixels)
+    agreed = verify_matches(gray, second, everywhere(gray), pixels)
     assert 0.1 < agreed.mean() < 0.95
     np.testing.assert_array_equal(
-        alike(gray, second, everywhere(gray), pixels[order]), agreed[order]
+        verify_matches(gray, second, everywhere(gray), pixels[order]), agreed[order]
     )
 
 
@@ -149,27 +154,33 @@ def test_takes_keypoints_in_single_precision(photo: np.ndarray) -> None:
     gray = luma(photo)
     pixels = edges(gray)
     first, second = (
-        alike(gray, seen_again(gray), everywhere(gray), pixels.astype(kind))
+        verify_matches(gray, seen_again(gray), everywhere(gray), pixels.astype(kind))
         for kind in (np.int64, np.float32)
     )
     np.testing.assert_array_equal(first, second)
 
 
 def test_the_seed_decides_and_hardly_matters(photo: np.ndarray) -> None:
-    """More blocks than are taken: the choice of strangers differs."""
+    """More blocks than are taken: the choice of null pairs differs."""
     gray = cv2.resize(luma(photo), (1472, 1280))
     pixels = every_pixel(gray)[::31]
     assert len(np.unique(pixels // BLOCK, axis=0)) > BLOCKS
-    found = [alike(gray, seen_again(gray), everywhere(gray), pixels, seed) for seed in (0, 0, 5)]
+    found = [
+        verify_matches(gray, seen_again(gray), everywhere(gray), pixels, seed=seed)
+        for seed in (0, 0, 5)
+    ]
     np.testing.assert_array_equal(found[0], found[1])
     assert (found[0] == found[2]).mean() > 0.95
 
 
-def test_up_to_a_megapixel_the_seed_has_no_say(photo: np.ndarray) -> None:
+def test_up_to_a_megapixel_the_seed_does_not_matter(photo: np.ndarray) -> None:
     gray = cv2.resize(luma(photo), (1000, 700))  # the largest of Oxford
     pixels = every_pixel(gray)[::31]
     assert 64 < len(np.unique(pixels // BLOCK, axis=0)) <= BLOCKS
-    found = [unlikeness(gray, seen_again(gray), everywhere(gray), pixels, seed) for seed in (0, 5)]
+    found = [
+        dissimilarity(gray, seen_again(gray), everywhere(gray), pixels, seed=seed)
+        for seed in (0, 5)
+    ]
     np.testing.assert_array_equal(found[0], found[1])
 
 
@@ -180,9 +191,13 @@ def test_what_is_known_of_the_unmoved_image_is_not_described_again_and_the_same(
     pixels, second = edges(gray), seen_again(np.roll(gray, 40, 1))
     second[:, :200] = seen_again(gray)[:, :200]
     found = {}
-    for edge in (strangers.EDGE, 10_000, 0):  # beyond the image: all moved images are described
-        monkeypatch.setattr(strangers, "EDGE", edge)
-        found[edge] = unlikeness(gray, second, everywhere(gray), pixels)
+    for edge in (
+        verification.DESCRIPTOR_REACH,
+        10_000,
+        0,
+    ):  # beyond the image: all moved images are described
+        monkeypatch.setattr(verification, "DESCRIPTOR_REACH", edge)
+        found[edge] = dissimilarity(gray, second, everywhere(gray), pixels)
     real, plain, none = found.values()
     assert 0.3 < (plain < 1).mean() < 0.95
     np.testing.assert_array_equal(np.isinf(real), np.isinf(plain))
@@ -194,39 +209,42 @@ def test_what_is_known_of_the_unmoved_image_is_not_described_again_and_the_same(
 def test_no_points_give_no_answers(photo: np.ndarray) -> None:
     gray = luma(photo)
     for nothing in (np.empty((0, 2)), np.empty((0, 2), np.int64)):
-        found = alike(gray, gray, everywhere(gray), nothing)
+        found = verify_matches(gray, gray, everywhere(gray), nothing)
         assert found.shape == (0,)
         assert found.dtype == bool
 
 
 def test_one_point_is_taken(photo: np.ndarray) -> None:
     gray = luma(photo)
-    found = alike(gray, gray, everywhere(gray), np.array([[80, 60]]))
+    found = verify_matches(gray, gray, everywhere(gray), np.array([[80, 60]]))
     assert found.tolist() == [True]
 
 
 def test_flat_images_tell_nothing(photo: np.ndarray) -> None:
-    """No place is more like another than like any stranger."""
+    """No place is more similar to another than to any unrelated one."""
     flat = np.full((70, 90), 90, np.uint8)
     pixels = every_pixel(flat)
-    assert not alike(flat, flat, everywhere(flat), pixels).any()
+    assert not verify_matches(flat, flat, everywhere(flat), pixels).any()
     for pair in ((luma(photo)[:70, :90], flat), (flat, luma(photo)[:70, :90])):
-        assert alike(*pair, everywhere(flat), pixels).mean() < 1.5 * STRANGERS
+        assert (
+            verify_matches(*pair, everywhere(flat), pixels).mean()
+            < 1.5 * OPTIONS.false_positive_rate
+        )
 
 
 @pytest.mark.parametrize("width", range(120, 280, 20))
 def test_images_that_are_flat_for_a_large_part_tell_nothing(width: int) -> None:
-    """A hundredth of the strangers are equal, flat ones: nothing can be more alike than they."""
+    """A hundredth of the null pairs are equal, flat ones: nothing can be more similar."""
     gray = np.full((300, 400), 235, np.uint8)
     noise = np.random.default_rng(width).normal(size=(300, width))
     gray[:, :width] = np.clip(128 + 150 * cv2.GaussianBlur(noise, (0, 0), 1.5), 0, 255)
-    assert np.isinf(unlikeness(gray, gray, everywhere(gray), every_pixel(gray))).all()
+    assert np.isinf(dissimilarity(gray, gray, everywhere(gray), every_pixel(gray))).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (5, 5), (1, 30), (16, 16)])
 def test_tiny_images_are_taken(shape: tuple[int, int]) -> None:
     gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    found = alike(gray, gray, everywhere(gray), every_pixel(gray))
+    found = verify_matches(gray, gray, everywhere(gray), every_pixel(gray))
     assert found.shape == (gray.size,)
     assert found.dtype == bool
 
@@ -240,7 +258,7 @@ def test_points_far_apart_are_all_described(photo: np.ndarray, odd: int) -> None
     assert (pixels.sum(axis=1) % 2 == odd).all()
     second = np.roll(gray, 57, axis=1)  # the left half is right, the other is not
     second[:, : gray.shape[1] // 2] = gray[:, : gray.shape[1] // 2]
-    scores = unlikeness(gray, second, everywhere(gray), pixels)
+    scores = dissimilarity(gray, second, everywhere(gray), pixels)
     right = pixels[:, 0] < gray.shape[1] // 2 - 50
     wrong = pixels[:, 0] > gray.shape[1] // 2 + 50
     assert np.isfinite(scores[right]).mean() > 0.9
@@ -254,5 +272,76 @@ def test_it_changes_little_which_points_are_described(photo: np.ndarray) -> None
     pixels = every_pixel(gray)
     even, odd = (pixels[pixels.sum(axis=1) % 2 == parity] for parity in (0, 1))
     second = seen_again(gray)
-    shares = [alike(gray, second, everywhere(gray), part).mean() for part in (even, odd)]
+    shares = [verify_matches(gray, second, everywhere(gray), part).mean() for part in (even, odd)]
     assert abs(shares[0] - shares[1]) < 0.03
+
+
+# Null pairs
+
+
+@pytest.fixture
+def gray(photo: np.ndarray) -> np.ndarray:
+    return cv2.resize(luma(photo), (301, 240))
+
+
+@pytest.fixture
+def points(gray: np.ndarray) -> np.ndarray:
+    return every_pixel(gray)[::7]
+
+
+def test_under_a_point_of_the_shifted_image_lies_its_null_partner(
+    gray: np.ndarray, points: np.ndarray
+) -> None:
+    chosen = sample_null_pairs(points, gray, everywhere(gray))
+    assert len(chosen) == len(OPTIONS.null_shifts)
+    for null in chosen:
+        np.testing.assert_array_equal(np.sort(null.rows), np.arange(len(points)))
+        here = points[null.rows]
+        np.testing.assert_array_equal(
+            null.shifted[here[:, 1], here[:, 0]],
+            gray[null.places[:, 1], null.places[:, 0]],
+        )
+        apart = np.abs(here - null.places).max(axis=1)
+        assert apart.min() >= min(gray.shape) // 3
+
+
+@pytest.mark.parametrize("size", OPTIONS.keypoint_sizes_px)
+def test_interior_descriptors_are_those_of_the_image_that_is_not_shifted(
+    gray: np.ndarray, points: np.ndarray, size: float
+) -> None:
+    for null in sample_null_pairs(points, gray, everywhere(gray)):
+        assert 0.1 < null.interior.mean() < 0.9
+        moved = dense_sift(null.shifted, points[null.rows], size)
+        unmoved = dense_sift(gray, null.places, size)
+        np.testing.assert_array_equal(moved[null.interior], unmoved[null.interior])
+        assert (moved != unmoved).any(axis=1).mean() > 0.03  # those at an edge are others
+
+
+def test_null_partners_are_valid(gray: np.ndarray, points: np.ndarray) -> None:
+    seen = everywhere(gray)
+    seen[:, 200:] = False
+    for null in sample_null_pairs(points, gray, seen):
+        assert 0.3 < len(null.rows) / len(points) < 0.9
+        assert null.places[:, 0].max() < 200
+
+
+def test_beyond_a_megapixel_blocks_are_chosen_by_the_seed(photo: np.ndarray) -> None:
+    gray = cv2.resize(luma(photo), (1472, 1280))
+    row, column = np.indices((20, 23))
+    points = np.column_stack([column.ravel(), row.ravel()]) * BLOCK + 5
+    assert len(points) > BLOCKS
+    chosen = [sample_null_pairs(points, gray, everywhere(gray), seed=seed) for seed in (0, 0, 5)]
+    for first, again, other in zip(*chosen, strict=True):
+        assert len(first.rows) == BLOCKS
+        np.testing.assert_array_equal(first.rows, again.rows)
+        assert set(first.rows) != set(other.rows)
+    together = {int(row) for null in chosen[0] for row in null.rows}
+    assert len(together) == len(points)  # each shift takes others while there are any
+
+
+def test_each_pixel_has_one_index() -> None:
+    pixels = np.array([[3, 1], [0, 0], [3, 1], [2, 2]])
+    distinct, index = index_map(pixels, (3, 4))
+    assert {tuple(xy) for xy in distinct.tolist()} == {(3, 1), (0, 0), (2, 2)}
+    np.testing.assert_array_equal(distinct[index[pixels[:, 1], pixels[:, 0]]], pixels)
+    assert (index >= 0).sum() == 3

@@ -17,7 +17,7 @@ from ...geometry import transform_points
 from ...geometry.residuals import transfer_errors
 from ...io.image import load_image, luma
 from ...matching.guided import guided_matches
-from ...matching.guided.homography import nearest_pixel
+from ...matching.guided.homography import nearest_keypoint
 from ...matching.options import get_preset
 from ...matching.pipeline import unguided_matches
 from ..baselines import Method
@@ -151,7 +151,7 @@ def _measure(
     cells: dict[str, tuple[Cell, ...]] = {}
     for truth, one in judged.items():
         places = transform_points(unguided.keypoints0, one.homography)
-        gaps = nearest_pixel(places, unguided.keypoints1, (second[1], second[0]))[1]
+        gaps = nearest_keypoint(places, unguided.keypoints1, (second[1], second[0]))[1]
         could = int(np.count_nonzero(gaps < CORRECT))
         right = _right(unguided.points0, unguided.points1, one)
         cells[truth] = (
@@ -218,7 +218,7 @@ def find_guided(workspace: Workspace, method: Method, pair: PlanarPair, seed: in
             guide, found = guided_matches(*grays, *points, seed=seed)
         if found is None:
             options = replace_options(get_preset("default"), seed=seed)
-            found = unguided_matches(grays, points, options, {})
+            found = unguided_matches(grays, points, options)
         return {
             "kind": np.array(guide.model),
             "matrix": np.empty((0, 3)) if guide.matrix is None else guide.matrix,

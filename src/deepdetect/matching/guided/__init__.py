@@ -1,5 +1,7 @@
 """Guided matching: a geometry from a few matches proposes dense ones, which are verified."""
 
+from .initial_geometry import InitialMatches, initial_matches
+from .options import GuidedOptions
 from .pipeline import guided_matches
 
-__all__ = ["guided_matches"]
+__all__ = ["GuidedOptions", "InitialMatches", "guided_matches", "initial_matches"]

@@ -1,4 +1,4 @@
-"""Views from the side, simulated: for pairs whose viewpoints differ too much for plain SIFT.
+"""Simulated views, for pairs whose viewpoints differ too much for plain SIFT.
 
 Yu and Morel, "ASIFT: A New Framework for Fully Affine Invariant Image Comparison", 2009. One image
 is seen from the side, in several directions, and compared with the other as it is; then the other
@@ -15,64 +15,69 @@ import numpy as np
 from ...features.keypoints import Keypoints
 from ...features.sift_detector import SiftOptions, detect_sift
 
-TILTS = (2.0, 2.0 * 2**0.5, 4.0)
-"""How many times shorter one direction is seen."""
+BLUR = 0.8
+"""Sigma of the blur before an image is shortened, in units of sqrt(tilt^2 - 1)."""
 
-STEP = 72.0
-"""Degrees between the directions, for a tilt of 1; the larger the tilt, the finer."""
-
-ALIAS = 0.8
-"""Blur before an image is shortened, in units of sqrt(tilt^2 - 1)."""
+GRAY_OUTSIDE = 128
 
 
-def tilted_views(gray: np.ndarray, tilt: float, most: int) -> Iterator[Keypoints]:
-    """Find the keypoints of an image as seen from the side, from directions all around.
+def simulated_views(
+    gray: np.ndarray, tilt: float, rotation_step_deg: float, sift: SiftOptions
+) -> Iterator[Keypoints]:
+    """Detect the keypoints of an image as seen from the side, from directions all around.
 
     Args:
         gray: (H, W) uint8 luma.
-        tilt: how many times shorter one direction is.
-        most: keypoints of each view.
+        tilt: how many times shorter one direction is seen.
+        rotation_step_deg: between the directions for a tilt of 1.
+        sift: the keypoints of each view.
 
     Yields:
-        The features of each view, at their positions in the image itself.
+        The described keypoints of each view, at their positions in the image itself.
     """
-    for turn in np.linspace(0, 180, round(180 * tilt / STEP), endpoint=False):
-        view, to_view = tilted(gray, tilt, float(turn))
-        found = detect_sift(view, SiftOptions(max_keypoints=most))
+    directions = round(180 * tilt / rotation_step_deg)
+    for rotation in np.linspace(0, 180, directions, endpoint=False):
+        view, to_view = simulate_view(gray, tilt, float(rotation))
+        found = detect_sift(view, sift)
         back = cv2.invertAffineTransform(to_view)
         xy = found.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
         inside = ((xy > 0) & (xy < np.array(gray.shape[::-1]) - 1)).all(1)
-        size = (gray.shape[1], gray.shape[0])
+        assert found.descriptors is not None
         yield Keypoints(
-            *(xy[inside], found.scores[inside], size), descriptors=found.descriptors[inside]
+            xy[inside],
+            found.scores[inside],
+            (gray.shape[1], gray.shape[0]),
+            descriptors=found.descriptors[inside],
         )
 
 
-def tilted(gray: np.ndarray, tilt: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
-    """Turn an image and shorten it along x, blurred before as a camera would.
+def simulate_view(
+    gray: np.ndarray, tilt: float, rotation_deg: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotate an image and shorten it along x, blurred before as by a camera.
 
     Args:
         gray: (H, W) uint8 luma.
-        tilt: how many times.
-        turn: degrees.
+        tilt: how many times it is shortened.
+        rotation_deg: before that.
 
     Returns:
-        The view, grey outside the image, and the (2, 3) affine map from the image to it.
+        The view, gray outside the image, and the (2, 3) affine map from the image to it.
     """
     height, width = gray.shape
-    angle = np.deg2rad(turn)
+    angle = np.deg2rad(rotation_deg)
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ rotation.T
     low = corners.min(0)
     across, down = np.ceil(corners.max(0) - low).astype(int)
     affine = np.column_stack([rotation, -low])
-    flags = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": 128}
-    turned = cv2.warpAffine(gray, affine, (int(across), int(down)), **flags)
-    blur = ALIAS * np.sqrt(tilt**2 - 1)
+    border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": GRAY_OUTSIDE}
+    rotated = cv2.warpAffine(gray, affine, (int(across), int(down)), **border)
+    blur = BLUR * np.sqrt(tilt**2 - 1)
     if blur > 0:
-        turned = cv2.GaussianBlur(turned, (0, 0), sigmaX=blur, sigmaY=0.01)
+        rotated = cv2.GaussianBlur(rotated, (0, 0), sigmaX=blur, sigmaY=0.01)
     size = (max(1, round(across / tilt)), int(down))
-    shrink = np.array([[1 / tilt, 0, 0], [0, 1.0, 0]])
-    view = cv2.warpAffine(turned, shrink, size, flags=cv2.INTER_LINEAR, **flags)
+    shorten = np.array([[1 / tilt, 0, 0], [0, 1.0, 0]])
+    view = cv2.warpAffine(rotated, shorten, size, flags=cv2.INTER_LINEAR, **border)
     affine[0] /= tilt
     return view, affine

@@ -1,49 +1,81 @@
-"""Dense matches of a plane or a turning camera: the keypoint nearest to where it must be."""
+"""Dense matches of a plane or a rotating camera: the keypoint nearest to its predicted position."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from ...features.matchers import DescriptorMatches
+from ...geometry.homography_refinement import refine_homography, refine_homography_irls
+from ...geometry.rescaling import downscale, scaled_homography
 from ...geometry.residuals import transform_points
 from ...geometry.zncc import warp_to_reference
-from .verification import unlikeness
-
-REACH = 1.0
-"""A keypoint matches when it is nearer than this to where the homography takes the other."""
+from .options import HomographyMatchingOptions, VerificationOptions
+from .verification import dissimilarity
 
 
-def matches_by_homography(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    xy0: np.ndarray,
-    xy1: np.ndarray,
+@dataclass(frozen=True, eq=False)
+class ImagePair:
+    """Two images and their keypoints.
+
+    Attributes:
+        gray0, gray1: (H0, W0), (H1, W1) uint8 luma.
+        xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
+    """
+
+    gray0: np.ndarray
+    gray1: np.ndarray
+    xy0: np.ndarray
+    xy1: np.ndarray
+
+
+def match_by_homography(
+    pair: ImagePair,
     homography: np.ndarray,
+    options: HomographyMatchingOptions = HomographyMatchingOptions(),
+    verification: VerificationOptions = VerificationOptions(),
     seed: int = 0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Match keypoints by a homography, and keep those that look alike.
+) -> DescriptorMatches:
+    """Match keypoints by a homography, and keep those whose patches are the same.
 
     Args:
-        gray0, gray1: (H, W) uint8 luma.
-        xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
+        pair: images and keypoints.
         homography: (3, 3) from the first image to the second.
-        seed: of the test of likeness.
+        options: how near a partner must be.
+        verification: when patches count as the same.
+        seed: of the null pairs.
 
     Returns:
-        (K,) rows of the first and of the second keypoints, and their `unlikeness`, under 1. A
-        keypoint of the second image may have several partners: each of the first counts once.
+        The matches, their ratios the `dissimilarity` of their patches, under 1. Each keypoint of
+        the first image is matched once at most, those of the second image perhaps more often.
     """
-    places = transform_points(xy0, homography)
-    rows1, distances = nearest_pixel(places, xy1, (gray1.shape[1], gray1.shape[0]))
-    rows0 = np.flatnonzero(distances < REACH)
+    gray0, gray1 = pair.gray0, pair.gray1
+    places = transform_points(pair.xy0, homography)
+    rows1, distances = nearest_keypoint(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
+    rows0 = np.flatnonzero(distances < options.max_distance_px)
     if not len(rows0):
-        return rows0, rows0, np.empty(0, np.float32)
-    warped, seen = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
-    scores = unlikeness(gray0, warped, seen, xy0[rows0], seed)
-    kept = rows0[scores < 1]
-    return kept, rows1[kept], scores[scores < 1]
+        return DescriptorMatches(rows0, rows0, np.empty(0, np.float32))
+    warped, valid = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
+    ratios = dissimilarity(gray0, warped, valid, pair.xy0[rows0], verification, seed)
+    kept = rows0[ratios < 1]
+    return DescriptorMatches(kept, rows1[kept], ratios[ratios < 1])
 
 
-def nearest_pixel(
+def refine_guiding_homography(
+    gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray, options: HomographyMatchingOptions
+) -> np.ndarray:
+    """Refine a homography on the images, scaled down to what that needs; (3, 3)."""
+    (small0, scale0), (small1, scale1) = (
+        downscale(gray, options.max_side_px) for gray in (gray0, gray1)
+    )
+    start = scaled_homography(homography, scale0, scale1)
+    found = refine_homography(small0, small1, start, options.refinement).homography
+    found = refine_homography_irls(small0, small1, found)
+    return scaled_homography(found, 1 / scale0, 1 / scale1)
+
+
+def nearest_keypoint(
     places: np.ndarray, xy: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the keypoint nearest to each place, of those in the 3x3 pixels around it.
@@ -54,10 +86,11 @@ def nearest_pixel(
         size: (width, height) of their image.
 
     Returns:
-        (N,) rows of `xy` and (N,) distances, infinite where there is none so near.
+        (N,) rows of `xy` and (N,) distances, -1 and infinite where there is none so near.
 
     Example:
-        >>> rows, far = nearest_pixel(np.array([[2.2, 3.0], [9, 9]]), np.array([[2, 3]]), (10, 10))
+        >>> places = np.array([[2.2, 3.0], [9, 9]])
+        >>> rows, far = nearest_keypoint(places, np.array([[2, 3]]), (10, 10))
         >>> rows[0], far.round(2).tolist()
         (np.int32(0), [0.2, inf])
     """

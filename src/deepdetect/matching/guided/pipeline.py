@@ -1,7 +1,8 @@
-"""Guided matching: a geometry from few points, sharpened, then all keypoints where it points.
+"""Guided matching: an initial geometry, refined, then all keypoints where it predicts them.
 
-Geometry only proposes: a pair stays when both places look alike once the geometry is taken out
-(`agreement_test`). The true geometry is never seen.
+Geometry only proposes: a pair is kept when its patches are the same once the geometry is taken out
+(`verification`), or when it is similar, moves like its neighbours and lies among other matches
+(`epipolar`).
 """
 
 from __future__ import annotations
@@ -10,35 +11,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..._shared.errors import unknown_name
 from ...features.matchers import DescriptorMatches
 from ...features.matches import Guide
 from ...geometry import GeometryOptions, estimate_geometry
-from ...geometry.homography_refinement import (
-    RefinementOptions,
-    refine_homography,
-    refine_homography_irls,
+from .epipolar import match_along_epipolar_lines
+from .homography import ImagePair, match_by_homography, refine_guiding_homography
+from .initial_geometry import (
+    InitialGeometry,
+    InitialMatches,
+    estimate_initial_geometry,
+    initial_matches,
 )
-from ...geometry.rescaling import downscale, scaled_homography
-from .epipolar import matches_by_epipolar_line
-from .homography import matches_by_homography
-from .initial_geometry import FirstPass, InitialMatches, first_pass
-from .prewarp import affinity_between, straightened
-
-MODELS = ("auto", "homography", "fundamental")
-
-LONGEST = 1600
-"""Longer sides are shrunk to so many pixels where the geometry is sharpened."""
-
-SHARPENING = RefinementOptions(max_rounds=2, windows_px=(15, 21, 41), inlier_threshold=0.5)
-
-ROUNDS = 2
-LEAST_MORE = 0.01
-"""New fundamental matrices from the dense matches, at the most, and the share of further matches
-that one must give."""
-
-FEWEST = 0.02
-"""With fewer matches than this share of the keypoints, the geometry is not trusted after all."""
+from .options import GuidedOptions
+from .prewarp import estimate_affinity, prewarp
 
 
 def guided_matches(
@@ -49,6 +34,7 @@ def guided_matches(
     model: str = "auto",
     seed: int = 0,
     initial: InitialMatches | None = None,
+    options: GuidedOptions = GuidedOptions(),
 ) -> tuple[Guide, DescriptorMatches | None]:
     """Match the keypoints of two images by their geometry.
 
@@ -57,82 +43,71 @@ def guided_matches(
         xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
         model: "homography", "fundamental" or "auto".
         seed: of all random choices.
-        initial: of `initial_matches`, where they are there already.
+        initial: sparse matches of the pair, where `initial_matches` has made them already.
+        options: all tuned numbers.
 
     Returns:
-        What guided, and the matches; None when nothing could.
+        The geometry that guided, and the matches; None when no geometry could be trusted.
 
     Raises:
         OptionError: the model is unknown.
     """
-    if model not in MODELS:
-        raise unknown_name("model", model, MODELS)
-    first = first_pass(gray0, gray1, model, seed, initial)
-    if first.kind == "none" or first.matrix is None:
+    if initial is None:
+        initial = initial_matches(gray0, gray1, options.initial_geometry)
+    first = estimate_initial_geometry(initial, model, seed, options.initial_geometry)
+    if first.matrix is None:
         return _guide(first, None), None
-    if first.kind == "homography":
-        matrix = sharpened(gray0, gray1, first.matrix)
-        rows0, rows1, ratios = matches_by_homography(gray0, gray1, xy0, xy1, matrix, seed)
+    pair = ImagePair(gray0, gray1, xy0, xy1)
+    if first.model == "homography":
+        by_homography = options.homography_matching
+        matrix = refine_guiding_homography(gray0, gray1, first.matrix, by_homography)
+        found = match_by_homography(pair, matrix, by_homography, options.verification, seed)
     else:
-        matrix, (rows0, rows1, ratios) = _by_lines(gray0, gray1, xy0, xy1, first, seed)
-    if len(rows0) < FEWEST * min(len(xy0), len(xy1)):
-        return _guide(replace(first, kind="none", points0=first.points0[:0]), None), None
-    return _guide(first, matrix), DescriptorMatches(rows0, rows1, ratios)
+        matrix, found = _match_scene_with_depth(pair, first, options, seed)
+    if len(found) < options.min_matched_fraction * min(len(xy0), len(xy1)):
+        return _guide(replace(first, model="none", points0=first.points0[:0]), None), None
+    return _guide(first, matrix), found
 
 
-def _by_lines(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    xy0: np.ndarray,
-    xy1: np.ndarray,
-    first: FirstPass,
-    seed: int,
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Match by a fundamental matrix; take a new one from the matches while that gives more.
+def _match_scene_with_depth(
+    pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
+) -> tuple[np.ndarray, DescriptorMatches]:
+    """Match by a fundamental matrix; estimate it again while that gives more matches.
 
-    The second image is turned as the first one stands where it does not stand so already.
+    The second image is aligned with the first where it is not already.
     """
-    affinity = affinity_between(first.points0, first.points1)
-    view = None if affinity is None else straightened(gray0, gray1, xy1, affinity)
+    epipolar = options.epipolar_matching
+    affinity = estimate_affinity(first.points0, first.points1, options.prewarp)
+    aligned = None if affinity is None else prewarp(pair, affinity, options.prewarp)
 
-    def matched(fundamental: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        if view is None:
-            return matches_by_epipolar_line(gray0, gray1, xy0, xy1, fundamental, seed)
-        rows0, rows1, ratios = matches_by_epipolar_line(
-            view.gray0, view.gray1, xy0, view.xy1, view.fundamental(fundamental), seed
-        )
-        return rows0, view.rows1[rows1], ratios
+    def match(fundamental: np.ndarray) -> DescriptorMatches:
+        if aligned is None:
+            return match_along_epipolar_lines(pair, fundamental, epipolar, seed)
+        warped = aligned.fundamental(fundamental)
+        return aligned.original(match_along_epipolar_lines(aligned.pair, warped, epipolar, seed))
 
     assert first.matrix is not None
-    best = first.matrix, matched(first.matrix)
-    for _ in range(ROUNDS):
-        rows0, rows1, _ = best[1]
-        options = GeometryOptions(model="fundamental", inlier_threshold=1.0, seed=seed)
-        matrix = estimate_geometry(xy0[rows0], xy1[rows1], options).matrix
+    best, found = first.matrix, match(first.matrix)
+    refit = GeometryOptions(
+        model="fundamental", inlier_threshold=epipolar.refit_threshold_px, seed=seed
+    )
+    for _ in range(epipolar.max_refits):
+        matrix = estimate_geometry(pair.xy0[found.rows0], pair.xy1[found.rows1], refit).matrix
         if matrix is None:
             break
-        found = matched(matrix)
-        if len(found[0]) <= len(rows0) * (1 + LEAST_MORE):
+        again = match(matrix)
+        if len(again) <= len(found) * (1 + epipolar.min_refit_gain):
             break
-        best = matrix, found
-    return best
+        best, found = matrix, again
+    return best, found
 
 
-def sharpened(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Refine a homography by the images, shrunk to what that needs; (3, 3)."""
-    (small0, scale0), (small1, scale1) = (downscale(gray, LONGEST) for gray in (gray0, gray1))
-    start = scaled_homography(homography, scale0, scale1)
-    found = refine_homography(small0, small1, start, SHARPENING).homography
-    found = refine_homography_irls(small0, small1, found)
-    return scaled_homography(found, 1 / scale0, 1 / scale1)
-
-
-def _guide(first: FirstPass, matrix: np.ndarray | None) -> Guide:
+def _guide(first: InitialGeometry, matrix: np.ndarray | None) -> Guide:
     return Guide(
-        first.kind,
+        first.model,
         matrix,
-        first.matches,
+        first.num_matches,
         len(first.points0),
         float(first.log10_nfa),
-        first.simulated,
+        first.num_views,
     )

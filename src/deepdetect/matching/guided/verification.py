@@ -1,143 +1,217 @@
-"""Which points look alike in both images once the geometry is taken out.
+"""Whether the patches around matched points are the same, once the geometry is taken out.
 
-The second image is warped into the frame of the first, and descriptors are taken from both at the
-same pixels, small and large ones. They are compared by their correlation, with the mean descriptor
-taken away: all descriptors have much in common, those of noise-like texture nearly everything.
-What two places that have nothing to do with each other look like is measured on the pair itself,
-by comparing with the warped image moved by a third of its size and more (`strangers`). A point
-agrees when its descriptors, with those right around it, are more alike than all but a hundredth of
-such strangers, and when most points about it agree too. Every second point is described, as on a
-chessboard: its neighbours share what it says.
+The second image is warped into the frame of the first, and descriptors of two sizes are taken from
+both at the same pixels. They are compared by their correlation about the mean descriptor: all
+descriptors have much in common, those of noise-like texture nearly everything.
+
+What unrelated patches look like is measured on the pair itself, by null pairs: the warped image is
+shifted by a third of its size and more, and what then lies under a point is unrelated to it, but of
+the same kind of scene and light. A point passes when its descriptors, averaged with those of its
+neighbours, are more similar than all but `false_positive_rate` of the null pairs, and when most
+points around it pass, too. Every second point is described, as on a chessboard: neighbours have
+nearly the same descriptors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ...features.dense_sift import dense_sift
 from ...features.sift import correlation_distance, to_root_sift
-from .strangers import choose_strangers, numbered
+from ...geometry.windows import gaussian_means, window_sums
+from .options import VerificationOptions
 
-SIZES = (3.0, 8.0)
-"""Diameters of the keypoints for these descriptors, in pixels."""
+DESCRIPTOR_REACH = 36
+"""Pixels that the largest descriptors see, with their gradient and blur. Further from all edges the
+descriptors of a shifted image are those of the image itself, described once for all shifts."""
 
-STRANGERS = 0.01
-"""Share of strangers that would pass by themselves."""
+NEIGHBOURHOOD = 5
+"""Side in pixels of the window around a point in which one of the described points must lie."""
 
-TOGETHER = 2.5
-"""Sigma in pixels of the mean over the points right around: neighbours agree together."""
+MIN_POINTS_OF_MEAN = 100
+"""With fewer points no mean descriptor is subtracted: it would be close to their own."""
 
-CROWD = 81
-MAJORITY = 0.5
-"""Side in pixels of the window about a point, and the share of its points that must agree."""
-
-NEAR = 5
-"""Side in pixels of the window in which one of the described points must lie."""
-
-SAME = 1e-6
-"""Rounding: so unlike are equal descriptors at most."""
-
-FEW = 100
-"""With fewer points no mean is taken away: theirs would be near to themselves."""
+MIN_NULL_DISTANCE = 1e-6
+"""Rounding: the distance of equal descriptors is at most this."""
 
 
-def alike(
-    gray0: np.ndarray, warped: np.ndarray, seen: np.ndarray, pixels: np.ndarray, seed: int = 0
+@dataclass(frozen=True, eq=False)
+class NullPairs:
+    """Pairs of unrelated points, by one shift of the second image.
+
+    Attributes:
+        rows: (N,) the points that have a partner.
+        places: (N, 2) where it is in the second image.
+        interior: (N,) bool: no descriptor sees an edge: it is the same with and without the shift.
+        shifted: (H, W) uint8, the second image shifted cyclically.
+    """
+
+    rows: np.ndarray
+    places: np.ndarray
+    interior: np.ndarray
+    shifted: np.ndarray
+
+
+def verify_matches(
+    gray0: np.ndarray,
+    warped: np.ndarray,
+    valid: np.ndarray,
+    pixels: np.ndarray,
+    options: VerificationOptions = VerificationOptions(),
+    seed: int = 0,
 ) -> np.ndarray:
-    """Tell which points agree, (N,) bool; arguments as of `unlikeness`."""
-    return unlikeness(gray0, warped, seen, pixels, seed) < 1
+    """Find the points whose patches are the same, (N,) bool; arguments as of `dissimilarity`."""
+    return dissimilarity(gray0, warped, valid, pixels, options, seed) < 1
 
 
-def unlikeness(
-    gray0: np.ndarray, warped: np.ndarray, seen: np.ndarray, pixels: np.ndarray, seed: int = 0
+def dissimilarity(
+    gray0: np.ndarray,
+    warped: np.ndarray,
+    valid: np.ndarray,
+    pixels: np.ndarray,
+    options: VerificationOptions = VerificationOptions(),
+    seed: int = 0,
 ) -> np.ndarray:
-    """Compare the surroundings of points.
+    """Compare the patches around points.
 
     Args:
         gray0: (H, W) uint8, the first image.
         warped: (H, W) uint8, the second one in the frame of the first.
-        seen: (H, W) bool, where that has content.
+        valid: (H, W) bool, where that has content.
         pixels: (N, 2) whole pixels of the first image.
-        seed: of the choice of strangers.
+        options: when patches count as the same.
+        seed: of the null pairs.
 
     Returns:
-        (N,) float32: how unlike they are (1 - correlation, with those around) over the bound that
-        a share of `STRANGERS` stays under. Infinite where the second image is not seen, where
-        most points about do not agree, and everywhere when strangers all look the same.
+        (N,) float32: 1 - correlation, averaged over neighbours, relative to the bound that a share
+        `false_positive_rate` of null pairs stays under. Infinite where the second image has no
+        content, where most points around are dissimilar, and everywhere when all null pairs look
+        the same.
     """
     pixels = np.asarray(pixels).astype(np.int64)
     result = np.full(len(pixels), np.inf, np.float32)
-    known = np.flatnonzero(seen[pixels[:, 1], pixels[:, 0]])
+    known = np.flatnonzero(valid[pixels[:, 1], pixels[:, 0]])
     if not len(known):
         return result
-    here = pixels[known]
-    described = here[_thinned(here, gray0.shape)]
-    moves = choose_strangers(described, warped, seen, seed)
-    # Each place of the second image is described once, however often it is a stranger.
-    used = [described, *(move.places[move.whole] for move in moves)]
-    places, number = numbered(np.concatenate(used), seen.shape)
-    own = number[described[:, 1], described[:, 0]]
-    unlike = np.zeros(len(described), np.float32)
-    stranger = [np.zeros(len(move.rows), np.float32) for move in moves]
-    for size in SIZES:
-        first = to_root_sift(dense_sift(gray0, described, size), overwrite=True)
-        total = first.sum(axis=0, dtype=np.int64)  # whole: the order of the points has no say
-        mean = (total / len(first) if len(first) >= FEW else 0 * total).astype(np.float32)
-        second = to_root_sift(dense_sift(warped, places, size), overwrite=True)
-        unlike += correlation_distance(first, np.arange(len(first)), second, own, mean)
-        for values, move in zip(stranger, moves, strict=True):
-            x, y = move.places[move.whole].T
-            rows, cut = move.rows[move.whole], move.rows[~move.whole]
-            values[move.whole] += correlation_distance(first, rows, second, number[y, x], mean)
-            others = to_root_sift(dense_sift(move.moved, described[cut], size), overwrite=True)
-            values[~move.whole] += correlation_distance(
-                first, cut, others, np.arange(len(cut)), mean
-            )
-    means = [
-        _together(described[move.rows], values, described[move.rows], gray0.shape)
-        for move, values in zip(moves, stranger, strict=True)
-    ]
-    strangers = np.concatenate(means)
-    bound = np.quantile(strangers, STRANGERS) if len(strangers) else 0
-    if bound <= SAME:  # strangers are all the same: likeness tells nothing
+    here, shape = pixels[known], gray0.shape
+    described = here[_every_second(here, shape)]
+    null_pairs = sample_null_pairs(described, warped, valid, options, seed)
+    distances, null_distances = _distances(gray0, warped, described, null_pairs, options)
+    sigma = options.smoothing_sigma_px
+    null_means = []
+    for null, values in zip(null_pairs, null_distances, strict=True):
+        points = described[null.rows]
+        null_means.append(gaussian_means(points, values, shape, sigma, points))
+    together = np.concatenate(null_means)
+    bound = np.quantile(together, options.false_positive_rate) if len(together) else 0
+    if bound <= MIN_NULL_DISTANCE:  # all null pairs look the same: similarity says nothing
         return result
-    ratios = _together(described, unlike, here, gray0.shape) / np.float32(bound)
-    crowd = _share_about(here, ratios < 1, gray0.shape)
-    result[known] = np.where(crowd >= MAJORITY, ratios, np.inf)
+    ratios = gaussian_means(described, distances, shape, sigma, here) / np.float32(bound)
+    window = options.window_px
+    count, passed = (
+        window_sums(here, part, shape, window, dtype=np.float32) for part in (1, ratios < 1)
+    )
+    support = passed / np.maximum(count, 1)
+    result[known] = np.where(support >= options.min_support, ratios, np.inf)
     return result
 
 
-def _thinned(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+def sample_null_pairs(
+    points: np.ndarray,
+    warped: np.ndarray,
+    valid: np.ndarray,
+    options: VerificationOptions = VerificationOptions(),
+    seed: int = 0,
+) -> list[NullPairs]:
+    """Pair points of some blocks of the image with unrelated places of the second image.
+
+    Args:
+        points: (N, 2) int64 pixels of the first image.
+        warped: (H, W) uint8, the second one in the frame of the first.
+        valid: (H, W) bool, where that has content: partners lie there only.
+        options: shifts and blocks.
+        seed: of the choice of blocks; up to a megapixel all blocks are taken, whatever the seed.
+
+    Returns:
+        One entry for each shift.
+    """
+    size = np.array(warped.shape[::-1])
+    result = []
+    blocks = _sample_blocks(points, options, seed)
+    for rows, share in zip(blocks, options.null_shifts, strict=True):
+        shift = np.rint(np.array(share) * size).astype(np.int64)
+        places = (points[rows] - shift) % size
+        known = valid[places[:, 1], places[:, 0]]
+        rows, places = rows[known], places[known]
+        inner = [
+            (np.minimum(xy, size - 1 - xy) >= DESCRIPTOR_REACH).all(axis=1)
+            for xy in (points[rows], places)
+        ]
+        shifted = np.roll(warped, shift[::-1], (0, 1))
+        result.append(NullPairs(rows, places, inner[0] & inner[1], shifted))
+    return result
+
+
+def index_map(pixels: np.ndarray, shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct pixels, (P, 2), and the (H, W) image of their rows, -1 elsewhere."""
+    index = np.full(tuple(shape[:2]), -1, np.int32)
+    index[pixels[:, 1], pixels[:, 0]] = 0
+    row, column = np.nonzero(index == 0)
+    index[row, column] = np.arange(len(row))
+    return np.column_stack([column, row]), index
+
+
+def _distances(
+    gray0: np.ndarray,
+    warped: np.ndarray,
+    points: np.ndarray,
+    null_pairs: Sequence[NullPairs],
+    options: VerificationOptions,
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return 1 - correlation of the points and of the null pairs, summed over the sizes."""
+    # Each place of the second image is described once, however often it is part of a null pair.
+    used = [points, *(null.places[null.interior] for null in null_pairs)]
+    places, index = index_map(np.concatenate(used), warped.shape)
+    own = index[points[:, 1], points[:, 0]]
+    distances = np.zeros(len(points), np.float32)
+    null_distances = [np.zeros(len(null.rows), np.float32) for null in null_pairs]
+    for size in options.keypoint_sizes_px:
+        first = to_root_sift(dense_sift(gray0, points, size), overwrite=True)
+        total = first.sum(axis=0, dtype=np.int64)  # exact: the order of the points does not matter
+        enough = len(first) >= MIN_POINTS_OF_MEAN
+        mean = (total / len(first) if enough else 0 * total).astype(np.float32)
+        second = to_root_sift(dense_sift(warped, places, size), overwrite=True)
+        distances += correlation_distance(first, np.arange(len(first)), second, own, mean)
+        for values, null in zip(null_distances, null_pairs, strict=True):
+            x, y = null.places[null.interior].T
+            inner, outer = null.rows[null.interior], null.rows[~null.interior]
+            values[null.interior] += correlation_distance(first, inner, second, index[y, x], mean)
+            others = to_root_sift(dense_sift(null.shifted, points[outer], size), overwrite=True)
+            rows = np.arange(len(outer))
+            values[~null.interior] += correlation_distance(first, outer, others, rows, mean)
+    return distances, null_distances
+
+
+def _every_second(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
     """Return the rows of every second point, and of those with none of these near."""
     second = pixels.sum(axis=1) % 2 == 0
-    image = _image(pixels, second, shape)
-    near = cv2.dilate(image, np.ones((NEAR, NEAR), np.uint8))[pixels[:, 1], pixels[:, 0]] > 0
+    image = np.zeros(tuple(shape[:2]), np.float32)
+    image[pixels[:, 1], pixels[:, 0]] = second
+    window = np.ones((NEIGHBOURHOOD, NEIGHBOURHOOD), np.uint8)
+    near = cv2.dilate(image, window)[pixels[:, 1], pixels[:, 0]] > 0
     return np.flatnonzero(second | ~near)
 
 
-def _together(
-    pixels: np.ndarray, values: np.ndarray, places: np.ndarray, shape: Sequence[int]
-) -> np.ndarray:
-    """Return the weighted mean of the values of the points around each place, (N,) float32."""
-    count, total = (_image(pixels, part, shape) for part in (np.float32(1), values))
-    count, total = (cv2.GaussianBlur(image, (0, 0), TOGETHER) for image in (count, total))
-    return (total / np.maximum(count, 1e-6))[places[:, 1], places[:, 0]]
-
-
-def _share_about(pixels: np.ndarray, agree: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-    """Return the share of the points in the window about each that agree, (N,) float32."""
-    count, total = (_image(pixels, part, shape) for part in (np.float32(1), agree))
-    sums = [
-        cv2.boxFilter(image, -1, (CROWD, CROWD), normalize=False, borderType=cv2.BORDER_CONSTANT)
-        for image in (count, total)
-    ]
-    return (sums[1] / np.maximum(sums[0], 1))[pixels[:, 1], pixels[:, 0]]
-
-
-def _image(pixels: np.ndarray, values: np.ndarray | np.float32, shape: Sequence[int]) -> np.ndarray:
-    image = np.zeros(tuple(shape[:2]), np.float32)
-    image[pixels[:, 1], pixels[:, 0]] = values
-    return image
+def _sample_blocks(pixels: np.ndarray, options: VerificationOptions, seed: int) -> list[np.ndarray]:
+    """Choose the points of some blocks for each shift: whole blocks, as neighbours are averaged."""
+    block = pixels // options.null_block_px
+    number = block[:, 1] * 1_000_000 + block[:, 0]
+    order = np.random.default_rng(seed).permutation(np.unique(number))
+    # Other blocks for each shift where there are enough, the same ones where there are not.
+    most, shifts = options.max_null_blocks, range(len(options.null_shifts))
+    chosen = [np.roll(order, -shift * most)[:most] for shift in shifts]
+    return [np.flatnonzero(np.isin(number, blocks)) for blocks in chosen]

@@ -20,8 +20,8 @@ from ...features.selection import SelectionOptions
 from ...features.sift_detector import SiftOptions, detect_sift
 from ...geometry.residuals import transform_points
 from ...io.image import luma
-from ..guided import guided_matches
-from ..guided.initial_geometry import InitialMatches, initial_matches, plain_first_pass
+from ..guided import InitialMatches, guided_matches, initial_matches
+from ..guided.initial_geometry import estimate_initial_geometry
 from .joint_fit import Correspondences, fit_jointly
 
 SIFT = SiftOptions(max_keypoints=2000)
@@ -148,8 +148,8 @@ def _registered_pairs(views: Sequence[_View], seed: int) -> list[RegisteredPair]
     for first, second in combinations(range(len(views)), 2):
         a, b = views[first], views[second]
         initial = initial_matches(a.gray, b.gray, (a.features, b.features))
-        found = plain_first_pass(initial, "homography", seed)
-        if found.kind != "none":
+        found = estimate_initial_geometry(initial, "homography", seed, simulate_views=False)
+        if found.model != "none":
             overlaps.append((len(found.points0), first, second, initial))
     overlaps.sort(key=lambda overlap: -overlap[0])
     pairs: list[RegisteredPair] = []
@@ -159,12 +159,12 @@ def _registered_pairs(views: Sequence[_View], seed: int) -> list[RegisteredPair]
         if enough and second in _reached(first, pairs):
             continue
         a, b = views[first], views[second]
-        guidance, matches = guided_matches(
+        guide, matches = guided_matches(
             a.gray, b.gray, a.keypoints, b.keypoints, "homography", seed, initial
         )
-        if guidance.matrix is not None and matches is not None and len(matches):
+        if guide.matrix is not None and matches is not None and len(matches):
             points = a.keypoints[matches.rows0]
-            pairs.append(RegisteredPair(first, second, guidance.matrix, points))
+            pairs.append(RegisteredPair(first, second, guide.matrix, points))
             partners[first] += 1
             partners[second] += 1
     return pairs

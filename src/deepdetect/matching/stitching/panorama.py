@@ -15,7 +15,7 @@ from ..._shared.timing import StageTimer
 from ...detector.detector import DeepDetect, HeatmapDetector
 from ...geometry.rescaling import downscale, scaled_homography
 from ...io.image import load_image
-from ..guided.initial_geometry import LONGEST
+from ..guided import GuidedOptions
 from .compositing import composite, least_stretched, plan_canvas
 from .joint_registration import register_jointly
 
@@ -62,7 +62,7 @@ def stitch(
 ) -> Panorama:
     """Make a flat panorama of photographs from one place, or of a plane.
 
-    Pairs are registered by guided matching (`guidance`) at reduced size, jointly refined, and
+    Pairs are registered by guided matching at reduced size, jointly refined, and
     drawn onto one canvas with equal brightness, seams where they differ least, and soft borders.
     A flat canvas shows less than 180 degrees, in practice 100 to 120.
 
@@ -155,7 +155,8 @@ def _check(
         raise OptionError(f"the scale must be above 0, not {scale}")
     if not max_canvas_megapixels > 0:
         raise OptionError(f"max_canvas_megapixels must be above 0, not {max_canvas_megapixels}")
-    if not 100 <= registration_side <= LONGEST:
+    largest = GuidedOptions().initial_geometry.max_side_px
+    if not 100 <= registration_side <= largest:
         raise OptionError(
-            f"registration_side must lie in [100, {LONGEST}] pixels, not {registration_side}"
+            f"registration_side must lie in [100, {largest}] pixels, not {registration_side}"
         )

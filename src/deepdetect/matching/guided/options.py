@@ -1,0 +1,257 @@
+"""Every tuned number of guided matching, with its unit.
+
+The bounds of the verification and the sizes of its windows were chosen on nine pairs of Oxford,
+with parts of their second images covered; those along epipolar lines on Middlebury's cones, teddy
+and art, as they are and rotated (docs/matching.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..._shared.errors import OptionError
+from ...features.sift_detector import SiftOptions
+from ...geometry.acontrario import MAX_LOG10_NFA
+from ...geometry.homography_refinement import RefinementOptions
+
+
+@dataclass(frozen=True)
+class InitialGeometryOptions:
+    """How a geometry is estimated from sparse SIFT matches.
+
+    Attributes:
+        max_side_px: longer sides are scaled down to this: the initial geometry need not be fine.
+        sift: the keypoints of each image; each simulated view gets half as many.
+        ratio: of the ratio test.
+        min_separation_px: matches that begin or end nearer together than this count as one.
+        homography_threshold_px, fundamental_threshold_px: matches within this agree with a model,
+            in pixels of the scaled images.
+        max_log10_nfa: a geometry is trusted when the logarithm of its number of false alarms is
+            below this.
+        tilts: of the simulated views: how many times shorter one direction is seen.
+        rotation_step_deg: between the directions of the views for a tilt of 1; the step is
+            inversely proportional to the tilt.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    max_side_px: int = 1200
+    sift: SiftOptions = field(default_factory=SiftOptions)
+    ratio: float = 0.85
+    min_separation_px: float = 2.0
+    homography_threshold_px: float = 3.0
+    fundamental_threshold_px: float = 1.5
+    max_log10_nfa: float = MAX_LOG10_NFA
+    tilts: tuple[float, ...] = (2.0, 2.0 * 2**0.5, 4.0)
+    rotation_step_deg: float = 72.0
+
+    def __post_init__(self) -> None:
+        _check_fractions(self, "ratio")
+        _check_positive(
+            self,
+            "max_side_px",
+            "min_separation_px",
+            "homography_threshold_px",
+            "fundamental_threshold_px",
+            "tilts",
+            "rotation_step_deg",
+        )
+
+    def threshold_px(self, model: str) -> float:
+        """Return the inlier threshold of a model."""
+        homography = model == "homography"
+        return self.homography_threshold_px if homography else self.fundamental_threshold_px
+
+
+@dataclass(frozen=True)
+class VerificationOptions:
+    """When two patches count as the same.
+
+    Attributes:
+        keypoint_sizes_px: diameters of the keypoints of the descriptors that are compared.
+        false_positive_rate: share of null pairs (unrelated patches of the two images) that pass.
+        smoothing_sigma_px: of the Gaussian mean over neighbouring points.
+        window_px: side of the window around a point in which most points must pass, odd.
+        min_support: share of the points in the window that must pass.
+        null_shifts: shifts between the patches of a null pair, in shares of width and height.
+        null_block_px: side of the blocks of the image that null pairs are taken from.
+        max_null_blocks: at most this many blocks for each shift, chosen at random: all of them up
+            to a megapixel.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    keypoint_sizes_px: tuple[float, ...] = (3.0, 8.0)
+    false_positive_rate: float = 0.01
+    smoothing_sigma_px: float = 2.5
+    window_px: int = 81
+    min_support: float = 0.5
+    null_shifts: tuple[tuple[float, float], ...] = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
+    null_block_px: int = 64
+    max_null_blocks: int = 256
+
+    def __post_init__(self) -> None:
+        _check_fractions(self, "false_positive_rate", "min_support", "null_shifts")
+        _check_positive(self, "keypoint_sizes_px", "smoothing_sigma_px", "window_px")
+        _check_positive(self, "null_block_px", "max_null_blocks")
+
+
+@dataclass(frozen=True)
+class HomographyMatchingOptions:
+    """How keypoints are matched by a homography.
+
+    Attributes:
+        max_side_px: longer sides are scaled down to this while the homography is refined.
+        refinement: how it is refined.
+        max_distance_px: from where the homography takes a keypoint to its partner.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    max_side_px: int = 1600
+    refinement: RefinementOptions = field(
+        default_factory=lambda: RefinementOptions(
+            max_rounds=2, windows_px=(15, 21, 41), inlier_threshold=0.5
+        )
+    )
+    max_distance_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "max_side_px", "max_distance_px")
+
+
+@dataclass(frozen=True)
+class EpipolarMatchingOptions:
+    """How keypoints are matched along epipolar lines.
+
+    Attributes:
+        keypoint_size_px: diameter of the keypoints of the descriptors: small, as depth jumps
+            within a large one.
+        max_epipolar_distance_px: from the epipolar line to a partner.
+        max_cycle_error_px: from a keypoint to the best partner of its best partner. Dense
+            keypoints have equally good neighbours, so it need not be 0.
+        false_positive_rate: share of random pairs whose descriptors are similar enough to pass.
+        null_pairs: number of random pairs that this is measured on.
+        motion_window_px: side of the window in which matches must move alike, odd.
+        max_motion_difference_px: by which the motions of neighbours may differ, in x and in y.
+        min_motion_support: share of the matches in the window that must move so.
+        density_window_px: side of the window around a match in which keypoints must be matched,
+            odd.
+        min_match_density: share of the keypoints in the window that must be matched.
+        min_relative_density: of the median of these shares, where that is less: scattered
+            keypoints are matched less often.
+        max_refits: the fundamental matrix is estimated again from the dense matches at most this
+            often,
+        min_refit_gain: as long as each new one gives this share of further matches.
+        refit_threshold_px: inlier threshold of these estimates.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    keypoint_size_px: float = 2.0
+    max_epipolar_distance_px: float = 1.5
+    max_cycle_error_px: float = 1.0
+    false_positive_rate: float = 0.02
+    null_pairs: int = 20_000
+    motion_window_px: int = 15
+    max_motion_difference_px: float = 1.5
+    min_motion_support: float = 0.8
+    density_window_px: int = 31
+    min_match_density: float = 0.35
+    min_relative_density: float = 0.5
+    max_refits: int = 2
+    min_refit_gain: float = 0.01
+    refit_threshold_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_fractions(self, "false_positive_rate", "min_motion_support")
+        _check_fractions(self, "min_match_density", "min_relative_density", "min_refit_gain")
+        _check_positive(
+            self,
+            "keypoint_size_px",
+            "max_epipolar_distance_px",
+            "max_cycle_error_px",
+            "null_pairs",
+            "motion_window_px",
+            "max_motion_difference_px",
+            "density_window_px",
+            "refit_threshold_px",
+        )
+
+
+@dataclass(frozen=True)
+class PrewarpOptions:
+    """When and how a second image is warped by an affinity before it is matched.
+
+    Attributes:
+        min_deviation: an affinity matters when it moves a point by more than this share of its
+            distance from another. The floor shears rectified pairs by less (0.13 on art), and so
+            small a rotation costs fewer matches than the warp; 12 degrees cost most of them.
+        max_anisotropy: an affinity that stretches one direction by more than this factor, relative
+            to the other or in all, is not trusted.
+        frame_margin: share of the sides of the first image by which the warped image may extend
+            beyond it: parallax moves points there. It bounds the memory.
+        max_distance_px: a pixel of the warped image stands for a keypoint nearer than this, in
+            pixels of the second image.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    min_deviation: float = 0.15
+    max_anisotropy: float = 6.0
+    frame_margin: float = 0.25
+    max_distance_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "min_deviation", "max_anisotropy", "frame_margin", "max_distance_px")
+
+
+@dataclass(frozen=True)
+class GuidedOptions:
+    """All tuned numbers of guided matching.
+
+    Attributes:
+        initial_geometry: the geometry that guides at first.
+        homography_matching: planes and rotating cameras.
+        epipolar_matching: scenes with depth.
+        prewarp: second images that are rotated, zoomed or sheared, of scenes with depth.
+        verification: when two patches count as the same.
+        min_matched_fraction: with fewer matches than this share of the keypoints, the geometry is
+            not trusted after all.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    initial_geometry: InitialGeometryOptions = field(default_factory=InitialGeometryOptions)
+    homography_matching: HomographyMatchingOptions = field(
+        default_factory=HomographyMatchingOptions
+    )
+    epipolar_matching: EpipolarMatchingOptions = field(default_factory=EpipolarMatchingOptions)
+    prewarp: PrewarpOptions = field(default_factory=PrewarpOptions)
+    verification: VerificationOptions = field(default_factory=VerificationOptions)
+    min_matched_fraction: float = 0.02
+
+    def __post_init__(self) -> None:
+        _check_fractions(self, "min_matched_fraction")
+
+
+def _check_positive(options: object, *names: str) -> None:
+    for name in names:
+        values = np.ravel(getattr(options, name))
+        if not (len(values) and (values > 0).all()):
+            raise OptionError(f"{name} must be above 0, not {getattr(options, name)}")
+
+
+def _check_fractions(options: object, *names: str) -> None:
+    for name in names:
+        values = np.ravel(getattr(options, name))
+        if not ((values >= 0) & (values <= 1)).all():
+            raise OptionError(f"{name} must lie in [0, 1], not {getattr(options, name)}")
