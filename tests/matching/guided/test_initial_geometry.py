@@ -16,7 +16,6 @@ from deepdetect.matching.guided.initial_geometry import (
     InitialGeometry,
     estimate_initial_geometry,
     initial_matches,
-    plain_first_pass,
 )
 from deepdetect.matching.guided.options import InitialGeometryOptions
 
@@ -359,13 +358,13 @@ def test_matches_that_the_homography_alone_explains_are_no_depth() -> None:
     assert select_model(by_homography, by_fundamental) == "homography"
 
 
-def test_the_plain_first_pass_takes_features_that_are_there(photo: np.ndarray) -> None:
+def test_features_that_are_there_are_taken(photo: np.ndarray) -> None:
     gray = luma(photo)
     second = warped(gray, MILD, (256, 240))
     features = detect_sift(gray), detect_sift(second)
-    found = plain_first_pass(initial_matches(gray, second, features), "homography")
-    whole = first_pass(gray, second, "homography")
-    assert (found.kind, whole.kind, whole.simulated) == ("homography", "homography", 0)
+    found = estimate_initial_geometry(initial_matches(gray, second, features), "homography")
+    whole = initial_geometry(gray, second, "homography")
+    assert (found.model, whole.model, whole.num_views) == ("homography", "homography", 0)
     np.testing.assert_allclose(found.matrix, whole.matrix)
     np.testing.assert_array_equal(found.points1, whole.points1)
     assert found.log10_nfa == whole.log10_nfa
@@ -374,10 +373,11 @@ def test_the_plain_first_pass_takes_features_that_are_there(photo: np.ndarray) -
     assert 0 < len(fewer.points0) <= 100
 
 
-def test_the_plain_first_pass_simulates_no_views(photo: np.ndarray) -> None:
+def test_views_are_simulated_only_where_they_are_wanted(photo: np.ndarray) -> None:
     gray = luma(photo)
     noise = np.random.default_rng(0).integers(0, 256, (240, 256)).astype(np.uint8)
     for other in (noise, np.zeros((64, 64), np.uint8)):
-        found = plain_first_pass(initial_matches(gray, other), "homography")
+        initial = initial_matches(gray, other)
+        found = estimate_initial_geometry(initial, "homography", simulate_views=False)
         assert_nothing(found)
-        assert found.simulated == 0
+        assert found.num_views == 0

@@ -222,7 +222,7 @@ def _estimate(
         )
     trusted = {name: one for name, one in found.items() if one.log10_nfa < options.max_log10_nfa}
     if len(trusted) == 2:
-        return trusted[select_model(*explained.values())]
+        return trusted[select_model(explained["homography"], explained["fundamental"])]
     candidates = (trusted or found).values()
     return min(candidates, key=lambda one: one.log10_nfa, default=_nothing(len(points0)))
 

@@ -53,7 +53,7 @@ def guided_matches(
         OptionError: the model is unknown.
     """
     if initial is None:
-        initial = initial_matches(gray0, gray1, options.initial_geometry)
+        initial = initial_matches(gray0, gray1, options=options.initial_geometry)
     first = estimate_initial_geometry(initial, model, seed, options.initial_geometry)
     if first.matrix is None:
         return _guide(first, None), None
