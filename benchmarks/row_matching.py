@@ -1,14 +1,14 @@
-"""Matching along rows, beside OpenCV's semi-global matching: points, exactness, time.
+"""Rectified matching and OpenCV's semi-global matching: points, accuracy, time.
 
     python benchmarks/row_matching.py DATA
 
 DATA holds the Middlebury scenes, as SCENE/left.png, right.png, disparity.png and calib.json. The
 rows of each scene:
 
-- keypoints: `match_rows` at the keypoints of the shipped geometry weights;
+- keypoints: `match_rectified` at the keypoints of the `dense` weights;
 - every: at every pixel, as it is by default;
-- edges: at every pixel, also near jumps of depth;
-- complete: the same, and what only the left view shows filled from behind;
+- edges: at every pixel, also near disparity discontinuities;
+- dense: the same, with occlusions filled;
 - SGBM: OpenCV's, with the range of the truth made a multiple of 16;
 - SGBM, framed: both views continued to the left by that range, so that OpenCV gives values
   also where the right view shows nothing.
@@ -35,10 +35,10 @@ from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.protocols.stereo_pipelines import sgbm_disparity
 from deepdetect.evaluation.protocols.stereo_truth import truths
 from deepdetect.io.image import load_image
-from deepdetect.reconstruction.stereo import COMPLETE, RowMatchingOptions, match_rows
+from deepdetect.reconstruction.stereo import DENSE, DisparityOptions, match_rectified
 
 TOLERANCES = (0.5, 1.0, 2.0, 4.0)
-AT_EDGES = RowMatchingOptions(uniqueness=1.0, edge_distance=0)
+AT_EDGES = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0)
 SEARCH_WITHOUT_TRUTH = 64
 
 
@@ -72,7 +72,7 @@ def ways(
         f"keypoints ({len(keypoints):,})": lambda: ours(left, right, keypoints),
         f"every ({len(every):,})": lambda: ours(left, right, every),
         "edges": lambda: ours(left, right, every, AT_EDGES),
-        "complete": lambda: ours(left, right, every, COMPLETE),
+        "dense": lambda: ours(left, right, every, DENSE),
         "SGBM": lambda: sgbm_disparity(left, right, count, 0),
         "SGBM, framed": lambda: sgbm_disparity(left, right, count, count),
     }
@@ -101,12 +101,12 @@ def ours(
     left: np.ndarray,
     right: np.ndarray,
     xy: np.ndarray,
-    options: RowMatchingOptions = RowMatchingOptions(),
+    options: DisparityOptions = DisparityOptions(),
 ) -> np.ndarray:
     """Return a map of the matches' disparities, NaN where there is none."""
-    found = match_rows(left, right, xy, options)
+    found = match_rectified(left, right, xy, options)
     out = np.full(left.shape[:2], np.nan, np.float32)
-    column, row = xy[found.rows].astype(int).T
+    column, row = xy[found.indices].astype(int).T
     out[row, column] = found.disparity
     return out
 

@@ -112,7 +112,7 @@ def main() -> None:
                 points0[rows], points1[rows], calibration, None, TwoViewOptions(subpixel=None)
             )
             pose = model.pose
-            off = np.abs(model.points[:, 2] / depth[rows[model.rows]] - 1)
+            off = np.abs(model.points[:, 2] / depth[rows[model.indices]] - 1)
             off = off[np.isfinite(off)]
             across = np.linalg.norm(np.cross(pose.translation, translation))
             direction = np.degrees(np.arctan2(across, pose.translation @ translation))

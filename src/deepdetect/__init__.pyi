@@ -39,5 +39,10 @@ from .reconstruction.pipeline import (
     reconstruct as reconstruct,
 )
 from .reconstruction.result import Reconstruction as Reconstruction
+from .reconstruction.stereo.matching import (
+    DisparityMap as DisparityMap,
+    DisparityOptions as DisparityOptions,
+    disparity_map as disparity_map,
+)
 
 __version__: str

@@ -122,7 +122,7 @@ def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
     np.testing.assert_array_equal(picture[row, column], colors)
     # Half the angle between the cameras has the tangent of half the baseline over the depth.
     angle = np.degrees(2 * np.arctan(BASELINE / 2 / told["depth"]["50%"]))
-    assert told["median_parallax_degrees"] == pytest.approx(angle, rel=0.05)
+    assert told["median_triangulation_angle_degrees"] == pytest.approx(angle, rel=0.05)
 
     stored = cv2.imread("out/m_depth.png", cv2.IMREAD_UNCHANGED)
     assert stored.dtype == np.uint16
@@ -194,7 +194,7 @@ def test_selection_options_and_weights_reach_the_detector(run, folder: Path) -> 
 CASES = {
     "identical images": ("left left --focal 995", "the same picture"),
     "identical, said to be rectified": ("left left --focal 995 --rectified", "the same picture"),
-    "pure rotation": ("left only-turned --focal 995", "a turn of the camera explains all"),
+    "pure rotation": ("left only-turned --focal 995", "a rotation of the camera explains all"),
     "pure rotation, said to be rectified": (
         "left only-turned --focal 995 --rectified",
         "have a match on their row",
@@ -222,7 +222,7 @@ CASES = {
     ),
     "two focal lengths": (
         "left right --calibration {}/two-focals.json",
-        "those of a rectified pair are one",
+        "two-focals.json), or give --not-rectified",
     ),
     "two centres, said to be rectified": (
         "left right --calibration {}/two-rows.json --rectified",
@@ -238,10 +238,13 @@ CASES = {
     ),
     "no calibration there": ("left right --calibration {}/nothing.json", "cannot be read"),
     "a calibration that is no JSON": ("left right --calibration {}/left.png", "not valid JSON"),
-    "no EXIF": ("left right", "carries no focal length (EXIF): give --focal or --calibration"),
+    "no EXIF": ("left right", "carries no focal length (EXIF): give --focal or --calib"),
     "a focal length of zero": ("left right --focal 0", "focal length must be above 0"),
     "a focal length that is no number": ("left right --focal nan", "must be finite"),
-    "two calibrations": ("left right --focal 995 --calibration {}/calib.json", "not both"),
+    "two calibrations": (
+        "left right --focal 995 --calibration {}/calib.json",
+        "give --calibration or --focal, not both",
+    ),
     "left and right exchanged": (
         "right left --calibration {}/calib.json",
         "left and right exchanged",
@@ -352,4 +355,5 @@ def test_the_progress_counts_every_stage(monkeypatch: pytest.MonkeyPatch, run, f
         assert run("reconstruct", *paths, "--focal", FOCAL, *more, "-o", "m.ply").exit_code == 0
     assert [bar.n == bar.total for bar in bars] == [True, True]
     assert bars[0].stages[:3] == ["rectified or not", "keypoints", "matching"]
-    assert bars[1].stages == ["keypoints and matching", "reconstruction", "files"]
+    assert bars[1].stages[:3] == ["keypoints and matching", "sub-pixel", "checks"]
+    assert bars[1].stages[-1] == "files"

@@ -24,6 +24,8 @@ from deepdetect.reconstruction.checks import (
     check_images,
     check_matches,
     check_pose,
+    has_foreground,
+    is_planar,
 )
 from deepdetect.reconstruction.subpixel import refine_matches
 
@@ -92,7 +94,7 @@ def test_dark_pairs_are_two_pictures(level: Any, photo: np.ndarray, mean: float,
         check_images(dark[0], dark[0])
 
 
-def test_a_dark_picture_stored_anew_is_the_same(level: Any) -> None:
+def test_a_dark_picture_saved_again_is_the_same(level: Any) -> None:
     dark = np.rint(level.left * (6 / level.left.mean())).astype(np.uint8)
     again = io.BytesIO()
     Image.fromarray(dark).save(again, "JPEG", quality=100)
@@ -122,16 +124,16 @@ def test_one_view_stored_badly(level: Any, detector: DeepDetect, one_line) -> No
 
 
 @pytest.mark.parametrize("guide", ["auto", "fundamental"])
-def test_a_camera_that_only_turned(
+def test_a_camera_that_only_rotated(
     level: Any, only_turned: np.ndarray, detector: DeepDetect, guide: str, one_line
 ) -> None:
     found = match_images(level.left, only_turned, detector, guide=guide)
     points = found.points0, found.points1
     camera = level.calibration.camera0
-    assert "a turn of the camera explains all" in refusal(
+    assert "a rotation of the camera explains all" in refusal(
         points, one_line, calibration=Calibration(camera, camera)
     )
-    assert "a plane, or the camera only turned" in refusal(points, one_line)
+    assert "a plane, or the camera only rotated" in refusal(points, one_line)
 
 
 def test_a_plane(photo: np.ndarray, one_line) -> None:
@@ -172,7 +174,7 @@ def test_no_overlap(level: Any, one_line) -> None:
     assert "do not overlap" in refusal(points, one_line)
     message = refusal(tuple(np.empty((2, 0, 2))), one_line)
     assert "there are no matches" in message
-    assert "lower it, or give a density" in message
+    assert "lower `threshold`, or give `density`" in message
 
 
 @pytest.mark.parametrize("name", ["art", "cones", "dolls", "moebius", "rocks", "cloth", "teddy"])
@@ -248,7 +250,7 @@ def test_no_pose_and_points_behind(turned: Any, refined: Any, one_line) -> None:
     behind = replace(pose, cheirality_ratio=0.4)
     for one, message in (
         (None, "no pose of the cameras fits"),
-        (behind, "only 40% of the points would lie before both cameras"),
+        (behind, "only 40% of the points would lie in front of both cameras"),
         (_worse(pose), "matches fit one pose of the cameras"),
     ):
         with pytest.raises(ReconstructionError, match=message) as error:
@@ -258,3 +260,16 @@ def test_no_pose_and_points_behind(turned: Any, refined: Any, one_line) -> None:
 
 def _worse(pose: RelativePose) -> RelativePose:
     return replace(pose, errors=pose.errors + 2)
+
+
+def test_what_stands_in_front_of_a_plane() -> None:
+    """100 matches on the plane, 10 off it of which the fundamental matrix explains so many."""
+    off_plane = np.append(np.ones(100), np.full(10, 20.0))
+    for explained, expected in ((10, True), (8, True), (7, False), (0, False)):
+        by_fundamental = np.ones(110, bool)
+        by_fundamental[100 + explained :] = False
+        assert has_foreground(off_plane, by_fundamental) == expected
+    assert not has_foreground(off_plane[:104], np.ones(104, bool))  # under 5 %
+    by_homography = off_plane < 2
+    assert is_planar(by_homography[:105], np.ones(105, bool))
+    assert not is_planar(np.arange(100) < 70, np.ones(100, bool))

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from deepdetect import OptionError
 from deepdetect.reconstruction.outliers import (
+    PointFilterOptions,
     disparity_space,
-    mean_neighbour_distances,
-    statistical_inliers,
-    statistical_inliers_on_grid,
+    mean_neighbor_distances,
+    sor_inliers,
+    sor_inliers_on_grid,
 )
 
 
@@ -30,9 +31,9 @@ def street() -> tuple[np.ndarray, np.ndarray]:
 def test_distances_are_those_of_brute_force() -> None:
     points = np.random.default_rng(0).normal(size=(400, 3)) * [1, 5, 0.1] + 1000
     gaps = np.sort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)
-    np.testing.assert_allclose(mean_neighbour_distances(points, 7), gaps[:, 1:8].mean(1), rtol=1e-3)
+    np.testing.assert_allclose(mean_neighbor_distances(points, 7), gaps[:, 1:8].mean(1), rtol=1e-3)
     np.testing.assert_allclose(
-        mean_neighbour_distances(points[:5], 50),
+        mean_neighbor_distances(points[:5], 50),
         np.linalg.norm(points[:5, None] - points[:5], axis=2).sum(1) / 4,
         rtol=1e-3,
     )
@@ -44,17 +45,17 @@ def test_distances_are_those_of_scipy_on_a_surface() -> None:
     space = disparity_space(points, 500)
     expected, _ = spatial.cKDTree(space).query(space, k=17)
     np.testing.assert_allclose(
-        mean_neighbour_distances(space, 16), expected[:, 1:].mean(1), rtol=1e-3
+        mean_neighbor_distances(space, 16), expected[:, 1:].mean(1), rtol=1e-3
     )
 
 
 def test_points_astray_are_found_near_and_far_in_disparity_space_only() -> None:
     points, astray = street()
-    kept = statistical_inliers(disparity_space(points, 500))
+    kept = sor_inliers(disparity_space(points, 500))
     assert (~kept[astray]).mean() > 0.9
     assert kept[~astray].mean() > 0.97
     # In space the spacing of the far points hides all that is astray among the near.
-    assert (~statistical_inliers(points)[astray]).mean() < 0.5
+    assert (~sor_inliers(points)[astray]).mean() < 0.5
 
 
 def test_pixels_and_disparities_are_the_space() -> None:
@@ -63,34 +64,43 @@ def test_pixels_and_disparities_are_the_space() -> None:
     np.testing.assert_allclose(disparity_space(points * 10, 100, 5), [[25, -50, 25]])
 
 
-def test_a_smaller_factor_removes_more() -> None:
+def test_a_smaller_ratio_removes_more() -> None:
     points, _ = street()
-    counts = [statistical_inliers(points, 8, factor).sum() for factor in (0, 0.5, 1, 2, 4)]
+    counts = [sor_inliers(points, 8, factor).sum() for factor in (0, 0.5, 1, 2, 4)]
     assert counts == sorted(counts)
     assert counts[0] < counts[-1]
 
 
 def test_the_scale_and_the_place_do_not_matter() -> None:
     points, _ = street()
-    kept = statistical_inliers(points)
+    kept = sor_inliers(points)
     for other in (points * 1000, points + [1e4, 0, 0], points[:, ::-1]):
-        assert (statistical_inliers(other) == kept).mean() > 0.999
+        assert (sor_inliers(other) == kept).mean() > 0.999
 
 
 def test_few_equal_and_infinite_points_raise_nothing() -> None:
     for count in (0, 1, 2, 3):
-        assert statistical_inliers(np.arange(3.0 * count).reshape(-1, 3)).all()
-    assert statistical_inliers(np.ones((5000, 3))).all()
+        assert sor_inliers(np.arange(3.0 * count).reshape(-1, 3)).all()
+    assert sor_inliers(np.ones((5000, 3))).all()
     points = np.random.default_rng(0).normal(size=(100, 3))
     points[3], points[7, 1] = np.nan, np.inf
-    assert not statistical_inliers(points)[[3, 7]].any()
-    assert statistical_inliers(points).sum() > 80
+    assert not sor_inliers(points)[[3, 7]].any()
+    assert sor_inliers(points).sum() > 80
 
 
 def test_what_is_wrong_is_said() -> None:
-    for options in ({"neighbours": 0}, {"factor": -1}, {"factor": float("nan")}):
+    for options in ({"neighbors": 0}, {"std_ratio": -1}, {"std_ratio": float("nan")}):
         with pytest.raises(OptionError):
-            statistical_inliers(np.ones((9, 3)), **options)
+            sor_inliers(np.ones((9, 3)), **options)
+    for options in (
+        {"min_parallax_px": -1},
+        {"sor_neighbors": -1},
+        {"sor_window_px": 8},
+        {"sor_std_ratio": float("nan")},
+        {"sor_disparity_weight": -1},
+    ):
+        with pytest.raises(OptionError):
+            PointFilterOptions(**options)
 
 
 def scattered(seed: int, share: float, size: tuple[int, int]) -> np.ndarray:
@@ -130,7 +140,7 @@ def test_on_a_grid_it_is_what_brute_force_finds(
     disparity = (middle + generator.normal(0, 1, len(pixels))).astype(np.float32)
     wild = generator.random(len(pixels)) < 0.05
     disparity[wild] += generator.uniform(-20, 20, wild.sum())
-    kept = statistical_inliers_on_grid(pixels, disparity, size, window, factor)
+    kept = sor_inliers_on_grid(pixels, disparity, size, window, factor)
     expected, gap = by_brute_force(pixels, disparity.astype(float), window, factor)
     assert kept.shape == (len(pixels),)
     near = gap > 1e-4
@@ -151,7 +161,7 @@ def test_on_a_grid_what_is_astray_is_found_and_surfaces_stay() -> None:
     astray = generator.random(len(true)) < 0.02
     disparity[astray] = generator.uniform(3, 120, astray.sum())
     far_off = astray & (np.abs(disparity - true) > 40)
-    kept = statistical_inliers_on_grid(pixels, disparity, (300, 200))
+    kept = sor_inliers_on_grid(pixels, disparity, (300, 200))
     assert (~kept[far_off]).mean() > 0.9
     assert kept[~astray].mean() > 0.97
 
@@ -161,7 +171,7 @@ def test_on_a_grid_neither_order_nor_zero_point_nor_place_matter() -> None:
     generator = np.random.default_rng(3)
     disparity = generator.normal(20, 1, len(pixels))
     disparity[::50] += 30
-    kept = statistical_inliers_on_grid(pixels, disparity, (60, 50))
+    kept = sor_inliers_on_grid(pixels, disparity, (60, 50))
     assert 0 < np.count_nonzero(~kept) < len(kept) / 5
     order = generator.permutation(len(pixels))
     for other, there in (
@@ -171,26 +181,26 @@ def test_on_a_grid_neither_order_nor_zero_point_nor_place_matter() -> None:
         ((pixels + [7, 3], disparity, (90, 80)), slice(None)),
         ((pixels[:, ::-1], disparity, (50, 60)), slice(None)),
     ):
-        np.testing.assert_array_equal(statistical_inliers_on_grid(*other), kept[there])
+        np.testing.assert_array_equal(sor_inliers_on_grid(*other), kept[there])
 
 
 def test_on_a_grid_one_alone_goes_where_most_have_others() -> None:
     block = np.stack(np.meshgrid(np.arange(12), np.arange(12)), -1).reshape(-1, 2)
     pixels = np.vstack([block, [[50, 50]]])
-    kept = statistical_inliers_on_grid(pixels, np.full(145, 9.0), (60, 60))
+    kept = sor_inliers_on_grid(pixels, np.full(145, 9.0), (60, 60))
     assert np.flatnonzero(~kept).tolist() == [144]
     # Where all stand alone none is worse than the others.
     sparse = np.stack(np.meshgrid(np.arange(0, 60, 20), np.arange(0, 60, 20)), -1).reshape(-1, 2)
-    assert statistical_inliers_on_grid(sparse, np.arange(9.0), (60, 60)).all()
-    assert statistical_inliers_on_grid(np.empty((0, 2)), np.empty(0), (60, 60)).shape == (0,)
-    assert statistical_inliers_on_grid(block, np.full(144, 9.0), (60, 60)).all()
+    assert sor_inliers_on_grid(sparse, np.arange(9.0), (60, 60)).all()
+    assert sor_inliers_on_grid(np.empty((0, 2)), np.empty(0), (60, 60)).shape == (0,)
+    assert sor_inliers_on_grid(block, np.full(144, 9.0), (60, 60)).all()
 
 
-def test_on_a_grid_a_smaller_factor_removes_more() -> None:
+def test_on_a_grid_a_smaller_ratio_removes_more() -> None:
     pixels = scattered(4, 0.5, (80, 80))
     disparity = np.random.default_rng(5).normal(30, 2, len(pixels))
     counts = [
-        np.count_nonzero(statistical_inliers_on_grid(pixels, disparity, (80, 80), 9, factor))
+        np.count_nonzero(sor_inliers_on_grid(pixels, disparity, (80, 80), 9, factor))
         for factor in (0, 0.5, 1, 2, 4)
     ]
     assert counts == sorted(counts)

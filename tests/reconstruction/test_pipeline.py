@@ -1,4 +1,4 @@
-"""Both roads from two photographs to points, judged by what is true."""
+"""Both pipelines from two photographs to points, compared with the truth."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.controls import EveryPixel
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.point_cloud import PointCloud
+from deepdetect.reconstruction.outliers import PointFilterOptions
 from deepdetect.reconstruction.pipeline import ReconstructionOptions, reconstruct
-from deepdetect.reconstruction.report import reconstruction_values
 from deepdetect.reconstruction.result import Reconstruction
-from deepdetect.reconstruction.stereo import COMPLETE, RowMatchingOptions
+from deepdetect.reconstruction.stereo import DENSE, DisparityOptions, disparity_map
 
 CONES_POINTS = 49_979
 """The paper's count."""
@@ -90,25 +90,25 @@ def test_points_are_the_disparities_by_the_calibration(found: Any) -> None:
     np.testing.assert_allclose(found.points[:, 2], expected, rtol=1e-5)
     seen = found.calibration.camera0.project(found.points)
     np.testing.assert_allclose(seen, found.pixels, atol=1e-3)
-    there = found.calibration.camera1.project(found.points - found.right_centre)
+    there = found.calibration.camera1.project(found.points - found.baseline_vector)
     np.testing.assert_allclose(there[:, 0], found.pixels[:, 0] - found.disparity, atol=1e-3)
     np.testing.assert_allclose(there[:, 1], found.pixels[:, 1], atol=1e-3)
     top = found.points[found.pixels[:, 1] < 100]
     assert (top[:, 1] < 0).all()
 
 
-@pytest.mark.parametrize("road", ["found", "posed"])
+@pytest.mark.parametrize("pipeline", ["found", "posed"])
 def test_arrays_belong_together(
-    road: str, request: pytest.FixtureRequest, cones: Any, turned: Any
+    pipeline: str, request: pytest.FixtureRequest, cones: Any, turned: Any
 ) -> None:
-    made: Reconstruction = request.getfixturevalue(road)
-    image = cones.left if road == "found" else turned.left
+    made: Reconstruction = request.getfixturevalue(pipeline)
+    image = cones.left if pipeline == "found" else turned.left
     count = len(made)
     assert made.points.shape == (count, 3)
     assert made.points.dtype == np.float32
     assert made.colors.dtype == np.uint8
     assert made.pixels.shape == (count, 2)
-    assert (made.disparity is None) == (road == "posed")
+    assert (made.disparity is None) == (pipeline == "posed")
     assert np.isfinite(made.points).all()
     assert (made.points[:, 2] > 0).all()
     column, row = made.pixels.astype(int).T
@@ -135,9 +135,9 @@ def test_a_pair_that_is_not_rectified_has_true_depths(posed: Any, turned: Any) -
     assert np.median(off) < 0.015
     assert (off < 0.05).mean() > 0.9
     assert turned.rotation_error(posed.pose.rotation) < 0.1
-    np.testing.assert_allclose(np.linalg.norm(posed.right_centre), 1)
+    np.testing.assert_allclose(np.linalg.norm(posed.baseline_vector), 1)
     assert len(posed.reprojection_errors) == len(posed)
-    with pytest.raises(ReconstructionError, match="take the depth map"):
+    with pytest.raises(ReconstructionError, match="use depth_map"):
         posed.disparity_map()
 
 
@@ -187,15 +187,15 @@ def test_a_wall_alone_gives_no_depth(facade: Any, detector: DeepDetect, one_line
 
 def test_the_right_camera_is_where_it_is_seen_from(posed: Any, turned: Any) -> None:
     """Points seen from there lie on their true matches, and the parallax is the rays' angle."""
-    there = (posed.points - posed.right_centre) @ posed.pose.rotation.T
+    there = (posed.points - posed.baseline_vector) @ posed.pose.rotation.T
     seen = turned.calibration.camera1.project(there)
     gap = np.linalg.norm(seen - turned.match(posed.pixels), axis=1)
     assert np.nanmedian(gap) < 0.5
     rays = posed.points / np.linalg.norm(posed.points, axis=1, keepdims=True)
-    others = posed.points - posed.right_centre
+    others = posed.points - posed.baseline_vector
     others /= np.linalg.norm(others, axis=1, keepdims=True)
     angle = np.degrees(2 * np.arcsin(np.linalg.norm(rays - others, axis=1) / 2))
-    np.testing.assert_allclose(posed.parallax(), angle, rtol=1e-3)
+    np.testing.assert_allclose(posed.triangulation_angles(), angle, rtol=1e-3)
 
 
 def test_a_baseline_gives_millimetres_and_the_same_points(turned: Any, level: Any) -> None:
@@ -208,10 +208,12 @@ def test_a_baseline_gives_millimetres_and_the_same_points(turned: Any, level: An
         )
         assert (metric.unit, plain.unit) == ("mm", "baseline")
         np.testing.assert_allclose(metric.points, plain.points * 193, rtol=1e-4)
-        np.testing.assert_allclose(metric.parallax(), plain.parallax(), rtol=1e-3)
+        np.testing.assert_allclose(
+            metric.triangulation_angles(), plain.triangulation_angles(), rtol=1e-3
+        )
 
 
-def test_both_roads_agree_on_a_rectified_pair(level: Any, detector: DeepDetect) -> None:
+def test_both_pipelines_agree_on_a_rectified_pair(level: Any, detector: DeepDetect) -> None:
     """Forced each way the depths are the same; found out it is the rectified one."""
     ways = [
         reconstruct(level.left, level.right, detector, calibration=level.calibration, rectified=way)
@@ -286,14 +288,16 @@ def test_options_reach_their_stages(level: Any, detector: DeepDetect) -> None:
     known = {"calibration": level.calibration}
     plain = reconstruct(*pair, **known)
     assert reconstruct(*pair, **known, max_keypoints=3000).keypoints == 3000
-    all_kept = reconstruct(*pair, **known, neighbours=0)
-    assert "alone" not in all_kept.dropped
-    assert len(all_kept) == len(plain) + plain.dropped["alone"]
-    stricter = reconstruct(*pair, **known, factor=0.5)
-    assert stricter.dropped["alone"] > plain.dropped["alone"]
-    at_edges = reconstruct(*pair, **known, rows=RowMatchingOptions(edge_distance=0))
-    assert len(at_edges) > len(plain)
-    near = reconstruct(*pair, **known, least_parallax_px=20, neighbours=0)
+    keep = PointFilterOptions(sor_neighbors=0)
+    all_kept = reconstruct(*pair, **known, point_filter=keep)
+    outliers = "statistical outlier"
+    assert outliers not in all_kept.dropped
+    assert len(all_kept) == len(plain) + plain.dropped[outliers]
+    stricter = reconstruct(*pair, **known, point_filter=PointFilterOptions(sor_std_ratio=0.5))
+    assert stricter.dropped[outliers] > plain.dropped[outliers]
+    edges = DisparityOptions(discontinuity_margin_px=0)
+    assert len(reconstruct(*pair, **known, disparity=edges)) > len(plain)
+    near = reconstruct(*pair, **known, point_filter=replace(keep, min_parallax_px=20))
     offset = near.calibration.disparity_offset_px
     assert near.disparity.min() + offset == pytest.approx(20, abs=0.5)
     assert len(near) == np.count_nonzero(all_kept.disparity + offset >= 20) < len(all_kept)
@@ -303,32 +307,52 @@ def test_options_reach_their_stages(level: Any, detector: DeepDetect) -> None:
     np.testing.assert_array_equal(asked.points, plain.points)
 
 
+def test_keypoints_of_a_rectified_pair_only_choose_pixels_of_the_disparity_map(
+    level: Any, detector: DeepDetect
+) -> None:
+    made = reconstruct(
+        level.left, level.right, detector, calibration=level.calibration, rectified=True
+    )
+    expected = disparity_map(level.left, level.right).disparity
+    column, row = made.pixels.astype(int).T
+    np.testing.assert_array_equal(made.disparity, expected[row, column])
+
+
 def test_what_the_right_image_does_not_show_is_filled_only_when_asked_for() -> None:
-    assert ReconstructionOptions().row_matching == RowMatchingOptions()
+    assert ReconstructionOptions().disparity_options == DisparityOptions()
     every = ReconstructionOptions(
         selection=dataclasses.replace(ReconstructionOptions().selection, density=1)
     )
-    assert every.row_matching == COMPLETE
-    own = RowMatchingOptions(uniqueness=1.2)
-    assert replace(every, rows=own).row_matching is own
+    assert every.disparity_options == DENSE
+    own = DisparityOptions(uniqueness_ratio=1.2)
+    assert replace(every, disparity=own).disparity_options is own
 
 
-def test_stages_are_told_as_they_end(level: Any, turned: Any, detector: DeepDetect) -> None:
+def test_stages_are_reported_as_they_end(level: Any, turned: Any, detector: DeepDetect) -> None:
     for pair, expected in (
         (level, ["rectified or not", "keypoints", "matching", "triangulation", "outlier removal"]),
-        (turned, ["rectified or not", "keypoints and matching", "reconstruction"]),
+        (
+            turned,
+            ["rectified or not", "keypoints and matching", "sub-pixel", "checks", "pose"]
+            + ["focal length", "triangulation", "outlier removal"],
+        ),
     ):
-        told: list[str] = []
+        reported: list[str] = []
         made = reconstruct(
             pair.left,
             pair.right,
             detector,
             calibration=pair.calibration,
             max_keypoints=20_000,
-            done=told.append,
+            progress=reported.append,
         )
-        assert told == expected
-        assert set(made.seconds) >= set(told) - {"reconstruction"}
+        assert reported == expected == list(made.seconds)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**31])
+def test_a_seed_out_of_range_is_refused(seed: int) -> None:
+    with pytest.raises(OptionError, match="seed must lie in"):
+        ReconstructionOptions(seed=seed)
 
 
 def test_options_and_results_are_frozen(found: Any) -> None:
@@ -342,7 +366,8 @@ def test_options_and_results_are_frozen(found: Any) -> None:
     [
         ({"densty": 1}, "density"),
         ({"rectifed": True}, "rectified"),
-        ({"neighbors": 3}, "neighbours"),
+        ({"progres": print}, "progress"),
+        ({"point_filters": None}, "point_filter"),
     ],
 )
 def test_an_unknown_option_names_the_nearest(
@@ -407,8 +432,8 @@ def test_no_keypoint_is_said(level: Any, detector: DeepDetect, one_line: Any) ->
             return np.full(level.left.shape[:2], 0.25, np.float32)
 
     for rectified, message in (
-        (True, "no pixel of the left image is above the threshold of 0.5: lower it"),
-        (None, "no pixel of the left image is above the threshold of 0.5: lower it"),
+        (True, "no pixel of the left image is above the threshold of 0.5: lower `threshold`"),
+        (None, "no pixel of the left image is above the threshold of 0.5: lower `threshold`"),
         (False, "or no pixel of one is above the threshold"),
     ):
         with pytest.raises(ReconstructionError) as error:
@@ -433,11 +458,11 @@ def test_cameras_that_contradict_rectified_rows_are_refused(level: Any, one_line
             message = refusal(
                 one_line, *pair, focal_px=None, calibration=wrong, rectified=rectified
             )
-            assert "mend the calibration (calib.json), or give --not-rectified" in message
+            assert "fix the calibration (calib.json), or pass `rectified=False`" in message
 
 
 @pytest.mark.parametrize("density", [None, 1])
-def test_a_small_turn_said_to_be_rectified_gives_no_cloud(
+def test_a_small_rotation_said_to_be_rectified_gives_no_cloud(
     density: int | None, level: Any, one_line: Any
 ) -> None:
     camera = level.calibration.camera0
@@ -447,7 +472,7 @@ def test_a_small_turn_said_to_be_rectified_gives_no_cloud(
         warp = camera.matrix @ rotation @ np.linalg.inv(camera.matrix)
         other = cv2.warpPerspective(level.left, warp, camera.size, flags=cv2.INTER_CUBIC)
         message = refusal(one_line, level.left, other, density=density, **known)
-        assert "a turn of the camera explains most disparities" in message
+        assert "a rotation of the camera explains most disparities" in message
 
 
 def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> None:
@@ -460,7 +485,9 @@ def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> Non
     path = tmp_path / "calib.json"
     path.write_text(json.dumps({"focal_px": 500, "baseline_mm": 0}))
     assert "baseline must be above 0" in refusal(one_line, *pair, focal_px=None, calibration=path)
-    assert "too far away" in refusal(one_line, *pair, least_parallax_px=1e4)
+    assert "too far away" in refusal(
+        one_line, *pair, point_filter=PointFilterOptions(min_parallax_px=1e4)
+    )
     narrow = np.ascontiguousarray(level.right[:, :-4])
     assert "images of 370x250" in refusal(
         one_line, level.left, narrow, focal_px=None, calibration=level.calibration
@@ -469,14 +496,21 @@ def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> Non
         reconstruct(level.left, narrow, EveryPixel(), focal_px=500, rectified=True)
 
 
+def test_the_representation_is_one_short_line(found: Any, posed: Any) -> None:
+    for made, pair in ((found, "rectified"), (posed, "not rectified")):
+        text = repr(made)
+        assert len(text) < 120
+        assert f"Reconstruction({len(made):,} points, {pair}, depth " in text
+
+
 def test_the_values_are_plain_and_complete(found: Any, posed: Any) -> None:
     for made in (found, posed):
-        values = reconstruction_values(made)
+        values = made.summary()
         assert json.loads(json.dumps(values, allow_nan=False)) == values
         assert values["points"] == len(made)
         assert values["depth"]["50%"] == pytest.approx(np.median(made.points[:, 2]), rel=1e-4)
-        assert values["median_parallax_degrees"] == pytest.approx(
-            np.median(made.parallax()), abs=1e-3
+        assert values["median_triangulation_angle_degrees"] == pytest.approx(
+            np.median(made.triangulation_angles()), abs=1e-3
         )
         assert "true scale is not known" in values["scale"]
     assert values["pose"]["rotation"] == posed.pose.rotation.tolist()

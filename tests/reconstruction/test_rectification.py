@@ -11,7 +11,7 @@ import pytest
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.io.image import load_image, luma
-from deepdetect.reconstruction.rectification import judge_rectification
+from deepdetect.reconstruction.rectification import detect_rectification
 
 SCENES = ("art", "cloth", "cones", "dolls", "moebius", "rocks", "teddy")
 OXFORD = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
@@ -50,24 +50,24 @@ def with_wrong(points: tuple[np.ndarray, ...], sizes: Any, share: float) -> list
 @pytest.mark.parametrize("name", SCENES)
 def test_rectified_scenes_are_recognised_also_among_wrong_matches(shared: Path, name: str) -> None:
     points0, points1, *sizes = scene(shared, name)
-    found = judge_rectification(points0, points1, *sizes)
+    found = detect_rectification(points0, points1, *sizes)
     assert found.rectified, found
     assert found.reason == ""
     assert not found.swapped
     assert abs(found.vertical_offset) < 0.3
     assert found.disparities[0] > 0
-    many = judge_rectification(*with_wrong((points0, points1), sizes, 0.8), *sizes)
+    many = detect_rectification(*with_wrong((points0, points1), sizes, 0.8), *sizes)
     assert many.rectified, many
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_views_the_wrong_way_round_are_told(shared: Path, name: str) -> None:
+def test_exchanged_views_are_noticed(shared: Path, name: str) -> None:
     points0, points1, *sizes = scene(shared, name)
-    found = judge_rectification(points1, points0, *sizes[::-1])
+    found = detect_rectification(points1, points0, *sizes[::-1])
     assert found.rectified
     assert found.swapped
     # An offset that is larger than all disparities: negative ones are in order.
-    assert not judge_rectification(points1, points0, *sizes[::-1], offset_px=500).swapped
+    assert not detect_rectification(points1, points0, *sizes[::-1], offset_px=500).swapped
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.8])
@@ -77,7 +77,7 @@ def test_moved_and_turned_views_are_not_rectified(shared: Path, name: str, wrong
     turn = cv2.getRotationMatrix2D((sizes[1][0] / 2, sizes[1][1] / 2), 1, 1)
     for other in (points1 + [0, 3], points1 - [0, 3], points1 @ turn[:, :2].T + turn[:, 2]):
         points = with_wrong((points0, other), sizes, wrong)
-        found = judge_rectification(*points, *sizes)
+        found = detect_rectification(*points, *sizes)
         assert not found.rectified, found
         assert "same row" in found.reason
 
@@ -86,7 +86,7 @@ def test_moved_and_turned_views_are_not_rectified(shared: Path, name: str, wrong
 @pytest.mark.parametrize("name", OXFORD)
 def test_planar_scenes_are_not_rectified(shared: Path, name: str, other: int) -> None:
     folder = shared / "data" / "oxford" / name
-    found = judge_rectification(*sparse_matches(folder / "img1.png", folder / f"img{other}.png"))
+    found = detect_rectification(*sparse_matches(folder / "img1.png", folder / f"img{other}.png"))
     assert not found.rectified, found
     assert found.reason
 
@@ -95,29 +95,29 @@ def test_dense_matches_of_the_whole_pipeline(
     level: Any, turned: Any, level_matches: Any, turned_matches: Any
 ) -> None:
     size = level.calibration.camera0.size
-    assert judge_rectification(*level_matches, size, size).rectified
-    found = judge_rectification(*turned_matches, size, size)
+    assert detect_rectification(*level_matches, size, size).rectified
+    found = detect_rectification(*turned_matches, size, size)
     assert not found.rectified
 
 
 def test_one_disparity_and_unequal_sizes_are_not_rectified() -> None:
     points = np.random.default_rng(0).uniform(0, 400, (800, 2))
-    found = judge_rectification(points, points - [7, 0], (400, 400), (400, 400))
+    found = detect_rectification(points, points - [7, 0], (400, 400), (400, 400))
     assert not found.rectified
     assert "same disparity (7 px)" in found.reason
     for other in ((400, 390), (390, 400)):
-        found = judge_rectification(points, points - [7, 0], (400, 400), other)
+        found = detect_rectification(points, points - [7, 0], (400, 400), other)
         assert "differ in size" in found.reason
-    same = judge_rectification(points, points, (400, 400), (400, 400))
+    same = detect_rectification(points, points, (400, 400), (400, 400))
     assert not same.rectified
 
 
 def test_a_slanted_plane_is_rectified_and_a_small_turn_is_not() -> None:
     points = np.random.default_rng(0).uniform((0, 0), (640, 480), (2000, 2))
     plane = points - np.column_stack([5 + points[:, 1] / 20, np.zeros(2000)])
-    assert judge_rectification(points, plane, (640, 480), (640, 480)).rectified
+    assert detect_rectification(points, plane, (640, 480), (640, 480)).rectified
     squeezed = points - np.column_stack([5 + points[:, 0] / 150, points[:, 1] / 500])
-    found = judge_rectification(points, squeezed, (640, 480), (640, 480))
+    found = detect_rectification(points, squeezed, (640, 480), (640, 480))
     assert "one homography explains" in found.reason
 
 
@@ -125,7 +125,7 @@ def test_random_and_no_matches_are_not_rectified() -> None:
     generator = np.random.default_rng(0)
     for count in (0, 1, 2, 5, 40, 2000):
         points0, points1 = generator.uniform(0, 400, (2, count, 2))
-        found = judge_rectification(points0, points1, (400, 400), (400, 400))
+        found = detect_rectification(points0, points1, (400, 400), (400, 400))
         assert not found.rectified
         assert "hardly any" in found.reason
 
@@ -134,7 +134,7 @@ def test_the_figures_are_those_of_the_pair() -> None:
     generator = np.random.default_rng(0)
     points = generator.uniform((0, 0), (640, 480), (3000, 2))
     disparity = generator.uniform(10, 50, 3000)
-    found = judge_rectification(
+    found = detect_rectification(
         points, points - np.column_stack([disparity, np.zeros(3000)]), (640, 480), (640, 480)
     )
     assert found.on_rows == found.matches

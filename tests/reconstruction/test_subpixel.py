@@ -150,11 +150,11 @@ def test_what_is_wrong_is_said(gray: np.ndarray) -> None:
         with pytest.raises(OptionError, match="whole pixels of the image"):
             refine_matches(gray, gray, np.array(points), np.array(points))
     for options in (
-        {"reach": 0},
-        {"sigma": 0},
-        {"rounds": 0},
-        {"farthest": -1},
-        {"least_correlation": 2},
+        {"patch_radius_px": 0},
+        {"sigma_px": 0},
+        {"max_iterations": 0},
+        {"max_shift_px": -1},
+        {"min_correlation": 2},
     ):
         with pytest.raises(OptionError):
             SubpixelOptions(**options)

@@ -10,6 +10,7 @@ from deepdetect import DeepDetect, OptionError, match_images
 from deepdetect._shared.errors import ReconstructionError
 from deepdetect.geometry.camera import calibration_from_focal
 from deepdetect.geometry.relative_pose import estimate_relative_pose
+from deepdetect.reconstruction.outliers import PointFilterOptions
 from deepdetect.reconstruction.two_view import (
     TwoViewOptions,
     TwoViewReconstruction,
@@ -24,7 +25,7 @@ def found(turned: Any, turned_matches: Any) -> TwoViewReconstruction:
 
 def depth_errors(turned: Any, found: TwoViewReconstruction, points0: np.ndarray) -> np.ndarray:
     """Return the shares by which depths are off, where the truth is known."""
-    true = turned.points(points0[found.rows])[:, 2]
+    true = turned.points(points0[found.indices])[:, 2]
     return np.abs(found.points[:, 2] / true - 1)[np.isfinite(true)]
 
 
@@ -51,9 +52,9 @@ def test_points_lie_where_their_pixels_look(turned: Any, turned_matches: Any, fo
     points0, _ = turned_matches
     calibration, pose = turned.calibration, found.pose
     seen = calibration.camera0.project(found.points)
-    assert np.abs(seen - points0[found.rows]).max() < 1.5
+    assert np.abs(seen - points0[found.indices]).max() < 1.5
     there = calibration.camera1.project(found.points @ pose.rotation.T + pose.translation)
-    gaps = np.stack([seen - points0[found.rows], there - found.points1])
+    gaps = np.stack([seen - points0[found.indices], there - found.points1])
     error = np.sqrt((gaps**2).sum((0, 2)) / 2)
     np.testing.assert_allclose(error, found.reprojection_errors, atol=2e-3)
     assert found.reprojection_errors.max() < 1
@@ -62,10 +63,10 @@ def test_points_lie_where_their_pixels_look(turned: Any, turned_matches: Any, fo
 
 def test_all_matches_are_accounted_for(turned_matches: Any, found: Any) -> None:
     assert len(found) + sum(found.dropped.values()) == len(turned_matches[0])
-    assert (np.diff(found.rows) > 0).all()
+    assert (np.diff(found.indices) > 0).all()
     assert len(found.points) == len(found.points1) == len(found.reprojection_errors)
-    assert len(found.points) == len(found.parallax)
-    assert found.dropped["not refined"] == len(turned_matches[0]) - len(found.posed)
+    assert len(found.points) == len(found.triangulation_angles)
+    assert found.dropped["not refined"] == len(turned_matches[0]) - len(found.pose_indices)
     assert set(found.seconds) >= {"sub-pixel", "pose", "triangulation", "outlier removal"}
 
 
@@ -73,7 +74,7 @@ def test_a_known_baseline_gives_millimetres(turned: Any, turned_matches: Any, fo
     calibration = replace(turned.calibration, baseline_mm=193.001)
     metric = reconstruct_two_view(*turned_matches, calibration, turned.grays)
     assert metric.unit == "mm"
-    np.testing.assert_array_equal(metric.rows, found.rows)
+    np.testing.assert_array_equal(metric.indices, found.indices)
     np.testing.assert_allclose(metric.points, found.points * 193.001, rtol=1e-5)
 
 
@@ -96,20 +97,25 @@ def test_wrong_matches_are_taken_out(turned: Any, turned_matches: Any, found: An
     points1[wrong] = generator.integers((0, 0), (370, 250), (wrong.sum(), 2))
     other = reconstruct_two_view(points0, points1, turned.calibration, turned.grays)
     assert turned.rotation_error(other.pose.rotation) < 0.1
-    assert wrong[other.rows].mean() < 0.02
+    assert wrong[other.indices].mean() < 0.02
     assert len(other) > 0.5 * len(found)
 
 
 def test_options_switch_stages_off(turned: Any, turned_matches: Any) -> None:
-    options = TwoViewOptions(neighbours=0, subpixel=None, least_parallax_px=0)
-    found = reconstruct_two_view(*turned_matches, turned.calibration, turned.grays, options)
-    assert "alone" not in found.dropped
+    options = TwoViewOptions(subpixel=None)
+    keep = PointFilterOptions(sor_neighbors=0, min_parallax_px=0)
+    found = reconstruct_two_view(*turned_matches, turned.calibration, turned.grays, options, keep)
+    assert "statistical outlier" not in found.dropped
     assert "not refined" not in found.dropped
     assert found.dropped["parallax"] == 0
     far = reconstruct_two_view(
-        *turned_matches, turned.calibration, None, replace(options, least_parallax_px=40)
+        *turned_matches,
+        turned.calibration,
+        None,
+        options,
+        replace(keep, min_parallax_px=40),
     )
-    assert np.radians(far.parallax.min()) * turned.calibration.camera0.focal_px[0] >= 40
+    assert np.radians(far.triangulation_angles.min()) * turned.calibration.camera0.focal_px[0] >= 40
     assert far.dropped["parallax"] > 0
 
 
@@ -127,26 +133,19 @@ def test_what_is_wrong_is_said(turned: Any, turned_matches: Any, level: Any, one
             *turned_matches,
             turned.calibration,
             None,
-            TwoViewOptions(least_parallax_px=1e4),
+            point_filter=PointFilterOptions(min_parallax_px=1e4),
         )
-    for options in (
-        {"inlier_threshold": 0},
-        {"reprojection_threshold": -1},
-        {"least_parallax_px": -1},
-        {"neighbours": -1},
-        {"factor": float("nan")},
-        {"seed": -1},
-    ):
+    for options in ({"max_epipolar_distance_px": 0}, {"max_reprojection_error_px": -1}):
         with pytest.raises(OptionError):
             TwoViewOptions(**options)
 
 
-def test_a_camera_that_only_turned_gives_no_cloud(level: Any, only_turned: np.ndarray) -> None:
+def test_a_camera_that_only_rotated_gives_no_cloud(level: Any, only_turned: np.ndarray) -> None:
     from deepdetect.io.image import luma
 
     found = match_images(level.left, only_turned, DeepDetect("dense"))
     calibration = replace(level.calibration, camera1=level.calibration.camera0)
-    with pytest.raises(ReconstructionError, match="turn of the camera"):
+    with pytest.raises(ReconstructionError, match="rotation of the camera"):
         reconstruct_two_view(
             found.points0, found.points1, calibration, (level.grays[0], luma(only_turned))
         )

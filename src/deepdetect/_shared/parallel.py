@@ -13,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from .errors import DeepDetectError, OptionError
 
@@ -137,7 +137,7 @@ def _one_opencv_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def parallel_for(count: int, work: Callable[[int, int], object]) -> None:
+def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> None:
     """Do a piece of work on parts of a range, in as many threads as there are processors.
 
     The parts do not depend on the number of threads as far as the work is concerned: it must
@@ -145,7 +145,8 @@ def parallel_for(count: int, work: Callable[[int, int], object]) -> None:
 
     Args:
         count: length of the range.
-        work: called with (start, stop) of each part; it should release Python's lock.
+        work: called with (start, stop, *arguments) for each part; it should release Python's lock.
+        arguments: the same for all parts.
 
     Example:
         >>> done = []
@@ -155,12 +156,12 @@ def parallel_for(count: int, work: Callable[[int, int], object]) -> None:
     """
     threads = min(processor_count(), count)
     if threads <= 1:
-        work(0, count)
+        work(0, count, *arguments)
         return
     parts = min(count, threads * PARTS_A_THREAD)
     edges = [count * k // parts for k in range(parts + 1)]
     with ThreadPoolExecutor(threads) as pool:
-        for future in [pool.submit(work, *edge) for edge in pairwise(edges)]:
+        for future in [pool.submit(work, *edge, *arguments) for edge in pairwise(edges)]:
             future.result()
 
 

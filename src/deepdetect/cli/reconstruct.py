@@ -1,7 +1,8 @@
-"""`deepdetect reconstruct`: two photographs to a model in space."""
+"""`deepdetect reconstruct`: two photographs to a 3D point cloud and depth maps."""
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -26,15 +27,19 @@ if TYPE_CHECKING:
     from ..io.depth import DepthPng
     from ..reconstruction.result import Reconstruction
 
-STAGES = 5
+WHOLE_PIXEL_SELECTION = dataclasses.replace(SELECTION, skip=(*SELECTION.skip, "subpixel"))
+
+STAGES = 8
 """Of a reconstruction at most; the files are one more."""
 
 
-@generated_command(SELECTION, short_help="Two photographs to a 3D reconstruction.")
+@generated_command(WHOLE_PIXEL_SELECTION, short_help="Two photographs to a 3D reconstruction.")
 @click.argument("left", type=PATH)
 @click.argument("right", type=PATH)
 @click.option(
-    "--calibration", type=PATH, help="JSON file of the cameras, as in docs/reconstruction.md."
+    "--calibration",
+    type=PATH,
+    help="JSON file of the cameras, as in docs/reconstruction.md.",
 )
 @click.option(
     "--focal",
@@ -46,7 +51,7 @@ STAGES = 5
 @click.option(
     "--rectified/--not-rectified",
     default=None,
-    help="Whether matches lie on the same row of both images.  [default: found out]",
+    help="Whether matches lie on the same row of both images.  [default: detected]",
 )
 @click.option(
     "-o",
@@ -68,11 +73,14 @@ def reconstruct(
     as_json: bool,
     **values: Any,
 ) -> None:
-    """Make a cloud of coloured points of a scene from the photographs LEFT and RIGHT.
+    """Reconstruct a cloud of coloured 3D points from the photographs LEFT and RIGHT.
 
-    Writes STEM.ply, STEM.glb (points in space), STEM.html (a page to turn them in, without
-    network), STEM_depth.png (16 bits, its scale inside), STEM_depth.npz (floats; disparities too
-    for rectified pairs), and STEM.json (counts, times and quality).
+    Writes STEM.ply and STEM.glb (the points), STEM.html (an offline viewer), STEM_depth.png (16
+    bits, with its scale), STEM_depth.npz (floats; disparities too for rectified pairs), and
+    STEM.json (counts, times and quality).
+
+    For rectified pairs the detector only chooses which pixels of a dense disparity map become
+    points; --density 1 takes all of them.
 
     \b
     deepdetect reconstruct left.png right.png --calibration calib.json -o model.ply
@@ -101,7 +109,7 @@ def reconstruct(
             calibration=calibration,
             focal_px=focal_px,
             rectified=rectified,
-            done=done,
+            progress=done,
             **chosen,
         )
         bar.update(STAGES - bar.n)
@@ -133,10 +141,9 @@ def _write(
     from .._shared.atomic import atomic_path
     from ..io.depth import save_depth_npz, save_depth_png
     from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
-    from ..reconstruction.report import reconstruction_values
 
     started = time.perf_counter()
-    values = reconstruction_values(found)
+    values = found.summary()
     notes = {
         "title": f"{images['left'].name} and {images['right'].name}",
         "pair": "rectified" if found.rectified else "not rectified",
@@ -146,14 +153,14 @@ def _write(
     for ending in POINT_CLOUD_WRITERS:
         save_point_cloud(found.cloud, files[ending], notes)
     depth = found.depth_map()
-    told = save_depth_png(depth, files["_depth.png"], found.unit)
+    stored = save_depth_png(depth, files["_depth.png"], found.unit)
     arrays = {} if found.disparity is None else {"disparity": found.disparity_map()}
     save_depth_npz(depth, files["_depth.npz"], found.unit, matched=found.matched_map(), **arrays)
     values["seconds"]["files"] = round(time.perf_counter() - started, 4)
     numbers = {
         **images,
         **values,
-        "depth_png": _told(told),
+        "depth_png": _depth_png_values(stored),
         "files": list(files.values()),
     }
     with atomic_path(files[".json"]) as temporary:
@@ -161,13 +168,13 @@ def _write(
     return numbers
 
 
-def _told(told: DepthPng) -> dict[str, Any]:
+def _depth_png_values(stored: DepthPng) -> dict[str, Any]:
     return {
-        "unit": told.unit,
-        "value_per_unit": told.value_per_unit,
+        "unit": stored.unit,
+        "value_per_unit": stored.value_per_unit,
         "unknown": 0,
-        "known_pixels": told.known,
-        "out_of_range": told.out_of_range,
+        "known_pixels": stored.known,
+        "out_of_range": stored.out_of_range,
     }
 
 
@@ -175,6 +182,7 @@ def _rows(found: Reconstruction, numbers: dict[str, Any]) -> list[tuple[str, str
     """Make the table of the terminal."""
     unit = {"mm": "mm", "baseline": "baselines"}[found.unit]
     depth, source = numbers["depth"], found.calibration.source
+    angle = numbers["median_triangulation_angle_degrees"]
     filled = f", {numbers['filled']:,} of them filled in" if numbers["filled"] else ""
     rows = [
         ("rectified", f"{'yes' if found.rectified else 'no'} ({numbers['rectified_why']})"),
@@ -185,7 +193,7 @@ def _rows(found: Reconstruction, numbers: dict[str, Any]) -> list[tuple[str, str
         ("points", f"{len(found):,} ({numbers['density']:.1%} of the pixels{filled})"),
         ("depth", f"{depth['5%']:.4g} to {depth['95%']:.4g} {unit}, median {depth['50%']:.4g}"),
         ("scale", numbers["scale"]),
-        ("parallax", f"{numbers['median_parallax_degrees']:.2f} degrees (median)"),
+        ("triangulation angle", f"{angle:.2f} degrees (median)"),
     ]
     if found.reprojection_errors is not None:
         error = numbers["median_reprojection_error_px"]

@@ -11,12 +11,12 @@ import numpy as np
 
 def window_sums(
     pixels: np.ndarray,
-    values: np.ndarray | float,
+    values: np.ndarray | np.generic | float,
     shape: Sequence[int],
     window_px: int,
     *,
     at: np.ndarray | None = None,
-    dtype: type[np.floating[Any]] = np.float64,
+    dtype: type[np.floating[Any]] | None = None,
 ) -> np.ndarray:
     """Sum the values of the pixels in the square window around each pixel.
 
@@ -26,14 +26,14 @@ def window_sums(
         shape: (H, W, ...) of the image.
         window_px: side of the window, odd.
         at: (M, 2) int64 centres of the windows; None: the pixels themselves.
-        dtype: of the sums.
+        dtype: of the sums; None: that of the values.
 
     Returns:
         (M,) sums, 0 where there is no pixel in the window.
 
     Example:
         >>> pixels = np.array([[0, 0], [2, 1], [9, 9]])
-        >>> window_sums(pixels, np.array([1, 2, 3]), (10, 10), 5).tolist()
+        >>> window_sums(pixels, np.array([1.0, 2, 3]), (10, 10), 5).tolist()
         [3.0, 3.0, 3.0]
     """
     image = _scatter(pixels, values, shape, dtype)
@@ -59,11 +59,11 @@ def gaussian_means(
 
 def _scatter(
     pixels: np.ndarray,
-    values: np.ndarray | float,
+    values: np.ndarray | np.generic | float,
     shape: Sequence[int],
-    dtype: type[np.floating[Any]],
+    dtype: type[np.floating[Any]] | None,
 ) -> np.ndarray:
     """Return an image with the values at their pixels, 0 elsewhere."""
-    image = np.zeros(tuple(shape[:2]), dtype)
+    image = np.zeros(tuple(shape[:2]), dtype or np.asarray(values).dtype)
     image[pixels[:, 1], pixels[:, 0]] = values
     return image

@@ -1,13 +1,13 @@
-"""Why two images give no depth, said in one sentence before any cloud is made.
+"""Why two images give no depth, in one sentence and before any cloud is made.
 
-Each check raises `ReconstructionError` when its reason holds, and is silent on good pairs. They are
-meant to be run in the order of this module: `check_images`, `check_matches`, and with a pose
-`check_pose` and `check_focal`; for rectified pairs `check_images`, then those of `row_degeneracy`.
+Each check raises `ReconstructionError` when its reason holds, and is silent on good pairs. They run
+in the order of this module: `check_images`, `check_matches`, and with a pose `check_pose` and
+`check_focal`; for rectified pairs `check_images`, then those of `rectified_checks`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -20,88 +20,127 @@ from ..geometry.camera import Calibration, Camera
 from ..geometry.model_selection import select_model
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
 
-FEWEST = 30
-"""Matches, one a cell, below which nothing is tried."""
 
-CELL = 16
-"""Side in pixels of the cells of the first image that give one match each to the tests: matches
-side by side are no independent evidence."""
+@dataclass(frozen=True)
+class CopyOptions:
+    """When two images are the same picture, perhaps saved again.
 
-THRESHOLD = 1.5
-PLANE_THRESHOLD = 2.0
-"""Pixels within which a match agrees with a fundamental matrix (Sampson's distance, one direction
-of error) and with a homography (two directions)."""
+    Attributes:
+        max_mean_difference_levels: grey levels by which copies differ in the mean.
+        max_difference_levels: grey levels by which they differ nearly everywhere.
+        max_difference_to_gradient: the same, as a multiple of what the picture differs from itself
+            shifted by a pixel: dark views differ by few levels.
+        quantile: the fraction of the pixels that is nearly everywhere.
+    """
 
-FLAT = 0.75
-"""A homography that explains less than this share of what the fundamental matrix does is no plane,
-whatever the other matches are."""
+    max_mean_difference_levels: float = 0.5
+    max_difference_levels: float = 8.0
+    max_difference_to_gradient: float = 0.5
+    quantile: float = 0.999
 
-CLEARLY = 3.0
-OF_CLEAR = 0.8
-FEW = 0.05
-"""A scene has depth, too, when a share of at least 0.05 of what the fundamental matrix explains is
-further from the plane than three thresholds, and is at least 0.8 of all that is so far off it: what
-stands before a wall. On planes wrong matches are so far off, and fewer of them lie on the lines: up
-to 0.65 of them on sixteen pairs of Oxford."""
 
-STILL = 0.5
-NOISE = 3.0
-"""Pixels: where half of the matches move less than the one, and nearly all less than the other,
-both images show the same view."""
+@dataclass(frozen=True)
+class StaticOptions:
+    """When matches show that both images have the same view.
 
-NEARLY_ALL = 0.9
+    Attributes:
+        max_median_motion_px: the median match moves less.
+        max_motion_px: nearly all matches move less.
+        quantile: the fraction of the matches that is nearly all.
+    """
 
-SAME = 0.5
-NOWHERE = 8.0
-OF_CONTRAST = 0.5
-"""Two images are the same picture, stored anew, when they differ by fewer grey levels than the one
-in the mean, and than the other nearly everywhere; and also nearly everywhere by less than this
-share of what the picture differs from itself moved by a pixel: dark views differ by few levels."""
+    max_median_motion_px: float = 0.5
+    max_motion_px: float = 3.0
+    quantile: float = 0.9
 
-NEARLY_EVERYWHERE = 0.999
 
-CALIBRATED = 0.75
-"""Of the matches that agree with a fundamental matrix, the share that must agree with the
-essential matrix: a right calibration explains as much."""
+@dataclass(frozen=True)
+class ForegroundOptions:
+    """When a scene that is mostly a plane has something in front of it.
 
-IN_FRONT = 0.75
-"""Share of the inliers of a pose that must lie before both cameras."""
+    On planes wrong matches are this far off, and fewer of them lie on their epipolar lines: up to
+    0.65 of them on sixteen pairs of Oxford.
 
-FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
-BETTER = 0.5
-"""Other focal lengths that are tried, in units of the given one, and by how much the median error
-must shrink for one of them: a focal length that is a fifth off passes."""
+    Attributes:
+        min_distance_px: from the plane's homography, for a match to be clearly off it.
+        min_fraction: of the matches that the fundamental matrix explains, clearly off the plane.
+        min_epipolar_fraction: of the matches clearly off the plane, explained by the fundamental
+            matrix.
+    """
 
-GOOD = 0.1
-"""Pixels of median error that no better focal length is looked for at."""
+    min_distance_px: float = 6.0
+    min_fraction: float = 0.05
+    min_epipolar_fraction: float = 0.8
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """Thresholds of the checks.
+
+    Attributes:
+        copy: when both images are one picture.
+        static: when nothing moves.
+        foreground: when a plane is not all there is.
+        grid_size_px: cells of the first image of this size give one match each: matches side by
+            side are no independent evidence.
+        min_matches: matches, one per cell, below which nothing is tried.
+        max_epipolar_distance_px: within which a match agrees with a fundamental matrix (Sampson).
+        max_transfer_error_px: within which a match agrees with a homography.
+        min_planar_ratio: matches of the homography per match of the fundamental matrix, below
+            which the scene is no plane.
+        min_pose_ratio: matches of the essential matrix per match of the fundamental matrix: with
+            a correct calibration the first explains as much.
+        min_in_front_fraction: of the inliers of a pose, in front of both cameras.
+        focal_factors: other focal lengths that are tried, in units of the given one.
+        max_focal_error_ratio: of the median error of another focal length to that of the given one,
+            which is refused below it: a focal length that is off by a fifth passes.
+        good_error_px: median error at which no other focal length is tried.
+    """
+
+    copy: CopyOptions = field(default_factory=CopyOptions)
+    static: StaticOptions = field(default_factory=StaticOptions)
+    foreground: ForegroundOptions = field(default_factory=ForegroundOptions)
+    grid_size_px: int = 16
+    min_matches: int = 30
+    max_epipolar_distance_px: float = 1.5
+    max_transfer_error_px: float = 2.0
+    min_planar_ratio: float = 0.75
+    min_pose_ratio: float = 0.75
+    min_in_front_fraction: float = 0.75
+    focal_factors: tuple[float, ...] = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
+    max_focal_error_ratio: float = 0.5
+    good_error_px: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the matches of a sound pair have shown, for the checks that follow.
+    """What the matches of a good pair have shown, for the checks that follow.
 
     Attributes:
-        rows: (K,) rows of the matches that were looked at, one a cell.
+        indices: (K,) of the matches that were used, one per cell.
         fundamental: (3, 3) that explains them best.
         explained: (K,) bool, which of them it explains.
-        by_homography: share of them that one homography explains.
+        by_homography: fraction of them that one homography explains.
         log10_nfa: decimal logarithm of the fundamental matrix's number of false alarms.
     """
 
-    rows: np.ndarray
+    indices: np.ndarray
     fundamental: np.ndarray
     explained: np.ndarray
     by_homography: float
     log10_nfa: float
 
 
-def check_images(gray0: np.ndarray, gray1: np.ndarray) -> None:
-    """Refuse two copies of one picture, also when one was stored anew without visible loss.
+def check_images(
+    gray0: np.ndarray, gray1: np.ndarray, options: CopyOptions = CopyOptions()
+) -> None:
+    """Refuse two copies of one picture, also when one was saved again without visible loss.
 
     Copies that lost more show the same view: `check_matches` and `check_disparities` refuse them.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
+        options: how little they differ.
 
     Raises:
         ReconstructionError: they are the same.
@@ -113,7 +152,7 @@ def check_images(gray0: np.ndarray, gray1: np.ndarray) -> None:
         deepdetect.ReconstructionError: both images are the same picture: depth needs two \
 photographs from two places
     """
-    if gray0.shape == gray1.shape and _same(gray0, gray1):
+    if gray0.shape == gray1.shape and _is_copy(gray0, gray1, options):
         raise ReconstructionError(
             "both images are the same picture: depth needs two photographs from two places"
         )
@@ -125,14 +164,16 @@ def check_matches(
     size1: tuple[int, int],
     calibration: Calibration | None = None,
     seed: int = 0,
+    options: CheckOptions = CheckOptions(),
 ) -> Evidence:
-    """Refuse matches that show no overlap, no movement, or no depth.
+    """Refuse matches that show no overlap, no motion, or no depth.
 
     Args:
         points0, points1: (M, 2) matched positions in pixels.
         size1: (width, height) of the second image.
-        calibration: tells a turning camera from a plane, where it is known.
+        calibration: tells a rotating camera from a plane, where it is known.
         seed: of the random samples.
+        options: the thresholds.
 
     Returns:
         What `check_pose` compares with.
@@ -143,64 +184,87 @@ def check_matches(
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    rows = grid_subsample(points0, CELL, seed)
-    first, second = points0[rows], points1[rows]
-    space, plane = (
+    indices = grid_subsample(points0, options.grid_size_px, seed)
+    first, second = points0[indices], points1[indices]
+    thresholds = {
+        "fundamental": options.max_epipolar_distance_px,
+        "homography": options.max_transfer_error_px,
+    }
+    epipolar, plane = (
         estimate_geometry(
-            *(first, second), GeometryOptions(model=model, inlier_threshold=threshold, seed=seed)
+            first, second, GeometryOptions(model=model, inlier_threshold=threshold, seed=seed)
         )
-        for model, threshold in (("fundamental", THRESHOLD), ("homography", PLANE_THRESHOLD))
+        for model, threshold in thresholds.items()
     )
-    if len(rows) < FEWEST or space.matrix is None:
+    if len(indices) < options.min_matches or epipolar.matrix is None:
         raise ReconstructionError(_no_overlap(len(points0)))
+    off_plane = _plane_errors(first, second, plane.matrix)
     alarms = [
-        log10_nfa(errors, model, threshold, size1)
-        for model, threshold, errors in (
-            ("fundamental", THRESHOLD, epipolar_errors(first, second, space.matrix)),
-            ("homography", PLANE_THRESHOLD, _plane_errors(first, second, plane.matrix)),
+        log10_nfa(errors, model, thresholds[model], size1)
+        for model, errors in (
+            ("fundamental", epipolar_errors(first, second, epipolar.matrix)),
+            ("homography", off_plane),
         )
     ]
     if min(alarms) > MAX_LOG10_NFA:
         raise ReconstructionError(_no_overlap(len(points0)))
-    moved = np.linalg.norm(second - first, axis=1)[space.inliers | plane.inliers]
-    if stands_still(moved):
+    motion = np.linalg.norm(second - first, axis=1)[epipolar.inliers | plane.inliers]
+    if is_static(motion, options.static):
         raise ReconstructionError(
             "nothing moves between the images: they show the same view, depth needs two "
             "photographs from two places"
         )
-    off = _plane_errors(first, second, plane.matrix)
-    if is_flat(plane.inliers, space.inliers) and not _stands_out(off, space.inliers):
-        raise ReconstructionError(_no_depth(first, second, plane.inliers, calibration))
+    planar = is_planar(plane.inliers, epipolar.inliers, options.min_planar_ratio)
+    if planar and not has_foreground(off_plane, epipolar.inliers, options.foreground):
+        explained = first[plane.inliers], second[plane.inliers]
+        raise ReconstructionError(_no_depth(*explained, calibration, options))
     return Evidence(
-        rows, space.matrix, space.inliers, float(plane.inliers.mean()), float(alarms[0])
+        indices=indices,
+        fundamental=epipolar.matrix,
+        explained=epipolar.inliers,
+        by_homography=float(plane.inliers.mean()),
+        log10_nfa=float(alarms[0]),
     )
 
 
-def check_pose(pose: RelativePose | None, evidence: Evidence, calibration: Calibration) -> None:
+def check_pose(
+    pose: RelativePose | None,
+    evidence: Evidence,
+    calibration: Calibration,
+    options: CheckOptions = CheckOptions(),
+) -> RelativePose:
     """Refuse a pose that explains far less than is possible: the calibration is wrong.
 
     Args:
         pose: of the same matches as the evidence; None when none could be estimated.
         evidence: of `check_matches`.
         calibration: that gave the pose.
+        options: the thresholds.
+
+    Returns:
+        The pose.
 
     Raises:
         ReconstructionError: too few matches agree with the pose, or too many points lie behind.
     """
     if pose is None:
-        raise ReconstructionError(f"no pose of the cameras fits the matches: {_wrong(calibration)}")
+        raise ReconstructionError(
+            f"no pose of the cameras fits the matches: {_wrong_focal(calibration)}"
+        )
     possible = np.count_nonzero(evidence.explained)
-    explained = np.count_nonzero(pose.errors[evidence.rows] < THRESHOLD)
-    if explained < CALIBRATED * possible:
+    errors = pose.errors[evidence.indices]
+    explained = np.count_nonzero(errors < options.max_epipolar_distance_px)
+    if explained < options.min_pose_ratio * possible:
         raise ReconstructionError(
             f"with this calibration only {explained:,} of {possible:,} matches fit one pose of "
-            f"the cameras: {_wrong(calibration)}"
+            f"the cameras: {_wrong_focal(calibration)}"
         )
-    if pose.cheirality_ratio < IN_FRONT:
+    if pose.cheirality_ratio < options.min_in_front_fraction:
         raise ReconstructionError(
-            f"only {pose.cheirality_ratio:.0%} of the points would lie before both cameras: "
-            f"{_wrong(calibration)}"
+            f"only {pose.cheirality_ratio:.0%} of the points would lie in front of both cameras: "
+            f"{_wrong_focal(calibration)}"
         )
+    return pose
 
 
 def check_focal(
@@ -210,77 +274,112 @@ def check_focal(
     evidence: Evidence,
     calibration: Calibration,
     seed: int = 0,
+    options: CheckOptions = CheckOptions(),
 ) -> None:
     """Refuse a focal length when quite another one fits the matches far better.
 
-    Where the camera only moved sideways every focal length fits as well, and a wrong one goes
-    unseen: it gives a scene that is stretched in depth. One that is too long shows less than one
-    that is too short.
+    Where the camera only moved sideways every focal length fits as well, and a wrong one is not
+    noticed: it gives a scene that is stretched in depth. One that is too long is noticed less than
+    one that is too short.
 
     Args:
         points0, points1: (M, 2) the matches that the pose and the evidence come from.
         pose, evidence, calibration: as of `check_pose`.
         seed: of the random samples.
+        options: the thresholds.
 
     Raises:
         ReconstructionError: another focal length halves the median error; it is named.
     """
-    rows = evidence.rows[evidence.explained]
-    given = float(np.median(pose.errors[rows]))
-    if given < GOOD:
+    indices = evidence.indices[evidence.explained]
+    first, second = points0[indices], points1[indices]
+    given = float(np.median(pose.errors[indices]))
+    if given < options.good_error_px:
         return
-    best, factor = BETTER * given, 1.0
-    for other in FOCAL_FACTORS:
+    best, best_factor = options.max_focal_error_ratio * given, 1.0
+    for factor in options.focal_factors:
         scaled = replace(
             calibration,
-            camera0=_with_focal(calibration.camera0, other),
-            camera1=_with_focal(calibration.camera1, other),
+            camera0=_with_focal(calibration.camera0, factor),
+            camera1=_with_focal(calibration.camera1, factor),
         )
-        found = estimate_relative_pose(points0[rows], points1[rows], scaled, THRESHOLD, seed)
-        if found is None or found.cheirality_ratio < IN_FRONT:
+        found = estimate_relative_pose(
+            first, second, scaled, options.max_epipolar_distance_px, seed
+        )
+        if found is None or found.cheirality_ratio < options.min_in_front_fraction:
             continue
         error = float(np.median(found.errors))
         if error < best:
-            best, factor = error, other
-    if factor != 1:
+            best, best_factor = error, factor
+    if best_factor != 1:
         focal = calibration.camera0.focal_px[0]
         raise ReconstructionError(
-            f"{_wrong(calibration)}: one of about {focal * factor:.0f} px fits the matches "
-            f"{given / best:.1f} times as well"
+            f"{_wrong_focal(calibration)}: one of about {focal * best_factor:.0f} px fits the "
+            f"matches {given / best:.1f} times as well"
         )
 
 
-def _same(gray0: np.ndarray, gray1: np.ndarray) -> bool:
-    difference = cv2.absdiff(gray0, gray1)
-    if difference.mean() >= SAME:
-        return False
-    largest = np.quantile(difference, NEARLY_EVERYWHERE)
-    contrast = np.quantile(cv2.absdiff(gray0[:, 1:], gray0[:, :-1]), NEARLY_EVERYWHERE)
-    return bool(largest <= min(NOWHERE, OF_CONTRAST * contrast))
-
-
-def is_flat(by_homography: np.ndarray, by_fundamental: np.ndarray) -> bool:
-    """Tell whether a homography explains all that can be explained, though many may be wrong.
+def is_planar(
+    by_homography: np.ndarray,
+    by_fundamental: np.ndarray,
+    min_ratio: float = CheckOptions.min_planar_ratio,
+) -> bool:
+    """Return whether a homography explains all that can be explained, though many may be wrong.
 
     Args:
         by_homography, by_fundamental: (M,) bool, the matches that each explains.
+        min_ratio: matches of the homography per match of the fundamental matrix.
     """
-    nearly = np.count_nonzero(by_homography) >= FLAT * np.count_nonzero(by_fundamental)
-    return bool(nearly and select_model(by_homography, by_fundamental) == "homography")
+    explained = np.count_nonzero(by_homography) >= min_ratio * np.count_nonzero(by_fundamental)
+    return bool(explained and select_model(by_homography, by_fundamental) == "homography")
 
 
-def stands_still(moved: np.ndarray) -> bool:
-    """Tell from how far matches move, in pixels, whether both images show the same view.
+def has_foreground(
+    off_plane_px: np.ndarray,
+    by_fundamental: np.ndarray,
+    options: ForegroundOptions = ForegroundOptions(),
+) -> bool:
+    """Return whether something stands in front of the plane, small as it may be.
+
+    Args:
+        off_plane_px: (N,) errors of the plane's homography.
+        by_fundamental: (N,) bool, the matches that the fundamental matrix explains.
+        options: the thresholds.
+    """
+    clear = off_plane_px > options.min_distance_px
+    foreground = np.count_nonzero(clear & by_fundamental)
+    needed = max(
+        options.min_epipolar_fraction * np.count_nonzero(clear),
+        options.min_fraction * np.count_nonzero(by_fundamental),
+    )
+    return bool(foreground > 0 and foreground >= needed)
+
+
+def is_static(motion_px: np.ndarray, options: StaticOptions = StaticOptions()) -> bool:
+    """Return whether matches that move this far show the same view in both images.
 
     Example:
-        >>> stands_still(np.array([0.1, 0.0, 0.3])), stands_still(np.array([0.1, 0.2, 7.0]))
+        >>> is_static(np.array([0.1, 0.0, 0.3])), is_static(np.array([0.1, 0.2, 7.0]))
         (True, False)
     """
-    moved = np.abs(moved)
-    return bool(np.median(moved) < STILL and np.quantile(moved, NEARLY_ALL) < NOISE)
+    motion = np.abs(motion_px)
+    return bool(
+        np.median(motion) < options.max_median_motion_px
+        and np.quantile(motion, options.quantile) < options.max_motion_px
+    )
 
 
-def _wrong(calibration: Calibration) -> str:
+def _is_copy(gray0: np.ndarray, gray1: np.ndarray, options: CopyOptions) -> bool:
+    difference = cv2.absdiff(gray0, gray1)
+    if difference.mean() >= options.max_mean_difference_levels:
+        return False
+    largest = np.quantile(difference, options.quantile)
+    gradient = np.quantile(cv2.absdiff(gray0[:, 1:], gray0[:, :-1]), options.quantile)
+    limit = min(options.max_difference_levels, options.max_difference_to_gradient * gradient)
+    return bool(largest <= limit)
+
+
+def _wrong_focal(calibration: Calibration) -> str:
     return (
         f"the focal length of {calibration.camera0.focal_px[0]:.0f} px ({calibration.source}) is "
         "probably wrong for these images"
@@ -290,20 +389,6 @@ def _wrong(calibration: Calibration) -> str:
 def _with_focal(camera: Camera, factor: float) -> Camera:
     fx, fy = camera.focal_px
     return replace(camera, focal_px=(fx * factor, fy * factor))
-
-
-def _stands_out(off: np.ndarray, inliers: np.ndarray) -> bool:
-    """Tell whether something stands before the plane, small as it may be.
-
-    Args:
-        off: (N,) pixels by which matches lie off the plane.
-        inliers: (N,) bool, those that the fundamental matrix explains.
-    """
-    clear = off > CLEARLY * PLANE_THRESHOLD
-    before = np.count_nonzero(clear & inliers)
-    return before > 0 and before >= max(
-        OF_CLEAR * np.count_nonzero(clear), FEW * np.count_nonzero(inliers)
-    )
 
 
 def _plane_errors(
@@ -318,7 +403,7 @@ def _no_overlap(matches: int) -> str:
     if not matches:
         return (
             "there are no matches: the photographs do not overlap, or do not show the same scene, "
-            "or no pixel of one is above the threshold (lower it, or give a density)"
+            "or no pixel of one is above the threshold (lower `threshold`, or give `density`)"
         )
     return (
         f"too few of the {matches:,} matches agree with one geometry: the photographs do not "
@@ -327,21 +412,34 @@ def _no_overlap(matches: int) -> str:
 
 
 def _no_depth(
-    points0: np.ndarray, points1: np.ndarray, inliers: np.ndarray, calibration: Calibration | None
+    points0: np.ndarray,
+    points1: np.ndarray,
+    calibration: Calibration | None,
+    options: CheckOptions,
 ) -> str:
-    if calibration is not None and _only_turned(points0[inliers], points1[inliers], calibration):
+    if calibration is not None and is_pure_rotation(
+        points0, points1, calibration, options.max_epipolar_distance_px
+    ):
         return (
-            "a turn of the camera explains all the matches and there is no depth: move it "
+            "a rotation of the camera explains all the matches and there is no depth: move it "
             "sideways between the photographs"
         )
     return (
         "one homography explains all the matches: the photographs show a plane, or the camera "
-        "only turned, and there is no depth"
+        "only rotated, and there is no depth"
     )
 
 
-def _only_turned(points0: np.ndarray, points1: np.ndarray, calibration: Calibration) -> bool:
-    """Tell whether one rotation takes the matches' rays onto each other, by Kabsch's method."""
+def is_pure_rotation(
+    points0: np.ndarray, points1: np.ndarray, calibration: Calibration, max_error_px: float
+) -> bool:
+    """Return whether one rotation maps the rays of matches onto each other (Kabsch's method).
+
+    Args:
+        points0, points1: (M, 2) matched positions.
+        calibration: of both cameras.
+        max_error_px: median error in the second image.
+    """
     rays0, rays1 = (
         rays / np.linalg.norm(rays, axis=1, keepdims=True)
         for rays in (calibration.camera0.rays(points0), calibration.camera1.rays(points1))
@@ -349,4 +447,4 @@ def _only_turned(points0: np.ndarray, points1: np.ndarray, calibration: Calibrat
     u, _, vt = np.linalg.svd(rays1.T @ rays0)
     rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     seen = calibration.camera1.project(rays0 @ rotation.T)
-    return bool(np.median(np.linalg.norm(seen - points1, axis=1)) < THRESHOLD)
+    return bool(np.median(np.linalg.norm(seen - points1, axis=1)) < max_error_px)

@@ -1,23 +1,21 @@
-"""Two photographs in, coloured points in space out (paper, Figure 8).
+"""Two photographs in, coloured 3D points out (paper, Figure 8).
 
-    keypoints -> matches -> pose -> triangulation -> checks
-
-A rectified pair has one road less: its matches lie along the rows, their disparity is the depth.
+General pairs: keypoints -> matches -> pose -> triangulation -> checks. Rectified pairs: a dense
+disparity map, from which the keypoints of the left image take their points.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._shared.errors import ReconstructionError
-from .._shared.options import replace_options
+from .._shared.errors import OptionError, ReconstructionError
+from .._shared.options import replace_options, suggest_keywords
+from .._shared.timing import StageTimer
 from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
 from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
@@ -27,18 +25,19 @@ from ..matching.guided import InitialMatches, initial_matches
 from ..matching.options import get_preset
 from ..matching.pipeline import match_images
 from .checks import check_images
-from .outliers import statistical_inliers_on_grid
-from .rectification import Rectification, judge_rectification
-from .result import Reconstruction
-from .row_degeneracy import (
+from .outliers import PointFilterOptions, sor_inliers_on_grid
+from .rectification import Rectification, RectificationOptions, detect_rectification
+from .rectified_checks import (
+    RectifiedCheckOptions,
     check_cameras,
     check_depths,
     check_disparities,
     check_keypoints,
     check_matched,
-    check_turn,
+    check_pure_rotation,
 )
-from .stereo import COMPLETE, RowMatchingOptions, match_rows
+from .result import Reconstruction
+from .stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .two_view import TwoViewOptions, reconstruct_two_view
 
 
@@ -47,11 +46,15 @@ class ReconstructionOptions:
     """How a pair becomes points.
 
     Attributes:
-        selection: which pixels become keypoints.
-        rectified: whether matches lie on the same row of both images; None: found out.
-        rows: how rectified pairs are matched; None: `COMPLETE` when every pixel is asked for
-            (a density of 1), else the strict default.
-        two_view: all stages of pairs that are not rectified.
+        selection: which pixels become keypoints. They are whole pixels; `subpixel` does not apply.
+        rectified: whether matches lie on the same row of both images; None: detected.
+        rectification: when a pair counts as rectified.
+        disparity: the disparity map of rectified pairs; None: `DENSE` for a density of 1, else the
+            strict default.
+        rectified_checks: thresholds of the checks of rectified pairs.
+        two_view: all stages of pairs that are not rectified, with their checks.
+        point_filter: which points are kept.
+        seed: of all random choices.
 
     Raises:
         OptionError: a value is out of its range.
@@ -59,17 +62,26 @@ class ReconstructionOptions:
 
     selection: SelectionOptions = field(default_factory=SelectionOptions)
     rectified: bool | None = None
-    rows: RowMatchingOptions | None = None
+    rectification: RectificationOptions = field(default_factory=RectificationOptions)
+    disparity: DisparityOptions | None = None
+    rectified_checks: RectifiedCheckOptions = field(default_factory=RectifiedCheckOptions)
     two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
+    point_filter: PointFilterOptions = field(default_factory=PointFilterOptions)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.seed < 2**31:
+            raise OptionError(f"the seed must lie in [0, 2147483647], not {self.seed}")
 
     @property
-    def row_matching(self) -> RowMatchingOptions:
-        """The options for rectified pairs that hold."""
-        if self.rows is not None:
-            return self.rows
-        return COMPLETE if self.selection.density == 1 else RowMatchingOptions()
+    def disparity_options(self) -> DisparityOptions:
+        """The options of the disparity map, with the default filled in."""
+        if self.disparity is not None:
+            return self.disparity
+        return DENSE if self.selection.density == 1 else DisparityOptions()
 
 
+@suggest_keywords
 def reconstruct(
     left: Any,
     right: Any,
@@ -77,27 +89,43 @@ def reconstruct(
     *,
     calibration: Calibration | str | Path | None = None,
     focal_px: float | None = None,
+    rectified: bool | None = None,
+    threshold: float | None = None,
+    density: float | None = None,
+    max_keypoints: int | None = None,
+    nms_radius: int | None = None,
+    ignore: np.ndarray | None = None,
+    disparity: DisparityOptions | None = None,
+    two_view: TwoViewOptions | None = None,
+    point_filter: PointFilterOptions | None = None,
+    seed: int | None = None,
     options: ReconstructionOptions | None = None,
-    done: Callable[[str], object] = lambda stage: None,
-    **changes: Any,
+    progress: Callable[[str], object] | None = None,
 ) -> Reconstruction:
     """Reconstruct a scene from two photographs.
+
+    For a rectified pair the detector only chooses which pixels of a dense disparity map become
+    points; `disparity_map` gives that map without a detector. Every option that is None is as in
+    `options`.
 
     Args:
         left, right: anything `load_image` takes. For a pair that is not rectified "left" is only
             the first one, whose frame the points are in.
         detector: a `DeepDetect`, or anything with its `heatmap` method; default
             `DeepDetect("dense")`.
-        calibration: a `Calibration` or the path of a calib.json (`calibration` tells its
-            format); without one the focal length is taken from `focal_px`, or from EXIF.
+        calibration: a `Calibration` or the path of a calib.json (docs/reconstruction.md describes
+            its format); without one the focal length is taken from `focal_px`, or from EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
+        rectified: whether matches lie on the same row of both images; None: detected.
+        threshold, density, max_keypoints, nms_radius, ignore: which pixels become keypoints
+            (`SelectionOptions`). A density of 1 takes every pixel, and `DENSE` disparities. Without
+            `nms_radius`, pairs that are not rectified are matched without suppression.
+        disparity, two_view, point_filter, seed: as of `ReconstructionOptions`.
         options: all options at once.
-        done: called with the name of each stage when it is finished.
-        **changes: single options by name, also those of `SelectionOptions`, `TwoViewOptions`
-            and `SubpixelOptions`, as `density=1`, `rectified=True`, `neighbours=0`.
+        progress: called with the name of each stage when it ends.
 
     Returns:
-        The points, with everything that is known of them.
+        The points, with all that is known about them.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
@@ -105,65 +133,72 @@ def reconstruct(
         ReconstructionError: there is no calibration, it is wrong, or the pair gives no depth.
 
     Example:
-        >>> from deepdetect.evaluation.controls import EveryPixel
-        >>> rng = np.random.default_rng(0)
         >>> import cv2
+        >>> rng = np.random.default_rng(0)
         >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (96, 200)).astype(np.uint8), (0, 0), 1)
         >>> x, y = np.meshgrid(np.arange(160, dtype=np.float32), np.arange(96, dtype=np.float32))
         >>> left = cv2.remap(scene, x + 10 + y / 16, y, cv2.INTER_CUBIC)
         >>> right = cv2.remap(scene, x + 20 + y / 8, y, cv2.INTER_CUBIC)
-        >>> found = reconstruct(left, right, EveryPixel(), focal_px=300, rectified=True)
+        >>> found = reconstruct(left, right, focal_px=300, rectified=True, density=1)
         >>> shift = 10 + found.pixels[:, 1] / 16
         >>> bool(np.median(np.abs(found.disparity - shift)) < 0.1), found.unit
         (True, 'baseline')
     """
-    chosen = replace_options(options if options is not None else ReconstructionOptions(), **changes)
-    seconds: dict[str, float] = {}
+    given = {
+        "rectified": rectified,
+        "threshold": threshold,
+        "density": density,
+        "max_keypoints": max_keypoints,
+        "nms_radius": nms_radius,
+        "ignore": ignore,
+        "disparity": disparity,
+        "two_view": two_view,
+        "point_filter": point_filter,
+        "seed": seed,
+    }
+    chosen = ReconstructionOptions() if options is None else options
+    chosen = replace_options(
+        chosen, **{name: value for name, value in given.items() if value is not None}
+    )
     images = load_image(left), load_image(right)
-    sizes = tuple((image.shape[1], image.shape[0]) for image in images)
+    sizes = (images[0].shape[1], images[0].shape[0]), (images[1].shape[1], images[1].shape[0])
     known = _calibration(calibration, focal_px, (left, right), sizes)
     grays = luma(images[0]), luma(images[1])
-    check_images(*grays)
-
-    @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        started = time.perf_counter()
-        yield
-        seconds[name] = time.perf_counter() - started
-        done(name)
-
+    check_images(*grays, chosen.two_view.checks.copy)
+    timer = StageTimer(progress)
     initial = rectification = None
-    rectified = chosen.rectified
-    if rectified is None:
-        with stage("rectified or not"):
+    is_rectified = chosen.rectified
+    if is_rectified is None:
+        with timer.stage("rectified or not"):
             initial = initial_matches(*grays)
-            rectification = judge_rectification(
+            rectification = detect_rectification(
                 initial.points0,
                 initial.points1,
                 *sizes,
                 offset_px=known.disparity_offset_px,
-                seed=chosen.two_view.seed,
+                seed=chosen.seed,
+                options=chosen.rectification,
             )
-        rectified = rectification.rectified
+        is_rectified = rectification.rectified
         if rectification.swapped:
+            offset = known.disparity_offset_px
             raise ReconstructionError(
                 "this is a rectified pair with left and right exchanged: give the other one first"
-                + _or_offset(known)
+                + (f"; or the disparity offset of {offset:g} px is wrong" if offset else "")
             )
     if detector is None:
         detector = DeepDetect("dense")
-    make = _from_rows if rectified else _from_matches
-    return make(
-        _Pair(images, grays, detector, known, chosen, initial, rectification, seconds, stage)
-    )
+    pair = _Pair(images, grays, detector, known, chosen, initial, rectification, timer)
+    return _reconstruct_rectified(pair) if is_rectified else _reconstruct_general(pair)
 
 
 Images = tuple[np.ndarray, np.ndarray]
+Size = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """What both roads begin with."""
+    """What both pipelines begin with."""
 
     images: Images
     grays: Images
@@ -172,138 +207,140 @@ class _Pair:
     options: ReconstructionOptions
     initial: InitialMatches | None
     rectification: Rectification | None
-    seconds: dict[str, float]
-    stage: Callable[[str], Any]
+    timer: StageTimer
 
 
-def _from_rows(pair: _Pair) -> Reconstruction:
-    """Reconstruct a rectified pair."""
-    images, options, calibration = pair.images, pair.options, pair.calibration
-    check_cameras(calibration)
-    with pair.stage("keypoints"):
+def _reconstruct_rectified(pair: _Pair) -> Reconstruction:
+    """Take the keypoints of the left image from the disparity map of the pair."""
+    image, options, calibration, timer = pair.images[0], pair.options, pair.calibration, pair.timer
+    checks, disparity_options = options.rectified_checks, options.disparity_options
+    check_cameras(calibration, checks)
+    with timer.stage("keypoints"):
         # Disparities are those of pixels.
         selection = replace(options.selection, subpixel=False)
-        keypoints = find_keypoints(pair.detector, images[0], selection)
+        keypoints = find_keypoints(pair.detector, image, selection)
     check_keypoints(len(keypoints), options.selection)
-    with pair.stage("matching"):
-        found = match_rows(*pair.grays, keypoints.xy, options.row_matching)
-    row_options = options.row_matching
-    sure = row_options.uniqueness > 1
-    check_matched(np.count_nonzero(found.matched), len(keypoints), sure)
-    check_disparities(found.disparity)
-    pixels, disparity = keypoints.xy[found.rows], found.disparity
-    check_turn(pixels[found.matched], disparity[found.matched], calibration)
-    check_depths(disparity, calibration)
-    size = (images[0].shape[1], images[0].shape[0])
-    with pair.stage("triangulation"):
+    with timer.stage("matching"):
+        found = compute_disparity(*pair.grays, disparity_options).at(keypoints)
+    matched = found.matched
+    unique = disparity_options.uniqueness_ratio > 1
+    check_matched(int(np.count_nonzero(matched)), len(keypoints), unique, checks)
+    check_disparities(found.disparity, checks)
+    pixels, disparity = keypoints.xy[found.indices], found.disparity
+    check_pure_rotation(pixels[matched], disparity[matched], calibration, checks.rotation)
+    check_depths(disparity, calibration, checks)
+    size = (image.shape[1], image.shape[0])
+    with timer.stage("triangulation"):
         depth = calibration.depth_mm(disparity)
         rays = calibration.camera0.rays(pixels)
-    moved = disparity + calibration.disparity_offset_px
-    in_front = moved > 0
-    kept = in_front & (moved >= options.two_view.least_parallax_px)
+    shift = disparity + calibration.disparity_offset_px
+    in_front = shift > 0
+    kept = in_front & (shift >= options.point_filter.min_parallax_px)
     dropped = {
         "behind a camera": int(np.count_nonzero(~in_front)),
         "parallax": int(np.count_nonzero(in_front & ~kept)),
     }
     points = rays[kept] * depth[kept, None]
-    if options.two_view.neighbours and row_options.edge_distance:
-        with pair.stage("outlier removal"):
-            inliers = statistical_inliers_on_grid(
-                pixels[kept], disparity[kept], size, factor=options.two_view.factor
+    if options.point_filter.sor_neighbors and disparity_options.discontinuity_margin_px:
+        with timer.stage("outlier removal"):
+            inliers = sor_inliers_on_grid(
+                pixels[kept],
+                disparity[kept],
+                size,
+                options.point_filter.sor_window_px,
+                options.point_filter.sor_std_ratio,
             )
-        dropped["alone"] = int(np.count_nonzero(~inliers))
+        dropped["statistical outlier"] = int(np.count_nonzero(~inliers))
         kept[kept] = inliers
         points = points[inliers]
     if not len(points):
         raise ReconstructionError(
-            "no disparity tells a depth: all are too small, the scene is too far away for cameras "
+            "no disparity gives a depth: all are too small, the scene is too far away for cameras "
             "so close together"
         )
     pixels = pixels[kept]
     columns, rows = pixels.astype(np.int64).T
     return Reconstruction(
-        points.astype(np.float32),
-        images[0][rows, columns],
-        pixels.astype(np.float32),
-        disparity[kept],
-        found.matched[kept],
-        "baseline" if calibration.baseline_mm is None else "mm",
-        size,
-        True,
-        pair.rectification,
-        calibration,
-        None,
-        None,
-        len(keypoints),
-        len(found),
-        dropped,
-        pair.seconds,
+        points=points.astype(np.float32),
+        colors=image[rows, columns],
+        pixels=pixels.astype(np.float32),
+        disparity=disparity[kept],
+        matched=matched[kept],
+        unit="baseline" if calibration.baseline_mm is None else "mm",
+        size=size,
+        rectified=True,
+        rectification=pair.rectification,
+        calibration=calibration,
+        pose=None,
+        reprojection_errors=None,
+        keypoints=len(keypoints),
+        matches=len(found),
+        dropped=dropped,
+        seconds=timer.seconds,
     )
 
 
-def _from_matches(pair: _Pair) -> Reconstruction:
-    """Reconstruct a pair that is not rectified."""
-    images, options, seconds = pair.images, pair.options, pair.seconds
+def _reconstruct_general(pair: _Pair) -> Reconstruction:
+    """Match the keypoints of both images, estimate the pose and triangulate."""
+    image, options, timer = pair.images[0], pair.options, pair.timer
     # Matches are refined from whole pixels of the left image. Suppression would leave few pixels
     # that are keypoints in both images.
     radius = options.selection.nms_radius or 0
     selection = replace(options.selection, subpixel=False, nms_radius=radius)
-    with pair.stage("keypoints and matching"):
+    with timer.stage("keypoints and matching"):
         found = match_images(
-            *images,
+            *pair.images,
             pair.detector,
             options=replace_options(
                 get_preset("default"), selection=selection, matcher="patchmatch"
             ),
-            # A homography would keep the points of one plane, and drop all that stands before it.
+            # A homography would keep the points of one plane, and drop all in front of it.
             guide="fundamental",
             model="none",
-            seed=options.two_view.seed,
+            seed=options.seed,
             initial=pair.initial,
         )
-    with pair.stage("reconstruction"):
-        made = reconstruct_two_view(
-            found.points0, found.points1, pair.calibration, pair.grays, options.two_view
-        )
-    seconds.pop("reconstruction")
-    seconds.update(made.seconds)
-    pixels = found.points0[made.rows]
+    made = reconstruct_two_view(
+        found.points0,
+        found.points1,
+        pair.calibration,
+        pair.grays,
+        options.two_view,
+        options.point_filter,
+        options.seed,
+        timer,
+    )
+    pixels = found.points0[made.indices]
     columns, rows = np.rint(pixels).astype(np.int64).T
     return Reconstruction(
-        made.points,
-        images[0][rows, columns],
-        pixels,
-        None,
-        np.ones(len(pixels), bool),
-        made.unit,
-        (images[0].shape[1], images[0].shape[0]),
-        False,
-        pair.rectification,
-        pair.calibration,
-        made.pose,
-        made.reprojection_errors,
-        len(found.keypoints0),
-        len(found),
-        made.dropped,
-        seconds,
+        points=made.points,
+        colors=image[rows, columns],
+        pixels=pixels,
+        disparity=None,
+        matched=np.ones(len(pixels), bool),
+        unit=made.unit,
+        size=(image.shape[1], image.shape[0]),
+        rectified=False,
+        rectification=pair.rectification,
+        calibration=pair.calibration,
+        pose=made.pose,
+        reprojection_errors=made.reprojection_errors,
+        keypoints=len(found.keypoints0),
+        matches=len(found),
+        dropped=made.dropped,
+        seconds=timer.seconds,
     )
-
-
-def _or_offset(calibration: Calibration) -> str:
-    """The other reason for disparities of the wrong sign, where there can be one."""
-    offset = calibration.disparity_offset_px
-    return f"; or the disparity offset of {offset:g} px is wrong" if offset else ""
 
 
 def _calibration(
     given: Calibration | str | Path | None,
     focal_px: float | None,
     images: tuple[Any, Any],
-    sizes: tuple[tuple[int, int], ...],
+    sizes: tuple[Size, Size],
 ) -> Calibration:
     """Return the calibration that is given, or the one the photographs carry."""
     if given is not None and focal_px is not None:
-        raise ReconstructionError("give a calibration or a focal length, not both")
+        raise ReconstructionError("give `calibration` or `focal_px`, not both")
     if isinstance(given, Calibration):
         given.check_sizes(*sizes)
         return given

@@ -2,39 +2,48 @@
 
 The rows are a model without any parameter. A pair is rectified when they explain about as many
 matches as the best models with parameters do: a robust fundamental matrix, and rows that are
-moved, tilted and spread. What share of all matches that is does not matter: many may be wrong.
+shifted, tilted and scaled. What fraction of all matches that is does not matter: many may be wrong.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..features.selection import grid_subsample
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
-from .checks import PLANE_THRESHOLD, is_flat, stands_still
+from .checks import StaticOptions, is_planar, is_static
 
-ROWS = 1.0
-"""Rows by which a match of a rectified pair may be off."""
 
-AS_MANY = 0.9
-"""Share of the matches of the best other model that the rows must explain."""
+@dataclass(frozen=True)
+class RectificationOptions:
+    """When a pair counts as rectified.
 
-LEAST_SPREAD = 2.0
-"""Pixels between the 5th and 95th percentile of the disparities of a pair with depth; whole pixels
-differ by one for nothing."""
+    Attributes:
+        max_row_distance_px: rows by which a match of a rectified pair may be off.
+        min_inlier_ratio: matches on rows per match that the best other model explains.
+        min_disparity_spread_px: between the 5th and 95th percentile of the disparities of a pair
+            with depth; whole pixels differ by one for no reason.
+        min_planar_spread_px: the same for a pair that one homography explains: a slanted plane has
+            as much, a camera that rotated a little does not.
+        max_transfer_error_px: within which a match agrees with the homography.
+        min_planar_ratio: matches of the homography per match of the fundamental matrix, of a plane.
+        grid_size_px: cells of the left image of this size give one match each.
+        iterations: samples of three matches, for the rows that are shifted, tilted and scaled.
+        static: when nothing moves.
+    """
 
-PLANE_SPREAD = 8.0
-"""The same for a pair that one homography explains: a slanted plane has as much, a camera that
-turned a little does not."""
-
-CELL = 8
-"""Side in pixels of the cells of the left image that give one match each."""
-
-DRAWS = 500
-"""Samples of three matches for the rows that are moved, tilted and spread."""
+    max_row_distance_px: float = 1.0
+    min_inlier_ratio: float = 0.9
+    min_disparity_spread_px: float = 2.0
+    min_planar_spread_px: float = 8.0
+    max_transfer_error_px: float = 2.0
+    min_planar_ratio: float = 0.75
+    grid_size_px: int = 8
+    iterations: int = 500
+    static: StaticOptions = field(default_factory=StaticOptions)
 
 
 @dataclass(frozen=True)
@@ -46,10 +55,10 @@ class Rectification:
         reason: why not; empty when it is.
         swapped: it is rectified, but the left image was given as the right one: most disparities
             are negative.
-        on_rows: number of matches (one a cell) within a row of each other, of `matches`.
+        on_rows: number of matches (one per cell) within a row of each other, of `matches`.
         by_fundamental: number of them that the fundamental matrix explains as closely.
-        by_other_rows: the same for the rows that are moved, tilted and spread.
-        matches: number of matches that were looked at.
+        by_other_rows: the same for the rows that are shifted, tilted and scaled.
+        matches: number of matches that were used.
         vertical_offset: median of y in the second less y in the first image, in pixels, of those
             that the fundamental matrix explains.
         line_angle: largest angle between a row and an epipolar line, in degrees, at the corners
@@ -70,93 +79,109 @@ class Rectification:
     disparities: tuple[float, float, float]
 
 
-def judge_rectification(
+def detect_rectification(
     points0: np.ndarray,
     points1: np.ndarray,
     size0: tuple[int, int],
     size1: tuple[int, int],
     offset_px: float = 0.0,
     seed: int = 0,
+    options: RectificationOptions = RectificationOptions(),
 ) -> Rectification:
-    """Tell from matches whether a pair is rectified.
+    """Decide from matches whether a pair is rectified.
 
     Args:
         points0, points1: (M, 2) matched positions in the left and the right image.
         size0, size1: (width, height) of the images.
-        offset_px: what is added to a disparity before it tells the depth (calibration).
+        offset_px: what is added to a disparity before it gives the depth (calibration).
         seed: of the random samples.
+        options: the thresholds.
 
     Example:
         >>> left = np.random.default_rng(0).uniform(0, (640, 480), (900, 2))
         >>> right = left - np.column_stack([20 + 5 * np.sin(left[:, 1] / 30), np.zeros(900)])
-        >>> judge_rectification(left, right, (640, 480), (640, 480)).rectified
+        >>> detect_rectification(left, right, (640, 480), (640, 480)).rectified
         True
-        >>> judge_rectification(left, right + [0, 3], (640, 480), (640, 480)).rectified
+        >>> detect_rectification(left, right + [0, 3], (640, 480), (640, 480)).rectified
         False
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    rows = grid_subsample(points0, CELL, seed)
-    first, second = points0[rows], points1[rows]
-    vertical = np.abs(second[:, 1] - first[:, 1])
-    level = vertical <= ROWS
+    indices = grid_subsample(points0, options.grid_size_px, seed)
+    first, second = points0[indices], points1[indices]
+    limit = options.max_row_distance_px
+    on_rows = np.abs(second[:, 1] - first[:, 1]) <= limit
     # Of a rectified pair Sampson's distance is that in rows over the root of 2.
-    options = GeometryOptions(inlier_threshold=ROWS / np.sqrt(2), seed=seed)
-    space = estimate_geometry(first, second, options)
-    other = _best_other_rows(first, second, size0, seed)
-    disparity = (first - second)[level, 0]
+    epipolar = estimate_geometry(
+        first, second, GeometryOptions(inlier_threshold=limit / np.sqrt(2), seed=seed)
+    )
+    other_rows = _best_other_rows(first, second, size0, seed, options)
+    disparity = (first - second)[on_rows, 0]
     spread = np.quantile(disparity, [0.05, 0.5, 0.95]) if len(disparity) else np.full(3, np.nan)
-    offset = np.nan
-    if space.inliers.any():
-        offset = float(np.median((second - first)[space.inliers, 1]))
-    counts = tuple(int(np.count_nonzero(part)) for part in (level, space.inliers, other))
-    # Rows are a line in every point; nothing was drawn, so this is on the safe side.
-    alarms = log10_nfa(np.where(level, 0, np.inf), "fundamental", ROWS, size1)
-    reason = _reason(size0, size1, alarms, counts, offset, spread)
-    if not reason and stands_still(disparity):
+    vertical_offset = np.nan
+    if epipolar.inliers.any():
+        vertical_offset = float(np.median((second - first)[epipolar.inliers, 1]))
+    counts = tuple(int(np.count_nonzero(part)) for part in (on_rows, epipolar.inliers, other_rows))
+    # Rows are a line in every point; nothing was sampled, so this is on the safe side.
+    alarms = log10_nfa(np.where(on_rows, 0, np.inf), "fundamental", limit, size1)
+    if size0 != size1:
+        reason = "the images differ in size"
+    elif alarms > MAX_LOG10_NFA:
+        reason = "hardly any match is on the same row in both images"
+    else:
+        reason = _reason(counts, vertical_offset, spread, options)
+    if not reason and is_static(disparity, options.static):
         reason = "nothing moves between the images"
-    if not reason and spread[2] - spread[0] < PLANE_SPREAD:
-        plane = GeometryOptions(model="homography", inlier_threshold=PLANE_THRESHOLD, seed=seed)
-        if is_flat(estimate_geometry(first, second, plane).inliers, space.inliers):
-            reason = "one homography explains all the matches: they move nearly alike"
+    if not reason and spread[2] - spread[0] < options.min_planar_spread_px:
+        plane = estimate_geometry(
+            first,
+            second,
+            GeometryOptions(
+                model="homography", inlier_threshold=options.max_transfer_error_px, seed=seed
+            ),
+        )
+        if is_planar(plane.inliers, epipolar.inliers, options.min_planar_ratio):
+            reason = "one homography explains all the matches: all move nearly the same"
+    on_rows_count, by_fundamental, by_other_rows = counts
     return Rectification(
-        not reason,
-        reason,
-        bool(not reason and spread[1] + offset_px < 0),
-        *counts,
-        len(rows),
-        offset,
-        _line_angle(space.matrix, size0),
-        (float(spread[0]), float(spread[1]), float(spread[2])),
+        rectified=not reason,
+        reason=reason,
+        swapped=bool(not reason and spread[1] + offset_px < 0),
+        on_rows=on_rows_count,
+        by_fundamental=by_fundamental,
+        by_other_rows=by_other_rows,
+        matches=len(indices),
+        vertical_offset=vertical_offset,
+        line_angle=_line_angle(epipolar.matrix, size0),
+        disparities=(float(spread[0]), float(spread[1]), float(spread[2])),
     )
 
 
 def _reason(
-    size0: tuple[int, int],
-    size1: tuple[int, int],
-    alarms: float,
     counts: tuple[int, ...],
-    offset: float,
+    vertical_offset: float,
     spread: np.ndarray,
+    options: RectificationOptions,
 ) -> str:
+    """Return why rows are not the geometry of the pair; empty when they may be."""
     on_rows, by_fundamental, by_other_rows = counts
-    if size0 != size1:
-        return "the images differ in size"
-    if alarms > MAX_LOG10_NFA:
-        return "hardly any match is on the same row in both images"
     best = max(by_fundamental, by_other_rows)
-    if on_rows < AS_MANY * best:
+    if on_rows < options.min_inlier_ratio * best:
         return (
             f"only {on_rows:,} of {best:,} matches that agree are on the same row in both images "
-            f"(median offset {offset:+.1f} px)"
+            f"(median offset {vertical_offset:+.1f} px)"
         )
-    if spread[2] - spread[0] < LEAST_SPREAD:
+    if spread[2] - spread[0] < options.min_disparity_spread_px:
         return f"all matches on rows have about the same disparity ({spread[1]:.3g} px)"
     return ""
 
 
 def _best_other_rows(
-    points0: np.ndarray, points1: np.ndarray, size: tuple[int, int], seed: int
+    points0: np.ndarray,
+    points1: np.ndarray,
+    size: tuple[int, int],
+    seed: int,
+    options: RectificationOptions,
 ) -> np.ndarray:
     """Fit the vertical shift as a plane over the image, robustly; (M,) bool that agree with it.
 
@@ -169,23 +194,26 @@ def _best_other_rows(
         return best
     design = np.column_stack([points0 / max(size), np.ones(len(points0))])
     generator = np.random.default_rng(seed)
-    for _ in range(DRAWS):
-        drawn = generator.integers(0, len(points0), 3)
-        if abs(np.linalg.det(design[drawn])) < 1e-4:
+
+    def agreeing(plane: np.ndarray) -> np.ndarray:
+        return np.abs(design @ plane - shift) <= options.max_row_distance_px
+
+    for _ in range(options.iterations):
+        sample = generator.integers(0, len(points0), 3)
+        if abs(np.linalg.det(design[sample])) < 1e-4:
             continue
-        plane = np.linalg.solve(design[drawn], shift[drawn])
-        agree = np.abs(design @ plane - shift) <= ROWS
+        agree = agreeing(np.linalg.solve(design[sample], shift[sample]))
         if np.count_nonzero(agree) > np.count_nonzero(best):
             best = agree
     if np.count_nonzero(best) >= 3:
-        plane = np.linalg.lstsq(design[best], shift[best], rcond=None)[0]
-        agree = np.abs(design @ plane - shift) <= ROWS
+        agree = agreeing(np.linalg.lstsq(design[best], shift[best], rcond=None)[0])
         if np.count_nonzero(agree) > np.count_nonzero(best):
             best = agree
     return best
 
 
 def _line_angle(fundamental: np.ndarray | None, size: tuple[int, int]) -> float:
+    """Return the largest angle between a row and an epipolar line at the corners, in degrees."""
     if fundamental is None:
         return float("nan")
     width, height = size

@@ -1,42 +1,52 @@
-"""What two photographs gave: points in space, and all that is known of them."""
+"""What two photographs gave: 3D points, and all that is known about them."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from .._shared.errors import ReconstructionError
-from ..geometry.camera import Calibration
+from ..geometry.camera import Calibration, Camera
 from ..geometry.point_cloud import PointCloud
 from ..geometry.relative_pose import RelativePose
 from .rectification import Rectification
 
+PERCENTILES = (0, 5, 25, 50, 75, 95, 100)
 
-@dataclass(frozen=True, eq=False)
+SCALE = {
+    "mm": "lengths are in mm",
+    "baseline": "lengths are in baselines: the true scale is not known (give baseline_mm in a "
+    "calib.json)",
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction:
-    """Points in space, and where they come from.
+    """3D points, and where they come from.
 
     Attributes:
         points: (N, 3) float32 in the frame of the left camera: x right, y down, z forward.
         colors: (N, 3) uint8 sRGB, of the left image.
-        pixels: (N, 2) float32, where each point lies in the left image.
+        pixels: (N, 2) float32 positions of the points in the left image.
         disparity: (N,) float32 in pixels for rectified pairs, else None: the match of the left
             (x, y) is the right (x - disparity, y).
-        matched: (N,) bool: seen in both images; False for points that were filled in (only when
+        matched: (N,) bool: seen in both images; False for points in filled occlusions (only when
             every pixel of a rectified pair is asked for).
         unit: "mm" when the baseline is known, else "baseline": the distance of the cameras is 1,
             and the true scale is not known.
         size: (width, height) of the left image.
-        rectified: which road was taken.
-        rectification: the figures by which it was chosen; None when it was asked for.
+        rectified: whether the pair was treated as rectified.
+        rectification: the figures by which that was decided; None when it was given.
         calibration: of the cameras.
         pose: of the right camera for pairs that are not rectified, else None.
-        reprojection_errors: (N,) float32 for pairs that are not rectified, else None: how far
-            points are seen from their matches, in pixels (root mean square of both images).
+        reprojection_errors: (N,) float32 for pairs that are not rectified, else None: distance
+            of the points from their matches, in pixels (root mean square of both images).
         keypoints: number of keypoints in the left image.
         matches: number of matches that the points were made from.
-        dropped: how many of these each check took away, in order.
+        dropped: how many of these each check removed, in order.
         seconds: time of each stage.
     """
 
@@ -60,25 +70,33 @@ class Reconstruction:
     def __len__(self) -> int:
         return len(self.points)
 
+    def __repr__(self) -> str:
+        pair = "rectified" if self.rectified else "not rectified"
+        low, high = np.percentile(self.points[:, 2], (5, 95)) if len(self) else (np.nan, np.nan)
+        return (
+            f"Reconstruction({len(self):,} points, {pair}, depth {low:.4g} to {high:.4g} "
+            f"{self.unit}, {self.size[0]}x{self.size[1]})"
+        )
+
     @property
     def cloud(self) -> PointCloud:
-        """The points with their colours, for the exporters."""
+        """The points with their colours, to be saved or drawn."""
         return PointCloud(self.points, self.colors, self.unit)
 
     @property
-    def right_centre(self) -> np.ndarray:
-        """Where the right camera stands, (3,) float64 in the frame and unit of the points."""
+    def baseline_vector(self) -> np.ndarray:
+        """From the left to the right camera's centre, (3,) float64, as the points."""
         length = 1.0 if self.calibration.baseline_mm is None else self.calibration.baseline_mm
         if self.pose is None:
             return np.array([length, 0, 0])
         return -length * (self.pose.rotation.T @ self.pose.translation)
 
-    def parallax(self) -> np.ndarray:
+    def triangulation_angles(self) -> np.ndarray:
         """Return the angle at each point between both cameras, (N,) float64 in degrees."""
         points = self.points.astype(np.float64)
-        there = points - self.right_centre
-        across = np.linalg.norm(np.cross(points, there), axis=1)
-        return np.degrees(np.arctan2(across, np.einsum("ij,ij->i", points, there)))
+        from_right = points - self.baseline_vector
+        across = np.linalg.norm(np.cross(points, from_right), axis=1)
+        return np.degrees(np.arctan2(across, np.einsum("ij,ij->i", points, from_right)))
 
     def depth_map(self) -> np.ndarray:
         """Return the depth at each pixel of the left image, (H, W) float32; NaN where unknown."""
@@ -91,15 +109,108 @@ class Reconstruction:
             ReconstructionError: the pair is not rectified.
         """
         if self.disparity is None:
-            raise ReconstructionError("only rectified pairs have disparities: take the depth map")
+            raise ReconstructionError("only rectified pairs have disparities: use depth_map()")
         return self._map(self.disparity)
 
     def matched_map(self) -> np.ndarray:
         """Return (H, W) bool: pixels whose point was seen in both images, and not filled in."""
         return self._map(self.matched.astype(np.float32)) == 1
 
+    def summary(self) -> dict[str, Any]:
+        """Return all but the arrays as plain values for JSON: counts, times and quality.
+
+        NaN becomes None.
+        """
+        errors, disparity = self.reprojection_errors, self.disparity
+        error = None if errors is None else round(float(np.median(errors)), 4)
+        angle = round(float(np.median(self.triangulation_angles())), 4)
+        return {
+            "points": len(self),
+            "filled": int(np.count_nonzero(~self.matched)),
+            "keypoints": self.keypoints,
+            "matches": self.matches,
+            "dropped": dict(self.dropped),
+            "width": self.size[0],
+            "height": self.size[1],
+            "density": round(len(self) / (self.size[0] * self.size[1]), 6),
+            "rectified": self.rectified,
+            "rectified_why": self._why(),
+            "rectification": _rectification_values(self.rectification),
+            "unit": self.unit,
+            "scale": SCALE[self.unit],
+            "depth": _percentiles(self.points[:, 2]),
+            "disparity": None if disparity is None else _percentiles(disparity),
+            "median_triangulation_angle_degrees": angle,
+            "median_reprojection_error_px": error,
+            "pose": _pose_values(self.pose),
+            "calibration": _calibration_values(self.calibration),
+            "seconds": {stage: round(value, 4) for stage, value in self.seconds.items()},
+        }
+
+    def _why(self) -> str:
+        """Say why the pair was treated as rectified or not."""
+        found = self.rectification
+        if found is None:
+            return "as asked for"
+        if found.rectified:
+            return f"{found.on_rows:,} of {found.matches:,} sparse matches are on the same row"
+        return found.reason
+
     def _map(self, values: np.ndarray) -> np.ndarray:
+        """Return values of the points at their pixels, (H, W) float32, NaN elsewhere."""
         result = np.full(self.size[::-1], np.nan, np.float32)
         columns, rows = np.rint(self.pixels).astype(np.int64).T
         result[rows, columns] = values
         return result
+
+
+def _rectification_values(rectification: Rectification | None) -> dict[str, Any] | None:
+    if rectification is None:
+        return None
+    return {name: _finite(value) for name, value in dataclasses.asdict(rectification).items()}
+
+
+def _pose_values(pose: RelativePose | None) -> dict[str, Any] | None:
+    if pose is None:
+        return None
+    return {
+        "rotation": pose.rotation.tolist(),
+        "translation": pose.translation.tolist(),
+        "angle_degrees": round(pose.angle, 4),
+        "in_front": round(pose.cheirality_ratio, 4),
+    }
+
+
+def _calibration_values(calibration: Calibration) -> dict[str, Any]:
+    return {
+        "source": calibration.source,
+        "baseline_mm": calibration.baseline_mm,
+        "disparity_offset_px": round(calibration.disparity_offset_px, 6),
+        "left": _camera_values(calibration.camera0),
+        "right": _camera_values(calibration.camera1),
+    }
+
+
+def _camera_values(camera: Camera) -> dict[str, Any]:
+    return {
+        "width": camera.size[0],
+        "height": camera.size[1],
+        "focal_px": list(camera.focal_px),
+        "cx": camera.centre[0],
+        "cy": camera.centre[1],
+    }
+
+
+def _percentiles(values: np.ndarray) -> dict[str, float]:
+    found = np.percentile(values.astype(np.float64), PERCENTILES)
+    return {
+        f"{percent}%": float(f"{value:.6g}")
+        for percent, value in zip(PERCENTILES, found, strict=True)
+    }
+
+
+def _finite(value: Any) -> Any:
+    """Replace what is not finite, which JSON does not have, by None."""
+    if isinstance(value, (tuple, list)):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

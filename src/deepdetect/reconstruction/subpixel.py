@@ -1,14 +1,14 @@
-"""Matches below the pixel: the patch about a point is laid onto the second image.
+"""Matches to sub-pixel accuracy: the patch around a point is aligned to the second image.
 
 Inverse compositional alignment (Baker and Matthews, "Lucas-Kanade 20 years on", 2004), with gain
-and offset of the light taken out. The patch is turned and sheared as its surroundings are: first
-as all matches are together (a similarity), then as the refined matches around it are (an affinity).
+and offset of the light taken out. The patch is rotated and sheared as its surroundings are: first
+as all matches together (a similarity), then as the refined matches around it (an affinity).
 
 Chosen by measurement (benchmarks/two_view.py) against a parabola through the correlation of the
-same patches, turned alike, at the nearest whole pixels. Share of the matches of the Motorcycle pair
-within 0.25 / 0.5 px of the truth, of those that converge (88 %): 65 / 83 % (parabola 49 / 74 %;
-before, of all matches, 36 / 63 %); with its views turned against each other by 14 degrees (84 %)
-62 / 79 % (parabola 31 / 59 %; before 9 / 29 %).
+same patches, rotated likewise, at the nearest whole pixels. Fraction of the matches of the
+Motorcycle pair within 0.25 / 0.5 px of the truth, of those that converge (88 %): 65 / 83 %
+(parabola 49 / 74 %; before, of all matches, 36 / 63 %); with its views rotated against each other
+by 14 degrees (84 %) 62 / 79 % (parabola 31 / 59 %; before 9 / 29 %).
 """
 
 from __future__ import annotations
@@ -20,20 +20,7 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.parallel import parallel_for
-
-AROUND = 15
-"""Side in pixels of the window whose matches give a patch its affinity."""
-
-RIDGE = 20.0
-"""Matches spread over the window that the similarity of all counts for beside those in it: few, or
-those of one line, give no affinity of their own."""
-
-SETTLED = 0.01
-ROUGHLY = 0.05
-"""A smaller shift, in pixels, is no shift; in the first alignment, which only serves the second."""
-
-SAMPLE = 5000
-"""Matches that the similarity is estimated from."""
+from ..geometry.windows import window_sums
 
 
 @dataclass(frozen=True)
@@ -41,37 +28,60 @@ class SubpixelOptions:
     """How matches are refined.
 
     Attributes:
-        reach: the patch has 2 reach + 1 pixels a side.
-        sigma: of the Gaussian weight of its pixels, in pixels.
-        rounds: of the alignment, at the most.
-        farthest: pixels that a match may move in each of the two alignments.
-        least_correlation: of both patches at the end; a match under it has not converged.
+        patch_radius_px: the patch has 2 radius + 1 pixels a side.
+        sigma_px: of the Gaussian weight of its pixels.
+        max_iterations: of each of the two alignments.
+        max_shift_px: that a match may move in each of the two alignments.
+        min_correlation: of both patches at the end; a match below it has not converged.
+        convergence_px: a smaller step ends the alignment.
+        coarse_convergence_px: the same in the first alignment, which only serves the second.
+        affinity_window_px: side of the window whose matches give a patch its affinity.
+        affinity_regularization: matches spread over the window that the similarity of all counts
+            for beside those in it: few, or those on one line, give no affinity of their own.
+        max_similarity_samples: matches that the similarity is estimated from.
 
     Raises:
         OptionError: a value is out of its range.
     """
 
-    reach: int = 4
-    sigma: float = 2.0
-    rounds: int = 15
-    farthest: float = 2.0
-    least_correlation: float = 0.8
+    patch_radius_px: int = 4
+    sigma_px: float = 2.0
+    max_iterations: int = 15
+    max_shift_px: float = 2.0
+    min_correlation: float = 0.8
+    convergence_px: float = 0.01
+    coarse_convergence_px: float = 0.05
+    affinity_window_px: int = 15
+    affinity_regularization: float = 20.0
+    max_similarity_samples: int = 5000
 
     def __post_init__(self) -> None:
-        if not 1 <= self.reach <= 31:
-            raise OptionError(f"the reach of a patch must lie in [1, 31], not {self.reach}")
-        for name in ("sigma", "rounds", "farthest"):
+        if not 1 <= self.patch_radius_px <= 31:
+            raise OptionError(
+                f"patch_radius_px must lie in [1, 31] pixels, not {self.patch_radius_px}"
+            )
+        for name in (
+            "sigma_px",
+            "max_iterations",
+            "max_shift_px",
+            "convergence_px",
+            "coarse_convergence_px",
+            "affinity_window_px",
+            "affinity_regularization",
+            "max_similarity_samples",
+        ):
             if not getattr(self, name) > 0:
                 raise OptionError(f"{name} must be above 0, not {getattr(self, name)}")
-        if not -1 <= self.least_correlation <= 1:
-            raise OptionError(
-                f"the least correlation must lie in [-1, 1], not {self.least_correlation}"
-            )
+        if not -1 <= self.min_correlation <= 1:
+            raise OptionError(f"min_correlation must lie in [-1, 1], not {self.min_correlation}")
+
+
+DEFAULTS = SubpixelOptions()
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedMatches:
-    """Matches below the pixel.
+    """Matches to sub-pixel accuracy.
 
     Attributes:
         points1: (N, 2) float64 positions in the second image; as they were where the alignment
@@ -90,20 +100,20 @@ def refine_matches(
     gray1: np.ndarray,
     points0: np.ndarray,
     points1: np.ndarray,
-    options: SubpixelOptions = SubpixelOptions(),
+    options: SubpixelOptions = DEFAULTS,
 ) -> RefinedMatches:
     """Refine the second positions of matches.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
         points0: (N, 2) whole pixels of the first image.
-        points1: (N, 2) positions in the second, right within a pixel or two.
+        points1: (N, 2) positions in the second, right to a pixel or two.
         options: of the alignment.
 
     Returns:
-        The refined positions. Flat patches, those that reach over the border, those that move
-        too far, and those that stay unlike have not converged. The result does not depend on the
-        number of threads.
+        The refined positions. Flat patches, those that extend over the border, those that move
+        too far, and those that remain too different have not converged. The result does not depend
+        on the number of threads.
 
     Raises:
         OptionError: a first position is not on a pixel of its image, or an option is out of range.
@@ -119,10 +129,12 @@ def refine_matches(
     pixels0 = np.rint(np.asarray(points0, np.float64)).reshape(-1, 2)
     inside = (pixels0 >= 0).all() and (pixels0 < (gray0.shape[1], gray0.shape[0])).all()
     if not inside or (pixels0 != np.asarray(points0).reshape(-1, 2)).any():
-        raise OptionError("the first points of matches to refine must be whole pixels of the image")
+        raise OptionError(
+            "points0 must be whole pixels of the image: detect keypoints with subpixel=False"
+        )
     pixels0 = pixels0.astype(np.int64)
     start = np.ascontiguousarray(points1, np.float64).reshape(-1, 2)
-    known = np.isfinite(start).all(1)
+    known: np.ndarray = np.isfinite(start).all(1)
     known[known] = ((start[known] >= 0) & (start[known] < gray1.shape[::-1])).all(1)
     if not known.all():
         found = refine_matches(gray0, gray1, pixels0[known], start[known], options)
@@ -133,16 +145,23 @@ def refine_matches(
     if not len(pixels0):
         return RefinedMatches(start, known, np.zeros(0, np.float32))
     images = gray0.astype(np.float32), gray1.astype(np.float32)
-    together = similarity(pixels0, start)
-    shapes = np.broadcast_to(together, (len(pixels0), 2, 2))
-    found = _aligned(images, pixels0, start, shapes, options, ROUGHLY)
-    shapes = local_affinities(pixels0, found.points1, found.converged, gray0.shape, together)
-    return _aligned(images, pixels0, found.points1, shapes, options)
+    overall = similarity(pixels0, start, options.max_similarity_samples)
+    affinities = np.broadcast_to(overall, (len(pixels0), 2, 2))
+    coarse = options.coarse_convergence_px
+    found = _align(images, pixels0, start, affinities, options, coarse)
+    affinities = local_affinities(
+        pixels0, found.points1, found.converged, gray0.shape, overall, options
+    )
+    return _align(images, pixels0, found.points1, affinities, options, options.convergence_px)
 
 
-def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-    """Return how all matches together turn and scale the first image, (2, 2) float64."""
-    every = -(-len(points0) // SAMPLE)
+def similarity(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    max_samples: int = DEFAULTS.max_similarity_samples,
+) -> np.ndarray:
+    """Return how all matches together rotate and scale the first image, (2, 2) float64."""
+    every = -(-len(points0) // max_samples)
     first, second = (
         np.ascontiguousarray(points[::every], np.float64) for points in (points0, points1)
     )
@@ -156,37 +175,37 @@ def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
 def local_affinities(
     pixels0: np.ndarray,
     points1: np.ndarray,
-    sure: np.ndarray,
+    converged: np.ndarray,
     shape: tuple[int, ...],
-    together: np.ndarray,
+    overall: np.ndarray,
+    options: SubpixelOptions = DEFAULTS,
 ) -> np.ndarray:
-    """Fit an affinity to the sure matches in the window about each.
+    """Fit an affinity to the converged matches in the window around each.
 
     Args:
         pixels0: (N, 2) whole pixels of the first image, each once.
         points1: (N, 2) their matches.
-        sure: (N,) bool, those that count.
+        converged: (N,) bool, those that count.
         shape: (H, W) of the first image.
-        together: (2, 2), what few or badly spread matches fall back on.
+        overall: (2, 2), what few or badly spread matches fall back on.
+        options: the window and the regularization.
 
     Returns:
         (N, 2, 2) float32, derivatives of the second position by the first.
     """
-    column, row = np.asarray(pixels0, np.int64).T
+    pixels0 = np.asarray(pixels0, np.int64)
+    column, row = pixels0.T
     # Sums of squares are of differences: keep the numbers small.
     across, down = column - shape[1] / 2, row - shape[0] / 2
-    rest = points1 - np.column_stack([across, down]) @ together.T
+    rest = points1 - np.column_stack([across, down]) @ overall.T
+    size = options.affinity_window_px
 
-    def sums(values: np.ndarray | float) -> np.ndarray:
-        image = np.zeros(shape[:2])
-        image[row[sure], column[sure]] = np.broadcast_to(values, len(row))[sure]
-        window, border = (AROUND, AROUND), cv2.BORDER_CONSTANT
-        image = cv2.boxFilter(image, -1, window, normalize=False, borderType=border)
-        return image[row, column]
+    def sums(values: np.ndarray) -> np.ndarray:
+        return window_sums(pixels0[converged], values[converged], shape, size, at=pixels0)
 
-    count, sum_x, sum_y = sums(1.0), sums(across), sums(down)
+    count, sum_x, sum_y = sums(np.ones(len(row))), sums(across), sums(down)
     count = np.maximum(np.rint(count), 1)
-    ridge = RIDGE * (AROUND**2 - 1) / 12
+    ridge = options.affinity_regularization * (size**2 - 1) / 12
     xx = sums(across**2) - sum_x**2 / count + ridge
     yy = sums(down**2) - sum_y**2 / count + ridge
     xy = sums(across * down) - sum_x * sum_y / count
@@ -198,28 +217,44 @@ def local_affinities(
         by_y = sums(down * values) - sum_y * mean
         result[:, axis, 0] = (yy * by_x - xy * by_y) / (xx * yy - xy**2)
         result[:, axis, 1] = (xx * by_y - xy * by_x) / (xx * yy - xy**2)
-    return (result + together).astype(np.float32)
+    return (result + overall).astype(np.float32)
 
 
-def _aligned(
+def _align(
     images: tuple[np.ndarray, np.ndarray],
     pixels0: np.ndarray,
     start: np.ndarray,
-    shapes: np.ndarray,
+    affinities: np.ndarray,
     options: SubpixelOptions,
-    settled: float = SETTLED,
+    convergence_px: float,
 ) -> RefinedMatches:
+    """Align the patches, each warped by its affinity, in threads."""
     from .subpixel_kernel import align
 
-    offsets = np.arange(-options.reach, options.reach + 1)
-    window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * options.sigma**2))
+    offsets = np.arange(-options.patch_radius_px, options.patch_radius_px + 1)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * options.sigma_px**2))
+    window, affinities = window.astype(np.float32), np.ascontiguousarray(affinities, np.float32)
     refined = np.empty((len(pixels0), 2))
     converged = np.empty(len(pixels0), bool)
     correlation = np.empty(len(pixels0), np.float32)
-    arguments = (
-        *(*images, pixels0, start, np.ascontiguousarray(shapes, np.float32)),
-        *(window.astype(np.float32), int(options.rounds), settled, float(options.farthest)),
-        *(np.float32(options.least_correlation), refined, converged, correlation),
-    )
-    parallel_for(len(pixels0), lambda first, last: align(first, last, *arguments))
+
+    def run(first: int, last: int) -> None:
+        align(
+            first,
+            last,
+            *images,
+            pixels0,
+            start,
+            affinities,
+            window,
+            int(options.max_iterations),
+            convergence_px,
+            float(options.max_shift_px),
+            np.float32(options.min_correlation),
+            refined,
+            converged,
+            correlation,
+        )
+
+    parallel_for(len(pixels0), run)
     return RefinedMatches(refined, converged, correlation)

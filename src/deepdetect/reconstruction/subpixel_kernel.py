@@ -38,11 +38,11 @@ def align(  # type: ignore[no-untyped-def]
     image1,
     pixels0,
     points1,
-    shapes,
+    affinities,
     window,
-    rounds,
-    settled,
-    farthest,
+    iterations,
+    convergence,
+    max_shift,
     least,
     refined,
     converged,
@@ -57,19 +57,19 @@ def align(  # type: ignore[no-untyped-def]
         first, last: rows of the matches.
         image0, image1: (H, W) float32.
         pixels0: (N, 2) int64 in the first image.
-        points1: (N, 2) float64 beginnings in the second.
-        shapes: (N, 2, 2) float32, the local affinity from the first to the second image.
+        points1: (N, 2) float64 starting positions in the second.
+        affinities: (N, 2, 2) float32, the local affinity from the first to the second image.
         window: (S, S) float32 weights of the patch.
-        rounds: at the most.
-        settled: a shift under this ends it, in pixels.
-        farthest: from the beginning, in pixels.
+        iterations: at the most.
+        convergence: a smaller shift ends them, in pixels.
+        max_shift: from the start, in pixels.
         least: correlation at the end.
         refined: (N, 2) float64, written; as at the beginning where nothing converges.
         converged: (N,) bool, written.
         correlation: (N,) float32 weighted, of both patches at the end, written.
     """
     side = window.shape[0]
-    reach = side // 2
+    radius = side // 2
     height0, width0 = image0.shape
     height1, width1 = image1.shape
     count = side * side
@@ -84,12 +84,17 @@ def align(  # type: ignore[no-untyped-def]
         x0, y0 = pixels0[k, 0], pixels0[k, 1]
         refined[k, 0], refined[k, 1] = points1[k, 0], points1[k, 1]
         converged[k], correlation[k] = False, 0
-        if x0 < reach + 1 or y0 < reach + 1 or x0 > width0 - reach - 2 or y0 > height0 - reach - 2:
+        if (
+            x0 < radius + 1
+            or y0 < radius + 1
+            or x0 > width0 - radius - 2
+            or y0 > height0 - radius - 2
+        ):
             continue
         mean, mean_x, mean_y = np.float32(0), np.float32(0), np.float32(0)
         j = 0
-        for down in range(-reach, reach + 1):
-            for across in range(-reach, reach + 1):
+        for down in range(-radius, radius + 1):
+            for across in range(-radius, radius + 1):
                 y, x = y0 + down, x0 + across
                 value = image0[y, x]
                 sx = np.float32(0.5) * (image0[y, x + 1] - image0[y, x - 1])
@@ -121,11 +126,16 @@ def align(  # type: ignore[no-untyped-def]
         determinant = xx * yy - xy * xy
         if determinant <= np.float32(1e-6) * (xx + yy) * (xx + yy) or xx + yy <= 0:
             continue
-        a, b, c, d = shapes[k, 0, 0], shapes[k, 0, 1], shapes[k, 1, 0], shapes[k, 1, 1]
-        spread_x = reach * (abs(a) + abs(b)) + 2
-        spread_y = reach * (abs(c) + abs(d)) + 2
+        a, b, c, d = (
+            affinities[k, 0, 0],
+            affinities[k, 0, 1],
+            affinities[k, 1, 0],
+            affinities[k, 1, 1],
+        )
+        spread_x = radius * (abs(a) + abs(b)) + 2
+        spread_y = radius * (abs(c) + abs(d)) + 2
         x1, y1 = points1[k, 0], points1[k, 1]
-        for _ in range(rounds):
+        for _ in range(iterations):
             if (
                 x1 < spread_x
                 or y1 < spread_y
@@ -135,8 +145,8 @@ def align(  # type: ignore[no-untyped-def]
                 break
             mean = np.float32(0)
             j = 0
-            for down in range(-reach, reach + 1):
-                for across in range(-reach, reach + 1):
+            for down in range(-radius, radius + 1):
+                for across in range(-radius, radius + 1):
                     value = _cubic(image1, x1 + a * across + b * down, y1 + c * across + d * down)
                     seen[j] = value
                     mean += weight[j] * value
@@ -159,9 +169,9 @@ def align(  # type: ignore[no-untyped-def]
             x1 -= a * step_x + b * step_y
             y1 -= c * step_x + d * step_y
             gone_x, gone_y = x1 - points1[k, 0], y1 - points1[k, 1]
-            if not gone_x * gone_x + gone_y * gone_y <= farthest * farthest:
+            if not gone_x * gone_x + gone_y * gone_y <= max_shift * max_shift:
                 break
-            if step_x * step_x + step_y * step_y < settled * settled:
+            if step_x * step_x + step_y * step_y < convergence * convergence:
                 if correlation[k] >= least:
                     converged[k] = True
                     refined[k, 0], refined[k, 1] = x1, y1

@@ -1,23 +1,21 @@
-"""Points in space from the matches of two calibrated images that need not be rectified.
+"""Points from the matches of two calibrated images that need not be rectified.
 
 Sub-pixel matches -> relative pose -> triangulation -> checks -> points.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from .._shared.errors import OptionError, ReconstructionError
+from .._shared.timing import StageTimer
 from ..geometry.camera import Calibration
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
 from ..geometry.triangulation import triangulate
-from .checks import check_focal, check_images, check_matches, check_pose
-from .outliers import disparity_space, statistical_inliers
+from .checks import CheckOptions, check_focal, check_images, check_matches, check_pose
+from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import SubpixelOptions, refine_matches
 
 
@@ -26,64 +24,52 @@ class TwoViewOptions:
     """How matches become points.
 
     Attributes:
-        inlier_threshold: a match agrees with the pose when it is nearer to it than this, in
-            pixels (Sampson's distance).
-        reprojection_threshold: a point stays when it is seen nearer than this to its match, in
-            pixels (root mean square of both images).
-        least_parallax_px: both rays of a point must differ by so many pixels' angle: less says
-            nothing of the depth.
-        neighbours, factor: of the statistical outlier removal; 0 neighbours leave it out.
+        max_epipolar_distance_px: within which a match agrees with the pose (Sampson's distance).
+        max_reprojection_error_px: of a point that is kept (root mean square of both images).
         subpixel: how matches are refined, or None: they are taken as they are.
-        seed: of all random choices.
+        checks: thresholds of the checks.
 
     Raises:
         OptionError: a value is out of its range.
     """
 
-    inlier_threshold: float = 1.0
-    reprojection_threshold: float = 0.5
-    least_parallax_px: float = 2.0
-    neighbours: int = 16
-    factor: float = 2.0
+    max_epipolar_distance_px: float = 1.0
+    max_reprojection_error_px: float = 0.5
     subpixel: SubpixelOptions | None = field(default_factory=SubpixelOptions)
-    seed: int = 0
+    checks: CheckOptions = field(default_factory=CheckOptions)
 
     def __post_init__(self) -> None:
-        for name in ("inlier_threshold", "reprojection_threshold"):
+        for name in ("max_epipolar_distance_px", "max_reprojection_error_px"):
             if not getattr(self, name) > 0:
                 raise OptionError(f"{name} must be above 0 pixels, not {getattr(self, name)}")
-        for name in ("least_parallax_px", "neighbours", "factor"):
-            if not getattr(self, name) >= 0:
-                raise OptionError(f"{name} must not be negative, but is {getattr(self, name)}")
-        if not 0 <= self.seed < 2**31:
-            raise OptionError(f"the seed must lie in [0, 2147483647], not {self.seed}")
 
 
 @dataclass(frozen=True, eq=False)
 class TwoViewReconstruction:
-    """Points in space.
+    """Triangulated points of a pair.
 
     Attributes:
         points: (N, 3) float32 in the frame of the left camera: x right, y down, z forward.
         unit: "mm" when the baseline is known, else "baseline": the distance of the cameras is 1.
-        rows: (N,) int64, the match that each comes from, rising.
-        points1: (N, 2) float64 its place in the right image, refined.
-        pose: of the right camera; its inliers and errors belong to `posed`.
-        posed: (P,) int64, the matches that the pose was estimated from: those that were refined.
+        indices: (N,) int64, the match that each comes from, rising.
+        points1: (N, 2) float64 positions in the right image, refined.
+        pose: of the right camera; its inliers and errors belong to `pose_indices`.
+        pose_indices: (P,) int64, the matches that the pose was estimated from: those that were
+            refined.
         reprojection_errors: (N,) float32 in pixels, root mean square of both images.
-        parallax: (N,) float32 angle between both rays in degrees.
-        dropped: how many matches each check took away, in order.
+        triangulation_angles: (N,) float32 angle between both rays in degrees.
+        dropped: how many matches each check removed, in order.
         seconds: time of each stage.
     """
 
     points: np.ndarray
     unit: str
-    rows: np.ndarray
+    indices: np.ndarray
     points1: np.ndarray
     pose: RelativePose
-    posed: np.ndarray
+    pose_indices: np.ndarray
     reprojection_errors: np.ndarray
-    parallax: np.ndarray
+    triangulation_angles: np.ndarray
     dropped: dict[str, int]
     seconds: dict[str, float]
 
@@ -97,6 +83,9 @@ def reconstruct_two_view(
     calibration: Calibration,
     images: tuple[np.ndarray, np.ndarray] | None = None,
     options: TwoViewOptions = TwoViewOptions(),
+    point_filter: PointFilterOptions = PointFilterOptions(),
+    seed: int = 0,
+    timer: StageTimer | None = None,
 ) -> TwoViewReconstruction:
     """Reconstruct the points of a pair.
 
@@ -106,98 +95,90 @@ def reconstruct_two_view(
         calibration: of both cameras.
         images: (H, W) uint8 luma of both, for the refinement; None leaves it out.
         options: of all stages.
+        point_filter: which points are kept.
+        seed: of all random choices.
+        timer: of the stages; None: a new one.
 
     Raises:
-        ReconstructionError: the pair gives no depth (`degeneracy` says why), the calibration is
-            for images of another size, or no point is left.
+        ReconstructionError: the pair gives no depth (`checks` says why), the calibration is for
+            images of another size, or no point is left.
 
     Example:
-        >>> from .calibration import Camera
+        >>> from deepdetect.geometry.camera import Camera
         >>> camera = Camera((640, 480), 500.0)
         >>> grid = np.stack(np.meshgrid(np.arange(0, 640, 16), np.arange(0, 480, 16)), -1)
         >>> left = grid.reshape(-1, 2).astype(float)
         >>> depth = 5 + np.sin(left[:, 0] / 40) + np.cos(left[:, 1] / 50)
-        >>> space = camera.rays(left) * depth[:, None]
-        >>> right = camera.project(space - [1, 0.1, 0])
+        >>> true = camera.rays(left) * depth[:, None]
+        >>> right = camera.project(true - [1, 0.1, 0])
         >>> found = reconstruct_two_view(left, right, Calibration(camera, camera))
-        >>> scale = np.hypot(1, 0.1)
-        >>> len(found) > 1000, bool(np.allclose(found.points * scale, space[found.rows], rtol=1e-2))
+        >>> points = found.points * np.hypot(1, 0.1)
+        >>> len(found) > 1000, bool(np.allclose(points, true[found.indices], rtol=1e-2))
         (True, True)
     """
-    seconds: dict[str, float] = {}
+    timer = StageTimer() if timer is None else timer
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    rows = np.arange(len(points0))
+    indices = np.arange(len(points0))
     dropped: dict[str, int] = {}
+    checks = options.checks
     if images is not None:
         calibration.check_sizes(*((image.shape[1], image.shape[0]) for image in images))
-        check_images(*images)
+        check_images(*images, checks.copy)
         if options.subpixel is not None:
-            with _timed(seconds, "sub-pixel"):
+            with timer.stage("sub-pixel"):
                 refined = refine_matches(*images, points0, points1, options.subpixel)
-            rows = np.flatnonzero(refined.converged)
+            indices = np.flatnonzero(refined.converged)
             points1 = refined.points1
-            dropped["not refined"] = len(points0) - len(rows)
-    with _timed(seconds, "checks"):
-        evidence = check_matches(
-            points0[rows], points1[rows], calibration.camera1.size, calibration, options.seed
+            dropped["not refined"] = len(points0) - len(indices)
+    used = points0[indices], points1[indices]
+    with timer.stage("checks"):
+        evidence = check_matches(*used, calibration.camera1.size, calibration, seed, checks)
+    with timer.stage("pose"):
+        pose = check_pose(
+            estimate_relative_pose(*used, calibration, options.max_epipolar_distance_px, seed),
+            evidence,
+            calibration,
+            checks,
         )
-    with _timed(seconds, "pose"):
-        pose = estimate_relative_pose(
-            points0[rows], points1[rows], calibration, options.inlier_threshold, options.seed
-        )
-        check_pose(pose, evidence, calibration)
-    assert pose is not None
-    with _timed(seconds, "focal length"):
-        check_focal(points0[rows], points1[rows], pose, evidence, calibration, options.seed)
-    posed = rows
-    baseline = calibration.baseline_mm
-    length = 1.0 if baseline is None else baseline
-    with _timed(seconds, "triangulation"):
-        found = triangulate(
-            points0[rows], points1[rows], calibration, pose.rotation, pose.translation * length
-        )
+    with timer.stage("focal length"):
+        check_focal(*used, pose, evidence, calibration, seed, checks)
+    baseline = 1.0 if calibration.baseline_mm is None else calibration.baseline_mm
+    with timer.stage("triangulation"):
+        found = triangulate(*used, calibration, pose.rotation, pose.translation * baseline)
     focal = calibration.camera0.focal_px[0]
-    kept = np.ones(len(rows), bool)
+    kept = np.ones(len(indices), bool)
     for reason, passed in (
         ("far from its epipolar line", pose.inliers),
         ("behind a camera", found.cheirality),
-        ("reprojection error", found.reprojection_errors < options.reprojection_threshold),
-        ("parallax", found.triangulation_angle * focal >= options.least_parallax_px),
+        ("reprojection error", found.reprojection_errors < options.max_reprojection_error_px),
+        ("parallax", found.triangulation_angle * focal >= point_filter.min_parallax_px),
     ):
         dropped[reason] = int(np.count_nonzero(kept & ~passed))
         kept &= passed
-    if options.neighbours:
-        with _timed(seconds, "outlier removal"):
-            space = disparity_space(found.points[kept], focal, length)
-            alone = ~statistical_inliers(space, options.neighbours, options.factor)
-        dropped["alone"] = int(alone.sum())
-        kept[kept] = ~alone
+    if point_filter.sor_neighbors:
+        with timer.stage("outlier removal"):
+            space = disparity_space(
+                found.points[kept], focal, baseline, point_filter.sor_disparity_weight
+            )
+            inliers = sor_inliers(space, point_filter.sor_neighbors, point_filter.sor_std_ratio)
+        dropped["statistical outlier"] = int(np.count_nonzero(~inliers))
+        kept[kept] = inliers
     if not kept.any():
+        counts = ", ".join(f"{reason}: {count:,}" for reason, count in dropped.items() if count)
         raise ReconstructionError(
-            f"none of the {len(points0):,} matches gives a point ({_counts(dropped)}): take "
+            f"none of the {len(points0):,} matches gives a point ({counts}): take "
             "photographs that overlap more, or check the calibration"
         )
     return TwoViewReconstruction(
-        found.points[kept].astype(np.float32),
-        "baseline" if baseline is None else "mm",
-        rows[kept],
-        points1[rows[kept]],
-        pose,
-        posed,
-        found.reprojection_errors[kept].astype(np.float32),
-        np.degrees(found.triangulation_angle[kept]).astype(np.float32),
-        dropped,
-        seconds,
+        points=found.points[kept].astype(np.float32),
+        unit="baseline" if calibration.baseline_mm is None else "mm",
+        indices=indices[kept],
+        points1=points1[indices[kept]],
+        pose=pose,
+        pose_indices=indices,
+        reprojection_errors=found.reprojection_errors[kept].astype(np.float32),
+        triangulation_angles=np.degrees(found.triangulation_angle[kept]).astype(np.float32),
+        dropped=dropped,
+        seconds=timer.seconds,
     )
-
-
-def _counts(dropped: dict[str, int]) -> str:
-    return ", ".join(f"{reason}: {count:,}" for reason, count in dropped.items() if count)
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    started = time.perf_counter()
-    yield
-    seconds[stage] = time.perf_counter() - started

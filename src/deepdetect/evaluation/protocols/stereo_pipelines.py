@@ -17,7 +17,7 @@ from ...datasets.types import CalibratedStereoPair
 from ...detector.detector import DeepDetect, HeatmapDetector
 from ...detector.heatmap import HeatmapOptions
 from ...reconstruction.pipeline import reconstruct
-from ...reconstruction.stereo.search_range import find_search_range
+from ...reconstruction.stereo.matching import find_disparity_range
 from ..baselines import CLASSICAL
 from ..baselines.sift import low_sift
 from ..cache import file_digest
@@ -142,7 +142,7 @@ def _reconstructed(
         calibration=scene.calibration,
         rectified=True,
         density=density,
-        done=done,
+        progress=done,
     )
     meters.lap("geometry")
     assert found.disparity is not None
@@ -197,8 +197,8 @@ def sgbm(scene: CalibratedStereoPair) -> StereoPoints:
     """
     meters = StageMeters()
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
-    search = find_search_range(*gray)
-    largest = 64 if search is None else search.largest
+    search = find_disparity_range(*gray)
+    largest = 64 if search is None else search.max_disparity
     count = max(16, -(-(largest + 1) // 16) * 16)
     disparity = sgbm_disparity(scene.left, scene.right, count, count)
     rows, columns = np.nonzero(np.isfinite(disparity))

@@ -1,6 +1,21 @@
-"""Disparities of rectified pairs."""
+"""Dense disparity maps of rectified pairs."""
 
-from .row_matching import COMPLETE, RowMatches, RowMatchingOptions, match_rows
-from .semi_global import SearchRange
+from .matching import (
+    DENSE,
+    DisparityMap,
+    DisparityOptions,
+    RectifiedMatches,
+    disparity_map,
+    match_rectified,
+)
+from .sgm import DisparityRange
 
-__all__ = ["COMPLETE", "RowMatches", "RowMatchingOptions", "SearchRange", "match_rows"]
+__all__ = [
+    "DENSE",
+    "DisparityMap",
+    "DisparityOptions",
+    "DisparityRange",
+    "RectifiedMatches",
+    "disparity_map",
+    "match_rectified",
+]

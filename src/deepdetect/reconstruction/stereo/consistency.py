@@ -1,53 +1,63 @@
-"""Which disparities of a map can be trusted, and what is behind an edge."""
+"""Which disparities of a map can be trusted, and how gaps between surfaces are filled."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
-JUMP = 1.0
-"""Pixels; a disparity that differs by more from its neighbour's is on another surface."""
-
-SLACK = 8
-"""Pixels that a gap may be wider than what hides it: the windows on both sides reach so far."""
+MAX_DIFFERENCE_PX = 1.0
+"""A disparity that differs by more from its neighbour's belongs to another surface."""
 
 SUBDIVISIONS = 4
-"""Parts of a pixel in which OpenCV's filter of speckles counts."""
+"""Parts of a pixel in which OpenCV's speckle filter counts."""
 
 
-def without_islands(disparity: np.ndarray, known: np.ndarray, size: int) -> np.ndarray:
-    """Leave out small patches that differ in disparity from all around: most are wrong.
+def filter_speckles(
+    disparity: np.ndarray,
+    known: np.ndarray,
+    max_area_px: int,
+    max_difference_px: float = MAX_DIFFERENCE_PX,
+) -> np.ndarray:
+    """Remove small patches whose disparity differs from all around them: most are wrong.
 
     Args:
         disparity: (H, W) float32 in pixels.
         known: (H, W) bool.
-        size: pixels; patches of at most so many are left out.
+        max_area_px: patches of at most this many pixels are removed.
+        max_difference_px: of disparities on one surface; a patch is connected by steps of at most
+            twice that.
 
     Returns:
-        (H, W) bool, the known pixels without them.
+        (H, W) bool, the known pixels without the patches.
 
     Example:
         >>> disparity = np.zeros((20, 20), np.float32)
         >>> disparity[5:8, 5:8] = 7
-        >>> int(without_islands(disparity, disparity >= 0, 10).sum())
+        >>> int(filter_speckles(disparity, disparity >= 0, 10).sum())
         391
     """
-    nothing = np.iinfo(np.int16).min
-    steps = np.where(known, np.rint(disparity * SUBDIVISIONS), nothing).astype(np.int16)
-    cv2.filterSpeckles(steps, nothing, size, round(2 * JUMP * SUBDIVISIONS))
-    return known & (steps != nothing)
+    invalid = np.iinfo(np.int16).min
+    steps = np.where(known, np.rint(disparity * SUBDIVISIONS), invalid).astype(np.int16)
+    cv2.filterSpeckles(steps, invalid, max_area_px, round(2 * max_difference_px * SUBDIVISIONS))
+    return known & (steps != invalid)
 
 
-def depth_edges(disparity: np.ndarray, known: np.ndarray, distance: int) -> np.ndarray:
-    """Find the pixels near a jump of depth.
+def near_discontinuity(
+    disparity: np.ndarray,
+    known: np.ndarray,
+    distance_px: int,
+    max_difference_px: float = MAX_DIFFERENCE_PX,
+) -> np.ndarray:
+    """Find the pixels near a disparity discontinuity.
 
     The window of a match there sees both surfaces, and gives a pixel beside the nearer one its
-    disparity. Where nothing is known, the farther of both sides is taken to go on.
+    disparity. Where nothing is known, the farther of both sides is assumed to continue.
 
     Args:
         disparity: (H, W) float32 in pixels.
         known: (H, W) bool.
-        distance: in pixels, along rows, columns or both.
+        distance_px: along rows, columns or both.
+        max_difference_px: of neighbouring disparities on one surface.
 
     Returns:
         (H, W) bool.
@@ -55,43 +65,48 @@ def depth_edges(disparity: np.ndarray, known: np.ndarray, distance: int) -> np.n
     Example:
         >>> disparity = np.zeros((5, 9), np.float32)
         >>> disparity[:, 4:] = 3
-        >>> depth_edges(disparity, disparity >= 0, 1)[0].astype(int)
+        >>> near_discontinuity(disparity, disparity >= 0, 1)[0].astype(int)
         array([0, 0, 1, 1, 1, 1, 0, 0, 0])
     """
-    whole = behind(disparity, known)[0]
+    filled = fill_occlusions(disparity, known)[0]
     near = np.zeros(disparity.shape, np.uint8)
-    across = np.abs(np.diff(whole, axis=1)) > JUMP
-    along = np.abs(np.diff(whole, axis=0)) > JUMP
+    across = np.abs(np.diff(filled, axis=1)) > max_difference_px
+    along = np.abs(np.diff(filled, axis=0)) > max_difference_px
     near[:, 1:] |= across
     near[:, :-1] |= across
     near[1:] |= along
     near[:-1] |= along
-    side = 2 * distance + 1
+    side = 2 * distance_px + 1
     return cv2.dilate(near, np.ones((side, side), np.uint8)) > 0
 
 
-def behind(disparity: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fill_occlusions(
+    disparity: np.ndarray, known: np.ndarray, slack_px: float = 8
+) -> tuple[np.ndarray, np.ndarray]:
     """Fill unknown pixels with the farther of the nearest known ones on both sides of their row.
 
-    What the right view does not see lies behind what hides it.
+    What the right view does not see lies behind what occludes it.
 
     Args:
         disparity: (H, W) float32 in pixels.
         known: (H, W) bool.
+        slack_px: by which a gap may be wider than the occlusion explains: the matching windows on
+            both sides extend this far.
 
     Returns:
-        (H, W) float32 disparity, 0 in rows where nothing is known; and (H, W) bool, where there
-        is something known on both sides, and the gap is no wider than what the nearer surface
-        can hide.
+        (H, W) float32 disparity, 0 in rows where nothing is known; and (H, W) bool, true where
+        both sides are known and the gap is no wider than what the nearer surface can occlude.
     """
     width = disparity.shape[1]
     column = np.arange(width)
     left = np.maximum.accumulate(np.where(known, column, -1), axis=1)
     right = np.minimum.accumulate(np.where(known, column, width)[:, ::-1], axis=1)[:, ::-1]
-    one, other = (
+    at_left, at_right = (
         np.take_along_axis(disparity, np.clip(at, 0, width - 1), axis=1) for at in (left, right)
     )
-    at_left, at_right = left >= 0, right < width
-    farther = np.where(at_left & at_right, np.minimum(one, other), np.where(at_left, one, other))
-    hidden = right - left - 1 <= np.abs(one - other) + SLACK
-    return np.where(at_left | at_right, farther, np.float32(0)), at_left & at_right & hidden
+    has_left, has_right = left >= 0, right < width
+    farther = np.where(has_left, at_left, at_right)
+    farther = np.where(has_left & has_right, np.minimum(at_left, at_right), farther)
+    occluded = right - left - 1 <= np.abs(at_left - at_right) + slack_px
+    filled = np.where(has_left | has_right, farther, np.float32(0))
+    return filled, has_left & has_right & occluded

@@ -1,8 +1,8 @@
-"""The compiled part of `row_refinement`. Importing it takes numba; the first call compiles.
+"""The compiled part of `refinement`. Importing it takes numba; the first call compiles.
 
-Windows are summed with the pixels of a row innermost, many at once in the processor's wide
-registers. Arrays have a frame of `reach` pixels; the disparity of what is unknown is UNKNOWN there,
-so far from any other that it is never on the same surface.
+Windows are summed with the pixels of a row innermost, many at once in vector registers. Arrays are
+padded by `radius` pixels; unknown disparities are UNKNOWN, so far from any other that they are
+never on the same surface.
 """
 
 from __future__ import annotations
@@ -13,15 +13,12 @@ from ..._shared.kernels import compiled
 
 UNKNOWN = np.float32(1e9)
 
-LEAST_GAIN = np.float32(0.2)
-"""Where the right view's contrast fits with less, it shows something else: no step."""
-
 BLOCK = 128
-"""Pixels of a row that are done together: what is in the works stays in the nearest cache."""
+"""Pixels of a row that are processed together, so that the sums stay in the nearest cache."""
 
 
 @compiled(nogil=True, fastmath=True)
-def smooth_rows(first, last, disparity, reach, jump, out):  # type: ignore[no-untyped-def]
+def smooth_rows(first, last, disparity, radius, max_difference, out):  # type: ignore[no-untyped-def]
     """Write the mean disparity of the same surface around each pixel of some rows.
 
     Pixels of the window count in pairs, one on each side of its centre, so that the mean of a
@@ -29,9 +26,9 @@ def smooth_rows(first, last, disparity, reach, jump, out):  # type: ignore[no-un
 
     Args:
         first, last: the rows.
-        disparity: (H + 2 reach, W + 2 reach) float32 in its frame.
-        reach: of the window, pixels to each side.
-        jump: pixels whose disparity differs by more belong to another surface.
+        disparity: (H + 2 radius, W + 2 radius) float32, padded.
+        radius: of the window, pixels to each side.
+        max_difference: pixels whose disparity differs by more belong to another surface.
         out: (H, W) float32, written; of unknown pixels it means nothing.
     """
     width = out.shape[1]
@@ -39,19 +36,19 @@ def smooth_rows(first, last, disparity, reach, jump, out):  # type: ignore[no-un
     for y in range(first, last):
         for start in range(0, width, BLOCK):
             count = min(BLOCK, width - start)
-            here = disparity[y + reach, start + reach : start + reach + count]
+            here = disparity[y + radius, start + radius : start + radius + count]
             total[:] = 0
             weight[:] = 1
-            for j in range(reach + 1):
-                for i in range(-reach, reach + 1):
+            for j in range(radius + 1):
+                for i in range(-radius, radius + 1):
                     if j == 0 and i <= 0:
                         continue
-                    left, right = start + reach - i, start + reach + i
-                    above = disparity[y + reach - j, left : left + count]
-                    below = disparity[y + reach + j, right : right + count]
+                    left, right = start + radius - i, start + radius + i
+                    above = disparity[y + radius - j, left : left + count]
+                    below = disparity[y + radius + j, right : right + count]
                     for x in range(count):
                         one, other = above[x] - here[x], below[x] - here[x]
-                        both = abs(one) <= jump and abs(other) <= jump
+                        both = abs(one) <= max_difference and abs(other) <= max_difference
                         total[x] += one + other if both else np.float32(0)
                         weight[x] += np.float32(2) if both else np.float32(0)
             for x in range(count):
@@ -66,7 +63,7 @@ def sample_rows(first, last, right, disparity, values, slopes):  # type: ignore[
         first, last: the rows.
         right: (H, W) float32.
         disparity: (H, W) float32.
-        values, slopes: (H, W) float32, written: grey, and its change a pixel to the right.
+        values, slopes: (H, W) float32, written: grey, and its change per pixel to the right.
     """
     width = right.shape[1]
     for y in range(first, last):
@@ -87,7 +84,7 @@ def sample_rows(first, last, right, disparity, values, slopes):  # type: ignore[
 
 @compiled(nogil=True, fastmath=True)
 def step_rows(  # type: ignore[no-untyped-def]
-    first, last, left, values, slopes, disparity, reach, jump, noise, out
+    first, last, left, values, slopes, disparity, radius, max_difference, noise, min_gain, out
 ):
     """Write the disparity after one step of Lucas-Kanade along the row.
 
@@ -96,9 +93,10 @@ def step_rows(  # type: ignore[no-untyped-def]
 
     Args:
         first, last: the rows.
-        left, values, slopes, disparity: (H + 2 reach, W + 2 reach) float32, each in its frame.
-        reach, jump: as of `smooth_rows`.
+        left, values, slopes, disparity: (H + 2 radius, W + 2 radius) float32, padded.
+        radius, max_difference: as of `smooth_rows`.
         noise: grey levels; the step shrinks where the slopes are no stronger.
+        min_gain: where the contrast of the right view fits with less, there is no step.
         out: (H, W) float32, written.
     """
     width = out.shape[1]
@@ -106,7 +104,7 @@ def step_rows(  # type: ignore[no-untyped-def]
     for y in range(first, last):
         for start in range(0, width, BLOCK):
             count = min(BLOCK, width - start)
-            row, column = y + reach, start + reach
+            row, column = y + radius, start + radius
             here = disparity[row, column : column + count]
             # Less the greys at the centre: the sums stay small, and exact.
             middle = left[row, column : column + count]
@@ -114,15 +112,15 @@ def step_rows(  # type: ignore[no-untyped-def]
             # Sums over the window: pixels, left grey, right grey, slope, and their products.
             for total in (n, p, v, s, vv, ss, vs, pv, ps):
                 total[:] = 0
-            for j in range(-reach, reach + 1):
-                for i in range(-reach, reach + 1):
+            for j in range(-radius, radius + 1):
+                for i in range(-radius, radius + 1):
                     at = column + i
                     depth = disparity[row + j, at : at + count]
                     first_view = left[row + j, at : at + count]
                     second_view = values[row + j, at : at + count]
                     slope = slopes[row + j, at : at + count]
                     for x in range(count):
-                        same = abs(depth[x] - here[x]) <= jump
+                        same = abs(depth[x] - here[x]) <= max_difference
                         weight = np.float32(1) if same else np.float32(0)
                         a = weight * (first_view[x] - middle[x])
                         b = weight * (second_view[x] - other[x])
@@ -141,10 +139,10 @@ def step_rows(  # type: ignore[no-untyped-def]
                 spread = vv[x] - v[x] * v[x] / n[x] + floor
                 steep = ss[x] - s[x] * s[x] / n[x] + floor
                 mixed = vs[x] - v[x] * s[x] / n[x]
-                alike = pv[x] - p[x] * v[x] / n[x] + floor  # a flat window has gain 1
+                covariance = pv[x] - p[x] * v[x] / n[x] + floor  # a flat window has gain 1
                 moved = ps[x] - p[x] * s[x] / n[x]
                 area = spread * steep - mixed * mixed
-                gain = (alike * steep - moved * mixed) / area
-                change = (alike * mixed - moved * spread) / area
-                ratio = change / gain if gain > LEAST_GAIN else np.float32(0)
+                gain = (covariance * steep - moved * mixed) / area
+                change = (covariance * mixed - moved * spread) / area
+                ratio = change / gain if gain > min_gain else np.float32(0)
                 out[y, start + x] = here[x] + min(max(ratio, np.float32(-1)), np.float32(1))

@@ -13,25 +13,26 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
-from deepdetect.reconstruction.row_degeneracy import (
-    LEAST_MATCHED,
-    LEAST_SURE,
+from deepdetect.reconstruction.rectified_checks import (
+    RectifiedCheckOptions,
     check_cameras,
     check_depths,
     check_disparities,
     check_keypoints,
     check_matched,
-    check_turn,
+    check_pure_rotation,
 )
-from deepdetect.reconstruction.stereo import COMPLETE, RowMatchingOptions, match_rows
+from deepdetect.reconstruction.stereo import DENSE, DisparityOptions, match_rectified
 
 
-@pytest.mark.parametrize(("sure", "least"), [(True, LEAST_SURE), (False, LEAST_MATCHED)])
-def test_few_matches_are_told_with_their_number(sure: bool, least: float, one_line) -> None:
+@pytest.mark.parametrize(("unique", "least"), [(True, 0.1), (False, 0.25)])
+def test_too_few_matches_are_refused_with_their_number(
+    unique: bool, least: float, one_line
+) -> None:
     enough = int(np.ceil(least * 10_000))
-    check_matched(enough, 10_000, sure)
+    check_matched(enough, 10_000, unique)
     with pytest.raises(ReconstructionError, match=f"only {enough - 1:,} of 10,000") as error:
-        check_matched(enough - 1, 10_000, sure)
+        check_matched(enough - 1, 10_000, unique)
     one_line(error.value)
 
 
@@ -79,23 +80,26 @@ def test_what_is_very_far_away_is_not_behind() -> None:
 def test_cameras_that_no_rectified_pair_has(one_line) -> None:
     left = Camera((640, 480), 500.0, (320.0, 240.0))
 
-    def told(**changes: Any) -> str:
+    def refusal(**changes: Any) -> str:
         with pytest.raises(ReconstructionError) as error:
             check_cameras(Calibration(left, replace(left, **changes), source="c.json"))
         message = one_line(error.value)
-        assert "mend the calibration (c.json), or give --not-rectified" in message
+        assert "fix the calibration (c.json), or pass `rectified=False`" in message
         return message
 
-    assert "are 500 and 510 px" in told(focal_px=(510.0, 500.0))
-    assert "are 500 and 490 px" in told(focal_px=(500.0, 490.0))
-    assert "cy of the left and the right view are 240 and 243 px" in told(centre=(320.0, 243.0))
+    assert "are 500 and 510 px" in refusal(focal_px=(510.0, 500.0))
+    assert "are 500 and 490 px" in refusal(focal_px=(500.0, 490.0))
+    assert "cy of the left and the right view are 240 and 243 px" in refusal(centre=(320.0, 243.0))
     for changes in ({"focal_px": 504.0}, {"centre": (390.0, 240.0)}, {"centre": (320.0, 238.5)}):
         check_cameras(Calibration(left, replace(left, **changes)))
 
 
 def test_no_keypoints(one_line) -> None:
     for selection, message in (
-        (SelectionOptions(threshold=0.75), "above the threshold of 0.75: lower it, or give a"),
+        (
+            SelectionOptions(threshold=0.75),
+            "threshold of 0.75: lower `threshold`, or give `density`",
+        ),
         (SelectionOptions(density=1e-7), "a density of 1e-07 gives no keypoint"),
     ):
         check_keypoints(1, selection)
@@ -115,28 +119,28 @@ def turned_disparity(calibration: Calibration, degrees: tuple[float, ...]) -> np
 
 
 @pytest.mark.parametrize("degrees", [(0, -1, 0), (0, 2, 0), (0, -0.5, 0), (0.05, -1, 0.2)])
-def test_a_turn_is_known_by_its_bend(degrees: tuple[float, ...], one_line) -> None:
+def test_a_rotation_is_recognised_by_its_bend(degrees: tuple[float, ...], one_line) -> None:
     camera = Camera((640, 480), 600.0)
     right = replace(camera, focal_px=602.0, centre=(350.0, 239.5))
     for calibration in (Calibration(camera, camera), Calibration(camera, right)):
         disparity = turned_disparity(calibration, degrees)
         wrong = np.random.default_rng(1).random(len(PIXELS)) < 0.3
         disparity[wrong] += 9
-        with pytest.raises(ReconstructionError, match="a turn of the camera explains") as error:
-            check_turn(PIXELS, disparity, calibration)
+        with pytest.raises(ReconstructionError, match="a rotation of the camera explains") as error:
+            check_pure_rotation(PIXELS, disparity, calibration)
         one_line(error.value)
 
 
 @pytest.mark.parametrize("focal", [300.0, 600.0, 3000.0])
 @pytest.mark.parametrize("slant", [(0, 0), (2e-3, 0), (0, 3e-3), (0.01, -0.01), (0.1, 0)])
-def test_a_wall_before_two_cameras_is_no_turn(slant: tuple[float, float], focal: float) -> None:
+def test_a_wall_before_two_cameras_is_no_rotation(slant: tuple[float, float], focal: float) -> None:
     camera = Camera((640, 480), focal)
     noise = np.random.default_rng(0).normal(0, 0.1, len(PIXELS))
     for shift in (0, 5, 40):
-        check_turn(PIXELS, shift + PIXELS @ slant + noise, Calibration(camera, camera))
+        check_pure_rotation(PIXELS, shift + PIXELS @ slant + noise, Calibration(camera, camera))
 
 
-def test_bent_surfaces_are_no_turn() -> None:
+def test_bent_surfaces_are_no_rotation() -> None:
     """Random quadrics of little depth, which a turn with a roll comes near to."""
     camera = Camera((640, 480), 1200.0)
     generator = np.random.default_rng(0)
@@ -145,32 +149,32 @@ def test_bent_surfaces_are_no_turn() -> None:
         bent = np.column_stack([x, y, x * x, x * y, y * y]) @ generator.normal(size=5)
         bent *= generator.uniform(0.5, 4) / np.ptp(np.quantile(bent, [0.05, 0.95]))
         disparity = generator.uniform(0, 60) + bent + generator.normal(0, 0.1, len(x))
-        check_turn(PIXELS, disparity, Calibration(camera, camera))
+        check_pure_rotation(PIXELS, disparity, Calibration(camera, camera))
 
 
-def test_too_few_matches_and_impossible_focal_lengths_tell_no_turn() -> None:
+def test_too_few_matches_and_impossible_focal_lengths_give_no_rotation() -> None:
     camera = Camera((640, 480), 600.0)
     calibration = Calibration(camera, camera)
     disparity = turned_disparity(calibration, (0, -2, 0))
-    check_turn(PIXELS[::300], disparity[::300], calibration)
+    check_pure_rotation(PIXELS[::300], disparity[::300], calibration)
     tiny = Camera((640, 480), 1.0)
-    check_turn(PIXELS, disparity, Calibration(tiny, tiny))
+    check_pure_rotation(PIXELS, disparity, Calibration(tiny, tiny))
 
 
 @pytest.mark.parametrize("name", ["art", "cones", "dolls", "moebius", "teddy"])
-def test_scenes_with_depth_are_no_turn(shared: Path, name: str) -> None:
+def test_scenes_with_depth_are_no_rotation(shared: Path, name: str) -> None:
     true = load_middlebury(shared / "data" / "middlebury" / name).disparity
     row, column = np.nonzero(np.isfinite(true))
     pixels = np.stack([column, row], 1).astype(np.float64)
     for focal in (0.5, 1, 3):
         camera = Camera(true.shape[::-1], focal * true.shape[1])
-        check_turn(pixels, true[row, column], Calibration(camera, camera))
+        check_pure_rotation(pixels, true[row, column], Calibration(camera, camera))
 
 
-@pytest.mark.parametrize("options", [RowMatchingOptions(), COMPLETE], ids=["strict", "complete"])
+@pytest.mark.parametrize("options", [DisparityOptions(), DENSE], ids=["strict", "complete"])
 @pytest.mark.parametrize("degrees", [0.5, 1, 2, 4])
-def test_a_photograph_of_a_turned_camera(
-    level: Any, options: RowMatchingOptions, degrees: float
+def test_a_photograph_of_a_rotated_camera(
+    level: Any, options: DisparityOptions, degrees: float
 ) -> None:
     camera = level.calibration.camera0
     rotation = cv2.Rodrigues(np.radians([0, -degrees, 0]))[0]
@@ -181,11 +185,19 @@ def test_a_photograph_of_a_turned_camera(
         (other, Calibration(camera, camera)),
         (level.right, level.calibration),
     ):
-        found = match_rows(luma(level.left), luma(right), pixels, options)
-        matches = pixels[found.rows][found.matched], found.disparity[found.matched]
+        found = match_rectified(luma(level.left), luma(right), pixels, options)
+        matches = pixels[found.indices][found.matched], found.disparity[found.matched]
         check_disparities(matches[1])
         if right is level.right:
-            check_turn(*matches, calibration)
+            check_pure_rotation(*matches, calibration)
             continue
-        with pytest.raises(ReconstructionError, match="a turn of the camera explains"):
-            check_turn(*matches, calibration)
+        with pytest.raises(ReconstructionError, match="a rotation of the camera explains"):
+            check_pure_rotation(*matches, calibration)
+
+
+def test_thresholds_are_options() -> None:
+    check_matched(1, 10_000, options=RectifiedCheckOptions(min_unique_fraction=0))
+    check_disparities(np.full(100, 7.0), RectifiedCheckOptions(min_disparity_spread_px=0))
+    left = Camera((640, 480), 500.0)
+    cameras = Calibration(left, replace(left, focal_px=600.0))
+    check_cameras(cameras, RectifiedCheckOptions(max_focal_difference_fraction=0.3))

@@ -1,0 +1,300 @@
+"""Why a pair that is treated as rectified gives no depth, in one sentence.
+
+As `checks`, for disparities; in the order of this module.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from .._shared.errors import ReconstructionError
+from ..features.selection import SelectionOptions, grid_subsample
+from ..geometry.camera import Calibration
+from .checks import StaticOptions, is_static
+
+
+@dataclass(frozen=True)
+class RotationOptions:
+    """When disparities are those of a camera that only rotated.
+
+    Walls are planes in disparity, a rotation bends them. Chosen on four views rotated by half a
+    degree to two (fraction 0.64, ratio 0.33 at worst) and as many drawn on slanted walls before two
+    cameras (ratio 5.3 at least); Motorcycle and seven scenes of Middlebury ask for rotations that
+    would leave the rows.
+
+    Attributes:
+        max_error_px: within which the rotation explains a disparity.
+        min_explained_fraction: of the disparities.
+        max_ratio_to_plane: median error of the rotation over that of the best plane in disparity.
+        max_off_row_px: median distance by which the rotation moves matches off their rows: on rows
+            they were found.
+        iterations: of the robust fits.
+        grid_size_px: cells of this size give one match each.
+        min_matches: one per cell, below which nothing is tried.
+        max_samples: matches that are used at the most.
+    """
+
+    max_error_px: float = 0.3
+    min_explained_fraction: float = 0.5
+    max_ratio_to_plane: float = 0.5
+    max_off_row_px: float = 1.0
+    iterations: int = 12
+    grid_size_px: int = 16
+    min_matches: int = 30
+    max_samples: int = 50_000
+
+
+@dataclass(frozen=True)
+class RectifiedCheckOptions:
+    """Thresholds of the checks of rectified pairs.
+
+    Attributes:
+        max_focal_difference_fraction: of the focal lengths of both views. Rectified views have one;
+            lengths given to three digits pass, and at 0.01 a row is off by 2 px at the edge of 400.
+        max_cy_difference_px: of cy of both views: twice what a match may be off its row.
+        min_unique_fraction: of the keypoints with a match on their row, where only unique matches
+            count: unrelated photographs gave up to 0.005, rectified pairs at least 0.35.
+        min_matched_fraction: the same where all matches count: up to 0.16, and at least 0.64.
+        min_disparity_spread_px: between the 5th and 95th percentile, in a scene with depth.
+        min_disparity_px: with the offset; smaller ones put points behind the cameras.
+        max_behind_fraction: of the points, behind the cameras.
+        static: when both images show the same view.
+        rotation: when the camera only rotated.
+    """
+
+    max_focal_difference_fraction: float = 0.01
+    max_cy_difference_px: float = 2.0
+    min_unique_fraction: float = 0.1
+    min_matched_fraction: float = 0.25
+    min_disparity_spread_px: float = 0.5
+    min_disparity_px: float = -1.0
+    max_behind_fraction: float = 0.25
+    static: StaticOptions = field(default_factory=StaticOptions)
+    rotation: RotationOptions = field(default_factory=RotationOptions)
+
+
+DEFAULTS = RectifiedCheckOptions()
+
+
+def check_cameras(calibration: Calibration, options: RectifiedCheckOptions = DEFAULTS) -> None:
+    """Refuse a calibration that no rectified pair has.
+
+    Args:
+        calibration: of a pair treated as rectified.
+        options: the thresholds.
+
+    Raises:
+        ReconstructionError: focal lengths or cy of both views differ.
+
+    Example:
+        >>> from deepdetect.geometry.camera import Camera
+        >>> check_cameras(Calibration(Camera((640, 480), 500), Camera((640, 480), 600)))
+        Traceback (most recent call last):
+        ...
+        deepdetect.ReconstructionError: the focal lengths of the left and the right view \
+are 500 and 600 px, those of a rectified pair are one: fix the calibration (given), or pass \
+`rectified=False`
+    """
+    camera0, camera1 = calibration.camera0, calibration.camera1
+    advice = f"fix the calibration ({calibration.source}), or pass `rectified=False`"
+    for focal0, focal1 in zip(camera0.focal_px, camera1.focal_px, strict=True):
+        if abs(focal1 - focal0) > options.max_focal_difference_fraction * focal0:
+            raise ReconstructionError(
+                f"the focal lengths of the left and the right view are {focal0:g} and {focal1:g} "
+                f"px, those of a rectified pair are one: {advice}"
+            )
+    cy0, cy1 = camera0.centre[1], camera1.centre[1]
+    if abs(cy1 - cy0) > options.max_cy_difference_px:
+        raise ReconstructionError(
+            f"cy of the left and the right view are {cy0:g} and {cy1:g} px, those of a rectified "
+            f"pair are one: {advice}"
+        )
+
+
+def check_keypoints(keypoints: int, selection: SelectionOptions) -> None:
+    """Refuse an image without keypoints.
+
+    Args:
+        keypoints: their number.
+        selection: how they were chosen.
+
+    Raises:
+        ReconstructionError: there are none.
+    """
+    if keypoints:
+        return
+    if selection.density is not None:
+        raise ReconstructionError(
+            f"a density of {selection.density:g} gives no keypoint in the left image: raise "
+            "`density`"
+        )
+    raise ReconstructionError(
+        f"no pixel of the left image is above the threshold of {selection.threshold:g}: lower "
+        "`threshold`, or give `density` (an image of one grey level shows nothing)"
+    )
+
+
+def check_matched(
+    matched: int, keypoints: int, unique: bool = True, options: RectifiedCheckOptions = DEFAULTS
+) -> None:
+    """Refuse a pair treated as rectified of which hardly any keypoint has a match on its row.
+
+    Args:
+        matched: number of keypoints with a match; those in filled occlusions have none.
+        keypoints: number of keypoints.
+        unique: whether only matches count that no other place on the row comes near to.
+        options: the thresholds.
+
+    Raises:
+        ReconstructionError: there are too few.
+    """
+    least = options.min_unique_fraction if unique else options.min_matched_fraction
+    if matched < least * keypoints:
+        raise ReconstructionError(
+            f"only {matched:,} of {keypoints:,} keypoints have a match on their row: the "
+            "photographs hardly overlap or show different scenes, or the pair is not rectified"
+        )
+
+
+def check_disparities(disparity: np.ndarray, options: RectifiedCheckOptions = DEFAULTS) -> None:
+    """Refuse disparities of a rectified pair that are all one value.
+
+    Args:
+        disparity: (N,) in pixels; those that are not finite do not count.
+        options: the thresholds.
+
+    Raises:
+        ReconstructionError: there are none, or they do not differ.
+
+    Example:
+        >>> check_disparities(np.full(100, 7.0))
+        Traceback (most recent call last):
+        ...
+        deepdetect.ReconstructionError: all disparities are 7 px: one image is the other \
+shifted sideways, or both show one plane, and there is no depth
+    """
+    known = np.asarray(disparity)[np.isfinite(disparity)]
+    if not len(known):
+        raise ReconstructionError("no disparity was found: the images do not overlap")
+    if is_static(known, options.static):
+        raise ReconstructionError(
+            "all disparities are 0: both images were taken from one place, without a baseline"
+        )
+    low, middle, high = np.quantile(known, [0.05, 0.5, 0.95])
+    if high - low >= options.min_disparity_spread_px:
+        return
+    raise ReconstructionError(
+        f"all disparities are {middle:.3g} px: one image is the other shifted sideways, or both "
+        "show one plane, and there is no depth"
+    )
+
+
+def check_pure_rotation(
+    pixels: np.ndarray,
+    disparity: np.ndarray,
+    calibration: Calibration,
+    options: RotationOptions = RotationOptions(),
+) -> None:
+    """Refuse disparities that a camera which only rotated explains.
+
+    A rotation by an angle a about the vertical moves pixels along their rows by f a (1 + x^2) at
+    first order, x the slope of the ray: about like a wall, but bent. With a focal length that is
+    far off, with a tilt besides that takes matches off their rows, or when it bends by less than
+    the noise, a rotation is not noticed.
+
+    Args:
+        pixels: (N, 2) positions in the left image.
+        disparity: (N,) their disparities in pixels.
+        calibration: tells the rays.
+        options: the thresholds.
+
+    Raises:
+        ReconstructionError: one rotation explains most disparities, and far better than a plane.
+    """
+    chosen = np.arange(len(pixels))
+    if len(chosen) > options.max_samples:
+        chosen = np.random.default_rng(0).choice(len(chosen), options.max_samples, replace=False)
+    chosen = chosen[grid_subsample(pixels[chosen], options.grid_size_px)]
+    if len(chosen) < options.min_matches:
+        return
+    pixels, disparity = np.asarray(pixels, np.float64)[chosen], np.asarray(disparity)[chosen]
+    by_rotation = _rotation_errors(pixels, disparity, calibration, options)
+    by_plane = _plane_errors(pixels, disparity, options.iterations)
+    better = np.median(by_rotation) < options.max_ratio_to_plane * np.median(by_plane)
+    explained = np.mean(by_rotation < options.max_error_px)
+    if better and explained > options.min_explained_fraction:
+        raise ReconstructionError(
+            "a rotation of the camera explains most disparities and there is no depth: move it "
+            "sideways between the photographs"
+        )
+
+
+def check_depths(
+    disparity: np.ndarray, calibration: Calibration, options: RectifiedCheckOptions = DEFAULTS
+) -> None:
+    """Refuse disparities of a rectified pair of which many would lie behind the cameras.
+
+    Args:
+        disparity: (N,) in pixels.
+        calibration: tells the offset.
+        options: the thresholds.
+
+    Raises:
+        ReconstructionError: left and right are exchanged, or the offset is wrong.
+    """
+    offset = calibration.disparity_offset_px
+    behind = float(np.mean(disparity + offset < options.min_disparity_px))
+    if behind > options.max_behind_fraction:
+        raise ReconstructionError(
+            f"{behind:.0%} of the points would lie behind the cameras: left and right are "
+            f"exchanged, or the disparity offset of {offset:g} px ({calibration.source}) is wrong"
+        )
+
+
+def _rotation_errors(
+    pixels: np.ndarray, disparity: np.ndarray, calibration: Calibration, options: RotationOptions
+) -> np.ndarray:
+    """Fit a rotation to disparities robustly; (N,) what it leaves unexplained, in pixels.
+
+    About the vertical and the line of sight: a tilt hardly changes disparities. Infinite when none
+    leaves the matches on their rows.
+    """
+    camera = calibration.camera1
+    rays = calibration.camera0.rays(pixels)
+    wanted = (pixels[:, 0] - disparity - camera.centre[0]) / camera.focal_px[0]
+    # The rotation about the vertical that most pixels ask for is near enough to begin with.
+    angle = np.median(np.arctan(wanted) - np.arctan(rays[:, 0]))
+    rotation = cv2.Rodrigues(np.array([0, angle, 0]))[0]
+    error = np.empty(0)
+    for iteration in range(options.iterations + 1):
+        rotated = rays @ rotation.T
+        if (rotated[:, 2] <= 0).any():  # only with a focal length that cannot be
+            return np.full(len(pixels), np.inf)
+        x, y = (rotated[:, :2] / rotated[:, 2:]).T
+        error = wanted - x
+        if iteration < options.iterations:
+            slopes = np.column_stack([1 + x * x, -y])
+            angles = _robust_step(slopes, error, camera.focal_px[0])
+            rotation = cv2.Rodrigues(np.array([0, *angles]))[0] @ rotation
+    off_row = y * camera.focal_px[1] + camera.centre[1] - pixels[:, 1]
+    if np.median(np.abs(off_row)) > options.max_off_row_px:
+        return np.full(len(pixels), np.inf)
+    return np.abs(error) * camera.focal_px[0]
+
+
+def _plane_errors(pixels: np.ndarray, disparity: np.ndarray, iterations: int) -> np.ndarray:
+    """Fit disparities linear in x and y robustly; (N,) what they leave unexplained, in pixels."""
+    design = np.column_stack([pixels / max(pixels.max(), 1), np.ones(len(pixels))])
+    plane = np.array([0, 0, np.median(disparity)])
+    for _ in range(iterations):
+        plane = plane + _robust_step(design, disparity - design @ plane, 1.0)
+    return np.abs(disparity - design @ plane)
+
+
+def _robust_step(design: np.ndarray, error: np.ndarray, pixel: float) -> np.ndarray:
+    """Return the change of parameters that lessens the sum of absolute errors (reweighting)."""
+    weight = 1 / np.sqrt(np.maximum(np.abs(error) * pixel, 0.02))
+    return np.linalg.lstsq(design * weight[:, None], error * weight, rcond=None)[0]

@@ -1,0 +1,322 @@
+"""Dense disparity maps of rectified pairs, and the matches of keypoints that they give."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ..._shared.errors import ImageError, OptionError
+from ...features.keypoints import Keypoints
+from ...io.image import load_image, luma
+from .consistency import (
+    MAX_DIFFERENCE_PX,
+    fill_occlusions,
+    filter_speckles,
+    near_discontinuity,
+)
+from .refinement import DisparityRefinementOptions, refine_disparity
+from .sgm import DisparityRange, SGMOptions, is_textured, semi_global_matching
+
+
+@dataclass(frozen=True)
+class RangeSearchOptions:
+    """How the range of disparities is found, on a small copy of the pair.
+
+    The defaults were chosen so that the range holds all of the Motorcycle pair and of the
+    Middlebury scenes of the benchmark, without being much wider.
+
+    Attributes:
+        width_px: of the small copy.
+        uniqueness_ratio: least ratio of the cost of any other place on the row: what has no match
+            is rarely so clear.
+        max_speckle_area_px: patches of the small copy up to this size do not count.
+        tail_fraction: of the disparities at each end, which may be wrong.
+        margin_px: of the small copy, added at both ends of the range.
+        margin_fraction: of the range, added at both ends, too, for what is too small to be seen.
+    """
+
+    width_px: int = 160
+    uniqueness_ratio: float = 1.3
+    max_speckle_area_px: int = 50
+    tail_fraction: float = 0.01
+    margin_px: float = 1.5
+    margin_fraction: float = 0.2
+
+
+@dataclass(frozen=True)
+class DisparityOptions:
+    """How the disparities of a rectified pair are found, and which of them are kept.
+
+    Attributes:
+        disparity_range: smallest and largest disparity in whole pixels; None: found on a small
+            copy of the pair, by `range_search`.
+        uniqueness_ratio: the cost of any other place on the row, over that of the match, is at
+            least this.
+        discontinuity_margin_px: pixels this near to a disparity discontinuity are left out: the
+            windows that are compared extend so far, and give what lies beside a near object its
+            disparity. Objects up to twice as wide vanish. 0 keeps them.
+        fill_occlusions: give what the right image does not show, between two surfaces, the
+            disparity of the farther one. Such pixels have no match: `DisparityMap.matched`.
+        max_speckle_area_px: patches of one surface up to this size are left out.
+        max_difference_px: of neighbouring disparities on one surface.
+        occlusion_slack_px: by which an occlusion may be wider than the step of disparity that
+            causes it.
+        sgm: penalties of semi-global matching.
+        refinement: to sub-pixel accuracy.
+        range_search: used without a `disparity_range`.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    disparity_range: tuple[int, int] | None = None
+    uniqueness_ratio: float = 1.05
+    discontinuity_margin_px: int = 4
+    fill_occlusions: bool = False
+    max_speckle_area_px: int = 100
+    max_difference_px: float = MAX_DIFFERENCE_PX
+    occlusion_slack_px: float = 8
+    sgm: SGMOptions = field(default_factory=SGMOptions)
+    refinement: DisparityRefinementOptions = field(default_factory=DisparityRefinementOptions)
+    range_search: RangeSearchOptions = field(default_factory=RangeSearchOptions)
+
+    def __post_init__(self) -> None:
+        if self.disparity_range is not None:
+            if len(self.disparity_range) != 2 or any(int(d) != d for d in self.disparity_range):
+                raise OptionError("disparity_range takes two whole disparities, as (0, 63)")
+            DisparityRange(*self.disparity_range)
+        if not self.uniqueness_ratio >= 1:
+            raise OptionError(f"uniqueness_ratio must be at least 1, not {self.uniqueness_ratio}")
+        if not 0 <= self.discontinuity_margin_px <= 100:
+            raise OptionError(
+                "discontinuity_margin_px must be between 0 and 100 pixels, not "
+                f"{self.discontinuity_margin_px}"
+            )
+        for name in ("max_speckle_area_px", "max_difference_px", "occlusion_slack_px"):
+            if not getattr(self, name) >= 0:
+                raise OptionError(f"{name} must not be negative, but is {getattr(self, name)}")
+
+
+DENSE = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True)
+"""As many pixels as possible: those near discontinuities too, and occluded ones filled."""
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedMatches:
+    """Keypoints of the left view of a rectified pair with their disparities.
+
+    Attributes:
+        indices: (K,) int64 of the keypoints that have a disparity, rising.
+        disparity: (K,) float32 in pixels: the match of the left (x, y) is the right
+            (x - disparity, y).
+        matched: (K,) bool: seen in both views; False for those in filled occlusions.
+    """
+
+    indices: np.ndarray
+    disparity: np.ndarray
+    matched: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+@dataclass(frozen=True, eq=False)
+class DisparityMap:
+    """The disparity of each pixel of the left view of a rectified pair.
+
+    Attributes:
+        disparity: (H, W) float32 in pixels: the match of the left (x, y) is the right
+            (x - disparity, y). NaN where there is none that can be trusted.
+        matched: (H, W) bool: seen in both views; False in filled occlusions and where the
+            disparity is NaN.
+        disparity_range: the disparities that were tried; None where the views agree on nothing.
+    """
+
+    disparity: np.ndarray
+    matched: np.ndarray
+    disparity_range: DisparityRange | None
+
+    def at(self, keypoints: Keypoints | np.ndarray) -> RectifiedMatches:
+        """Return the disparities of keypoints: the map is only sampled, nothing is matched again.
+
+        Args:
+            keypoints: of the left view, on whole pixels; or their (N, 2) positions.
+
+        Raises:
+            OptionError: they are not (N, 2), or not on pixels of the left view.
+        """
+        column, row = _whole_pixels(keypoints, self.disparity.shape)
+        disparity = self.disparity[row, column]
+        indices = np.flatnonzero(np.isfinite(disparity))
+        matched = self.matched[row[indices], column[indices]]
+        return RectifiedMatches(indices, disparity[indices], matched)
+
+
+def disparity_map(
+    left: Any, right: Any, options: DisparityOptions = DisparityOptions()
+) -> DisparityMap:
+    """Find the disparity of every pixel of the left view of a rectified pair.
+
+    Census transform and semi-global matching; both views must agree, no other place on the row may
+    be as good, small patches apart from all around are left out, and so is what lies near a
+    disparity discontinuity. Then the disparities are refined to sub-pixel accuracy. The light may
+    differ between the views. No detector takes part: for rectified pairs `reconstruct` takes its
+    points from this map, at the keypoints of the left image.
+
+    Args:
+        left, right: images of the same size, anything `load_image` takes; only their luma is used.
+        options: what is matched and kept; `DENSE` gives as many pixels as possible.
+
+    Returns:
+        The disparities, the same for any number of threads.
+
+    Raises:
+        ImageError: the images cannot be read, or differ in size.
+        OptionError: the disparity range is wider than the image.
+
+    Example:
+        >>> scene = np.random.default_rng(0).integers(0, 256, (64, 120), np.uint8)
+        >>> scene = cv2.GaussianBlur(scene, (0, 0), 1)
+        >>> found = disparity_map(scene[:, :100], scene[:, 12:112])
+        >>> float(np.nanmedian(found.disparity).round(1))
+        12.0
+        >>> found.at(np.array([[40, 20], [60, 30], [2, 30]])).indices.tolist()
+        [0, 1]
+    """
+    return compute_disparity(luma(load_image(left)), luma(load_image(right)), options)
+
+
+def match_rectified(
+    left: Any,
+    right: Any,
+    keypoints: Keypoints | np.ndarray,
+    options: DisparityOptions = DisparityOptions(),
+) -> RectifiedMatches:
+    """Find the disparities of keypoints of the left view: `disparity_map`, sampled at them.
+
+    Args:
+        left, right, options: as of `disparity_map`.
+        keypoints: of the left view, on whole pixels; or their (N, 2) positions.
+
+    Raises:
+        ImageError, OptionError: as of `disparity_map` and `DisparityMap.at`.
+    """
+    return disparity_map(left, right, options).at(keypoints)
+
+
+def compute_disparity(
+    left: np.ndarray, right: np.ndarray, options: DisparityOptions = DisparityOptions()
+) -> DisparityMap:
+    """Compute the `disparity_map` of (H, W) uint8 luma."""
+    if left.shape != right.shape:
+        sizes = " and ".join(f"{view.shape[1]}x{view.shape[0]}" for view in (left, right))
+        raise ImageError(f"the views of a rectified pair must have one size, not {sizes}")
+    disparities = _disparity_range(left, right, options)
+    if disparities is None:
+        nowhere = np.zeros(left.shape, bool)
+        return DisparityMap(np.full(left.shape, np.nan, np.float32), nowhere, None)
+    found = semi_global_matching(left, right, disparities, options.sgm)
+    clear = found.uniqueness_ratio >= options.uniqueness_ratio
+    known = filter_speckles(
+        found.disparity,
+        found.consistent & clear & is_textured(left),
+        options.max_speckle_area_px,
+        options.max_difference_px,
+    )
+    disparity = refine_disparity(
+        left, right, found.disparity, known, options.refinement, options.max_difference_px
+    )
+    matched = known
+    if options.discontinuity_margin_px:
+        matched = known & ~near_discontinuity(
+            disparity, known, options.discontinuity_margin_px, options.max_difference_px
+        )
+    kept = matched
+    if options.fill_occlusions:
+        filled, occluded = fill_occlusions(disparity, known, options.occlusion_slack_px)
+        disparity = np.where(known, disparity, filled)
+        kept = matched | (occluded & ~known)
+    return DisparityMap(np.where(kept, disparity, np.float32(np.nan)), matched, disparities)
+
+
+def find_disparity_range(
+    left: np.ndarray, right: np.ndarray, options: DisparityOptions = DisparityOptions()
+) -> DisparityRange | None:
+    """Find the disparities of a rectified pair, of both signs and up to half its width.
+
+    A small copy of the pair is matched over all of them. What both views agree on, in patches of
+    some size, gives the range.
+
+    Args:
+        left, right: (H, W) uint8 luma.
+        options: its `range_search` and `sgm`.
+
+    Returns:
+        The range, or None where the views agree on nothing.
+
+    Example:
+        >>> scene = np.random.default_rng(0).integers(0, 256, (30, 80), np.uint8)
+        >>> scene = cv2.resize(scene, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+        >>> found = find_disparity_range(scene[:, 40:300], scene[:, :260])
+        >>> found.min_disparity <= -40 <= found.max_disparity < 0
+        True
+    """
+    search = options.range_search
+    height, width = left.shape
+    scale = max(width / search.width_px, 1.0)
+    if scale > 1:
+        size = (round(width / scale), max(round(height / scale), 1))
+        left, right = (
+            cv2.resize(view, size, interpolation=cv2.INTER_AREA) for view in (left, right)
+        )
+        scale = width / size[0]
+    half = left.shape[1] // 2
+    found = semi_global_matching(left, right, DisparityRange(-half, half), options.sgm)
+    clear = found.consistent & (found.uniqueness_ratio >= search.uniqueness_ratio)
+    known = filter_speckles(found.disparity, clear, search.max_speckle_area_px)
+    if not known.any():
+        return None
+    low, high = np.quantile(
+        found.disparity[known], [search.tail_fraction, 1 - search.tail_fraction]
+    )
+    margin = search.margin_px + search.margin_fraction * (high - low)
+    smallest = int(np.floor((low - margin) * scale))
+    largest = int(np.ceil((high + margin) * scale))
+    return DisparityRange(max(smallest, 1 - width), min(largest, width - 1))
+
+
+def _disparity_range(
+    left: np.ndarray, right: np.ndarray, options: DisparityOptions
+) -> DisparityRange | None:
+    """Return the range that is given, or the one that is found."""
+    if options.disparity_range is None:
+        return find_disparity_range(left, right, options)
+    given = DisparityRange(*(int(disparity) for disparity in options.disparity_range))
+    width = left.shape[1]
+    if max(abs(given.min_disparity), abs(given.max_disparity)) >= width:
+        raise OptionError(
+            f"disparities from {given.min_disparity} to {given.max_disparity} do not fit images "
+            f"{width} pixels wide: narrow disparity_range"
+        )
+    return given
+
+
+def _whole_pixels(
+    keypoints: Keypoints | np.ndarray, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return columns and rows of keypoints that lie on pixels of an image."""
+    given = np.asarray(keypoints.xy if isinstance(keypoints, Keypoints) else keypoints)
+    if given.ndim != 2 or given.shape[1] != 2 or given.dtype.kind not in "iuf":
+        raise OptionError(f"keypoints must be an array of shape (N, 2), not {given.shape}")
+    pixels = np.rint(np.where(np.isfinite(given), given, -1)).astype(np.int64)
+    height, width = shape
+    inside = (pixels >= 0).all() and (pixels < [width, height]).all()
+    if (pixels != given).any() or not inside:
+        raise OptionError(
+            "rectified matching takes keypoints on whole pixels of the left view: detect them with "
+            "subpixel=False"
+        )
+    return pixels[:, 0], pixels[:, 1]

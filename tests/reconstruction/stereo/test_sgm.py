@@ -1,0 +1,175 @@
+"""Census and whole disparities, compared with their definitions and with OpenCV."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import OptionError
+from deepdetect.reconstruction.stereo import sgm as module
+from deepdetect.reconstruction.stereo.sgm import (
+    CENSUS_RADIUS_X,
+    CENSUS_RADIUS_Y,
+    DisparityRange,
+    SGMOptions,
+    census,
+    is_textured,
+    matching_cost,
+    semi_global_matching,
+)
+
+
+@pytest.fixture(scope="module")
+def motorcycle() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    pytest.importorskip("skimage", reason="needs scikit-image for its stereo pair")
+    from deepdetect.datasets.middlebury import load_motorcycle
+
+    pair = load_motorcycle()
+    part = slice(150, 310)
+    left, right = (
+        cv2.cvtColor(np.ascontiguousarray(view[part]), cv2.COLOR_RGB2GRAY)
+        for view in (pair.left, pair.right)
+    )
+    return left, right, pair.disparity[part]
+
+
+def test_the_census_says_which_neighbours_are_darker() -> None:
+    gray = np.random.default_rng(0).integers(0, 256, (20, 30), np.uint8)
+    words = census(gray)
+    x_radius, y_radius = CENSUS_RADIUS_X, CENSUS_RADIUS_Y
+    framed = np.pad(gray, ((y_radius, y_radius), (x_radius, x_radius)), mode="edge")
+    for y, x in ((0, 0), (7, 12), (19, 29)):
+        window = framed[y : y + 2 * y_radius + 1, x : x + 2 * x_radius + 1].ravel()
+        darker = np.delete(window, len(window) // 2) < gray[y, x]
+        assert f"{int(words[y, x]):062b}" == "".join(str(int(bit)) for bit in darker)
+
+
+def test_light_does_not_change_it() -> None:
+    gray = np.random.default_rng(0).integers(0, 100, (20, 30), np.uint8)
+    np.testing.assert_array_equal(census(gray), census((gray * 2 + 30).astype(np.uint8)))
+
+
+def test_costs_are_sums_of_distances() -> None:
+    generator = np.random.default_rng(0)
+    shape = (9, 14)
+    left, right = (generator.integers(0, 2**62, shape, np.uint64) for _ in range(2))
+    for smallest, count in ((-3, 16), (0, 5), (-30, 70), (13, 4)):
+        distance = np.full((*shape, count), 31)
+        for y, x, d in np.ndindex(distance.shape):
+            there = x - (d + smallest)
+            if 0 <= there < shape[1]:
+                distance[y, x, d] = int(left[y, x] ^ right[y, there]).bit_count()
+        framed = np.pad(distance, ((1, 1), (1, 1), (0, 0)), mode="edge")
+        sums = sum(framed[j : j + 9, i : i + 14] for j in range(3) for i in range(3))
+        np.testing.assert_array_equal(matching_cost(left, right, smallest, count), sums // 4)
+
+
+def test_flat_windows_have_no_texture() -> None:
+    gray = np.full((20, 40), 250, np.uint8)
+    gray[5, 35] = 200
+    found = is_textured(gray)
+    assert found[2:9, 31:40].all()
+    assert found.sum() == 63
+
+
+def test_the_paths_are_those_of_the_definition() -> None:
+    """Sums over the eight paths, step by step, on a small volume."""
+    generator = np.random.default_rng(0)
+    gray = generator.integers(0, 256, (9, 14), np.uint8)
+    left, right = (generator.integers(0, 2**62, gray.shape, np.uint64) for _ in range(2))
+    total = module._aggregate(gray, left, right, -3, 16, SGMOptions())
+    height, width = gray.shape
+    cost = matching_cost(left, right, -3, 16).astype(int)
+    expected = np.zeros_like(cost)
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+        path = np.zeros_like(cost)
+        for y in range(height)[:: dy or 1]:
+            for x in range(width)[:: dx or 1]:
+                before = (y - dy, x - dx)
+                path[y, x] = cost[y, x]
+                if not (0 <= before[0] < height and 0 <= before[1] < width):
+                    continue
+                change = abs(int(gray[y, x]) - int(gray[before]))
+                large = int(max(100 / (1 + change / 8), 25) * 9 / 4)
+                last = path[before]
+                steps = np.pad(last, 1, constant_values=10**6)
+                near = np.minimum(steps[:-2], steps[2:]) + 45
+                path[y, x] += np.minimum.reduce([last, near, np.full(16, last.min() + large)])
+                path[y, x] -= last.min()
+        expected += path
+    np.testing.assert_array_equal(total, expected)
+
+
+def test_it_is_at_least_as_right_as_opencv(motorcycle) -> None:
+    left, right, truth = motorcycle
+    found = semi_global_matching(left, right, DisparityRange(0, 63))
+    other = cv2.StereoSGBM_create(
+        0, 64, 5, 600, 2400, uniquenessRatio=10, speckleWindowSize=100, speckleRange=2
+    )
+    theirs = other.compute(left, right) / 16
+    shares = [
+        np.mean(np.abs(disparity - truth)[known & np.isfinite(truth)] <= 1)
+        for disparity, known in ((found.disparity, found.consistent), (theirs, theirs >= 0))
+    ]
+    assert shares[0] > shares[1] - 0.01
+    assert found.consistent.mean() > 0.75
+    both = found.consistent & (theirs >= 0)
+    assert np.median(np.abs(found.disparity - theirs)[both]) < 0.2
+
+
+def test_bands_give_nearly_what_the_whole_gives(
+    motorcycle, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left, right, _ = motorcycle
+    whole = semi_global_matching(left, right, DisparityRange(0, 63))
+    monkeypatch.setattr(module, "VOLUME_BYTES", 3 * left.shape[1] * 64 * 100)
+    bands = semi_global_matching(left, right, DisparityRange(0, 63))
+    both = whole.consistent & bands.consistent
+    assert both.mean() > 0.97 * whole.consistent.mean()
+    assert np.mean(np.abs(whole.disparity - bands.disparity)[both] > 1) < 0.01
+    assert not np.array_equal(whole.uniqueness_ratio, bands.uniqueness_ratio)  # there were bands
+
+
+def test_disparities_stay_in_their_range() -> None:
+    generator = np.random.default_rng(0)
+    left, right = (generator.integers(0, 256, (30, 50), np.uint8) for _ in range(2))
+    for search in (DisparityRange(-7, 4), DisparityRange(3, 3), DisparityRange(-49, 49)):
+        found = semi_global_matching(left, right, search)
+        inside = found.disparity[found.consistent]
+        assert ((inside >= search.min_disparity) & (inside <= search.max_disparity)).all()
+        _, column = np.nonzero(found.consistent)
+        there = column - np.rint(inside)
+        assert ((there >= 0) & (there < 50)).all()
+        assert (found.uniqueness_ratio[found.consistent] >= 0).all()
+
+
+def test_an_empty_range_is_refused() -> None:
+    with pytest.raises(OptionError, match="exchange"):
+        DisparityRange(3, 2)
+
+
+def test_larger_penalties_give_smoother_surfaces(motorcycle) -> None:
+    left, right, _ = motorcycle
+    steps = []
+    for options in (SGMOptions(p1=0, p2=0), SGMOptions(), SGMOptions(p1=80, p2=400)):
+        found = semi_global_matching(left, right, DisparityRange(0, 63), options)
+        steps.append(np.mean(np.abs(np.diff(found.disparity, axis=1)) > 1))
+    assert steps[0] > steps[1] > steps[2]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"p1": -1},
+        {"p1": 200},
+        {"p2": float("nan")},
+        {"p2": 1e4},
+        {"p2_half_gradient_levels": 0},
+        {"min_p2_to_p1": 0.5},
+    ],
+)
+def test_penalties_out_of_range_are_refused(values: dict, one_line) -> None:
+    with pytest.raises(OptionError) as error:
+        SGMOptions(**values)
+    one_line(error.value)
