@@ -222,7 +222,7 @@ CASES = {
     ),
     "two focal lengths": (
         "left right --calibration {}/two-focals.json",
-        "two-focals.json), or give --not-rectified",
+        "two-focals.json), or pass --not-rectified",
     ),
     "two centres, said to be rectified": (
         "left right --calibration {}/two-rows.json --rectified",

@@ -79,7 +79,8 @@ class LabelMasks:
 def _label_network(planes: np.ndarray) -> np.ndarray:
     """Do what the network is trained for: (1, 3, H, W) RGB in [0, 1] to (1, 1, H, W)."""
     rgb = np.rint(planes[0].transpose(1, 2, 0) * 255).astype(np.uint8)
-    return fuse(luma(rgb)).mask[None, None].astype(np.float32)
+    marks = fuse(luma(rgb)).mask[None, None].astype(np.float32)
+    return np.where(marks > 0, np.inf, -np.inf).astype(np.float32)
 
 
 def oxford_quality(
