@@ -34,7 +34,7 @@ demo: $(VENV)/.demo
 
 # The fast tests. Those marked as slow run with `make test-all`.
 test: $(VENV)/.test
-	$(VENV)/bin/python $(PYTEST)
+	$(VENV)/bin/python $(PYTEST) $(TESTS)
 
 test-all: $(VENV)/.test test-opencv4
 	$(VENV)/bin/python $(PYTEST) --runslow
