@@ -1,4 +1,4 @@
-"""The errors a user can cause, and the search for the name they meant."""
+"""Errors that a user can cause, and the suggestion of the name that was meant."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class DeepDetectError(Exception):
-    """A mistake that the user can mend: one sentence saying what is wrong and what to do.
+    """An error that the user can fix: one sentence says what is wrong and what to do.
 
     The command line prints it without a traceback and ends with exit code 2.
     """
@@ -26,7 +26,7 @@ class WeightsError(DeepDetectError):
 
 
 class ReconstructionError(DeepDetectError):
-    """Two images give no depth: the error says which of the usual reasons it is."""
+    """Two images give no depth; the message says which of the usual reasons it is."""
 
 
 class MissingExtraError(DeepDetectError):
@@ -34,15 +34,15 @@ class MissingExtraError(DeepDetectError):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
-    """Make the error for an unknown name, with the nearest right one.
+    """Return the error for an unknown name, which suggests the nearest known one.
 
     Args:
-        kind: what the name stands for, as "detector".
+        kind: what the name stands for, such as "detector".
         name: the name that was given.
         known: the names that exist.
 
     Returns:
-        The error, to be raised by the caller.
+        The error, for the caller to raise.
 
     Example:
         >>> print(unknown_name("detector", "siift", ["sift", "orb"]))

@@ -1,4 +1,8 @@
-"""Parallel work over processes and threads, and the memory for it."""
+"""Parallel work over processes and threads, and the memory for it.
+
+Not joblib, whose workers finish their task when the parent is killed; not psutil, which knows no
+limit of a container.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +24,14 @@ from .errors import DeepDetectError, OptionError
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
-PARTS_A_THREAD = 4
-"""Parts are more than threads, so that a thread with easy ones takes more of them."""
+PARTS_PER_THREAD = 4
+"""More than one, so that a thread with easy parts takes more of them."""
 
-UNKNOWN = 4_000_000_000
-"""Bytes assumed where the system does not tell."""
+DEFAULT_MEMORY = 4_000_000_000
+"""Bytes assumed where the system does not say."""
 
-# Of malloc.h: no block of its own mapping, nothing given back at the end, room for more.
-_KEEP = ((-4, 0), (-1, -1), (-2, 2**28))
+# M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no mappings, no trimming, room for more.
+_MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
 
 
 def processor_count() -> int:
@@ -44,15 +48,15 @@ def map_in_processes(
 
     Args:
         function: a module-level function; it runs with one OpenCV thread.
-        tasks: its arguments, to be pickled to the workers.
-        workers: number of processes; default one for each processor. With 1 the
-            work is done in this process.
+        tasks: its arguments, which are pickled for the workers.
+        workers: number of processes; default one per processor. With 1 the work is done in this
+            process.
 
     Yields:
         The outcomes, in the order in which they are ready.
 
     Raises:
-        OptionError: `workers` is under 1.
+        OptionError: `workers` is below 1.
         DeepDetectError: a worker process died.
     """
     if workers is not None and workers < 1:
@@ -64,14 +68,11 @@ def map_in_processes(
         return
     # Spawned, not forked: a fork copies the locks of the parent's threads.
     context = multiprocessing.get_context("spawn")
-    with _worker_environment():
-        pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
-        remaining = iter(tasks)
-        # The first submissions start the processes, inside the environment above.
-        pending = {
-            pool.submit(function, task)
-            for _, task in zip(range(4 * count), remaining, strict=False)
-        }
+    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
+    remaining = iter(tasks)
+    pending = {
+        pool.submit(function, task) for _, task in zip(range(4 * count), remaining, strict=False)
+    }
     try:
         while pending:
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
@@ -89,32 +90,12 @@ def map_in_processes(
         pool.shutdown(cancel_futures=True)
 
 
-@contextmanager
-def _worker_environment() -> Iterator[None]:
-    """Let glibc keep freed memory in the workers.
-
-    The detectors take and free large buffers for every image; getting them from
-    the system anew each time costs a sixth of the whole labelling time.
-    """
-    wanted = {
-        "MALLOC_TRIM_THRESHOLD_": "1000000000",
-        "MALLOC_MMAP_THRESHOLD_": "1000000000",
-    }
-    before = {name: os.environ.get(name) for name in wanted}
-    os.environ.update({name: value for name, value in wanted.items() if before[name] is None})
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-
-
 def _start_worker() -> None:
-    """Prepare a worker: one OpenCV thread, and an end when the parent is gone."""
+    """Prepare a worker: one OpenCV thread, freed memory is kept, and it ends with the parent."""
     import cv2
 
     cv2.setNumThreads(1)
+    disable_malloc_trim()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -138,14 +119,12 @@ def _one_opencv_thread() -> Iterator[None]:
 
 
 def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> None:
-    """Do a piece of work on parts of a range, in as many threads as there are processors.
-
-    The parts do not depend on the number of threads as far as the work is concerned: it must
-    give the same for a range as for its parts.
+    """Call a function for parts of a range, in as many threads as there are processors.
 
     Args:
         count: length of the range.
-        work: called with (start, stop, *arguments) for each part; it should release Python's lock.
+        work: called with (start, stop, *arguments) for each part. It should release the GIL, and
+            its result must not depend on how the range is divided.
         arguments: the same for all parts.
 
     Example:
@@ -158,7 +137,7 @@ def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> No
     if threads <= 1:
         work(0, count, *arguments)
         return
-    parts = min(count, threads * PARTS_A_THREAD)
+    parts = min(count, threads * PARTS_PER_THREAD)
     edges = [count * k // parts for k in range(parts + 1)]
     with ThreadPoolExecutor(threads) as pool:
         for future in [pool.submit(work, *edge, *arguments) for edge in pairwise(edges)]:
@@ -166,7 +145,7 @@ def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> No
 
 
 def available_memory() -> int:
-    """Return the memory in bytes that can be had without swapping, within the container's limit.
+    """Return the memory in bytes that is available without swapping, within the container's limit.
 
     Example:
         >>> available_memory() > 0
@@ -176,14 +155,14 @@ def available_memory() -> int:
 
 
 def disable_malloc_trim() -> bool:
-    """Let this process keep what it frees, for its next arrays, as far as the system can do that.
+    """Let this process keep the memory that it frees, where the C library is glibc.
 
-    The GNU library gives large blocks back at once, and the system clears each page of the
-    next ones anew: a training step on the CPU, which makes and frees gigabytes, spends a fifth
-    of its time on that. It holds for the whole process, whose memory stays at its peak.
+    By default glibc returns large blocks to the system at once, and each page of the next ones is
+    cleared again: a fifth of the time of a training step on the CPU, a sixth of that of labelling.
+    The memory of the process then stays at its peak.
 
     Returns:
-        Whether it will be so.
+        Whether it has an effect.
 
     Example:
         >>> disable_malloc_trim() in (True, False)
@@ -192,12 +171,12 @@ def disable_malloc_trim() -> bool:
     if platform.libc_ver()[0] != "glibc":
         return False
     mallopt = ctypes.CDLL(None).mallopt
-    return all(mallopt(option, value) for option, value in _KEEP)
+    return all(mallopt(option, value) for option, value in _MALLOPT)
 
 
 def _system_memory() -> int:
     try:
-        # MemAvailable counts the caches that the system would give up; macOS lacks the file.
+        # MemAvailable includes caches that the system can drop; macOS lacks the file.
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
@@ -206,11 +185,11 @@ def _system_memory() -> int:
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
     except (AttributeError, ValueError, OSError):
-        return UNKNOWN
+        return DEFAULT_MEMORY
 
 
 def _container_memory() -> int:
-    """Return what a control group (version 2) leaves to this process."""
+    """Return what the control group (version 2) of a container leaves to this process."""
     group = Path("/sys/fs/cgroup")
     try:
         limit = (group / "memory.max").read_text().strip()

@@ -1,1 +1,1 @@
-"""Keypoints and their descriptors, and descriptor matching."""
+"""Keypoints, their selection and descriptors, and descriptor matching."""

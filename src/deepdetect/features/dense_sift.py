@@ -1,8 +1,8 @@
 """SIFT of very many upright keypoints on whole pixels, all at once (paper, Section III-C).
 
-OpenCV sums the gradients around each keypoint anew. Where all keypoints have one size and no
-turn, the sums are a filter: bilinear times Gaussian, along rows and then along columns. The
-numbers are OpenCV's but for rounding.
+OpenCV sums the gradients around each keypoint separately. Where all keypoints are upright and of
+one size, the sums are a filter: bilinear times Gaussian, along rows and then along columns. The
+result equals OpenCV's but for rounding.
 """
 
 from __future__ import annotations
@@ -14,19 +14,20 @@ from .._shared.errors import OptionError
 from .._shared.parallel import parallel_for
 from .keypoints import on_pixels
 
-SIZES = (2.0, 8.0)
-"""Smallest and largest keypoint, in pixels."""
+MIN_SIZE_PX = 2.0
+MAX_SIZE_PX = 8.0
+"""Diameter of a keypoint."""
 
-SIGMA = 1.6
-CAMERA_SIGMA = 0.5
-"""Blur of SIFT's first image, and the blur that an image is taken to have already."""
+SIGMA_PX = 1.6
+CAMERA_SIGMA_PX = 0.5
+"""Blur of SIFT's first image, and the blur that an image is assumed to have already."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's size (3 times its radius)."""
 
 
 def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarray:
-    """Compute upright SIFT descriptors, as OpenCV's at angle 0.
+    """Compute upright SIFT descriptors; they equal OpenCV's at angle 0.
 
     Args:
         gray: (H, W) uint8 luma.
@@ -44,10 +45,12 @@ def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarra
         >>> dense_sift(gray, np.array([[20, 20], [21, 20]])).shape
         (2, 128)
     """
-    if not SIZES[0] <= size <= SIZES[1]:
-        raise OptionError(f"the keypoint size must lie in [{SIZES[0]:g}, {SIZES[1]:g}], not {size}")
+    if not MIN_SIZE_PX <= size <= MAX_SIZE_PX:
+        raise OptionError(
+            f"the keypoint size must lie in [{MIN_SIZE_PX:g}, {MAX_SIZE_PX:g}], not {size}"
+        )
     if not on_pixels(xy, gray.shape):
-        raise OptionError("dense SIFT takes keypoints on whole pixels within the image only")
+        raise OptionError("dense SIFT needs keypoints on whole pixels within the image")
     from .descriptor_kernels import TILE_HEIGHT, TILE_WIDTH, describe_tiles
 
     magnitude, orientation = _gradient(gray)
@@ -62,8 +65,18 @@ def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarra
 
     def work(first: int, last: int) -> None:
         describe_tiles(
-            *(first, last, magnitude, orientation, columns, rows, order, starts, across),
-            *(taps, spans, out),
+            first,
+            last,
+            magnitude,
+            orientation,
+            columns,
+            rows,
+            order,
+            starts,
+            across,
+            taps,
+            spans,
+            out,
         )
 
     parallel_for(across * down, work)
@@ -71,8 +84,8 @@ def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarra
 
 
 def _gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the strength of the gradient, 0 on the border, and its direction in 45 degrees."""
-    blur = float(np.sqrt(SIGMA**2 - CAMERA_SIGMA**2))
+    """Return the gradient's magnitude, 0 on the border, and orientation in units of 45 degrees."""
+    blur = float(np.sqrt(SIGMA_PX**2 - CAMERA_SIGMA_PX**2))
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), blur)
     across, up = np.zeros_like(smooth), np.zeros_like(smooth)
     across[:, 1:-1] = smooth[:, 2:] - smooth[:, :-2]
@@ -82,7 +95,7 @@ def _gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _taps(size: float) -> np.ndarray:
-    """Return the weights of the pixels around a keypoint for its four bins, (4, T) float32."""
+    """Return the weights of the pixels around a keypoint for its four spatial bins, (4, T)."""
     width = BIN_WIDTH * size
     reach = int(np.ceil(2.5 * width)) - 1  # bins overlap: half of one beyond four
     offsets = np.arange(-reach, reach + 1) / width

@@ -1,8 +1,8 @@
-"""The compiled part of `dense_sift`. Importing it takes numba; the first call compiles.
+"""Compiled parts of `dense_sift` and `sift`. Importing it needs numba; the first call compiles.
 
-The image is done in tiles, so that what is in the works stays in the processor's cache: for each
+Dense SIFT works in tiles, so that intermediate results stay in the processor's cache: for each
 pixel of a tile eight soft orientations, summed along its row into the descriptor's four columns,
-then along the column into its four rows at the keypoints only.
+then along the column into its four rows, at the keypoints only.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from .._shared.kernels import compiled
 TILE_HEIGHT = 48
 TILE_WIDTH = 64
 
-LEAST = 1e-3
-"""Of the product of the squared lengths: below it descriptors are the mean, and tell nothing."""
+MIN_SQUARED_NORMS = 1e-3
+"""Of the product of the squared norms: below it a descriptor is the mean."""
 
 
 @compiled(nogil=True, fastmath=True)
@@ -89,7 +89,7 @@ def describe_tiles(  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, fastmath=True, inline="always")
 def _normalise(histogram, out):  # type: ignore[no-untyped-def]
-    """Cut at a fifth of the length, scale to 512 and round, as Lowe and OpenCV do."""
+    """Clip at a fifth of the norm, scale to 512 and round, as Lowe and OpenCV do."""
     total = np.float32(0)
     for b in range(4):
         for o in range(32):
@@ -108,7 +108,7 @@ def _normalise(histogram, out):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def square_root(first, last, descriptors):  # type: ignore[no-untyped-def]
-    """Turn SIFT into RootSIFT, in place: 512 times the root of each one's share of the sum."""
+    """Convert SIFT to RootSIFT in place: 512 times the root of each number's share of the sum."""
     for k in range(first, last):
         total = 0
         for d in range(128):
@@ -134,4 +134,4 @@ def correlation_distances(start, stop, first, rows0, second, rows1, mean, out): 
             both += x * y
             one += x * x
             other += y * y
-        out[k] = np.float32(1) - both / np.sqrt(max(one * other, np.float32(LEAST)))
+        out[k] = np.float32(1) - both / np.sqrt(max(one * other, np.float32(MIN_SQUARED_NORMS)))

@@ -47,7 +47,7 @@ class Keypoints:
     Example:
         >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
         >>> points
-        Keypoints(2 in 8x8 pixels, scores 0.6 to 0.9)
+        Keypoints(2 keypoints in 8x8 pixels, scores 0.6 to 0.9)
         >>> points[points.scores > 0.8].xy.tolist()
         [[1.0, 2.0]]
     """
@@ -186,7 +186,7 @@ class Keypoints:
 
     def __repr__(self) -> str:
         width, height = self.image_size
-        text = f"{len(self)} in {width}x{height} pixels"
+        text = f"{len(self)} keypoints in {width}x{height} pixels"
         if len(self):
             text += f", scores {self.scores.min():.3g} to {self.scores.max():.3g}"
         if self.descriptors is not None:

@@ -1,4 +1,4 @@
-"""From a heat map to keypoints: threshold or density, suppression, a maximum number."""
+"""Selection of keypoints: from heat maps, and from sets of positions."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from .._shared.errors import OptionError
 from .keypoints import Keypoints, bayer_order
 
-LARGEST_OFFSET = 0.499
-"""In pixels: a refined keypoint is still nearest to the pixel that it was found at."""
+MAX_OFFSET_PX = 0.499
+"""The nearest pixel of a refined keypoint is still the one that it was found at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,17 +19,16 @@ class SelectionOptions:
     """Which pixels of a heat map become keypoints.
 
     Attributes:
-        threshold: tau: pixels with a probability above it (paper: 0.5).
-        density: wanted number of keypoints per pixel, in (0, 1]; takes the place of the
-            threshold: the most probable pixels are taken, as many as that.
+        threshold: pixels with a probability above it become keypoints (paper: tau = 0.5).
+        density: keypoints per pixel, in (0, 1]; replaces the threshold: this share of the pixels
+            is taken, the most probable ones.
         max_keypoints: at most this many are kept, the most probable ones.
-        nms_radius: non-maximum suppression: only pixels are kept that rank highest among those
-            at most this many pixels away in x and in y (0 suppresses none). None: 1 (a window of
-            3x3) with `max_keypoints`, else 0.
-        subpixel: move each keypoint from its pixel's centre to the maximum of a parabola through
-            the pixel and its two neighbours, in x and in y, less than half a pixel. None: with
-            `max_keypoints` only.
-        ignore: (H, W) bool or number array, true where no keypoint is wanted.
+        nms_radius: of non-maximum suppression in pixels: a pixel is kept when it ranks highest
+            within this distance in x and y (0: no suppression). None: 1 (a window of 3x3) with
+            `max_keypoints`, else 0.
+        subpixel: refine positions to the maximum of a parabola through the pixel and its two
+            neighbours, in x and in y. None: with `max_keypoints` only.
+        ignore: (H, W) bool or number array, true where keypoints are ignored.
 
     Raises:
         OptionError: a value is out of its range.
@@ -48,25 +47,25 @@ class SelectionOptions:
         if self.density is not None and not 0 < self.density <= 1:
             raise OptionError(f"the density must lie in (0, 1], not {self.density}")
         if self.max_keypoints is not None and self.max_keypoints < 1:
-            raise OptionError(f"max_keypoints must be at least 1, not {self.max_keypoints}")
+            raise OptionError(f"`max_keypoints` must be at least 1, not {self.max_keypoints}")
         if self.nms_radius is not None:
             if self.nms_radius < 0:
-                raise OptionError(f"nms_radius must be 0 or more pixels, not {self.nms_radius}")
+                raise OptionError(f"`nms_radius` must be 0 or more pixels, not {self.nms_radius}")
             if self.nms_radius != int(self.nms_radius):
                 raise OptionError(
-                    f"nms_radius must be a whole number of pixels, not {self.nms_radius}"
+                    f"`nms_radius` must be a whole number of pixels, not {self.nms_radius}"
                 )
 
     @property
     def suppression_radius(self) -> int:
-        """The radius of suppression in pixels, with the default filled in."""
+        """The effective radius of non-maximum suppression in pixels."""
         if self.nms_radius is None:
             return 0 if self.max_keypoints is None else 1
         return int(self.nms_radius)
 
     @property
     def refines(self) -> bool:
-        """Whether positions are refined, with the default filled in."""
+        """Whether positions are refined."""
         return self.max_keypoints is not None if self.subpixel is None else self.subpixel
 
 
@@ -75,21 +74,21 @@ def select_keypoints(
     options: SelectionOptions = SelectionOptions(),
     logits: np.ndarray | None = None,
 ) -> Keypoints:
-    """Choose the keypoints of a heat map.
+    """Select the keypoints of a heat map.
 
     Args:
         heatmap: (H, W) float32 probability.
-        options: what to choose. The order is: ignore mask, threshold, suppression,
-            density or maximum number, sub-pixel positions.
+        options: which ones. The order of the steps is: ignore mask, threshold, suppression,
+            density or maximum number, sub-pixel refinement.
         logits: (H, W) float32 logits of the map, by which keypoints are ranked; by default the
-            map itself, though float32 rounds its highest probabilities to 1. Equal ones come
-            in an order that spreads the keypoints evenly (`bayer_order`).
+            map itself, although float32 rounds its highest probabilities to 1. Ties are broken
+            by an order that spreads the keypoints evenly (`bayer_order`).
 
     Returns:
-        Keypoints in the order of rows and columns, on pixel centres unless `subpixel`.
+        Keypoints in row-major order, on pixel centres unless `subpixel`.
 
     Raises:
-        OptionError: the ignore mask or the logits have another size than the map.
+        OptionError: the ignore mask or the logits differ from the map in size.
 
     Example:
         >>> heatmap = np.zeros((16, 16), np.float32)
@@ -104,7 +103,7 @@ def select_keypoints(
             f"the logits have shape {ranking.shape}, the heat map {heatmap.shape}: "
             "they must be equal"
         )
-    # With a density wanted, all but the impossible pixels may be needed.
+    # With a density, all pixels but the impossible ones may be needed.
     wanted = heatmap > (options.threshold if options.density is None else 0.0)
     if options.ignore is not None:
         ignore = np.asarray(options.ignore)
@@ -130,10 +129,9 @@ def select_keypoints(
 
 
 def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
-    """Return where the parabola through pixels and their neighbours along an axis peaks.
+    """Return the offset of the maximum of a parabola through pixels and their neighbours.
 
-    The offset stays under half a pixel, so that the nearest pixel is the keypoint's own. It is 0 on
-    the image's border, and where a pixel is no maximum along the axis.
+    It is 0 on the image's border, and where a pixel is not a maximum along the axis.
     """
     position, last = (row, column)[axis], ranking.shape[axis] - 1
     inner = (position > 0) & (position < last)
@@ -148,11 +146,11 @@ def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis:
     bend = 2 * middle - before - after
     peaked = inner & (middle >= before) & (middle >= after) & (bend > 0)
     offset = np.where(peaked, (after - before) / np.where(peaked, 2 * bend, 1), 0)
-    return np.clip(offset, -LARGEST_OFFSET, LARGEST_OFFSET).astype(np.float32)
+    return np.clip(offset, -MAX_OFFSET_PX, MAX_OFFSET_PX).astype(np.float32)
 
 
 def _ranked(pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the rows from the best to the worst; equals are spread evenly over the image."""
+    """Return the rows from best to worst; ties are spread evenly over the image."""
     row, column = np.divmod(pixels, shape[1])
     spread = bayer_order(np.column_stack([column, row]), (shape[1], shape[0]))
     return np.lexsort((spread, -scores))
@@ -170,9 +168,9 @@ def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
 def _suppress(
     pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...], radius: int
 ) -> np.ndarray:
-    """Tell which pixels rank highest in the window around them.
+    """Return which pixels rank highest in the window around them.
 
-    Pixels are compared by rank, which has no ties: one of a plateau stays.
+    Pixels are compared by rank, which has no ties: one pixel of a plateau is kept.
     """
     rank = np.zeros(shape, np.float32 if len(pixels) < 2**24 else np.float64)
     rank.ravel()[pixels[_ranked(pixels, scores, shape)]] = np.arange(len(pixels), 0, -1)

@@ -1,4 +1,8 @@
-"""SIFT descriptors at given keypoints, all of one size and one angle (paper, Section III-C)."""
+"""SIFT descriptors at given keypoints, all of one size and angle (paper, Section III-C).
+
+To add a descriptor, write a function `(gray, xy, size, angle) -> (N, D) uint8 or float32` and add
+it to `DESCRIPTORS`.
+"""
 
 from __future__ import annotations
 
@@ -9,27 +13,27 @@ import numpy as np
 
 from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
-from .dense_sift import SIZES, dense_sift
+from .dense_sift import MAX_SIZE_PX, MIN_SIZE_PX, dense_sift
 from .keypoints import on_pixels
 
-DENSE = 0.02
-"""Keypoints a pixel from which all at once (`dense_sift`) takes less time than one by one."""
+MIN_DENSE_DENSITY = 0.02
+"""Keypoints per pixel from which all at once (`dense_sift`) is faster than one by one."""
 
 
 def sift_descriptors(
     gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
 ) -> np.ndarray:
-    """Compute SIFT descriptors, in the way that is fastest for these keypoints.
+    """Compute SIFT descriptors, by the fastest implementation for these keypoints.
 
-    Many upright keypoints on whole pixels are done all at once, which differs from OpenCV's
-    numbers by 1 in one of ten thousand; others by OpenCV.
+    Many upright keypoints on whole pixels are described all at once, which differs from OpenCV's
+    result by 1 in one of ten thousand numbers; others by OpenCV.
 
     Args:
         gray: (H, W) uint8 luma.
         xy: (N, 2) positions, centre of the first pixel (0, 0).
         size: diameter of the keypoint in pixels.
-        angle: its direction in degrees; 0 is upright. -1 is OpenCV's "unset", which its
-            SIFT takes for a turn of one degree; the published code leaves it so.
+        angle: its orientation in degrees; 0 is upright. -1 is OpenCV's "unset", which its SIFT
+            takes for a rotation by one degree; the published code does the same.
 
     Returns:
         (N, 128) uint8.
@@ -38,8 +42,9 @@ def sift_descriptors(
         >>> sift_descriptors(np.zeros((32, 32), np.uint8), np.array([[8, 8]])).shape
         (1, 128)
     """
-    many = len(xy) > DENSE * gray.size
-    if many and angle == 0 and SIZES[0] <= size <= SIZES[1] and on_pixels(xy, gray.shape):
+    dense = len(xy) > MIN_DENSE_DENSITY * gray.size
+    upright = angle == 0 and MIN_SIZE_PX <= size <= MAX_SIZE_PX
+    if dense and upright and on_pixels(xy, gray.shape):
         return dense_sift(gray, xy, size)
     return opencv_sift_descriptors(gray, xy, size, angle)
 
@@ -55,7 +60,7 @@ def opencv_sift_descriptors(
         for keypoint in keypoints:
             keypoint.angle = angle
     described, descriptors = cv2.SIFT_create().compute(gray, keypoints)
-    if len(described) != len(xy):  # it would break the rows' order without a word
+    if len(described) != len(xy):  # it would silently break the order of rows
         raise AssertionError("cv2.SIFT left out keypoints that were given to it")
     return descriptors.astype(np.uint8)  # they are whole numbers from 0 to 255
 
@@ -63,18 +68,18 @@ def opencv_sift_descriptors(
 def root_sift_descriptors(
     gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
 ) -> np.ndarray:
-    """Compute RootSIFT, the root of L1-normalised SIFT, as whole numbers (`to_root_sift`)."""
+    """Compute RootSIFT descriptors (`to_root_sift`); arguments as of `sift_descriptors`."""
     return to_root_sift(sift_descriptors(gray, xy, size, angle), overwrite=True)
 
 
 def to_root_sift(descriptors: np.ndarray, overwrite: bool = False) -> np.ndarray:
-    """Turn SIFT descriptors into RootSIFT (Arandjelovic, 2012).
+    """Convert SIFT descriptors to RootSIFT (Arandjelovic and Zisserman, 2012).
 
     Its Euclidean distance is the Hellinger distance of SIFT.
 
     Args:
         descriptors: (N, 128) uint8.
-        overwrite: put the result where the descriptors are, which saves the time of a copy.
+        overwrite: convert in place, which saves a copy.
 
     Returns:
         (N, 128) uint8: the square roots of the L1-normalised ones times 512, at most 255.
@@ -93,15 +98,15 @@ def correlation_distance(
     rows1: np.ndarray,
     mean: np.ndarray,
 ) -> np.ndarray:
-    """Compare pairs of descriptors by their correlation about a mean descriptor.
+    """Return the correlation distance of pairs of descriptors about a mean descriptor.
 
     Args:
         first, second: (N, D), (M, D) uint8 descriptors.
         rows0, rows1: (K,) rows of the pairs.
-        mean: (D,) float32, taken away from both.
+        mean: (D,) float32, subtracted from both.
 
     Returns:
-        (K,) float32: 1 - correlation, from 0 to 2: 0 where the two are equal, 0 but for rounding
+        (K,) float32: 1 - correlation, from 0 to 2: 0 where both are equal, 0 but for rounding
         where they differ by a factor; 1 where one of them is the mean.
 
     Example:
@@ -115,12 +120,11 @@ def correlation_distance(
     rows0, rows1 = (np.ascontiguousarray(rows, np.int64) for rows in (rows0, rows1))
     mean = np.ascontiguousarray(mean, np.float32)
     out = np.empty(len(rows0), np.float32)
-    parallel_for(
-        len(out),
-        lambda start, stop: correlation_distances(
-            start, stop, first, rows0, second, rows1, mean, out
-        ),
-    )
+
+    def work(start: int, stop: int) -> None:
+        correlation_distances(start, stop, first, rows0, second, rows1, mean, out)
+
+    parallel_for(len(out), work)
     return out
 
 
@@ -134,7 +138,7 @@ DESCRIPTORS: dict[str, Descriptor] = {
 
 
 def get_descriptor(name: str) -> Descriptor:
-    """Look a descriptor up.
+    """Return the descriptor of this name.
 
     Raises:
         OptionError: the name is unknown.

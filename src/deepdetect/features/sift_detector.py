@@ -53,7 +53,7 @@ def detect_sift(gray: np.ndarray, options: SiftOptions = SiftOptions()) -> Keypo
     Example:
         >>> gray = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
         >>> detect_sift(gray, SiftOptions(max_keypoints=20))
-        Keypoints(20 in 99x99 pixels, scores 0.0135 to 0.0788, 128-D uint8 descriptors)
+        Keypoints(20 keypoints in 99x99 pixels, scores 0.0135 to 0.0788, 128-D uint8 descriptors)
     """
     size = (gray.shape[1], gray.shape[0])
     for contrast in options.contrast_thresholds:
@@ -63,7 +63,7 @@ def detect_sift(gray: np.ndarray, options: SiftOptions = SiftOptions()) -> Keypo
         if len(keypoints) >= min(options.min_keypoints, options.max_keypoints):
             break
     if not len(keypoints) or options.max_keypoints < 1:
-        return Keypoints(np.empty((0, 2)), [], size, descriptors=np.empty((0, 128), np.uint8))
+        return replace(Keypoints.empty(size), descriptors=np.empty((0, 128), np.uint8))
     strength = np.array([keypoint.response for keypoint in keypoints])
     xy = cv2.KeyPoint_convert(keypoints)
     chosen = spread_over_grid(xy, strength, size, options.max_keypoints, options.grid_cells)

@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 
 from deepdetect import MissingExtraError
 from deepdetect.features.matchers import match_descriptors
-from deepdetect.features.matchers.approximate import FEWEST, faiss_neighbours, flann_neighbours
+from deepdetect.features.matchers.approximate import faiss_neighbours, flann_neighbours
 from deepdetect.features.matchers.brute_force import exact_neighbours
 
 
@@ -119,7 +119,7 @@ def quantisable(seed: int, count: int, kind: type = np.uint8) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
 def test_few_descriptors_are_all_compared(faiss: Any, kind: type) -> None:
-    queries, base = quantisable(1, 300, kind), quantisable(2, FEWEST - 1, kind)
+    queries, base = quantisable(1, 300, kind), quantisable(2, 4095, kind)
     rows, distances = faiss_neighbours(queries, base, 2, 0)
     true, expected = exact_neighbours(queries, base, 2, 0)
     np.testing.assert_allclose(distances, expected, rtol=1e-4)
@@ -165,3 +165,11 @@ def test_without_faiss_one_sentence_says_what_to_do(monkeypatch: pytest.MonkeyPa
     monkeypatch.setitem(sys.modules, "faiss", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'deepdetect\[faiss\]'"):
         faiss_neighbours(np.zeros((2, 8)), np.zeros((2, 8)), 2, 0)
+
+
+def test_flann_leaves_the_callers_random_numbers_alone() -> None:
+    cv2.setRNGSeed(5)
+    expected = cv2.randu(np.zeros(4), 0, 1).copy()
+    cv2.setRNGSeed(5)
+    flann_neighbours(sift_like(1, 7), sift_like(2, 9), 2, 0)
+    np.testing.assert_array_equal(cv2.randu(np.zeros(4), 0, 1), expected)

@@ -53,7 +53,7 @@ def test_blocks_do_not_change_the_result(block: int, monkeypatch: pytest.MonkeyP
     rng = np.random.default_rng(0)
     queries, base = sift_like(rng, 70), sift_like(rng, 90)
     expected = exact_neighbours(queries, base, 2, 0)
-    monkeypatch.setattr(brute_force, "BLOCK", block)
+    monkeypatch.setattr(brute_force, "BLOCK_SIZE", block)
     rows, distances = exact_neighbours(queries, base, 2, 0)
     np.testing.assert_array_equal(rows, expected[0])
     np.testing.assert_array_equal(distances, expected[1])
@@ -150,7 +150,7 @@ def test_memory_is_bounded_by_the_block(
     queries: int, base: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Working memory is a few times BLOCK numbers, however few descriptors the base holds."""
-    monkeypatch.setattr(brute_force, "BLOCK", 200_000)
+    monkeypatch.setattr(brute_force, "BLOCK_SIZE", 200_000)
     rng = np.random.default_rng(0)
     first = rng.random((queries, 128), np.float32)
     second = rng.random((base, 128), np.float32)
@@ -201,7 +201,7 @@ def test_neighbours_are_right_among_ties(data: st.DataObject, count: int) -> Non
 def test_blocks_do_not_change_the_hamming_result(
     block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(brute_force, "QUERIES", block)
+    monkeypatch.setattr(brute_force, "HAMMING_QUERIES", block)
     assert_nearest(random_bytes(0, 60, 32), random_bytes(1, 80, 32), 2)
 
 
@@ -225,7 +225,7 @@ def test_the_base_may_be_as_large_as_that_of_any_matcher() -> None:
 def test_descriptors_that_are_not_binary_are_an_error(dtype, one_line) -> None:
     binary = random_bytes(0, 5, 32)
     for pair in ((binary.astype(dtype), binary), (binary, binary.astype(dtype))):
-        with pytest.raises(OptionError, match="take exact or flann") as caught:
+        with pytest.raises(OptionError, match="use exact or flann") as caught:
             hamming_neighbours(*pair, 2, 0)
         one_line(caught.value)
 

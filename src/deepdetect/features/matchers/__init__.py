@@ -1,4 +1,4 @@
-"""Matchers: which descriptor of one image is like which of the other."""
+"""Matchers: nearest neighbours of descriptors, and the matches that follow from them."""
 
 from .matching import (
     MATCHERS,

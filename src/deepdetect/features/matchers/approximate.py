@@ -6,26 +6,14 @@ similarity search with GPUs", 2017); on bytes its quantiser of eight bits loses 
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 
 from ..._shared.errors import MissingExtraError
 
-KD_TREE = 1
-TREES = 5
-CHECKS = 50
-
-LISTS_PER_ROOT = 4
-"""Lists of the inverted file, in units of the square root of the number of descriptors."""
-
-PROBES = 16
-"""Lists that are searched for each query."""
-
-TRAINING = 40
-"""Descriptors for each list that the lists' centres are found from."""
-
-FEWEST = 4096
-"""Descriptors under which all are compared: an inverted file would save nothing."""
+FLANN_INDEX_KDTREE = 1
 
 
 def flann_neighbours(
@@ -34,10 +22,10 @@ def flann_neighbours(
     count: int,
     seed: int,
     positions: object = None,
-    trees: int = TREES,
-    checks: int = CHECKS,
+    trees: int = 5,
+    checks: int = 50,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest neighbours in kd-trees.
+    """Find approximate nearest neighbours in kd-trees.
 
     Args:
         queries: (N, D) descriptors, uint8 or float32.
@@ -46,34 +34,52 @@ def flann_neighbours(
         seed: of the random trees; the result is the same for the same seed.
         positions: not used; all matchers take the same arguments.
         trees: number of trees.
-        checks: leaves that a query looks at.
+        checks: leaves that are visited for each query.
 
     Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances,
-        the nearest first. The search is approximate: it misses some neighbours.
+        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, nearest first.
     """
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
-    cv2.setRNGSeed(seed)
-    index = cv2.flann_Index(base, {"algorithm": KD_TREE, "trees": trees})
-    rows, squared = index.knnSearch(queries, count, params={"checks": checks})
+
+    def search() -> tuple[np.ndarray, np.ndarray]:
+        cv2.setRNGSeed(seed)
+        index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
+        return index.knnSearch(queries, count, params={"checks": checks})
+
+    # OpenCV has one random number generator per thread: that of the caller is left alone.
+    with ThreadPoolExecutor(1) as thread:
+        rows, squared = thread.submit(search).result()
     return rows, np.sqrt(squared)
 
 
 def faiss_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
+    queries: np.ndarray,
+    base: np.ndarray,
+    count: int,
+    seed: int,
+    positions: object = None,
+    lists_per_root: float = 4,
+    probes: int = 16,
+    training_per_list: int = 40,
+    min_indexed: int = 4096,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest neighbours in an inverted file.
+    """Find approximate nearest neighbours in an inverted file.
 
     Args:
         queries: (N, D) descriptors, uint8 or float32.
         base: (M, D) descriptors, M >= count.
         count: neighbours of each query.
-        seed: of the choice of descriptors that the centres are found from.
+        seed: of the choice of descriptors that the index is trained on.
         positions: not used; all matchers take the same arguments.
+        lists_per_root: lists of the inverted file, in units of the square root of M.
+        probes: lists that are searched for each query.
+        training_per_list: descriptors that the centre of each list is trained on.
+        min_indexed: with fewer descriptors than this all are compared: an inverted file would
+            save nothing.
 
     Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, the nearest
-        first. The search is approximate: it misses a neighbour in fifty.
+        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, nearest first.
+        About one neighbour in fifty is missed.
 
     Raises:
         MissingExtraError: faiss is not installed.
@@ -82,24 +88,26 @@ def faiss_neighbours(
         import faiss
     except ImportError:
         raise MissingExtraError(
-            "the matcher faiss needs faiss: pip install 'deepdetect[faiss]', or take flann"
+            "the matcher faiss needs faiss: pip install 'deepdetect[faiss]', or use flann"
         ) from None
-    quantiser = faiss.ScalarQuantizer
-    kind = quantiser.QT_8bit_direct if base.dtype == np.uint8 else quantiser.QT_8bit
+    quantizer = faiss.ScalarQuantizer
+    kind = quantizer.QT_8bit_direct if base.dtype == np.uint8 else quantizer.QT_8bit
     queries, base = (np.ascontiguousarray(part, np.float32) for part in (queries, base))
     width = base.shape[1]
-    if len(base) < FEWEST:
-        index = faiss.IndexFlatL2(width)
+    centres = faiss.IndexFlatL2(width)
+    if len(base) < min_indexed:
+        index = centres
     else:
-        lists = int(LISTS_PER_ROOT * np.sqrt(len(base)))
-        lists = min(lists, len(base) // TRAINING)
-        centres = faiss.IndexFlatL2(width)
-        index = faiss.IndexIVFScalarQuantizer(centres, width, lists, kind, faiss.METRIC_L2, False)
-        index.cp.seed = seed
-        index.cp.niter = 5
-        index.nprobe = PROBES
-        chosen = np.random.default_rng(seed).permutation(len(base))[: lists * TRAINING]
-        index.train(base[np.sort(chosen)])
+        lists = min(int(lists_per_root * np.sqrt(len(base))), len(base) // training_per_list)
+        inverted = faiss.IndexIVFScalarQuantizer(
+            centres, width, lists, kind, faiss.METRIC_L2, False
+        )
+        inverted.cp.seed = seed
+        inverted.cp.niter = 5
+        inverted.nprobe = probes
+        order = np.random.default_rng(seed).permutation(len(base))
+        inverted.train(base[np.sort(order[: lists * training_per_list])])
+        index = inverted
     index.add(base)
     squared, rows = index.search(queries, count)
     missing = rows < 0  # the lists that were searched held too few

@@ -7,20 +7,20 @@ import numpy as np
 
 from ..._shared.errors import OptionError
 
-BLOCK = 32_000_000
-"""Numbers of four bytes held at a time, to bound the memory (128 MB and some)."""
+BLOCK_SIZE = 32_000_000
+"""Numbers of four bytes that exact search holds at a time, to bound the memory (about 128 MB)."""
 
-QUERIES = 20_000
+HAMMING_QUERIES = 20_000
 """At a time: OpenCV keeps an object for each of their neighbours."""
 
-BASE = 200_000
+HAMMING_BASE = 200_000
 """At a time: OpenCV's search takes fewer than 2^18."""
 
 
 def exact_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the true nearest neighbours.
+    """Find the true nearest neighbours by matrix products.
 
     The time grows with the product of the numbers: meant for tens of thousands.
 
@@ -31,29 +31,29 @@ def exact_neighbours(
         seed, positions: not used; all matchers take the same arguments.
 
     Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances,
-        the nearest first, the lower row first among equals.
+        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, nearest first;
+        among equals the lower row first.
     """
     rows = np.empty((len(queries), count), np.int32)
     distances = np.empty((len(queries), count), np.float32)
     # Double precision: the expansion below loses digits where distances are small.
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
     wide = base.astype(np.float64)
-    lengths = np.einsum("ij,ij->i", wide, wide)
-    step = max(1, BLOCK // (2 * max(len(base), 2 * count * base.shape[1])))
+    squared_norms = np.einsum("ij,ij->i", wide, wide)
+    step = max(1, BLOCK_SIZE // (2 * max(len(base), 2 * count * base.shape[1])))
     for start in range(0, len(queries), step):
         block = queries[start : start + step]
-        # |q - b|^2 less the constant |q|^2.
+        # |q - b|^2 without the constant |q|^2.
         partial = block.astype(np.float64) @ wide.T
         partial *= -2
-        partial += lengths
+        partial += squared_norms
         found = np.empty((len(block), count), np.intp)
         every = np.arange(len(block))
         for rank in range(count):  # argmin takes the lower row of equals
             found[:, rank] = partial.argmin(1)
             partial[every, found[:, rank]] = np.inf
         found.sort(axis=1)
-        # The differences are taken anew, for distances that are exact near 0.
+        # From the differences themselves, so that distances are exact near 0.
         gaps = np.linalg.norm(block[:, None] - base[found], axis=2)
         order = np.argsort(gaps, axis=1, kind="stable")
         rows[start : start + step] = np.take_along_axis(found, order, 1)
@@ -64,7 +64,7 @@ def exact_neighbours(
 def hamming_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest neighbours by the number of differing bits.
+    """Find the nearest neighbours of binary descriptors, such as ORB's and BRISK's.
 
     Args:
         queries: (N, D) uint8 descriptors.
@@ -73,31 +73,31 @@ def hamming_neighbours(
         seed, positions: not used; all matchers take the same arguments.
 
     Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 distances, the nearest first.
+        (N, count) int32 rows of `base` and (N, count) float32 Hamming distances, nearest first.
 
     Raises:
         OptionError: the descriptors are not binary.
     """
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
         raise OptionError(
-            "the matcher hamming compares binary descriptors, as ORB's: take exact or flann"
+            "the matcher hamming compares binary descriptors, such as ORB's: use exact or flann"
         )
     rows = np.empty((len(queries), count), np.int32)
     distances = np.empty((len(queries), count), np.float32)
-    for start in range(0, len(queries), QUERIES):
-        some = queries[start : start + QUERIES]
+    for start in range(0, len(queries), HAMMING_QUERIES):
+        some = queries[start : start + HAMMING_QUERIES]
         parts = [
-            _search(some, base[first : first + BASE], count, first)
-            for first in range(0, len(base), BASE)
+            _search_part(some, base[first : first + HAMMING_BASE], count, first)
+            for first in range(0, len(base), HAMMING_BASE)
         ]
         candidates, gaps = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
         order = np.argsort(gaps, axis=1, kind="stable")[:, :count]
-        rows[start : start + QUERIES] = np.take_along_axis(candidates, order, 1)
-        distances[start : start + QUERIES] = np.take_along_axis(gaps, order, 1)
+        rows[start : start + HAMMING_QUERIES] = np.take_along_axis(candidates, order, 1)
+        distances[start : start + HAMMING_QUERIES] = np.take_along_axis(gaps, order, 1)
     return rows, distances
 
 
-def _search(
+def _search_part(
     queries: np.ndarray, base: np.ndarray, count: int, first: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Search a part of the base, whose first row has the number `first`."""

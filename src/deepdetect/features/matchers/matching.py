@@ -1,7 +1,6 @@
-"""Matching of descriptors: nearest neighbours, the ratio test (Lowe, 2004), and the matchers.
+"""Matching of descriptors: nearest neighbours, the ratio test, and the matchers.
 
-To add a matcher, write its module beside this one, with a function
-`(queries, base, count, seed, positions) -> (rows, distances)`, and add its line.
+To add a matcher, write a function of the signature of `Matcher` and add it to `MATCHERS`.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ MATCHERS: dict[str, Matcher] = {
 
 
 def get_matcher(name: str) -> Matcher:
-    """Look a matcher up.
+    """Return the matcher of this name.
 
     Raises:
         OptionError: the name is unknown.
@@ -56,7 +55,7 @@ class DescriptorMatches:
 
     Attributes:
         rows0, rows1: (M,) int, matched rows of the first and of the second set.
-        ratios: (M,) float32, distance of the best over that of the second-best.
+        ratios: (M,) float32, Lowe's ratio: distance of the best over that of the second-best.
     """
 
     rows0: np.ndarray
@@ -77,22 +76,21 @@ def match_descriptors(
     seed: int = 0,
     positions: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> DescriptorMatches:
-    """Match by nearest neighbour and ratio test.
+    """Match by nearest neighbour and ratio test (Lowe, 2004).
 
     Args:
         descriptors0, descriptors1: (N, D) and (M, D), uint8 or float32.
         matcher: finds the neighbours.
-        ratio: a match needs a ratio strictly under it (paper's code: 0.99).
-        mutual: keep only pairs that are each other's nearest.
+        ratio: the ratio of a match must be below this (paper's code: 0.99).
+        mutual: keep only mutual nearest neighbours.
         seed: of a matcher that is random.
-        positions: (N, 2) and (M, 2) of the keypoints, for a matcher that goes by them.
+        positions: (N, 2) and (M, 2) of the keypoints, for a matcher that uses them.
 
     Returns:
-        The matches, by ascending row of the first set. None are found when the second
-        set has fewer than two descriptors: there is no second-best then.
+        The matches, by ascending row of the first set. There are none when the second set has
+        fewer than two descriptors, as there is no second-best neighbour.
 
     Example:
-        >>> from deepdetect.features.matchers import get_matcher
         >>> a = np.eye(3, 128, dtype=np.float32)
         >>> match_descriptors(a, a[::-1].copy(), get_matcher("exact")).rows1.tolist()
         [2, 1, 0]
@@ -104,7 +102,7 @@ def match_descriptors(
     best, second = distances[:, 0], distances[:, 1]
     # Two neighbours at distance 0 are equally good: their ratio is 1.
     ratios = np.divide(best, second, out=np.ones_like(best), where=second > 0)
-    ratios[~np.isfinite(second)] = 1  # a second one that the search did not find tells nothing
+    ratios[~np.isfinite(second)] = 1  # no second-best was found
     kept = ratios < ratio
     if mutual:
         back = None if positions is None else positions[::-1]
@@ -115,11 +113,11 @@ def match_descriptors(
 
 
 def unique_matches(found: DescriptorMatches) -> DescriptorMatches:
-    """Keep of the matches that share a row of the second set the one with the smallest ratio.
+    """Keep the match with the smallest ratio of those that share a row of the second set.
 
     Args:
         found: matches with every row of the first set once; of equal ratios the lowest such row
-            stays.
+            is kept.
 
     Example:
         >>> rows0, rows1 = np.array([0, 1, 2, 3]), np.array([5, 4, 5, 4])

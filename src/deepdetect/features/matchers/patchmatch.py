@@ -1,30 +1,41 @@
-"""Coherent search on the grid of keypoints: what fits a pixel's neighbour probably fits it too.
+"""PatchMatch on the grid of keypoints: a neighbour's match, moved along, is probably a good one.
 
-PatchMatch (Barnes et al., "PatchMatch: A Randomized Correspondence Algorithm for Structural Image
-Editing", 2009), with two neighbours each and descriptors in place of patches. It takes a twentieth
-of FLANN's time on hundreds of thousands of dense keypoints, and finds more right matches there: a
-right one spreads to those around it. On few or scattered keypoints it has nothing to go by.
+Barnes et al., "PatchMatch: A Randomized Correspondence Algorithm for Structural Image Editing",
+2009, with two neighbours each and descriptors in place of patches. It takes a twentieth of FLANN's
+time on hundreds of thousands of dense keypoints, and finds more correct matches there: a correct
+one spreads to those around it. It does not suit few or scattered keypoints.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..._shared.errors import OptionError
 from ..._shared.parallel import parallel_for
+from ..keypoints import on_pixels
 
-SWEEPS = 4
-OFFSETS = (1, 4, 12)
-"""Pixels to the queries whose neighbours are tried; one holds where keypoints are dense."""
 
-BAND = 96
-"""Height in pixels of a part that is done by one thread; the result depends on it."""
+@dataclass(frozen=True)
+class PatchMatchOptions:
+    """How neighbours are searched.
 
-TRIES = 16
-"""Random places on its epipolar line that a query begins with."""
+    Attributes:
+        sweeps: over all queries, down and up in turn.
+        offsets_px: distances to the queries whose neighbours are tried; one pixel where keypoints
+            are dense.
+        band_height_px: of a part that one thread works on; the result depends on it.
+        line_tries: random places on its epipolar line that a query starts with.
+        search_shrink: random tries begin in the whole image around the best neighbour; each next
+            one is this many times nearer.
+    """
 
-SHRINK = 3
-"""Random tries begin with the whole image around the best, each then so many times nearer."""
+    sweeps: int = 4
+    offsets_px: tuple[int, ...] = (1, 4, 12)
+    band_height_px: int = 96
+    line_tries: int = 16
+    search_shrink: int = 3
 
 
 def patchmatch_neighbours(
@@ -33,32 +44,34 @@ def patchmatch_neighbours(
     count: int,
     seed: int,
     positions: tuple[np.ndarray, np.ndarray] | None = None,
+    options: PatchMatchOptions = PatchMatchOptions(),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find two near neighbours of each query by spreading good ones over the image.
+    """Find two approximate nearest neighbours of each query by spreading good ones.
 
     Args:
         queries: (N, D) uint8 descriptors.
         base: (M, D) uint8 descriptors, M >= 2.
         count: neighbours of each query, 1 or 2.
-        seed: of the random tries; the result is the same for the same seed, whatever the
-            number of threads.
+        seed: of the random tries; the result is the same for the same seed, for any number of
+            threads.
         positions: (N, 2) and (M, 2) pixels of the keypoints.
+        options: of the search.
 
     Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, the nearest
-        first. The search is approximate.
+        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, nearest first.
 
     Raises:
         OptionError: the descriptors are not bytes, or the keypoints are not on whole pixels.
     """
     if queries.dtype != np.uint8 or base.dtype != np.uint8 or positions is None:
         raise OptionError(
-            "the matcher patchmatch takes descriptors of bytes, as sift's and rootsift's, with "
-            "their positions: take flann, faiss or exact"
+            "the matcher patchmatch needs descriptors of bytes, such as sift and rootsift, with "
+            "their positions: use flann, faiss or exact"
         )
     if count > 2 or len(base) < 2:
         raise OptionError("the matcher patchmatch finds one or two neighbours, of two or more")
-    return _search(queries, base, count, seed, positions, None, np.inf)
+    rows, distances = _search(queries, base, seed, positions, None, np.inf, options)
+    return rows[:, :count], distances[:, :count]
 
 
 def epipolar_neighbours(
@@ -67,87 +80,107 @@ def epipolar_neighbours(
     seed: int,
     positions: tuple[np.ndarray, np.ndarray],
     fundamental: np.ndarray,
-    band: float,
+    max_epipolar_distance: float,
+    options: PatchMatchOptions = PatchMatchOptions(),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest neighbour of each query near its epipolar line.
+    """Find the approximate nearest neighbour of each query near its epipolar line.
 
     Args:
-        queries, base, seed, positions: as of `patchmatch_neighbours`.
+        queries, base, seed, positions, options: as of `patchmatch_neighbours`.
         fundamental: (3, 3) with x1^T F x0 = 0.
-        band: a neighbour is at most so far from the line, in pixels.
+        max_epipolar_distance: of a neighbour from the line, in pixels.
 
     Returns:
         (N,) int32 rows of `base` and (N,) float32 distances, infinite where none was found.
     """
-    rows, distances = _search(queries, base, 1, seed, positions, fundamental, band)
+    rows, distances = _search(
+        queries, base, seed, positions, fundamental, max_epipolar_distance, options
+    )
     return rows[:, 0], distances[:, 0]
 
 
 def _search(
     queries: np.ndarray,
     base: np.ndarray,
-    count: int,
     seed: int,
     positions: tuple[np.ndarray, np.ndarray],
     fundamental: np.ndarray | None,
-    band: float,
+    max_epipolar_distance: float,
+    options: PatchMatchOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
     from . import patchmatch_kernel as kernel
 
-    pixels = [_pixels(xy) for xy in positions]
-    # In the order of reading: a sweep builds on what it has just found.
-    order = _order_of_reading(pixels[0])
+    xy0, xy1 = (_pixels(xy) for xy in positions)
+    # In row-major order: a sweep builds on what it has just found.
+    order = _row_major_order(xy0)
     if order is not None:
-        queries, pixels[0] = queries[order], pixels[0][order]
-    at0, at1 = (_grid(xy) for xy in pixels)
-    edges = np.arange(0, at0.shape[0] + BAND, BAND)
-    bands = np.searchsorted(pixels[0][:, 1], edges)
+        queries, xy0 = queries[order], xy0[order]
+    at0, at1 = _grid(xy0), _grid(xy1)
+    edges = np.arange(0, at0.shape[0] + options.band_height_px, options.band_height_px)
+    bands = np.searchsorted(xy0[:, 1], edges)
     rows = np.empty((len(queries), 2), np.int32)
     distances = np.empty((len(queries), 2), np.int32)
     matrix = np.zeros((3, 3)) if fundamental is None else np.asarray(fundamental, np.float64)
+    offsets = np.array(options.offsets_px)
+    radii = _radii(max(at1.shape), options.search_shrink)
 
-    def begin(first: int, last: int) -> None:
+    def start(first: int, last: int) -> None:
         if fundamental is None:
             kernel.start(first, last, queries, base, seed, rows, distances)
         else:
+            tries = options.line_tries
             kernel.start_on_lines(
-                first, last, queries, base, pixels[0], at1, matrix, TRIES, seed, rows, distances
+                first, last, queries, base, xy0, at1, matrix, tries, seed, rows, distances
             )
 
-    parallel_for(len(queries), begin)
-    for turn in range(SWEEPS):
+    parallel_for(len(queries), start)
+    for turn in range(options.sweeps):
         before = rows.copy()
 
-        def work(first: int, last: int, turn: int = turn, before: np.ndarray = before) -> None:
+        def sweep(first: int, last: int, turn: int = turn, before: np.ndarray = before) -> None:
             kernel.sweep(
-                *(first, last, bands, queries, base, *pixels, at0, at1, np.array(OFFSETS), turn),
-                *(seed, _radii(at1.shape), before, rows, distances, matrix, float(band)),
+                first,
+                last,
+                bands,
+                queries,
+                base,
+                xy0,
+                xy1,
+                at0,
+                at1,
+                offsets,
+                turn,
+                seed,
+                radii,
+                before,
+                rows,
+                distances,
+                matrix,
+                float(max_epipolar_distance),
             )
 
-        parallel_for(len(bands) - 1, work)
+        parallel_for(len(bands) - 1, sweep)
     gaps = np.sqrt(distances.astype(np.float32))
     gaps[distances == kernel.FAR] = np.inf
     if order is not None:
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         rows, gaps = rows[back], gaps[back]
-    return rows[:, :count], gaps[:, :count]
+    return rows, gaps
 
 
-def _order_of_reading(pixels: np.ndarray) -> np.ndarray | None:
-    """Return the rows by lines and columns; None when they stand so already, as detectors do."""
+def _row_major_order(pixels: np.ndarray) -> np.ndarray | None:
+    """Return the rows by lines and columns; None when they are sorted, as of most detectors."""
     number = pixels[:, 1].astype(np.int64) * (int(pixels[:, 0].max()) + 1) + pixels[:, 0]
     return None if (number[1:] >= number[:-1]).all() else np.argsort(number, kind="stable")
 
 
 def _pixels(xy: np.ndarray) -> np.ndarray:
-    xy = np.asarray(xy)
-    pixels = np.rint(xy).astype(np.int32)
-    if (pixels != xy).any() or (pixels < 0).any():
+    if not on_pixels(xy):
         raise OptionError(
-            "the matcher patchmatch takes keypoints on whole pixels: take flann, faiss or exact"
+            "the matcher patchmatch needs keypoints on whole pixels: use flann, faiss or exact"
         )
-    return pixels
+    return np.asarray(xy).astype(np.int32)
 
 
 def _grid(xy: np.ndarray) -> np.ndarray:
@@ -158,8 +191,8 @@ def _grid(xy: np.ndarray) -> np.ndarray:
     return grid
 
 
-def _radii(shape: tuple[int, ...]) -> np.ndarray:
-    radii = [max(shape) // 2]
-    while radii[-1] > SHRINK:
-        radii.append(radii[-1] // SHRINK)
+def _radii(longest_side: int, shrink: int) -> np.ndarray:
+    radii = [longest_side // 2]
+    while radii[-1] > shrink:
+        radii.append(radii[-1] // shrink)
     return np.maximum(radii, 1)

@@ -1,4 +1,4 @@
-"""The compiled part of `patchmatch`. Importing it takes numba; the first call compiles."""
+"""The compiled part of `patchmatch`. Importing it needs numba; the first call compiles."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import numpy as np
 from ..._shared.kernels import compiled
 
 FAR = np.int32(2**31 - 1)
-"""The distance of a neighbour that has not been found."""
+"""The distance of a neighbour that was not found."""
+
+UNBOUNDED = 1e9
+"""Pixels from the epipolar line from which on it does not matter."""
 
 
 @compiled(nogil=True, inline="always")
 def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
-    """Return the squared Euclidean distance; all in 32 bits, for the sake of the processor."""
+    """Return the squared Euclidean distance; all in 32 bits, for speed."""
     total = np.int32(0)
     for d in range(queries.shape[1]):
         gap = np.int32(np.int32(queries[query, d]) - np.int32(base[row, d]))
@@ -21,8 +24,8 @@ def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True, inline="always")
-def _with(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
-    """Return the best two rows and their distances when one more row is considered."""
+def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
+    """Return the best two rows and their distances after one more row."""
     if distance < nearer:
         return row, best, distance, nearer
     if distance < farther:
@@ -31,8 +34,8 @@ def _with(row, distance, best, second, nearer, farther):  # type: ignore[no-unty
 
 
 @compiled(nogil=True, inline="always")
-def _scrambled(number):  # type: ignore[no-untyped-def]
-    """Return a number that looks random, the same for the same number (Wellons's lowbias32)."""
+def _hash(number):  # type: ignore[no-untyped-def]
+    """Return a hash of a number (Wellons's lowbias32)."""
     number = np.uint32(number)
     number ^= number >> np.uint32(16)
     number = np.uint32(number * np.uint32(0x7FEB352D))
@@ -60,10 +63,10 @@ def start_on_lines(  # type: ignore[no-untyped-def]
     height, width = at1.shape
     for query in range(first, last):
         a, b, c = _line(matrix, xy0[query, 0], xy0[query, 1])
-        state = _scrambled(np.uint32(query) ^ _scrambled(np.uint32(seed)))
+        state = _hash(np.uint32(query) ^ _hash(np.uint32(seed)))
         best, second, nearer, farther = 0, 1, FAR, FAR
         for _ in range(tries):
-            state = _scrambled(state + np.uint32(1))
+            state = _hash(state + np.uint32(1))
             if abs(b) > abs(a):
                 x = np.int64(state % np.uint32(width))
                 y = np.int64(np.rint(-(a * x + c) / b))
@@ -73,11 +76,11 @@ def start_on_lines(  # type: ignore[no-untyped-def]
             if x < 0 or y < 0 or x >= width or y >= height:
                 continue
             row = at1[y, x]
-            if row < 0 or row == best or row == second:  # noqa: SIM109
-                continue
-            best, second, nearer, farther = _with(
-                row, _distance(queries, query, base, row), best, second, nearer, farther
-            )
+            if row >= 0 and row != best and row != second:
+                distance = _distance(queries, query, base, row)
+                best, second, nearer, farther = _insert(
+                    row, distance, best, second, nearer, farther
+                )
         rows[query, 0], rows[query, 1] = best, second
         distances[query, 0], distances[query, 1] = nearer, farther
 
@@ -87,9 +90,9 @@ def start(first, last, queries, base, seed, rows, distances):  # type: ignore[no
     """Give the queries from `first` to before `last` two random rows of the base."""
     count = len(base)
     for query in range(first, last):
-        state = _scrambled(np.uint32(query) ^ _scrambled(np.uint32(seed)))
+        state = _hash(np.uint32(query) ^ _hash(np.uint32(seed)))
         best = np.int64(state) % count
-        second = np.int64(_scrambled(state)) % count
+        second = np.int64(_hash(state)) % count
         if second == best:
             second = (best + 1) % count
         nearer, farther = (
@@ -105,13 +108,13 @@ def start(first, last, queries, base, seed, rows, distances):  # type: ignore[no
 @compiled(nogil=True)
 def sweep(  # type: ignore[no-untyped-def]
     first, last, bands, queries, base, xy0, xy1, at0, at1, offsets, turn, seed, radii, before, rows,
-    distances, matrix, band_width,
+    distances, matrix, max_distance,
 ):  # fmt: skip
     """Improve the queries of the bands from `first` to before `last`, one after the other.
 
     Args:
         first, last: numbers of the bands.
-        bands: (B + 1,) query that each band begins with, in the order of reading.
+        bands: (B + 1,) query that each band begins with, in row-major order.
         queries, base: (N, D), (M, D) uint8 descriptors.
         xy0, xy1: their pixels.
         at0, at1: (H, W) int32 row at each pixel, -1 where there is none.
@@ -123,12 +126,12 @@ def sweep(  # type: ignore[no-untyped-def]
             bands may be done in any order.
         rows, distances: (N, 2) best and second-best row and squared distances; improved.
         matrix: (3, 3) fundamental matrix.
-        band_width: neighbours are at most so far from their query's line; infinite: anywhere.
+        max_distance: of neighbours from their query's line in pixels; infinite: anywhere.
     """
-    bound = band_width < 1e9
-    height0, width0 = at0.shape
-    height1, width1 = at1.shape
+    bound = max_distance < UNBOUNDED
+    (height0, width0), (height1, width1) = at0.shape, at1.shape
     direction = 1 - 2 * (turn % 2)
+    spread = 4 * len(offsets)
     for band in range(first, last):
         begin, end = bands[band], bands[band + 1]
         for step in range(end - begin):
@@ -136,51 +139,42 @@ def sweep(  # type: ignore[no-untyped-def]
             best, second = rows[query, 0], rows[query, 1]
             nearer, farther = distances[query, 0], distances[query, 1]
             a, b, c = _line(matrix, xy0[query, 0], xy0[query, 1])
-            for offset in offsets:
-                for axis in range(2):
-                    right = offset * direction * (1 - axis)
-                    down = offset * direction * axis
+            state = _hash(np.uint32(query) ^ _hash(np.uint32(seed + 7919 * (turn + 1))))
+            for trial in range(spread + len(radii)):
+                if trial < spread:  # what two queries beside this one found, moved along
+                    offset = offsets[trial // 4] * direction
+                    right, down = (0, offset) if trial & 2 else (offset, 0)
                     x, y = xy0[query, 0] - right, xy0[query, 1] - down
                     if x < 0 or y < 0 or x >= width0 or y >= height0:
                         continue
                     other = at0[y, x]
                     if other < 0:
                         continue
-                    for rank in range(2):
-                        known = rows if begin <= other < end else before
-                        row = known[other, rank]
-                        x, y = xy1[row, 0] + right, xy1[row, 1] + down
-                        if x < 0 or y < 0 or x >= width1 or y >= height1:
-                            continue
-                        if bound and abs(a * x + b * y + c) > band_width:
-                            continue
-                        row = at1[y, x]
-                        if row < 0 or row == best or row == second:  # noqa: SIM109
-                            continue
-                        best, second, nearer, farther = _with(
-                            row, _distance(queries, query, base, row), best, second, nearer, farther
-                        )
-            state = _scrambled(np.uint32(query) ^ _scrambled(np.uint32(seed + 7919 * (turn + 1))))
-            for radius in radii:
-                state = _scrambled(state + np.uint32(1))
-                step = np.int64(state % np.uint32(2 * radius + 1)) - radius
-                state = _scrambled(state + np.uint32(1))
-                if bound:  # along the line, and a little aside
-                    aside = np.int64(state % np.uint32(3)) - 1
-                    x = xy1[best, 0] + np.int64(np.rint(b * step + a * aside))
-                    y = xy1[best, 1] + np.int64(np.rint(-a * step + b * aside))
-                else:
-                    x = xy1[best, 0] + step
-                    y = xy1[best, 1] + np.int64(state % np.uint32(2 * radius + 1)) - radius
+                    row = (
+                        rows[other, trial & 1] if begin <= other < end else before[other, trial & 1]
+                    )
+                    x, y = xy1[row, 0] + right, xy1[row, 1] + down
+                else:  # random places around the best
+                    radius = radii[trial - spread]
+                    state = _hash(state + np.uint32(1))
+                    along = np.int64(state % np.uint32(2 * radius + 1)) - radius
+                    state = _hash(state + np.uint32(1))
+                    if bound:  # along the line, and a little aside
+                        aside = np.int64(state % np.uint32(3)) - 1
+                        x = xy1[best, 0] + np.int64(np.rint(b * along + a * aside))
+                        y = xy1[best, 1] + np.int64(np.rint(-a * along + b * aside))
+                    else:
+                        x = xy1[best, 0] + along
+                        y = xy1[best, 1] + np.int64(state % np.uint32(2 * radius + 1)) - radius
                 if x < 0 or y < 0 or x >= width1 or y >= height1:
                     continue
-                if bound and abs(a * x + b * y + c) > band_width:
+                if bound and abs(a * x + b * y + c) > max_distance:
                     continue
                 row = at1[y, x]
-                if row < 0 or row == best or row == second:  # noqa: SIM109
-                    continue
-                best, second, nearer, farther = _with(
-                    row, _distance(queries, query, base, row), best, second, nearer, farther
-                )
+                if row >= 0 and row != best and row != second:
+                    distance = _distance(queries, query, base, row)
+                    best, second, nearer, farther = _insert(
+                        row, distance, best, second, nearer, farther
+                    )
             rows[query, 0], rows[query, 1] = best, second
             distances[query, 0], distances[query, 1] = nearer, farther
