@@ -1,8 +1,8 @@
-"""How the kernels are compiled. Importing this takes numba; nothing is compiled before a call.
+"""Compilation of the kernels by numba, at the first call of each.
 
-The compiled code is kept where numba keeps it: in NUMBA_CACHE_DIR, in `__pycache__` beside the
+The compiled code is cached where numba does so: in NUMBA_CACHE_DIR, in `__pycache__` beside the
 module, or in the user's cache folder. Where none of them can be written, as in a read-only
-container, it is kept in a folder of this user in the temporary directory, or else not at all.
+container, it is cached in a folder of this user in the temporary directory, or else not at all.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from typing import Any
 import numba
 
 _lock = threading.Lock()
+_config: Any = numba.config  # its names are made at run time
 
 
 def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function with numba at its first call.
+    """Return a decorator that compiles a function with numba at its first call, and caches it.
 
     Args:
         flags: of `numba.njit`, all but `cache`.
@@ -30,33 +31,33 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     def decorate(function: Callable[..., Any]) -> Any:
         try:
             return numba.njit(cache=True, **flags)(function)
-        except RuntimeError:  # numba found no folder that can be written
+        except RuntimeError:  # numba found no writable folder
             return _compiled_elsewhere(function, flags)
 
     return decorate
 
 
 def _compiled_elsewhere(function: Callable[..., Any], flags: dict[str, Any]) -> Any:
-    """Compile a function for which numba has no folder: with one of ours, or without a cache."""
+    """Compile with a cache folder of our own, or without a cache."""
     folder = _temporary_folder()
     if folder is None:
         return numba.njit(**flags)(function)
     with _lock:
-        before = numba.config.CACHE_DIR
+        before = _config.CACHE_DIR
         # Read while a function is decorated, not when it is called.
-        numba.config.CACHE_DIR = str(folder)
+        _config.CACHE_DIR = str(folder)
         try:
             return numba.njit(cache=True, **flags)(function)
-        except RuntimeError:  # no space left there, or numba was told to look elsewhere only
+        except RuntimeError:  # no space left there, or numba is set to look elsewhere only
             return numba.njit(**flags)(function)
         finally:
-            numba.config.CACHE_DIR = before
+            _config.CACHE_DIR = before
 
 
 def _temporary_folder() -> Path | None:
-    """Return a folder in the temporary directory that is this user's alone, if there can be one.
+    """Return a folder in the temporary directory that only this user can write, if possible.
 
-    Who can write there can have us run anything, and the temporary directory is everyone's.
+    Whoever can write there can make us run any code.
     """
     if not hasattr(os, "getuid"):
         return None

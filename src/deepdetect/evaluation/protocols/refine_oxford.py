@@ -82,7 +82,7 @@ def _refine(pair: PlanarPair, path: Path) -> RefinedPair:
     if start is not None:
         found.append(refine_homography(gray0, gray1, start))
     best = max(found, key=lambda refinement: refinement.zncc)
-    published = found[0].before
+    published = found[0].initial_zncc
     size0, size1 = ((gray.shape[1], gray.shape[0]) for gray in (gray0, gray1))
     moved = displacement(best.homography, pair.homography, size0, size1)
     there = pair.first.with_name(path.name)  # read before it may be written over

@@ -7,6 +7,7 @@ similarity search with GPUs", 2017); on bytes its quantiser of eight bits loses 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import cv2
 import numpy as np
@@ -95,19 +96,15 @@ def faiss_neighbours(
     queries, base = (np.ascontiguousarray(part, np.float32) for part in (queries, base))
     width = base.shape[1]
     centres = faiss.IndexFlatL2(width)
-    if len(base) < min_indexed:
-        index = centres
-    else:
+    index: Any = centres
+    if len(base) >= min_indexed:
         lists = min(int(lists_per_root * np.sqrt(len(base))), len(base) // training_per_list)
-        inverted = faiss.IndexIVFScalarQuantizer(
-            centres, width, lists, kind, faiss.METRIC_L2, False
-        )
-        inverted.cp.seed = seed
-        inverted.cp.niter = 5
-        inverted.nprobe = probes
+        index = faiss.IndexIVFScalarQuantizer(centres, width, lists, kind, faiss.METRIC_L2, False)
+        index.cp.seed = seed
+        index.cp.niter = 5
+        index.nprobe = probes
         order = np.random.default_rng(seed).permutation(len(base))
-        inverted.train(base[np.sort(order[: lists * training_per_list])])
-        index = inverted
+        index.train(base[np.sort(order[: lists * training_per_list])])
     index.add(base)
     squared, rows = index.search(queries, count)
     missing = rows < 0  # the lists that were searched held too few
