@@ -84,6 +84,7 @@ def temporary_folder(sealed: Path) -> Path:
     return sealed.parent / "temporary" / f"deepdetect-numba-{os.getuid()}"
 
 
+@pytest.mark.slow
 def test_matching_where_nothing_can_be_written_beside_the_package(sealed: Path) -> None:
     source = sealed.parent / "source"
     shutil.copytree(PACKAGE, source / "deepdetect", ignore=shutil.ignore_patterns("__pycache__"))
@@ -105,6 +106,7 @@ def test_the_cache_in_the_temporary_directory(sealed: Path) -> None:
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
 
 
+@pytest.mark.slow
 @needs_users
 @pytest.mark.parametrize("kind", ["file", "link", "open to others"])
 def test_a_folder_that_another_user_may_have_made_is_not_taken(kind: str, sealed: Path) -> None:
@@ -136,6 +138,7 @@ def test_a_folder_of_another_user_is_not_taken(sealed: Path) -> None:
 @pytest.mark.skipif(
     not hasattr(numba.config, "CACHE_LOCATOR_CLASSES"), reason="needs a later numba"
 )
+@pytest.mark.slow
 def test_where_numba_is_told_to_look_nowhere_else(sealed: Path) -> None:
     assert run(ADD, sealed, NUMBA_CACHE_LOCATOR_CLASSES="InTreeCacheLocator") == "None 0"
 

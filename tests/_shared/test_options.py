@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from deepdetect._shared.errors import OptionError
-from deepdetect._shared.options import option_names, replace_options
+from deepdetect._shared.options import option_names, replace_options, suggest_keywords
 from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry import GeometryOptions
 from deepdetect.matching.options import PRESETS, MatchingOptions
@@ -42,7 +42,7 @@ class Outer:
         ({"inner": Inner(name="x"), "depth": 7}, Outer(inner=Inner(7, "x"))),
     ],
 )
-def test_changed(changes: dict[str, object], expected: Outer) -> None:
+def test_replace_options(changes: dict[str, object], expected: Outer) -> None:
     options = Outer()
     assert replace_options(options, **changes) == expected
     assert options == Outer()
@@ -97,3 +97,17 @@ def test_no_name_is_used_twice(preset: str) -> None:
     groups += [options.heatmap] if options.heatmap is not None else []
     every = [name for group in groups for name in type(group).__dataclass_fields__]
     assert sorted(every) == sorted(option_names(options))
+
+
+def test_a_decorated_function_suggests_the_right_keyword() -> None:
+    @suggest_keywords
+    def detect(image: str, *, max_keypoints: int | None = None) -> int | None:
+        """Detect."""
+        return max_keypoints
+
+    assert detect("a.png", max_keypoints=5) == 5
+    assert detect.__doc__ == "Detect."
+    with pytest.raises(OptionError, match="did you mean 'max_keypoints'"):
+        detect("a.png", maxkeypoints=5)
+    with pytest.raises(TypeError):
+        detect()

@@ -20,9 +20,9 @@ def every_pixel(gray: np.ndarray) -> np.ndarray:
     return np.column_stack([column.ravel(), row.ravel()])
 
 
-@pytest.mark.parametrize("size", [2.0, 2.5, 3.0, 4.0, 5.3, 6.4, 8.0])
+@pytest.mark.parametrize("size", [2.0, 3.0, 5.3, 8.0])
 def test_equals_opencv_on_every_pixel_of_a_photograph(photo: np.ndarray, size: float) -> None:
-    gray = luma(photo)[:150, :220]
+    gray = luma(photo)[:100, :140]
     xy = every_pixel(gray)
     found = dense_sift(gray, xy, size)
     difference = np.abs(found.astype(int) - opencv_sift_descriptors(gray, xy, size))

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from deepdetect import OptionError
 from deepdetect.evaluation.baselines import CLASSICAL
-from deepdetect.features.keypoints import Keypoints, bayer_order
+from deepdetect.features.keypoints import Keypoints, bayer_order, on_pixels
 from deepdetect.io.image import luma
 
 SIZE = (256, 256)
@@ -248,3 +248,32 @@ def test_positions_between_pixels_go_with_the_nearest() -> None:
 
 def test_no_positions_have_no_ranks() -> None:
     assert bayer_order(np.empty((0, 2)), (8, 8)).shape == (0,)
+
+
+def test_the_logits_rank_where_there_are_any() -> None:
+    points = Keypoints(np.zeros((3, 2)), [1, 1, 1], (8, 8), logits=[20, 30, 25])
+    assert points.best(2).logits.tolist() == [30, 25]
+
+
+@pytest.mark.parametrize("name", ["logits", "sizes", "angles", "octaves", "descriptors"])
+def test_every_column_needs_one_row_per_keypoint(name: str, one_line) -> None:
+    with pytest.raises(OptionError) as caught:
+        Keypoints(np.zeros((3, 2)), np.zeros(3), SIZE, **{name: np.zeros((2, 4))})
+    assert name in str(caught.value)
+    one_line(caught.value)
+
+
+def test_the_text_of_keypoints_is_one_short_line() -> None:
+    assert repr(Keypoints.empty((640, 480))) == "Keypoints(0 keypoints in 640x480 pixels)"
+    described = Keypoints([[1, 2]], [0.25], (640, 480), descriptors=np.zeros((1, 128), np.uint8))
+    assert repr(described) == (
+        "Keypoints(1 keypoints in 640x480 pixels, scores 0.25 to 0.25, 128-D uint8 descriptors)"
+    )
+
+
+def test_whole_pixels_are_told_from_others() -> None:
+    assert on_pixels([[0, 0], [7, 4]], (5, 8))
+    assert on_pixels([[70, 40]])
+    assert not on_pixels([[8, 4]], (5, 8))
+    assert not on_pixels([[-1, 0]])
+    assert not on_pixels([[1.5, 0]])

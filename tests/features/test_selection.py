@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from deepdetect import DeepDetect
 from deepdetect._shared.errors import OptionError
 from deepdetect.features.keypoints import Keypoints
-from deepdetect.features.selection import SelectionOptions, select_keypoints
+from deepdetect.features.selection import SelectionOptions, grid_subsample, select_keypoints
 
 
 def bayer(bits: int) -> np.ndarray:
@@ -63,7 +63,6 @@ LEVELS = st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0]) | st.floats(0, 1, width=32
 SHAPES = st.tuples(st.integers(1, 12), st.integers(1, 12))
 
 
-@settings(max_examples=300)
 @given(data=st.data(), shape=SHAPES)
 def test_equals_plain_loops(data: st.DataObject, shape: tuple[int, int]) -> None:
     heatmap = data.draw(arrays(np.float32, shape, elements=LEVELS))
@@ -312,3 +311,13 @@ def test_logits_of_another_size() -> None:
         select_keypoints(np.zeros((4, 5), np.float32), logits=np.zeros((5, 4), np.float32))
     with pytest.raises(OptionError, match="as many logits as scores"):
         Keypoints([[1, 2]], [0.5], (8, 5), [1.0, 2.0])
+
+
+def test_grid_subsample_takes_one_of_each_cell() -> None:
+    points = np.random.default_rng(0).uniform(0, 100, (5000, 2))
+    rows = grid_subsample(points, 10)
+    assert len(rows) == 100
+    assert len(np.unique(points[rows] // 10, axis=0)) == 100
+    assert (np.diff(rows) > 0).all()
+    np.testing.assert_array_equal(rows, grid_subsample(points, 10))
+    assert (rows != grid_subsample(points, 10, seed=1)).any()

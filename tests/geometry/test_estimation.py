@@ -92,9 +92,8 @@ def assert_consistent(geometry: Geometry, count: int) -> None:
 
 
 @every_way
-@pytest.mark.parametrize("seed", [0, 1])
-def test_finds_the_model_among_outliers(model: str, estimator: str, seed: int) -> None:
-    scene = make_scene(model, seed)
+def test_finds_the_model_among_outliers(model: str, estimator: str) -> None:
+    scene = make_scene(model)
     geometry = estimate_geometry(scene.points0, scene.points1, make_options(model, estimator))
     assert geometry.model == model
     assert_consistent(geometry, len(scene.true))
@@ -102,7 +101,7 @@ def test_finds_the_model_among_outliers(model: str, estimator: str, seed: int) -
     # A random point falls near a line of 480 pixels far more often than near a point.
     assert geometry.inliers[~scene.true].mean() < (0.01 if model == "homography" else 0.05)
     # Judged on other matches, without noise: the model itself is right.
-    fresh = make_scene(model, seed + 100, outliers=0, noise=0)
+    fresh = make_scene(model, 100, outliers=0, noise=0)
     assert np.median(judged(fresh.points0, fresh.points1, model, geometry.matrix)) < 0.3
 
 
@@ -117,34 +116,14 @@ def test_without_noise_the_matrix_is_the_true_one(model: str, estimator: str) ->
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_essential_gives_rotation_and_direction(estimator: str, seed: int) -> None:
-    scene = make_scene("essential", seed, noise=0.1)
+def test_essential_gives_rotation_and_direction(estimator: str) -> None:
+    scene = make_scene("essential", noise=0.1)
     options = make_options("essential", estimator)
     matrix = estimate_geometry(scene.points0, scene.points1, options).matrix
     first, second, shift = cv2.decomposeEssentialMat(matrix)
     cosines = [(np.trace(turn @ TURN.T) - 1) / 2 for turn in (first, second)]
     assert np.degrees(np.arccos(min(1.0, max(cosines)))) < 1
     assert np.degrees(np.arccos(min(1.0, abs(float(shift[:, 0] @ SHIFT))))) < 3
-
-
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_an_essential_matrix_has_two_equal_singular_values_and_a_zero(estimator: str) -> None:
-    scene = make_scene("essential")
-    options = make_options("essential", estimator)
-    matrix = estimate_geometry(scene.points0, scene.points1, options).matrix
-    first, second, third = np.linalg.svd(matrix)[1]
-    assert second / first > 0.99
-    assert third / first < 1e-3
-
-
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_a_fundamental_matrix_has_rank_two(estimator: str) -> None:
-    scene = make_scene("fundamental")
-    options = make_options("fundamental", estimator)
-    matrix = estimate_geometry(scene.points0, scene.points1, options).matrix
-    singular = np.linalg.svd(matrix)[1]
-    assert singular[2] / singular[0] < 1e-6
 
 
 @every_way
@@ -169,41 +148,6 @@ def test_the_seed_decides_the_samples(model: str, estimator: str) -> None:
         for seed in range(6)
     }
     assert len(found) > 1
-
-
-def opencv_fit(scene: Scene, model: str, method: int) -> np.ndarray:
-    if model == "homography":
-        return cv2.findHomography(
-            scene.points0, scene.points1, method, 1.0, maxIters=10_000, confidence=0.999
-        )[0]
-    if model == "fundamental":
-        return cv2.findFundamentalMat(scene.points0, scene.points1, method, 1.0, 0.999, 10_000)[0]
-    points0 = cv2.undistortPoints(scene.points0, CAMERA0, None)
-    points1 = cv2.undistortPoints(scene.points1, CAMERA1, None)
-    threshold = 1 / 620  # a pixel over the mean focal length
-    return cv2.findEssentialMat(
-        points0, points1, np.eye(3), method, 0.999, threshold, maxIters=10_000
-    )[0]
-
-
-@every_way
-def test_judges_as_well_as_opencv_does_with_the_wanted_estimator(
-    model: str, estimator: str
-) -> None:
-    """The samples may differ, so the errors of true matches are compared."""
-    ratios = []
-    for seed in range(5):
-        scene = make_scene(model, seed, noise=0.5)
-        options = make_options(model, estimator)
-        found = estimate_geometry(scene.points0, scene.points1, options).matrix
-        method = {"magsac": cv2.USAC_MAGSAC, "ransac": cv2.RANSAC}[estimator]
-        fresh = make_scene(model, seed + 50, outliers=0, noise=0)
-        errors = [
-            np.median(judged(fresh.points0, fresh.points1, model, matrix))
-            for matrix in (found, opencv_fit(scene, model, method))
-        ]
-        ratios.append(errors[0] / errors[1])
-    assert 0.5 < np.median(ratios) < 2
 
 
 @every_way
@@ -276,24 +220,16 @@ def test_four_corners_make_a_homography(estimator: str) -> None:
 
 
 @every_way
-@pytest.mark.parametrize("count", [0, 1, 2, 3])
-def test_too_few_matches_give_no_matrix(model: str, estimator: str, count: int) -> None:
-    points = np.random.default_rng(0).uniform(0, 100, (count, 2)).astype(np.float32)
-    geometry = estimate_geometry(points, points + 1, make_options(model, estimator))
-    assert geometry.model == model
-    assert geometry.matrix is None
-    assert_consistent(geometry, count)
+def test_few_matches_do_no_harm(model: str, estimator: str) -> None:
+    for count in (0, 1, 2, 3, 4, 5, 7, 8, 14, 15):
+        scene = make_scene(model, count, count, outliers=0.3, noise=0.3)
+        geometry = estimate_geometry(scene.points0, scene.points1, make_options(model, estimator))
+        assert geometry.model == model
+        assert geometry.matrix is None or count > 3
+        assert_consistent(geometry, count)
 
 
-@every_way
-@pytest.mark.parametrize("count", range(4, 20))
-def test_few_matches_do_no_harm(model: str, estimator: str, count: int) -> None:
-    scene = make_scene(model, count, count, outliers=0.3, noise=0.3)
-    geometry = estimate_geometry(scene.points0, scene.points1, make_options(model, estimator))
-    assert_consistent(geometry, count)
-
-
-def degenerate(kind: str, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
+def degenerate(count: int = 40) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     ramp = np.arange(count, dtype=float)
     rng = np.random.default_rng(0)
     flat = np.stack([ramp * 3, np.full(count, 50.0)], 1)
@@ -313,37 +249,19 @@ def degenerate(kind: str, count: int = 40) -> tuple[np.ndarray, np.ndarray]:
         "no movement": (spread, spread),
         "mirrored": (spread, spread * [-1, 1]),
         "huge": (spread * 1e6, spread * 1e6 + 1),
-    }[kind]
-
-
-DEGENERATE = (
-    "all in one place",
-    "all at the origin",
-    "a row",
-    "a line",
-    "two places",
-    "a line to anywhere",
-    "one place to anywhere",
-    "anywhere to one place",
-    "pure chance",
-    "no movement",
-    "mirrored",
-    "huge",
-)
+    }
 
 
 @every_way
-@pytest.mark.parametrize("kind", DEGENERATE)
-def test_degenerate_input_does_no_harm(model: str, estimator: str, kind: str) -> None:
-    points0, points1 = degenerate(kind)
+def test_degenerate_input_does_no_harm(model: str, estimator: str) -> None:
     options = make_options(model, estimator, iterations=500)
-    geometry = estimate_geometry(points0, points1, options)
-    assert_consistent(geometry, len(points0))
+    for points0, points1 in degenerate().values():
+        assert_consistent(estimate_geometry(points0, points1, options), len(points0))
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS)
 def test_no_movement_is_the_identity(estimator: str) -> None:
-    points0, points1 = degenerate("no movement")
+    points0, points1 = degenerate()["no movement"]
     geometry = estimate_geometry(points0, points1, make_options("homography", estimator))
     np.testing.assert_allclose(geometry.matrix, np.eye(3), atol=1e-6)
     assert geometry.inliers.all()
@@ -410,14 +328,6 @@ def test_estimation_leaves_its_input_alone() -> None:
     estimate_geometry(scene.points0, scene.points1, make_options("homography"))
     np.testing.assert_array_equal(scene.points0, before[0])
     np.testing.assert_array_equal(scene.points1, before[1])
-
-
-def test_the_defaults_are_documented_ones() -> None:
-    options = GeometryOptions()
-    assert options.model == "fundamental"
-    assert options.estimator == "magsac"
-    assert options.inlier_threshold == 1.0
-    assert options.homography is None
 
 
 @pytest.mark.parametrize(

@@ -1,1 +1,1 @@
-"""What every other package uses: errors, options, files, processes."""
+"""What every other package uses: errors, registries, options, files, parallel work."""

@@ -14,17 +14,17 @@ from .errors import DeepDetectError
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Give a temporary path beside the final one, and rename it when the block ends well.
+    """Give a temporary path beside the final one, which is renamed when the block succeeds.
 
     Args:
-        path: the final path. Missing folders are made. The temporary name keeps the
-            suffix, since many writers choose the format by it.
+        path: the final path. Missing folders are created. The temporary name keeps the suffix,
+            by which many writers choose the format.
 
     Yields:
         The temporary path, which the block writes.
 
     Raises:
-        DeepDetectError: the file cannot be written (no right, no room, not a folder).
+        DeepDetectError: the file cannot be written (no permission, no space, not a folder).
 
     Example:
         >>> import tempfile
@@ -48,7 +48,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.replace(final)
     except OSError as error:
         raise DeepDetectError(
-            f"cannot write {final} ({error.strerror or error}): make room or choose another place"
+            f"cannot write {final} ({error.strerror or error}): "
+            "free some space, or choose another place"
         ) from error
     finally:
         if temporary is not None:
@@ -57,7 +58,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 @lru_cache(maxsize=1)
 def _umask() -> int:
-    """Return the mode bits that new files lack: mkstemp makes its files private."""
+    """Return the mode bits that new files lack: mkstemp creates private files."""
     umask = os.umask(0o077)  # it can only be read by setting it
     os.umask(umask)
     return umask

@@ -1,4 +1,4 @@
-"""Options as frozen dataclasses, in which an unknown name is an error that names the right one."""
+"""Options are frozen dataclasses; an unknown name is an error that suggests the right one."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ Result = TypeVar("Result")
 
 
 def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Make an unknown keyword of a function an error that names the nearest right one.
+    """Decorate a function so that an unknown keyword is an error with the nearest right one.
 
-    A decorator; the function keeps its signature, so that editors and type checkers see it.
+    The function keeps its signature, so that editors and type checkers see it.
 
     Raises:
-        OptionError: from the function, called with a keyword that it does not take.
+        OptionError: from the function, when called with an unknown keyword.
 
     Example:
         >>> @suggest_keywords
@@ -46,15 +46,15 @@ def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Paramet
 
 
 def replace_options(options: Options, **changes: Any) -> Options:
-    """Return options with some values changed, also those of options inside them.
+    """Return options with some values replaced, including those of nested options.
 
     Args:
         options: a frozen dataclass, some of whose fields may be such dataclasses.
         changes: new values by field name.
 
     Raises:
-        OptionError: a name is unknown (the nearest right one is named), or a dataclass
-            refuses a value.
+        OptionError: a name is unknown (the nearest right one is suggested), or a value is not
+            valid.
 
     Example:
         >>> from deepdetect.geometry import GeometryOptions
@@ -75,7 +75,7 @@ seed)
 
 
 def option_names(options: Any) -> list[str]:
-    """List the names that `replace_options` takes for these options, the outer ones first."""
+    """List the names that `replace_options` accepts for these options, outer ones first."""
     fields = [field.name for field in dataclasses.fields(options) if field.init]
     inner = [getattr(options, name) for name in fields]
     nested = [option_names(value) for value in inner if dataclasses.is_dataclass(value)]
@@ -83,7 +83,7 @@ def option_names(options: Any) -> list[str]:
 
 
 def _rebuild(options: Any, changes: dict[str, Any]) -> Any:
-    """Apply each change at the outermost place of its name; a new group before its members."""
+    """Apply each change to the outermost field of its name; a new group before its members."""
     fields = [field.name for field in dataclasses.fields(options) if field.init]
     values = {name: changes[name] for name in fields if name in changes}
     left = {name: value for name, value in changes.items() if name not in values}

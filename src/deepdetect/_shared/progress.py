@@ -1,4 +1,4 @@
-"""The progress bar of all long work: done, rate, time left."""
+"""The progress bar of long tasks."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any
 
 
 def progress(total: int, title: str, unit: str, quiet: bool = False, done: int = 0) -> Any:
-    """Make a progress bar on standard error.
+    """Return a progress bar on standard error.
 
     Args:
-        total: number of units in all.
+        total: number of units.
         title: the word before the bar.
-        unit: name of one unit, as "image".
+        unit: name of one unit, such as "image".
         quiet: show nothing.
-        done: units that were done before.
+        done: units that were done earlier.
 
     Returns:
         A tqdm bar: a context manager with `update(n)` and `set_postfix_str(text)`.

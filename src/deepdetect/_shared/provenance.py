@@ -1,4 +1,4 @@
-"""Where weights come from: command, versions, commit, machine."""
+"""Provenance of weights and reports: command, versions, commit, machine."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pathlib import Path
 from .parallel import processor_count
 
 PACKAGES = ("numpy", "opencv-contrib-python-headless", "pillow", "torch", "lightning-fabric")
-"""The packages that pixels, labels and weights go through."""
+"""The packages that results depend on."""
 
 
 def provenance() -> dict[str, str]:
-    """Return what is written into every checkpoint and weights file, name by name.
+    """Return what is written into every checkpoint, weights file and report, by name.
 
     Example:
         >>> sorted(provenance())
@@ -31,7 +31,7 @@ def provenance() -> dict[str, str]:
 
 
 def _command() -> str:
-    """Return the command line, with the program by its name."""
+    """Return the command line with the program's name."""
     program, *arguments = sys.argv or [""]
     path = Path(program)
     name = "deepdetect" if path.name == "__main__.py" else path.name
@@ -49,7 +49,7 @@ def _versions() -> list[str]:
 
 
 def _commit() -> str:
-    """Return the git commit of the sources, with a plus when files are changed, or ""."""
+    """Return the git commit of the sources, with "+" when files are modified, or ""."""
     sources = Path(__file__).resolve().parents[1]
     run = ["git", "-C", str(sources)]
     try:

@@ -22,9 +22,9 @@ SHIFT = np.array([11, 7])
 def pair(photo: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Descriptors and pixels of two views of a photograph, the second moved and dimmed."""
     gray = luma(photo)
-    views = gray[:220, :220], np.rint(gray[SHIFT[1] :, SHIFT[0] :][:220, :220] * 0.8)
+    views = gray[:150, :150], np.rint(gray[SHIFT[1] :, SHIFT[0] :][:150, :150] * 0.8)
     generator = np.random.default_rng(0)
-    row, column = np.indices((220, 220))
+    row, column = np.indices((150, 150))
     every = np.column_stack([column.ravel(), row.ravel()]).astype(np.float32)
     pixels = [every[generator.random(len(every)) < 0.5] for _ in views]
     described = [
@@ -49,7 +49,7 @@ def test_finds_the_moved_points_as_the_exact_search_does(pair) -> None:
         found = match_descriptors(*descriptors, matcher, ratio=0.95, positions=positions)
         moved = positions[0][found.rows0] - positions[1][found.rows1]
         correct.append(int((moved == SHIFT).all(axis=1).sum()))
-    assert correct[0] > 3000
+    assert correct[0] > 1000
     assert correct[1] > 0.9 * correct[0]
 
 
@@ -92,7 +92,7 @@ def test_mutual_matches_are_each_others(pair) -> None:
     )
     back = patchmatch_neighbours(*descriptors[::-1], 1, 0, positions[::-1])[0][:, 0]
     np.testing.assert_array_equal(back[found.rows1], found.rows0)
-    assert len(found) > 2000
+    assert len(found) > 800
 
 
 @given(
