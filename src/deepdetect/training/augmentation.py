@@ -1,21 +1,115 @@
-"""Changes of a crop and its label: mirrors, and colours of the same luma."""
+"""Augmentation: darkening, mirrors, colours of the same luma, and augmented views."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
+from .._shared.errors import OptionError
 from ..io.image import luma
 
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
 
+AUGMENTATION_VERSION = 2
+"""Part of the names of augmented views: when `augment` draws otherwise, old labels do not fit."""
+
+MAX_JITTER_SATURATION = 1.2
+"""`jitter_color` scales the saturation by a factor of up to this."""
+
+
+@dataclass(frozen=True)
+class Darkening:
+    """Two factors in (0, 1], those of Pillow's `ImageEnhance.Brightness` and `.Contrast`.
+
+    The published dark images fit brightness 0.3 and contrast 0.4.
+    """
+
+    brightness: float
+    contrast: float
+
+    def __post_init__(self) -> None:
+        for name in ("brightness", "contrast"):
+            if not 0 < getattr(self, name) <= 1:
+                raise OptionError(f"{name} must be above 0 and at most 1")
+
+
+@dataclass(frozen=True)
+class DarkeningRange:
+    """Ranges that the factors of a `Darkening` are drawn from.
+
+    The product stays under 0.25, so that a darkened image spans fewer than the 64
+    grey levels under which an image counts as of low visibility.
+    """
+
+    brightness: tuple[float, float] = (0.2, 0.45)
+    contrast: tuple[float, float] = (0.3, 0.55)
+
+    def draw(self, generator: np.random.Generator) -> Darkening:
+        """Draw both factors, rounded to thousandths so that a file name can hold them."""
+        return Darkening(
+            round(float(generator.uniform(*self.brightness)), 3),
+            round(float(generator.uniform(*self.contrast)), 3),
+        )
+
+
+@dataclass(frozen=True)
+class AugmentationRanges:
+    """Probabilities and ranges of `augment`.
+
+    Attributes:
+        crop_scale: side of the cut-out square, as a fraction of the largest that fits.
+        relight_probability: of another gamma, contrast and brightness.
+        max_log_gamma: the gamma is between exp(-x) and exp(x).
+        contrast, max_brightness_shift: of values in [0, 1], around 0.5.
+        blur_probability, blur_sigma_px: of a Gaussian blur.
+        noise_probability, noise_sigma_levels: of Gaussian noise, in grey levels.
+        jpeg_probability, jpeg_quality: of a JPEG compression.
+    """
+
+    crop_scale: tuple[float, float] = (0.7, 1.0)
+    relight_probability: float = 0.5
+    max_log_gamma: float = 0.5
+    contrast: tuple[float, float] = (0.5, 1.2)
+    max_brightness_shift: float = 0.15
+    blur_probability: float = 0.3
+    blur_sigma_px: tuple[float, float] = (0.5, 2.5)
+    noise_probability: float = 0.25
+    noise_sigma_levels: tuple[float, float] = (1, 8)
+    jpeg_probability: float = 0.35
+    jpeg_quality: tuple[int, int] = (20, 95)
+
+
+def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
+    """Reduce the brightness, then the contrast (paper, Section III-B).
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        darkening: the two factors.
+
+    Returns:
+        (H, W, 3) uint8, equal to what Pillow's `ImageEnhance` gives.
+
+    Example:
+        >>> int(darken(np.full((16, 16, 3), 200, np.uint8), Darkening(0.3, 0.4))[0, 0, 0])
+        60
+    """
+    # One value depends on itself and the mean only, so two tables of 256 entries do it all.
+    # Pillow blends in float32 and truncates.
+    levels = np.arange(256, dtype=np.float32)
+    dimmed = (levels * np.float32(darkening.brightness)).astype(np.uint8)
+    dark = cv2.LUT(rgb, dimmed)
+    mean = np.float32(int(_pillow_luma(dark).mean() + 0.5))
+    flattened = (mean + (levels - mean) * np.float32(darkening.contrast)).astype(np.uint8)
+    return cv2.LUT(dark, flattened)
+
 
 def flip(image: np.ndarray, mask: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror a crop left to right (axis 1) or upside down (axis 0).
+    """Mirror a crop and its label left to right (axis 1) or upside down (axis 0).
 
-    The label of a mirrored photograph is another one: some detectors have filters of even width, or
+    Some detectors label a mirrored photograph differently: they have filters of even width, or
     look for corners at even pixels of a smaller image (docs/training.md).
     """
     # Copies a hundred times faster than a negative stride.
@@ -23,46 +117,155 @@ def flip(image: np.ndarray, mask: np.ndarray, axis: int) -> tuple[np.ndarray, np
 
 
 def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror a crop along its diagonal: all detectors but BRISK mark the same pixels."""
+    """Mirror a crop and its label along the diagonal: only BRISK labels it differently."""
     return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
 
 
-def without_color(rgb: np.ndarray) -> np.ndarray:
-    """Replace an image's colours by its luma, from which labels are made: they stay the same.
+def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -> np.ndarray:
+    """Remove the colours or rotate the hue, both with the same luma.
+
+    Args:
+        rgb: (H, W, 3) uint8 RGB.
+        generator: draws which, and the angle.
+        exact: only remove colours: rotating them can change the luma by one level, which
+            matters for the keypoints of dark images.
+    """
+    if exact or generator.random() < 0.5:
+        return to_gray(rgb)
+    angle = generator.uniform(0, 2 * np.pi)
+    return rotate_hue(rgb, angle, generator.uniform(0, MAX_JITTER_SATURATION))
+
+
+def to_gray(rgb: np.ndarray) -> np.ndarray:
+    """Replace colours by the luma, the only thing that labels depend on.
 
     Args:
         rgb: (H, W, 3) uint8 RGB.
 
     Example:
-        >>> without_color(np.full((1, 1, 3), (200, 100, 50), np.uint8)).tolist()
+        >>> to_gray(np.full((1, 1, 3), (200, 100, 50), np.uint8)).tolist()
         [[[124, 124, 124]]]
     """
     return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
 
 
-def turn_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
-    """Turn the colours around the luma, which changes by rounding only.
+def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
+    """Rotate the colours around the luma, which changes by rounding only.
 
     Args:
         rgb: (H, W, 3) uint8 RGB.
-        angle: in radians, in the plane of B - Y and R - Y.
-        saturation: factor of the colours; where they would leave the range of the values, they
-            are faded until they do not.
+        angle: in radians, in the plane of Cb and Cr.
+        saturation: factor of the colours; those that would leave the range of uint8 are
+            desaturated until they fit.
 
     Returns:
         (H, W, 3) uint8 RGB, whose luma differs by at most one level.
     """
     red, green, blue = cv2.split(rgb.astype(np.float32))
     gray = RED * red + GREEN * green + BLUE * blue
-    # The two differences have these ranges, so that the turn is one of Cb and Cr.
-    wide_blue, wide_red = 1 - BLUE, 1 - RED
-    blue, red = (blue - gray) / wide_blue, (red - gray) / wide_red
+    # Scaled by their ranges, the two differences are Cb and Cr.
+    blue_range, red_range = 1 - BLUE, 1 - RED
+    blue, red = (blue - gray) / blue_range, (red - gray) / red_range
     cosine, sine = saturation * math.cos(angle), saturation * math.sin(angle)
-    blue, red = wide_blue * (cosine * blue - sine * red), wide_red * (sine * blue + cosine * red)
+    blue, red = blue_range * (cosine * blue - sine * red), red_range * (sine * blue + cosine * red)
     green = -(RED * red + BLUE * blue) / GREEN
-    # How far each pixel goes beyond white or black, as a multiple of the room that it has.
+    # How far each pixel goes beyond white or black, as a multiple of the available range.
     above = np.maximum(np.maximum(red, green), blue) / np.maximum(255 - gray, 1e-6)
     below = np.minimum(np.minimum(red, green), blue) / np.minimum(-gray, -1e-6)
-    share = 1 / np.maximum(np.maximum(above, below), 1)
-    turned = cv2.merge([gray + share * plane for plane in (red, green, blue)])
-    return cv2.convertScaleAbs(turned)
+    scale = 1 / np.maximum(np.maximum(above, below), 1)
+    rotated = cv2.merge([gray + scale * plane for plane in (red, green, blue)])
+    return cv2.convertScaleAbs(rotated)
+
+
+def augment(
+    rgb: np.ndarray, side: int, seed: int, ranges: AugmentationRanges = AugmentationRanges()
+) -> np.ndarray:
+    """Make an augmented view: a part of a photograph, rotated, relit, blurred, noisy, compressed.
+
+    Detectors that look at single pixels label a rotated or blurred photograph quite differently,
+    so each augmented view shows the network something new. Its label is made from the view
+    itself. Noise, interpolation and compression are those of NumPy and OpenCV: other versions may
+    give slightly different views for the same seed.
+
+    Args:
+        rgb: (H, W, 3) uint8 RGB.
+        side: of the view, in pixels.
+        seed: of all random choices.
+        ranges: what they are drawn from.
+
+    Returns:
+        (side, side, 3) uint8 RGB, all of it from inside the photograph.
+
+    Example:
+        >>> augment(np.full((64, 96, 3), 90, np.uint8), 32, seed=1).shape
+        (32, 32, 3)
+    """
+    generator = np.random.default_rng([AUGMENTATION_VERSION, seed])
+    view = _rotated_crop(rgb, side, ranges, generator)
+    if generator.random() < ranges.relight_probability:
+        view = _relight(view, ranges, generator)
+    if generator.random() < ranges.blur_probability:
+        view = cv2.GaussianBlur(view, (0, 0), generator.uniform(*ranges.blur_sigma_px))
+    if generator.random() < ranges.noise_probability:
+        noise = generator.normal(0, generator.uniform(*ranges.noise_sigma_levels), view.shape)
+        view = np.clip(np.rint(view + noise), 0, 255).astype(np.uint8)
+    if generator.random() < ranges.jpeg_probability:
+        view = _compress(view, int(generator.integers(*ranges.jpeg_quality)))
+    return view
+
+
+def _rotated_crop(
+    rgb: np.ndarray, side: int, ranges: AugmentationRanges, generator: np.random.Generator
+) -> np.ndarray:
+    """Cut out a square at any angle, whose corners lie inside the photograph."""
+    angle = generator.uniform(0, 2 * math.pi)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    extent = abs(cosine) + abs(sine)  # of a rotated square of side 1
+    window = (min(rgb.shape[:2]) - 1) / extent * generator.uniform(*ranges.crop_scale)
+    step = window / side
+    if step > 1:  # averaged before it is sampled more coarsely
+        factor = 1 / step
+        size = (max(round(rgb.shape[1] * factor), 1), max(round(rgb.shape[0] * factor), 1))
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        window = min(window * factor, (min(rgb.shape[:2]) - 1) / extent)
+        step = window / side
+    half = window * extent / 2
+    height, width = rgb.shape[:2]
+    centre = (
+        generator.uniform(half, max(width - 1 - half, half)),
+        generator.uniform(half, max(height - 1 - half, half)),
+    )
+    linear = step * np.array([[cosine, -sine], [sine, cosine]])
+    offset = np.array(centre) - linear @ np.full(2, (side - 1) / 2)
+    return cv2.warpAffine(
+        rgb,
+        np.column_stack([linear, offset]),
+        (side, side),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REFLECT_101,
+    )
+
+
+def _relight(
+    rgb: np.ndarray, ranges: AugmentationRanges, generator: np.random.Generator
+) -> np.ndarray:
+    """Change gamma, contrast and brightness, by a table of 256 entries."""
+    levels = np.arange(256) / 255
+    levels = levels ** math.exp(generator.uniform(-ranges.max_log_gamma, ranges.max_log_gamma))
+    levels = 0.5 + (levels - 0.5) * generator.uniform(*ranges.contrast)
+    levels = levels + generator.uniform(-ranges.max_brightness_shift, ranges.max_brightness_shift)
+    return np.clip(np.rint(255 * levels), 0, 255).astype(np.uint8)[rgb]
+
+
+def _compress(rgb: np.ndarray, quality: int) -> np.ndarray:
+    """Encode as JPEG and decode again."""
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)  # OpenCV's order, so that luma is luma
+    _, stored = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def _pillow_luma(rgb: np.ndarray) -> np.ndarray:
+    """Return Pillow's luma; for one colour in 800 it differs from OpenCV's by one level."""
+    # Whole numbers up to 2 ** 24, which float32 holds exactly.
+    weights = np.array([[19595, 38470, 7471, 0x8000]], np.float32)
+    return cv2.transform(rgb.astype(np.float32), weights).astype(np.uint32) >> 16

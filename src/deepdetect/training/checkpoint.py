@@ -2,33 +2,100 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import WeightsError
+from .model_card import CurvePoint
+from .optim import state_shapes
+
+
+@dataclass
+class TrainingState:
+    """How far a run has come.
+
+    Attributes:
+        step: optimiser steps done.
+        images: crops seen.
+        loss_sum, loss_count: of the training batches since the last point of the curves.
+        points: the loss curves.
+    """
+
+    step: int = 0
+    images: int = 0
+    loss_sum: float = 0.0
+    loss_count: int = 0
+    points: list[CurvePoint] = field(default_factory=list)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any], last_step: int) -> TrainingState:
+        """Read the state from a checkpoint's metadata.
+
+        Raises:
+            ValueError: a value is missing, of another type or out of its range.
+        """
+        counts = {name: _number(values, name, int) for name in ("step", "images", "loss_count")}
+        if counts["step"] > last_step:
+            raise ValueError(f"step {counts['step']} lies behind the last one, {last_step}")
+        rows = values.get("points")
+        if not isinstance(rows, list):
+            raise ValueError("points is not a list")
+        kinds = {
+            field.name: int if field.type == "int" else float
+            for field in dataclasses.fields(CurvePoint)
+        }
+        points = []
+        for row in rows:
+            if not isinstance(row, dict):
+                raise ValueError("a point is not an object")
+            points.append(CurvePoint(**{name: _number(row, name, k) for name, k in kinds.items()}))
+        return cls(**counts, loss_sum=_number(values, "loss_sum", float), points=points)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint file holds.
+
+    Attributes:
+        path: the file.
+        metadata: what `save_checkpoint` was given.
+        tensors: those of the network and of the optimisers, by name.
+    """
+
+    path: Path
+    metadata: dict[str, Any]
+    tensors: dict[str, Tensor]
+
+    def unfit(self, reason: object) -> WeightsError:
+        """Return the error for a checkpoint that cannot be resumed from."""
+        return _unfit(self.path, reason)
 
 
 def save_checkpoint(
-    path: Path, network: nn.Module, optimizers: Sequence[Optimizer], state: dict[str, Any]
+    path: Path, network: nn.Module, optimizers: Sequence[Optimizer], metadata: Mapping[str, Any]
 ) -> None:
-    """Write the network, the optimisers' moments and the run's state.
+    """Write the network, the state of the optimisers and that of the run.
 
     Args:
         path: the file.
         network: its state dict is stored under "network.".
-        optimizers: of its parameters; what they hold is stored under
-            "optimizer.MOMENT.PARAMETER".
-        state: anything JSON can hold.
+        optimizers: of its parameters; their state is stored under "optimizer.MOMENT.PARAMETER".
+        metadata: anything JSON can hold.
+
+    Raises:
+        DeepDetectError: the file cannot be written.
     """
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
     for name, parameter in network.named_parameters():
@@ -37,24 +104,14 @@ def save_checkpoint(
                 tensors[f"optimizer.{moment}.{name}"] = value
     contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with atomic_path(path) as temporary:
-        save_file(contiguous, temporary, metadata={"state": json.dumps(state)})
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """What a checkpoint file holds.
-
-    Attributes:
-        state: the run's state.
-        tensors: the network's and the optimisers', by name.
-    """
-
-    state: dict[str, Any]
-    tensors: dict[str, torch.Tensor]
+        try:
+            save_file(contiguous, temporary, metadata={"state": json.dumps(metadata)})
+        except SafetensorError as error:  # a full disk
+            raise OSError(str(error)) from None
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint's file.
+    """Read a checkpoint file.
 
     Raises:
         WeightsError: the file is damaged.
@@ -62,63 +119,71 @@ def read_checkpoint(path: Path) -> Checkpoint:
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in list(file.keys())}
-            state = json.loads((file.metadata() or {})["state"])
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+            metadata = json.loads((file.metadata() or {})["state"])
+    except (SafetensorError, OSError, KeyError, ValueError, RecursionError) as error:
         raise _unfit(path, error) from None
-    return Checkpoint(state, tensors)
+    if not isinstance(metadata, dict):
+        raise _unfit(path, "its state is not an object")
+    return Checkpoint(path, metadata, tensors)
 
 
-def restore(
-    checkpoint: Checkpoint, path: Path, network: nn.Module, optimizers: Sequence[Optimizer]
-) -> None:
+def restore(checkpoint: Checkpoint, network: nn.Module, optimizers: Sequence[Optimizer]) -> None:
     """Bring the network and its optimisers to a checkpoint's state.
 
+    All tensors are checked first: fused optimisers write beyond a moment of another shape.
+
     Raises:
-        WeightsError: the checkpoint does not fit the network.
+        WeightsError: the checkpoint does not fit the network; nothing was changed.
     """
+    names = {parameter: name for name, parameter in network.named_parameters()}
+    trained = [
+        (optimizer, parameter, state_shapes(optimizer, parameter))
+        for optimizer in optimizers
+        for group in optimizer.param_groups
+        for parameter in group["params"]
+    ]
+    wanted = {f"network.{n}": (v.dtype, tuple(v.shape)) for n, v in network.state_dict().items()}
+    for _, parameter, shapes in trained:
+        for moment, shape in shapes.items():
+            wanted[f"optimizer.{moment}.{names[parameter]}"] = torch.float32, shape
     tensors = checkpoint.tensors
-    prefix = "network."
-    try:
-        network.load_state_dict(
-            {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
-        )
-        moments = _moments(tensors)
-        names = {parameter: name for name, parameter in network.named_parameters()}
-        for optimizer in optimizers:
-            for group in optimizer.param_groups:
-                for parameter in group["params"]:
-                    held = moments[names[parameter]]
-                    optimizer.state[parameter] = {
-                        moment: _placed(value, parameter) for moment, value in held.items()
-                    }
-    except (KeyError, ValueError, RuntimeError) as error:
-        raise _unfit(path, error) from None
+    found = {name: (value.dtype, tuple(value.shape)) for name, value in tensors.items()}
+    for name in sorted(wanted.keys() | found.keys()):
+        if wanted.get(name) != found.get(name):
+            is_now, should = (each.get(name, "missing") for each in (found, wanted))
+            raise checkpoint.unfit(f"{name} is {is_now}, it should be {should}")
+    network.load_state_dict({name: tensors[f"network.{name}"] for name in network.state_dict()})
+    for optimizer, parameter, shapes in trained:
+        optimizer.state[parameter] = {
+            moment: _like(tensors[f"optimizer.{moment}.{names[parameter]}"], parameter)
+            for moment in shapes
+        }
 
 
-def _moments(tensors: dict[str, torch.Tensor]) -> dict[str, dict[str, torch.Tensor]]:
-    """Return what the optimisers hold, by parameter and moment."""
-    found: dict[str, dict[str, torch.Tensor]] = {}
-    for key, value in tensors.items():
-        kind, _, rest = key.partition(".")
-        if kind == "optimizer":
-            moment, _, name = rest.partition(".")
-            found.setdefault(name, {})[moment] = value
-    return found
-
-
-def _placed(value: torch.Tensor, parameter: nn.Parameter) -> torch.Tensor:
+def _like(value: Tensor, parameter: Tensor) -> Tensor:
     """Bring a moment to its parameter's device.
 
-    Laid out in memory as the parameter is: fused Adam walks them in parallel.
+    In the parameter's memory layout: fused Adam walks both in parallel.
     """
     if value.shape == parameter.shape:
         return torch.empty_like(parameter).copy_(value)
     return value.to(parameter.device, copy=True)
 
 
-def _unfit(path: Path, error: Exception) -> WeightsError:
-    reason = str(error).splitlines()[0]
+def _number(values: Mapping[str, Any], name: str, kind: type) -> Any:
+    """Return a finite number of a mapping, not negative if it is an integer."""
+    value = values.get(name)
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if kind is int and whole and value >= 0:
+        return value
+    if kind is float and (whole or isinstance(value, float)) and math.isfinite(value):
+        return float(value)
+    raise ValueError(f"{name} is not a number that it can be")
+
+
+def _unfit(path: Path, reason: object) -> WeightsError:
+    text = str(reason).splitlines()[0] if str(reason) else type(reason).__name__
     return WeightsError(
-        f"{path} is not a checkpoint of this network ({reason}): "
+        f"{path} is not a checkpoint of this network ({text}): "
         "delete it, or train into another folder"
     )

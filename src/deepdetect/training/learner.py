@@ -1,66 +1,50 @@
-"""The network and its optimisers: one step at a time."""
+"""The network with its optimisers: a training step, and the validation."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import numpy as np
 import torch
-from torch import nn
-from torch.nn.functional import binary_cross_entropy_with_logits
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits, pad
 
 from .._shared.errors import OptionError
+from ..evaluation.mask_scores import MaskScore, score_heatmap
 from ..io.image import luma
 from ..labels import visibility_of
-from .batch_norm import freeze_batch_norm
-from .device import DeviceOptions, Engine
-from .optimizers import make_optimizers
+from .engine import DeviceOptions, Engine, freeze_batch_norm
+from .optim import make_optimizers
+from .recipe import TrainingOptions
 
 
 class Learner:
     """A network on its device, with what optimises it.
 
     Args:
-        network: the network, with its start weights.
+        network: the network, with its initial weights.
         device: how it is run.
-        optimizer: name of the optimiser.
-        frozen_batch_norm: keep the statistics of the batch normalisation as they are.
-        pos_weight: weight of a marked pixel in the loss; others have 1.
-        low_light_pos_weight: the same in images of low visibility; None: as in all others.
-        pos_weight_uncertain: scale these weights by the uncertainty p(1 - p): they hold at a
-            probability of one half and fall to 1 where the network is certain.
-        freeze_encoder: keep the network's `encoder` as it is.
+        options: the recipe: optimiser, weights of the loss, what is frozen.
     """
 
-    def __init__(
-        self,
-        network: nn.Module,
-        device: DeviceOptions,
-        optimizer: str = "adam",
-        frozen_batch_norm: bool = False,
-        pos_weight: float = 1.0,
-        low_light_pos_weight: float | None = None,
-        pos_weight_uncertain: bool = False,
-        freeze_encoder: bool = False,
-    ) -> None:
-        self.frozen_batch_norm = frozen_batch_norm
-        self.freeze_encoder = freeze_encoder
-        if self.freeze_encoder:  # before it is compiled, which then leaves its gradients out
-            network.encoder.requires_grad_(False)
+    def __init__(self, network: nn.Module, device: DeviceOptions, options: TrainingOptions) -> None:
+        self.options = options
+        if options.freeze_encoder:  # before it is compiled, which then leaves its gradients out
+            network.get_submodule("encoder").requires_grad_(False)
         self.engine = Engine(network, device)
         self.network = self.engine.network
-        self.optimizers = make_optimizers(optimizer, self.network, self.engine.share)
-        dark = pos_weight if low_light_pos_weight is None else low_light_pos_weight
-        self.pos_weights = {"normal": pos_weight, "low": dark}
-        self.pos_weight_uncertain = pos_weight_uncertain
+        self.optimizers = make_optimizers(options.optimizer, self.network, self.engine.broadcast_)
 
-    def training_step(self, rgb: np.ndarray, masks: np.ndarray, rate: float, step: int) -> float:
+    def training_step(
+        self, images: Tensor, masks: Tensor, learning_rate: float, step: int
+    ) -> float:
         """Make one optimiser step.
 
         Args:
-            rgb: (B, crop, crop, 3) uint8, this process's part of the batch.
+            images: (B, crop, crop, 3) uint8 RGB, this process's part of the batch.
             masks: (B, crop, crop) bool, its labels.
-            rate: the learning rate.
+            learning_rate: the learning rate.
             step: number of the step, for the error.
 
         Returns:
@@ -70,41 +54,61 @@ class Learner:
             OptionError: the loss or its gradients are not finite.
         """
         self.network.train()
-        if self.frozen_batch_norm:
+        if self.options.frozen_batch_norm:
             freeze_batch_norm(self.network)
-        elif self.freeze_encoder:
-            freeze_batch_norm(self.network.encoder)
+        elif self.options.freeze_encoder:
+            freeze_batch_norm(self.network.get_submodule("encoder"))
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
             for group in optimizer.param_groups:
-                group["lr"] = rate
-        images = self.engine.images(rgb)
+                group["lr"] = learning_rate
         truth = self.engine.to_device(masks)[:, None].float()
-        logits = self.engine.logits(images)
-        weight = self._weight_of_marked(rgb)
-        if self.pos_weight_uncertain and weight is not None:
+        logits = self.engine.logits(self.engine.to_float(images))
+        weight = self._pos_weight(images)
+        if self.options.pos_weight_uncertain and weight is not None:
             probability = logits.detach().sigmoid()
             weight = 1 + (weight - 1) * 4 * probability * (1 - probability)
         loss = binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
         self.engine.backward(loss)
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
-        value = self.engine.mean_over_processes(loss.detach()).item()
+        value = self.engine.all_reduce_mean(loss.detach()).item()
         # A finite loss can have gradients that are not, in bfloat16.
         if not (math.isfinite(value) and torch.nn.utils.get_total_norm(gradients).isfinite()):
             raise OptionError(
-                f"the loss or its gradients are not finite at step {step}: start again with "
-                "--precision float32, or with a lower --learning-rate"
+                f"the loss or its gradients are not finite at step {step}: start again with the "
+                "precision float32, or with a lower learning_rate"
             )
         for optimizer in self.optimizers:
             optimizer.step()
         return value
 
-    def _weight_of_marked(self, rgb: np.ndarray) -> torch.Tensor | None:
+    def _pos_weight(self, images: Tensor) -> Tensor | None:
         """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
-        normal, dark = self.pos_weights["normal"], self.pos_weights["low"]
-        if normal == dark == 1:
-            return None
-        if normal == dark:  # the images need not be looked at
-            return self.engine.to_device(np.full(1, normal, np.float32))
-        found = [self.pos_weights[visibility_of(luma(image))] for image in rgb]
-        return self.engine.to_device(np.array(found, np.float32)[:, None, None, None])
+        normal, dark = self.options.pos_weight, self.options.low_light_pos_weight
+        if dark is None or dark == normal:  # the images need not be looked at
+            return None if normal == 1 else self.engine.to_device(torch.tensor([normal]))
+        weights = {"normal": normal, "low": dark}
+        found = [weights[visibility_of(luma(image))] for image in images.numpy()]
+        return self.engine.to_device(torch.tensor(found)[:, None, None, None])
+
+    def score(self, pairs: Iterable[tuple[Tensor, Tensor]]) -> list[MaskScore]:
+        """Score the network on images with known labels, one at a time, in float32.
+
+        Args:
+            pairs: (H, W, 3) uint8 RGB images and (H, W) bool labels.
+        """
+        was_training = self.network.training
+        self.network.eval()
+        scores = [score_heatmap(self._heatmap(image), mask.numpy()) for image, mask in pairs]
+        self.network.train(was_training)
+        return scores
+
+    @torch.inference_mode()
+    def _heatmap(self, image: Tensor) -> np.ndarray:
+        """Run the network on an image of any size."""
+        height, width = image.shape[:2]
+        batch = self.engine.to_float(image[None])
+        batch = pad(batch, (0, -width % 8, 0, -height % 8), mode="replicate")
+        batch = batch.contiguous(memory_format=torch.channels_last)
+        logits = self.network(batch)[0, 0, :height, :width]
+        return torch.sigmoid(logits.float()).cpu().numpy()

@@ -1,4 +1,4 @@
-"""What a training run does: all its options."""
+"""Training recipes: the options that decide which weights come out, and presets of them."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 
-from .._shared.errors import OptionError
+from .._shared.errors import OptionError, unknown_name
 from .._shared.registry import look_up
-from ..labels import DETECTOR_NAMES, LabelOptions, SettingChange
-from .darkening import DarkeningRange
-from .optimizers import OPTIMIZERS
+from ..labels import DETECTOR_NAMES, LABEL_SETTINGS, LabelOptions, SettingChange
+from .augmentation import DarkeningRange
+
+OPTIMIZERS = ("adam", "soap")
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A stretch of training with one crop size and one batch size.
+    """A part of the training with one crop size and one batch size.
 
     Attributes:
-        crop: side of the square crops, in pixels, a multiple of 8.
-        batch: crops in a batch.
-        epochs: how often each photograph is seen.
-        sides: shorter sides of the views that it takes crops from; default: all that are
+        crop: side of the square crops in pixels, a multiple of 8.
+        batch: crops per batch.
+        epochs: how often each image is seen.
+        sides: shorter sides of the views that crops are taken from; default: all that are
             large enough.
     """
 
@@ -62,53 +63,53 @@ class Stage:
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """Everything that decides which weights come out, given the photographs.
+    """Everything that decides which weights come out, given the images.
 
     Attributes:
-        stages: what is trained on, one after the other. Small crops give many cheap
-            steps first; whole images last teach what depends on the whole image
+        stages: what is trained on, one stage after the other. Small crops give many cheap
+            steps first; whole images at the end teach what depends on the whole image
             (Harris and Sobel labels are relative to the image's largest response).
-        interleave: go through all stages at the same time, their steps evenly mixed, not
-            one after the other: every size is seen until the end.
-        short_sides: sizes in pixels that the photographs' shorter side is scaled to;
-            a crop is taken from those that are large enough. The first is that of validation.
-        square: squash the photographs to squares, as the paper does, instead.
-        max_photos: use no more photographs than so many, those held out among them; None
-            uses all.
-        val_fraction: share of the photographs held out for validation, when no folder is named.
-        dark_fraction: share of darkened images (paper: a quarter).
-        dark_variants: darkened versions of each photograph at each size.
+        interleave: go through all stages at the same time, their steps evenly mixed, so that
+            every size is seen until the end.
+        short_sides: sizes in pixels that the shorter side of the images is scaled to. Crops are
+            taken from those that are large enough. The first is that of the validation.
+        square: squash the images to squares, as the paper does, instead.
+        max_images: use at most this many images, including those for validation; None uses all.
+        val_fraction: fraction of the images held out for validation, when no folder is given.
+        dark_fraction: fraction of darkened crops (paper: a quarter).
+        dark_variants: darkened versions of each image at each size.
         darkening: ranges of the darkening.
-        augmentations: varied views of each photograph at the first size, in normal and in dark
-            light: turned, relit, blurred, noisy or compressed (`variation.vary`). Each is taken
-            as often as the plain view of a size.
-        flips: mirror crops left to right and upside down. The label of a mirrored photograph
-            is another one, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
+        augmentations: augmented views of each image at the first size, in normal and in dark
+            light: rotated, relit, blurred, noisy or compressed. Each is used as often as the plain
+            view of a size.
+        flips: mirror crops left to right and upside down. The label of a mirrored image
+            is different, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
         transpositions: mirror crops along their diagonal, which changes labels of BRISK only.
-        color_jitter: share of crops whose colours are taken away or turned around the luma,
-            on which alone labels depend.
-        optimizer: "adam", or "soap", which learns more from an image (measured in the model
-            card of the bundled weights).
-        learning_rate, final_learning_rate: ends of its cosine annealing.
-        warm_up: steps over which the rate rises from zero. A run that starts from trained
-            weights needs them: Adam's first steps, without moments, would undo a good deal.
-        frozen_batch_norm: normalise by the statistics that the start weights bring along, as
-            the finished network does, not by those of each batch, which vary much from one
-            batch of a few images to the next. None: when a run starts from trained weights.
-        pos_weight: weight of a marked pixel in the loss. With 1, where the network is not sure
-            it marks too little, since most pixels are not marked: the keypoints above a
-            probability of 0.5 are fewer than the labels'. Above 1 there are more of them.
-        low_light_pos_weight: the same in crops of low visibility; None: as in all others.
+        color_jitter: fraction of the crops whose colours are removed, or rotated with the same
+            luma, the only thing that labels depend on.
+        optimizer: "adam", or "soap", which learns more per image (docs/history.md has the
+            measurements).
+        learning_rate, final_learning_rate: start and end of the cosine annealing.
+        warm_up: steps over which the learning rate rises from zero. A run that starts from
+            trained weights needs them: the first steps of Adam, whose moments are not known
+            yet, would undo much.
+        frozen_batch_norm: normalise by the batch statistics of the initial weights, as the
+            finished network does, not by those of each batch, which vary much between batches of a
+            few images. None: if the initial weights are trained ones.
+        pos_weight: weight of marked pixels in the loss. With 1 the network marks too little
+            where it is uncertain, since most pixels are not marked; above 1 it finds more
+            keypoints at a probability of 0.5.
+        low_light_pos_weight: the same in crops of low visibility; None: `pos_weight`.
         pos_weight_uncertain: scale these weights by the uncertainty p(1 - p): they hold at a
-            probability of one half and fall to 1 where the network is certain, so that certain
+            probability of one half and fall to 1 where the network is certain. So certain
             probabilities hardly move.
-        freeze_encoder: the encoder, nearly all of the weights, stays as it is, a
-            step takes about half of the time, and what the start weights know is kept. For few
-            photographs, and for changes of how many pixels are marked.
+        freeze_encoder: train the decoder only. The encoder has nearly all of the weights: a
+            step takes about half of the time, and what the initial weights know is kept. For few
+            images, or to change only how many pixels are marked.
         detectors: label detectors to fuse.
         label_changes: settings of label detectors that differ from the paper's.
-        val_count: how often the validation loss is taken.
-        seed: decides the start weights, the order, the crops and what is done to them.
+        val_count: how many times the validation loss is computed.
+        seed: of the initial weights, the order of the images, the crops and their augmentation.
 
     Raises:
         OptionError: a value is out of its range.
@@ -118,7 +119,7 @@ class TrainingOptions:
     interleave: bool = False
     short_sides: tuple[int, ...] = (480, 360, 240)
     square: bool = False
-    max_photos: int | None = None
+    max_images: int | None = None
     val_fraction: float = 0.05
     dark_fraction: float = 0.25
     dark_variants: int = 1
@@ -143,50 +144,51 @@ class TrainingOptions:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "detectors", LabelOptions(self.detectors).detectors)
-        look_up("optimizer", self.optimizer, OPTIMIZERS)
+        if self.optimizer not in OPTIMIZERS:
+            raise unknown_name("optimizer", self.optimizer, OPTIMIZERS)
+        self._check_sizes()
+        if self.max_images is not None and self.max_images < 2:
+            raise OptionError(f"max_images must be at least 2, not {self.max_images}")
+        if not 0 < self.val_fraction < 1:
+            raise OptionError(f"val_fraction must lie in (0, 1), not {self.val_fraction}")
+        for name in ("dark_fraction", "color_jitter"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise OptionError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
+        for name, least in (("augmentations", 0), ("warm_up", 0), ("dark_variants", 1)):
+            if getattr(self, name) < least:
+                raise OptionError(f"{name} must be at least {least}, not {getattr(self, name)}")
+        if self.val_count < 1:
+            raise OptionError(f"val_count must be at least 1, not {self.val_count}")
+        for name in ("pos_weight", "low_light_pos_weight"):
+            weight = getattr(self, name)
+            if weight is not None and not 0.1 <= weight <= 10:
+                raise OptionError(f"{name} must lie in [0.1, 10], not {weight}")
+        if self.pos_weight_uncertain and {self.pos_weight, self.low_light_pos_weight or 1} == {1}:
+            raise OptionError("pos_weight_uncertain needs a pos_weight other than 1")
+        if not 0 <= self.seed < 2**31:
+            raise OptionError(f"seed must lie in [0, 2147483647], not {self.seed}")
+        if not 0 <= self.final_learning_rate <= self.learning_rate:
+            raise OptionError(
+                "learning_rate must be at least final_learning_rate, and that must not be negative"
+            )
+
+    def _check_sizes(self) -> None:
         if not self.stages:
-            raise OptionError("a training run needs at least one stage")
+            raise OptionError("stages must name at least one stage")
         if not self.short_sides or min(self.short_sides) < 16:
-            raise OptionError("the short sides must be at least 16 pixels")
+            raise OptionError("short_sides must be at least 16 pixels")
         for side in (side for stage in self.stages for side in stage.sides):
             if side not in self.short_sides:
                 raise OptionError(
-                    f"a stage takes views of {side} pixels, which the short sides lack "
-                    f"({', '.join(map(str, self.short_sides))}): add it with --short-side"
+                    f"a stage takes views of {side} pixels, which are not among short_sides "
+                    f"({', '.join(map(str, self.short_sides))}): add them"
                 )
         largest = max(stage.crop for stage in self.stages)
         if largest > max(self.short_sides):
             raise OptionError(
                 f"a crop of {largest} pixels does not fit into images of "
-                f"{max(self.short_sides)}: raise the sizes or make the crops smaller"
+                f"{max(self.short_sides)}: make short_sides larger or the crops smaller"
             )
-        if self.max_photos is not None and self.max_photos < 2:
-            raise OptionError(f"max_photos must be at least 2, not {self.max_photos}")
-        if not 0 < self.val_fraction < 1:
-            raise OptionError(f"the share held out must lie in (0, 1), not {self.val_fraction}")
-        if not 0 <= self.dark_fraction <= 1:
-            raise OptionError(f"the dark fraction must lie in [0, 1], not {self.dark_fraction}")
-        if not 0 <= self.color_jitter <= 1:
-            raise OptionError(
-                f"the share of colour changes must lie in [0, 1], not {self.color_jitter}"
-            )
-        if self.augmentations < 0:
-            raise OptionError(f"the augmentations must not be negative, not {self.augmentations}")
-        if self.dark_variants < 1 or self.val_count < 1:
-            raise OptionError("dark variants and val_count must be at least 1")
-        for weight in (self.pos_weight, self.low_light_pos_weight):
-            if weight is not None and not 0.1 <= weight <= 10:
-                raise OptionError(
-                    f"the weight of marked pixels must lie in [0.1, 10], not {weight}"
-                )
-        if self.pos_weight_uncertain and {self.pos_weight, self.low_light_pos_weight or 1} == {1}:
-            raise OptionError("pos_weight_uncertain needs a pos_weight other than 1")
-        if self.warm_up < 0:
-            raise OptionError(f"the warm-up must not be negative, not {self.warm_up} steps")
-        if not 0 <= self.seed < 2**31:
-            raise OptionError(f"the seed must lie in [0, 2147483647], not {self.seed}")
-        if not 0 <= self.final_learning_rate <= self.learning_rate:
-            raise OptionError("the learning rate must not be under the final one, nor negative")
 
     @property
     def label_options(self) -> LabelOptions:
@@ -194,5 +196,52 @@ class TrainingOptions:
         return LabelOptions(self.detectors, changes=self.label_changes)
 
     def to_json(self) -> str:
-        """Return the options as JSON text, to be kept beside the weights."""
+        """Return the options as JSON text, which is stored with the weights."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+
+PRESETS: dict[str, TrainingOptions] = {
+    # Ours: small crops first, evenly scaled images of several sizes.
+    "default": TrainingOptions(),
+    # The paper's (Section III-B): about 33,000 images to train on and 8,000 for validation,
+    # squashed to 480x480, a quarter darkened, 100 epochs in batches of 64.
+    "paper": TrainingOptions(
+        stages=(Stage(480, 64, 100),),
+        short_sides=(480,),
+        square=True,
+        max_images=41_000,
+        val_fraction=8 / 41,
+        dark_fraction=0.25,
+        transpositions=False,
+        color_jitter=0.0,
+        learning_rate=1e-3,
+        final_learning_rate=1e-6,
+        val_count=20,
+    ),
+    # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser
+    # labels. Meant to start from trained weights, those named "default".
+    "dense": TrainingOptions(
+        stages=(Stage(480, 8, 5, (480,)), Stage(480, 8, 1, (720,)), Stage(240, 32, 3, (240,))),
+        interleave=True,
+        short_sides=(480, 240, 720),
+        dark_fraction=0.0,
+        label_changes=LABEL_SETTINGS["dense"].changes,
+        optimizer="soap",
+        learning_rate=1.5e-3,
+        warm_up=100,
+        val_count=6,
+    ),
+}
+
+
+def training_preset(name: str) -> TrainingOptions:
+    """Look a recipe up by its name.
+
+    Raises:
+        OptionError: the name is unknown (the nearest right one is named).
+
+    Example:
+        >>> training_preset("paper").stages
+        (Stage(crop=480, batch=64, epochs=100, sides=()),)
+    """
+    return look_up("training preset", name, PRESETS)

@@ -1,142 +1,390 @@
-"""Training the network on a folder of photographs (paper, Section III-B)."""
+"""Training the network on a folder of images (paper, Section III-B)."""
 
 from __future__ import annotations
 
 import dataclasses
+import json
+import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch.utils.data import DataLoader
 
-from .._shared.errors import OptionError
+from .._shared.errors import OptionError, WeightsError
+from .._shared.options import suggest_keywords
 from .._shared.progress import progress
+from .._shared.provenance import provenance
 from ..detector.network.espnet import ESPNet
-from ..detector.network.weights import average_weights
+from ..detector.network.onnx_export import export_onnx
+from ..detector.network.weights import (
+    average_weights,
+    load_network,
+    read_notes,
+    save_weights,
+    weights_digest,
+)
 from ..detector.pretrained import resolve_weights
-from .device import DeviceOptions
-from .preparation import Sources, prepare
-from .profile import WARM_UP_STEPS, StageProfile, profile_stages
+from ..evaluation.mask_scores import MaskScore, mean_score
+from .checkpoint import Checkpoint, TrainingState, read_checkpoint, restore, save_checkpoint
+from .dataset import CropDataset, TrainingData, ValidationDataset, loading, prepare_data
+from .engine import DeviceOptions, DistributedContext
+from .learner import Learner
+from .model_card import CurvePoint, save_curves, write_model_card
 from .recipe import TrainingOptions
-from .run import Run, TrainingResult
+from .sampler import CropSampler, Schedule
+
+CHECKPOINT = "checkpoint.safetensors"
+BEST = "best.safetensors"
+ONNX = "deepdetect.onnx"
+CARD = "MODEL_CARD.md"
+CHECKPOINT_SECONDS = 60.0
+"""A killed run loses at most this much time."""
+
+InitWeights = str | Path | Sequence[str | Path]
 
 
+@dataclass(frozen=True)
+class TrainingResult:
+    """The results of a run.
+
+    Attributes:
+        weights: safetensors file of the weights with the lowest validation loss.
+        onnx: the same weights as ONNX, for `DeepDetect(weights=...)`.
+        points: the loss curves.
+        best: the point of those weights.
+        images_per_second: mean rate, in 480x480 images' worth of pixels.
+    """
+
+    weights: Path
+    onnx: Path
+    points: list[CurvePoint]
+    best: CurvePoint
+    images_per_second: float
+
+
+@suggest_keywords
 def train(
-    photos: str | Path,
+    images: str | Path,
     output: str | Path,
     options: TrainingOptions = TrainingOptions(),
     *,
     validation: str | Path | None = None,
     labels: str | Path | None = None,
-    init_weights: str | Path | Sequence[str | Path] | None = None,
+    init_weights: InitWeights | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
     log: Callable[[str], None] | None = None,
 ) -> TrainingResult:
-    """Train the network on a folder of photographs.
+    """Train the network on a folder of images.
 
-    A run that was killed goes on from its last checkpoint when it is started again
-    with the same options, with the same result as an unbroken one. Labels are made in
-    processes of their own, so a script must call this under `if __name__ == "__main__":`.
+    A run that was interrupted resumes from its last checkpoint when it is started again
+    with the same options, with the same result as an uninterrupted one. Labels are made in
+    other processes, so a script must call this under `if __name__ == "__main__":`.
 
     Args:
-        photos: folder of photographs.
-        output: folder for checkpoint.safetensors, best.safetensors, deepdetect.onnx
-            and the loss curves.
+        images: folder of images, or of shards (`write_shards`).
+        output: folder for checkpoint.safetensors, best.safetensors, deepdetect.onnx,
+            MODEL_CARD.md and the loss curves.
         options: the recipe.
-        validation: folder of other photographs; default: some are held out.
-        labels: folder for the label cache; default: in `output`.
+        validation: folder of other images; default: some are held out.
+        labels: folder of the label cache; default: in `output`.
         init_weights: weights (.safetensors) to start from, or "default" or "dense" for those
             inside the package; of several, their mean; default: random ones, by the seed.
         device: how the network is run.
-        workers: processes that make labels; default one for each processor.
-        log: takes the one line that says how the network is run; without it there is
-            no progress bar either.
+        workers: processes that make labels; default one per processor.
+        log: takes lines of text for the user; without it there is no progress bar either.
 
     Returns:
-        The weights' files and the curves.
+        The weights' files and the loss curves.
 
     Raises:
-        ImageError: a folder is missing or empty, or a photograph cannot be read.
-        OptionError: the folder holds a run with other options, or the batch normalisation
-            or the encoder of random weights is to stay as it is.
-        WeightsError: the weights to start from are missing or do not fit.
+        ImageError: a folder is missing or empty.
+        OptionError: the folder holds a run with other options, or the batch statistics or the
+            encoder of random weights are to be frozen.
+        WeightsError: the initial weights are missing or do not fit.
+        DeepDetectError: an image cannot be read.
 
     Example:
-        >>> train("photographs", "run")  # doctest: +SKIP
+        >>> train("images", "run")  # doctest: +SKIP
     """
-    options, network = _initial_network(
-        options, init_weights
-    )  # before the labels, which take minutes
-    sources = Sources(Path(photos), Path(output), validation, labels)
-    made = prepare(sources, options, workers, quiet=log is None)
-    run = Run(made, Path(output), options, device, network, log)
-    result = run.fit()
-    run.engine.close()
+    trainer = make_trainer(
+        images, output, options, validation, labels, init_weights, device, workers, log
+    )
+    result = trainer.fit()
+    trainer.engine.close()
     return result
 
 
-def profile(
-    photos: str | Path,
+def make_trainer(
+    images: str | Path,
     output: str | Path,
     options: TrainingOptions = TrainingOptions(),
-    *,
-    steps: int = 30,
     validation: str | Path | None = None,
     labels: str | Path | None = None,
-    init_weights: str | Path | Sequence[str | Path] | None = None,
+    init_weights: InitWeights | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
     log: Callable[[str], None] | None = None,
-) -> list[StageProfile]:
-    """Time some steps of each stage of a run; nothing but the label cache is written.
+    resume: bool = True,
+) -> Trainer:
+    """Make the labels, and a trainer where its last checkpoint left off; arguments as of `train`.
 
     Args:
-        steps: steps to time in each stage.
-        photos, output, options, validation, labels, init_weights, device, workers, log: as of
-            `train`.
+        images, output, options, validation, labels, init_weights, device, workers, log: of `train`.
+        resume: resume from the folder's checkpoint.
+    """
+    options, network = _initial_network(options, init_weights)  # before the labels, for its errors
+    context = DistributedContext.from_environment()
+    data = prepare_data(
+        Path(images),
+        options,
+        Path(output),
+        validation=None if validation is None else Path(validation),
+        labels=None if labels is None else Path(labels),
+        workers=workers,
+        num_workers=device.worker_count(context),
+        quiet=log is None,
+    )
+    return Trainer(data, Path(output), options, device, network, log, resume)
 
-    Returns:
-        One profile a stage.
+
+class Trainer:
+    """One training run: its data, network, files and state.
+
+    Args:
+        data: what is trained on and validated with.
+        folder: where the files go.
+        options: the recipe.
+        device: how the network is run.
+        network: the network with its initial weights.
+        log: as of `train`.
+        resume: resume from the folder's checkpoint.
 
     Raises:
-        The errors of `train`.
-
-    Example:
-        >>> profile("photographs", "run")[0].images_per_second  # doctest: +SKIP
+        OptionError: the folder holds a run with other options.
+        WeightsError: its checkpoint is damaged.
     """
-    options = dataclasses.replace(options, interleave=False)  # each stage by itself
-    options, network = _initial_network(options, init_weights)
-    sources = Sources(Path(photos), Path(output), validation, labels)
-    made = prepare(sources, options, workers, quiet=log is None)
-    run = Run(made, Path(output), options, device, network, resume=False)
-    total = sum(min(n, steps + WARM_UP_STEPS) for n in run.schedule.steps_of_stage)
-    shown = log is not None and run.place.is_first
-    if shown:
-        log(f"timing {run.engine.describe()}")
-    with progress(total, "timing", "step", not shown) as bar:
-        profiles = profile_stages(run.learner, run.batches, steps, bar.update)
-    run.engine.close()
-    return profiles
+
+    def __init__(
+        self,
+        data: TrainingData,
+        folder: Path,
+        options: TrainingOptions,
+        device: DeviceOptions,
+        network: ESPNet,
+        log: Callable[[str], None] | None = None,
+        resume: bool = True,
+    ) -> None:
+        self.data, self.folder, self.options = data, folder, options
+        init_digest = weights_digest(network)
+        self.schedule = Schedule(options, len(data.training))
+        self.learner = Learner(network, device, options)
+        self.engine, self.network = self.learner.engine, self.learner.network
+        self.context = self.engine.context
+        self.num_workers = device.worker_count(self.context)
+        self.log = log if self.context.is_main else None
+        self.run = {
+            "options": options.to_json(),
+            "photographs": data.digest,
+            "start": init_digest,
+        }
+        self.metadata = {**provenance(), "run_on": self.engine.describe()}
+        self.state = TrainingState()
+        self.best: CurvePoint | None = None
+        if any(run != self.run for run in self.engine.all_gather(self.run)):
+            raise OptionError(
+                "the processes do not train on the same images with the same options: "
+                "every machine needs the same files and the same command"
+            )
+        if resume:
+            self._resume()
+
+    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
+        """Return the loader of the batches of some steps: (images, masks), see `CropDataset`."""
+        sampler = CropSampler(self.schedule, self.data.shard_sizes, self.context, first, last)
+        dataset = CropDataset(self.data.training, self.options)
+        return self._loader(dataset, batch_sampler=sampler)
+
+    def _loader(self, dataset: Any, **batches: Any) -> DataLoader[Any]:
+        return DataLoader(
+            dataset,
+            num_workers=self.num_workers,
+            pin_memory=self.engine.device.type == "cuda",
+            generator=torch.Generator(),  # not torch's own, whose state is the user's
+            **batches,
+        )
+
+    def fit(self) -> TrainingResult:
+        """Train to the last step."""
+        state, milestones = self.state, self.schedule.milestones(self.options.val_count)
+        started, pixels = time.monotonic(), 0
+        saved = started
+        if state.step < self.schedule.steps and self.log is not None:
+            self.log(f"training on {self.engine.describe()}")
+        if state.step in milestones and state.step not in {point.step for point in state.points}:
+            self._validate()  # the run was interrupted while it validated
+        bar = progress(self.schedule.steps, "training", "step", self.log is None, state.step)
+        with bar, loading(self.loader(state.step)) as batches:
+            for images, masks in batches:
+                rate = self.schedule.learning_rate(state.step)
+                state.loss_sum += self.learner.training_step(images, masks, rate, state.step)
+                state.loss_count += 1
+                state.step += 1
+                batch = len(masks) * self.context.world_size
+                state.images += batch
+                pixels += batch * masks[0].numel()
+                bar.update(1)
+                speed = pixels / (480 * 480) / (time.monotonic() - started)
+                loss = state.loss_sum / state.loss_count
+                bar.set_postfix_str(f"loss {loss:.4f}, {speed:.1f} images/s", False)
+                if state.step in milestones:
+                    self._save()  # the validation takes its time, too
+                    self._validate()
+                if state.step in milestones or time.monotonic() - saved > CHECKPOINT_SECONDS:
+                    self._save()
+                    saved = time.monotonic()
+        speed = pixels / (480 * 480) / max(time.monotonic() - started, 1e-9)
+        return self._result(speed)
+
+    def _result(self, images_per_second: float) -> TrainingResult:
+        best = self.engine.broadcast(self.best)
+        if best is None:
+            raise WeightsError(
+                f"{self.folder / BEST} is missing or damaged: train into another folder"
+            )
+        if self.context.is_main:
+            export_onnx(load_network(self.folder / BEST), self.folder / ONNX)
+            metadata = read_notes(self.folder / BEST)
+            write_model_card(self.folder / CARD, self.folder / BEST, metadata, self.state.points)
+        return TrainingResult(
+            weights=self.folder / BEST,
+            onnx=self.folder / ONNX,
+            points=self.state.points,
+            best=best,
+            images_per_second=images_per_second,
+        )
+
+    def _validate(self) -> None:
+        """Compute the validation losses; keep the weights if they are the best so far."""
+        dataset = ValidationDataset(self.data.validation, self.context)
+        with loading(self._loader(dataset, batch_size=None)) as pairs:
+            scores = self.learner.score(pairs)
+        normal = self._mean_score(scores[: len(scores) // 2])
+        dark = self._mean_score(scores[len(scores) // 2 :])
+        fraction, state = self.options.dark_fraction, self.state
+        point = CurvePoint(
+            step=state.step,
+            epoch=state.images / self.schedule.images,
+            images=state.images,
+            learning_rate=self.schedule.learning_rate(state.step - 1),
+            training_loss=state.loss_sum / state.loss_count,
+            validation_loss=(1 - fraction) * normal.loss + fraction * dark.loss,
+            normal_loss=normal.loss,
+            normal_iou=normal.iou,
+            dark_loss=dark.loss,
+            dark_iou=dark.iou,
+        )
+        state.loss_sum, state.loss_count = 0.0, 0
+        state.points.append(point)
+        if not self.context.is_main:
+            return
+        if self.best is None or point.validation_loss < self.best.validation_loss:
+            self.best = point
+            metadata = {
+                **self.run,
+                **self.metadata,
+                "photographs": str(self.schedule.images),
+                "photographs_digest": self.data.digest,
+                "point": json.dumps(dataclasses.asdict(point)),
+            }
+            save_weights(self.network, self.folder / BEST, metadata)
+        save_curves(state.points, self.folder)
+
+    def _mean_score(self, scores: list[MaskScore]) -> MaskScore:
+        """Average over the images of all processes."""
+        mine = mean_score(scores) if scores else MaskScore(0.0, 0.0, 0)
+        return mean_score(self.engine.all_gather(mine))
+
+    def _save(self) -> None:
+        if self.context.is_main:
+            metadata = {**dataclasses.asdict(self.state), **self.run, **self.metadata}
+            path = self.folder / CHECKPOINT
+            save_checkpoint(path, self.network, self.learner.optimizers, metadata)
+
+    def _resume(self) -> None:
+        """Resume from the checkpoint that the main process finds."""
+        found: Checkpoint | WeightsError | None = None
+        if self.context.is_main and (self.folder / CHECKPOINT).exists():
+            try:
+                found = read_checkpoint(self.folder / CHECKPOINT)
+            except WeightsError as error:
+                found = error
+        found = self.engine.broadcast(found)
+        if isinstance(found, WeightsError):
+            raise found  # by all processes, so that none waits for another
+        if found is None:
+            return
+        self._check_same_run(found)
+        try:
+            state = TrainingState.from_json(found.metadata, self.schedule.steps)
+        except ValueError as error:
+            raise found.unfit(error) from None
+        restore(found, self.network, self.learner.optimizers)
+        self.state = state
+        try:
+            load_network(self.folder / BEST)
+            self.best = CurvePoint(**json.loads(read_notes(self.folder / BEST)["point"]))
+        except (WeightsError, KeyError, TypeError, ValueError):
+            self.best = None  # the next validation writes it
+
+    def _check_same_run(self, checkpoint: Checkpoint) -> None:
+        before = checkpoint.metadata
+        try:
+            others = _different_options(json.loads(before["options"]), self.options)
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+            raise checkpoint.unfit(error) from None
+        other_start = before.get("start") != self.run["start"]
+        # Whether the statistics are frozen follows from the initial weights, which come last.
+        if others and not (other_start and others == ["frozen_batch_norm"]):
+            raise OptionError(
+                f"{self.folder} holds a run with other options ({', '.join(others)}): "
+                "use the same options to resume it, or another output folder"
+            )
+        if before.get("photographs") != self.data.digest:
+            raise OptionError(
+                f"{self.folder} holds a run over other images: use the same ones, to train "
+                "on and to validate with, or another output folder"
+            )
+        if other_start:
+            raise OptionError(
+                f"{self.folder} holds a run that started from other weights: "
+                "start from the same ones to resume it, or use another output folder"
+            )
+
+
+def _different_options(before: dict[str, Any], options: TrainingOptions) -> list[str]:
+    """Name the options that differ between a checkpoint and this run."""
+    now = json.loads(options.to_json())
+    return sorted(name for name in {**before, **now} if before.get(name) != now.get(name))
 
 
 def _initial_network(
-    options: TrainingOptions, init_weights: str | Path | Sequence[str | Path] | None
+    options: TrainingOptions, init_weights: InitWeights | None
 ) -> tuple[TrainingOptions, ESPNet]:
-    """Make the network with the weights that the run starts from, and settle what hangs on them."""
+    """Make the network with its initial weights, and resolve the options that depend on them."""
     if init_weights is not None:
         if options.frozen_batch_norm is None:
             options = dataclasses.replace(options, frozen_batch_norm=True)
         chosen = [init_weights] if isinstance(init_weights, (str, Path)) else list(init_weights)
         return options, average_weights([resolve_weights(name, ".safetensors") for name in chosen])
-    if options.frozen_batch_norm:
-        raise OptionError(
-            "random weights have no batch statistics to keep: name trained ones with --init, "
-            "or leave out --frozen-batch-norm"
-        )
-    if options.freeze_encoder:
-        raise OptionError(
-            "an encoder of random weights would stay random: name trained weights with --init, "
-            "or leave out --freeze-encoder"
-        )
+    for name, what in (("frozen_batch_norm", "batch statistics"), ("freeze_encoder", "encoder")):
+        if getattr(options, name):
+            raise OptionError(
+                f"{name} would keep the {what} of random weights: "
+                "give trained ones as init_weights, or leave it out"
+            )
     torch.manual_seed(options.seed)
     return dataclasses.replace(options, frozen_batch_norm=False), ESPNet()

@@ -1,103 +1,191 @@
-"""Views of a photograph for training: a size, and normal or darkened light."""
+"""The source images of a run, and their views: sizes, light, augmentation."""
 
 from __future__ import annotations
 
+import hashlib
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from ..io.image import load_image, scale_short_side
-from .darkening import Darkening, DarkeningRange, darken
-from .variation import VERSION as VARIATION_VERSION
-from .variation import vary
+from .._shared.errors import ImageError
+from ..io.image import find_images, load_image, scale_short_side
+from .augmentation import AUGMENTATION_VERSION, Darkening, augment, darken
+from .recipe import TrainingOptions
+
+DIGEST_BYTES = 65536
+"""The digest of an image depends on its size and this many bytes from its start."""
 
 
 @dataclass(frozen=True)
 class View:
-    """How a photograph is shown to the network.
+    """How an image is shown to the network.
 
     Attributes:
         short_side: length in pixels that the shorter side is scaled to.
-        darkening: the darkening, or None for the photograph as it is.
+        darkening: the darkening, or None for normal light.
         square: squashed to a square instead of scaled evenly.
-        variation: seed of a varied square (`vary`), or None for the whole photograph.
+        augmentation: seed of an augmented square (`augment`), or None for the whole image.
     """
 
     short_side: int
     darkening: Darkening | None = None
     square: bool = False
-    variation: int | None = None
+    augmentation: int | None = None
 
     @property
     def name(self) -> str:
-        """A short text that tells views of one photograph apart, fit for a file name."""
+        """A short text, unique among the views of an image and fit for a file name."""
         light = "normal"
         if self.darkening is not None:
             light = f"b{self.darkening.brightness:.3f}c{self.darkening.contrast:.3f}"
         shape = "x" * self.square
-        if self.variation is not None:
-            shape = f"v{VARIATION_VERSION}-{self.variation:08x}"
+        if self.augmentation is not None:
+            shape = f"v{AUGMENTATION_VERSION}-{self.augmentation:08x}"
         return f"{self.short_side}{shape}_{light}"
 
 
-def views_of(
-    name: str,
-    short_sides: tuple[int, ...],
-    darkening: DarkeningRange,
-    variants: int,
-    square: bool = False,
-    augmentations: int = 0,
-) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """List the normal and the dark views of a photograph, the same on every call.
+@dataclass(frozen=True)
+class SourceImage:
+    """An image that is trained on or validated with.
+
+    Attributes:
+        path: its file.
+        digest: eight hexadecimal digits that depend on the content.
+        normal, dark: its views.
+    """
+
+    path: Path
+    digest: str
+    normal: tuple[View, ...]
+    dark: tuple[View, ...]
+
+    @property
+    def validation_views(self) -> tuple[View, View]:
+        """The normal and the dark view that are validated with."""
+        return self.normal[0], self.dark[0]
+
+
+def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """List the normal and the dark views of an image, the same on every call.
 
     Args:
-        name: the photograph's relative path; its dark views are drawn from it.
-        short_sides: sizes of the views, in pixels.
-        darkening: ranges of the factors.
-        variants: dark views of each size.
-        square: squash the photograph to squares.
-        augmentations: varied views of the first size, each in normal and in dark light.
+        name: the image's relative path, the seed of its dark and augmented views.
+        options: sizes, darkening and augmentation.
 
     Returns:
-        The normal views and the dark ones, of each size in turn, the varied ones last.
+        The normal views and the dark ones, of each size in turn, the augmented ones last.
     """
     generator = np.random.default_rng(zlib.crc32(name.encode()))
-    normal = tuple(View(side, None, square) for side in short_sides)
+    normal = tuple(View(side, None, options.square) for side in options.short_sides)
     dark = tuple(
-        View(side, darkening.draw(generator), square)
-        for side in short_sides
-        for _ in range(variants)
+        View(side, options.darkening.draw(generator), options.square)
+        for side in options.short_sides
+        for _ in range(options.dark_variants)
     )
-    drawn = np.random.default_rng([zlib.crc32(name.encode()), 1])
-    for _ in range(augmentations):
-        seed = int(drawn.integers(2**32))
-        normal += (View(short_sides[0], None, False, seed),)
-        dark += (View(short_sides[0], darkening.draw(drawn), False, seed),)
+    generator = np.random.default_rng([zlib.crc32(name.encode()), 1])
+    side = options.short_sides[0]
+    for _ in range(options.augmentations):
+        seed = int(generator.integers(2**32))
+        normal += (View(side, None, False, seed),)
+        dark += (View(side, options.darkening.draw(generator), False, seed),)
     return normal, dark
 
 
-def squash(rgb: np.ndarray, side: int) -> np.ndarray:
-    """Scale an image to a square, as the paper's training images are (cubic)."""
-    if rgb.shape[:2] == (side, side):
-        return rgb
-    return cv2.resize(rgb, (side, side), interpolation=cv2.INTER_CUBIC)
-
-
-def render(photo: object, view: View) -> np.ndarray:
-    """Make a view of a photograph.
+def render(image: object, view: View) -> np.ndarray:
+    """Make a view of an image.
 
     Args:
-        photo: anything `load_image` takes.
+        image: anything `load_image` takes.
         view: the view.
 
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    if view.variation is not None:
-        rgb = vary(load_image(photo), view.short_side, view.variation)
-    else:
-        scale = squash if view.square else scale_short_side
-        rgb = scale(load_image(photo), view.short_side)
+    rgb = load_image(image)
+    if view.augmentation is not None:
+        rgb = augment(rgb, view.short_side, view.augmentation)
+    elif not view.square:
+        rgb = scale_short_side(rgb, view.short_side)
+    elif rgb.shape[:2] != (view.short_side, view.short_side):
+        size = (view.short_side, view.short_side)
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC)
     return rgb if view.darkening is None else darken(rgb, view.darkening)
+
+
+def list_images(
+    root: Path,
+    options: TrainingOptions,
+    exclude: Sequence[Path] = (),
+    limit: int | None = None,
+) -> list[SourceImage]:
+    """List the images below a folder with their views.
+
+    Args:
+        root: the folder.
+        options: sizes, darkening and augmentation of the views.
+        exclude: folders below it that are left out.
+        limit: take at most this many, chosen by the checksums of their names.
+
+    Raises:
+        ImageError: the folder is missing or empty.
+    """
+    paths = find_images(root, exclude)
+    if limit is not None and len(paths) > limit:
+        chosen = sorted(paths, key=lambda path: (zlib.crc32(path.name.encode()), path))[:limit]
+        paths = sorted(chosen)
+    return [
+        SourceImage(path, _digest_file(path), *views_of(path.relative_to(root).as_posix(), options))
+        for path in paths
+    ]
+
+
+def train_val_split(
+    images: Sequence[SourceImage], val_fraction: float = 0.05
+) -> tuple[list[SourceImage], list[SourceImage]]:
+    """Split images into those to train on and those for validation.
+
+    By the checksums of their names, so that an image stays on its side when others are added.
+
+    Args:
+        images: the images.
+        val_fraction: about this fraction of them is for validation.
+
+    Returns:
+        The images to train on, and those for validation.
+
+    Raises:
+        ImageError: there are too few images to split.
+    """
+    training: list[SourceImage] = []
+    validation: list[SourceImage] = []
+    for image in images:
+        # Of the reversed checksum, which is independent of the choice of `list_images`.
+        draw = int(f"{zlib.crc32(image.path.name.encode()):032b}"[::-1], 2) / 2**32
+        (validation if draw < val_fraction else training).append(image)
+    if not validation:
+        training, validation = training[:-1], training[-1:]
+    if not validation or not training:
+        raise ImageError(
+            "one image is too few to train on: add more, or name a folder for validation"
+        )
+    return training, validation
+
+
+def digest_images(training: Sequence[SourceImage], validation: Sequence[SourceImage]) -> str:
+    """Return a digest of the images that a run trains on and validates with."""
+    digests = [image.digest for image in training] + ["|"]
+    digests += [image.digest for image in validation]
+    return hashlib.sha256(" ".join(digests).encode()).hexdigest()[:16]
+
+
+def _digest_file(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            start = file.read(DIGEST_BYTES)
+        return f"{zlib.crc32(start, path.stat().st_size & 0xFFFFFFFF):08x}"
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check its rights") from None

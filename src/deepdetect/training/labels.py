@@ -1,4 +1,4 @@
-"""Labels of all views of all photographs, made once and kept as 1-bit PNG files."""
+"""Labels of the views of images, made once and kept as 1-bit PNG files."""
 
 from __future__ import annotations
 
@@ -19,89 +19,92 @@ from ..labels.batch import LabelTarget, LabelTask, label_files
 from ..labels.detectors import select_detectors
 from ..labels.settings import settings_for
 from ..labels.visibility import Visibility
-from .photos import Photo
-from .views import View, render
+from .views import SourceImage, View, render
 
 VISIBILITIES: tuple[Visibility, ...] = ("normal", "low")
 
 
 class LabelCache:
-    """The labels of photographs under one folder.
+    """The labels of the views of images, in one folder.
 
-    A label is named by the content of its photograph, so photographs of the same name
-    do not get each other's labels, and a replaced one gets a new label.
+    A label is named by the content of its image, so images of the same name do not get each
+    other's labels, and a replaced image gets a new label.
 
     Args:
-        folder: where the labels lie; other label settings get another subfolder.
-        options: the label options; each view decides the visibility itself.
+        folder: where the labels are; each set of label settings has its own subfolder.
+        options: the label options, except for the visibility, which depends on the view.
     """
 
     def __init__(self, folder: Path, options: LabelOptions) -> None:
         self.options = options
         self.folder = folder / settings_digest(options)
 
-    def path(self, photo: Photo, view: View) -> Path:
+    def path(self, image: SourceImage, view: View) -> Path:
         """Return the file of a label."""
-        return self.folder / f"{photo.path.stem}_{photo.digest}_{view.name}.png"
+        return self.folder / f"{image.path.stem}_{image.digest}_{view.name}.png"
 
-    def load(self, photo: Photo, view: View) -> np.ndarray:
+    def load(self, image: SourceImage, view: View) -> np.ndarray:
         """Read a label as (H, W) bool."""
-        return load_mask(self.path(photo, view))
+        return load_mask(self.path(image, view))
 
     def make(
-        self, wanted: Sequence[tuple[Photo, Sequence[View]]], workers: int | None, quiet: bool
+        self,
+        wanted: Sequence[tuple[SourceImage, Sequence[View]]],
+        workers: int | None = None,
+        quiet: bool = True,
     ) -> int:
-        """Make the labels that are not there yet, in parallel over processes.
+        """Make the labels that do not exist yet, in parallel over processes.
 
         Args:
-            wanted: photographs, each with the views that are needed.
-            workers: number of processes; default one for each processor.
+            wanted: images, each with the views whose labels are needed.
+            workers: number of processes; default one per processor.
             quiet: show no progress bar.
 
         Returns:
             How many were made.
 
         Raises:
-            DeepDetectError: a photograph cannot be read; the other labels are made all the same.
+            DeepDetectError: an image cannot be read; the other labels are made all the same.
         """
         there = {path.name for path in self.folder.glob("*.png")} if self.folder.is_dir() else set()
         tasks = []
-        for photo, views in wanted:
-            paths = [(view, self.path(photo, view)) for view in views]
+        for image, views in wanted:
             targets = tuple(
                 LabelTarget(
-                    path, view_options(view, self.options), transform=partial(render, view=view)
+                    self.path(image, view),
+                    view_label_options(view, self.options),
+                    transform=partial(render, view=view),
                 )
-                for view, path in paths
-                if path.name not in there
+                for view in views
+                if self.path(image, view).name not in there
             )
             if targets:
-                tasks.append(LabelTask(photo.path, targets))
+                tasks.append(LabelTask(image.path, targets))
         total = sum(len(task.targets) for task in tasks)
         with progress(total, "labels", "label", quiet) as bar:
             reports = label_files(tasks, workers, lambda _: bar.update(1))
         failures = {report.image: report.error for report in reports if report.error is not None}
         if failures:
             raise DeepDetectError(
-                f"{len(failures)} of {len(wanted)} photographs cannot be read, the labels of the "
+                f"{len(failures)} of {len(wanted)} images cannot be read, the labels of the "
                 f"others are kept; the first: {next(iter(failures.values()))}"
             )
         return total
 
 
-def view_options(view: View, options: LabelOptions) -> LabelOptions:
+def view_label_options(view: View, options: LabelOptions) -> LabelOptions:
     """Give a dark view the low-visibility settings, a normal one the normal settings."""
     visibility: Visibility = "normal" if view.darkening is None else "low"
     return dataclasses.replace(options, visibility=visibility)
 
 
-def label_of_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray:
-    """Make the label of a view of a (H, W, 3) uint8 RGB photograph, (H, W) bool."""
-    return fuse(luma(render(rgb, view)), view_options(view, options)).mask
+def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray:
+    """Make the label of a view of a (H, W, 3) uint8 RGB image, (H, W) bool."""
+    return fuse(luma(render(rgb, view)), view_label_options(view, options)).mask
 
 
 def settings_digest(options: LabelOptions) -> str:
-    """Name a folder by all that a label depends on besides the photograph and the view."""
+    """Return a digest of everything a label depends on besides the image and the view."""
     used = [
         (detector.name, *(repr(settings_for(detector, v, options.changes)) for v in VISIBILITIES))
         for detector in select_detectors(options.detectors)

@@ -1,0 +1,254 @@
+"""torch datasets: random crops to train on, and whole images for validation."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from .._shared.errors import DeepDetectError, ImageError
+from .._shared.parallel import available_memory
+from .augmentation import flip, jitter_color, transpose
+from .engine import DistributedContext
+from .labels import LabelCache
+from .recipe import Stage, TrainingOptions
+from .sampler import CropIndex
+from .shards import Shards, ShardSource, has_shards
+from .views import SourceImage, View, digest_images, list_images, render, train_val_split
+
+
+class ImageSource(Protocol):
+    """Images with labels, in a folder or in shards."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> SourceImage:
+        """Return an image, which lists its views."""
+        ...
+
+    def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool."""
+        ...
+
+
+class FolderSource:
+    """Images in files, with labels in a cache. Views are kept in memory up to a limit.
+
+    Args:
+        images: the images.
+        labels: their labels.
+        memory_bytes: how much memory views may take; those beyond it are rendered each time.
+    """
+
+    def __init__(
+        self, images: Sequence[SourceImage], labels: LabelCache, memory_bytes: int = 0
+    ) -> None:
+        self.images, self.labels, self.memory_bytes = images, labels, memory_bytes
+        self._kept: dict[tuple[int, View], tuple[np.ndarray, np.ndarray]] = {}
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, index: int) -> SourceImage:
+        return self.images[index]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_kept": {}}  # a process that is not forked has its own
+
+    def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool."""
+        if (index, view) in self._kept:
+            return self._kept[index, view]
+        source = self.images[index]
+        image, mask = render(source.path, view), self.labels.load(source, view)
+        if mask.shape != image.shape[:2]:
+            raise ImageError(
+                f"the label of {source.path} has another size than the image: "
+                f"delete {self.labels.folder} and start again"
+            )
+        if image.nbytes + mask.nbytes <= self.memory_bytes:
+            self.memory_bytes -= image.nbytes + mask.nbytes
+            self._kept[index, view] = image, mask
+        return image, mask
+
+
+class CropDataset(Dataset[tuple[Tensor, Tensor]]):
+    """Random crops of views, augmented. Its indices come from a `CropSampler`.
+
+    Each crop is a pure function of its index and the seed: (crop, crop, 3) uint8 RGB, and
+    (crop, crop) bool label.
+
+    Args:
+        source: the images.
+        options: the recipe.
+    """
+
+    def __init__(self, source: ImageSource, options: TrainingOptions) -> None:
+        self.source, self.options = source, options
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, index: CropIndex) -> tuple[Tensor, Tensor]:
+        options, side = self.options, index.stage.crop
+        generator = np.random.default_rng([options.seed, 2, index.epoch, index.position])
+        view = self._choose_view(self.source[index.image], index.stage, generator)
+        image, mask = self.source.load(index.image, view)
+        top = int(generator.integers(image.shape[0] - side + 1))
+        left = int(generator.integers(image.shape[1] - side + 1))
+        image = image[top : top + side, left : left + side]
+        mask = mask[top : top + side, left : left + side]
+        for axis in (1, 0) if options.flips else ():  # left-right, then upside down
+            if generator.random() < 0.5:
+                image, mask = flip(image, mask, axis)
+        if options.transpositions and generator.random() < 0.5:
+            image, mask = transpose(image, mask)
+        if generator.random() < options.color_jitter:
+            image = jitter_color(image, generator, exact=view.darkening is not None)
+        return torch.tensor(image), torch.tensor(mask)
+
+    def _choose_view(
+        self, image: SourceImage, stage: Stage, generator: np.random.Generator
+    ) -> View:
+        """Choose the light by the dark fraction, then one of the stage's sizes."""
+        dark = generator.random() < self.options.dark_fraction
+        fitting = [
+            view
+            for view in (image.dark if dark else image.normal)
+            if view.short_side >= stage.crop and (not stage.sides or view.short_side in stage.sides)
+        ]
+        return fitting[int(generator.integers(len(fitting)))]
+
+
+class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
+    """Whole images: (H, W, 3) uint8 RGB, and (H, W) bool label.
+
+    Those in normal light come first, then the darkened ones.
+
+    Args:
+        source: the images.
+        context: this process; it gets its part of the images.
+    """
+
+    def __init__(
+        self, source: ImageSource, context: DistributedContext = DistributedContext()
+    ) -> None:
+        self.source = source
+        self.indices = range(context.rank, len(source), context.world_size)
+
+    def __len__(self) -> int:
+        return 2 * len(self.indices)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        light, place = divmod(index, len(self.indices))
+        number = self.indices[place]
+        image, mask = self.source.load(number, self.source[number].validation_views[light])
+        return torch.tensor(image), torch.tensor(mask)
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """The images of a run.
+
+    Attributes:
+        training, validation: the images to train on and to validate with.
+        digest: a digest of which images there are.
+        shard_sizes: number of training images in each shard, None for images in a folder.
+    """
+
+    training: ImageSource
+    validation: ImageSource
+    digest: str
+    shard_sizes: tuple[int, ...] | None = None
+
+
+def prepare_data(
+    images: Path,
+    options: TrainingOptions,
+    output: Path,
+    *,
+    validation: Path | None = None,
+    labels: Path | None = None,
+    workers: int | None = None,
+    num_workers: int = 0,
+    quiet: bool = True,
+) -> TrainingData:
+    """List the images of a run and make the labels of all their views.
+
+    The first process of each machine makes the labels, the others wait for it.
+
+    Args:
+        images: folder of images, or of shards (`write_shards`).
+        options: the recipe.
+        output: folder of the run, which is left out when it is below the images.
+        validation: folder of other images; None holds out some of the first.
+        labels: folder of the label cache; None: in `output`.
+        workers: processes that make labels; default one per processor.
+        num_workers: processes that will load the data, for their share of the memory.
+        quiet: show no progress bar.
+
+    Raises:
+        ImageError: a folder is missing or empty.
+        OptionError: a batch cannot be divided evenly among the processes.
+        DeepDetectError: an image cannot be read.
+    """
+    context = DistributedContext.from_environment()
+    for stage in options.stages:
+        context.local_slice(stage.batch)  # an uneven one is reported before the labels are made
+    cache = LabelCache(output / "labels" if labels is None else labels, options.label_options)
+    exclude = (output, output / "labels" if labels is None else labels)
+    shards = Shards.open(images, options) if has_shards(images) else None
+    listed = [] if shards else list_images(images, options, exclude, options.max_images)
+    held_out: list[SourceImage] = []
+    if validation is not None:
+        held_out = list_images(validation, options, exclude)
+    elif not shards:
+        listed, held_out = train_val_split(listed, options.val_fraction)
+    if context.local_rank == 0:
+        wanted = [(i, i.normal + i.dark * (options.dark_fraction > 0)) for i in listed]
+        wanted += [(image, image.validation_views) for image in held_out]
+        cache.make(wanted, workers, quiet or not context.is_main)
+    context.barrier()
+    # Half of the free memory, for all processes together.
+    memory = available_memory() // (2 * context.local_world_size * max(1, num_workers))
+    held = FolderSource(held_out, cache, memory // 8)
+    if not shards:
+        return TrainingData(
+            FolderSource(listed, cache, memory), held, digest_images(listed, held_out)
+        )
+    source, sizes = ShardSource(shards.training, options), tuple(n for _, n in shards.training)
+    if validation is None:
+        own = ShardSource(shards.validation, options)
+        return TrainingData(source, own, shards.digest, sizes)
+    return TrainingData(source, held, f"{shards.digest} {digest_images([], held_out)}", sizes)
+
+
+@contextlib.contextmanager
+def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
+    """Iterate over a loader; an error in one of its processes comes as it was raised there.
+
+    Yields:
+        The iterator over its batches. OpenCV has one thread meanwhile: a forked process cannot
+        use the threads of its parent.
+    """
+    threads = cv2.getNumThreads()
+    if loader.num_workers:
+        cv2.setNumThreads(1)
+    try:
+        yield iter(loader)
+    except DeepDetectError as error:
+        # torch puts the whole traceback into the message.
+        text = str(error).strip()
+        if not text.startswith("Caught "):
+            raise
+        raise type(error)(text.splitlines()[-1].partition(": ")[2]) from None
+    finally:
+        cv2.setNumThreads(threads)

@@ -1,0 +1,164 @@
+"""Optimisers by name: Adam and SOAP."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from .._shared.errors import unknown_name
+from .recipe import OPTIMIZERS
+
+INITIAL_POWER_ITERATIONS = 3
+"""Steps of the power iteration from the axes to the first eigenbasis of `Soap`."""
+
+Broadcast = Callable[[Tensor], object]
+
+
+def make_optimizers(
+    name: str, network: nn.Module, broadcast_: Broadcast = lambda tensor: None
+) -> list[Optimizer]:
+    """Make the optimisers that together train a network's parameters, except frozen ones.
+
+    Args:
+        name: "adam", or "soap": SOAP for the kernels, Adam for biases and the like.
+        network: the network.
+        broadcast_: replaces a tensor, in place, by that of the main process.
+
+    Raises:
+        OptionError: the name is unknown (the nearest right one is named).
+
+    Example:
+        >>> len(make_optimizers("adam", nn.Linear(2, 1)))
+        1
+    """
+    trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    if name == "adam":
+        return [torch.optim.Adam(trained, fused=True)]
+    if name == "soap":
+        kernels = [parameter for parameter in trained if parameter.ndim > 1]
+        vectors = [parameter for parameter in trained if parameter.ndim <= 1]
+        return [Soap(kernels, broadcast_=broadcast_), torch.optim.Adam(vectors, fused=True)]
+    raise unknown_name("optimizer", name, OPTIMIZERS)
+
+
+def state_shapes(optimizer: Optimizer, parameter: Tensor) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of what an optimiser of `make_optimizers` keeps of a parameter."""
+    if isinstance(optimizer, Soap):
+        rows, columns = len(parameter), parameter[0].numel()
+        return {
+            "step": (),
+            "exp_avg": (rows, columns),
+            "exp_avg_sq": (rows, columns),
+            **dict.fromkeys(("left", "left_basis"), (rows, rows)),
+            **dict.fromkeys(("right", "right_basis"), (columns, columns)),
+        }
+    shape = tuple(parameter.shape)
+    return {"step": (), "exp_avg": shape, "exp_avg_sq": shape}
+
+
+class Soap(Optimizer):
+    """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
+
+    For matrices and convolution kernels: a kernel is a matrix with one row per output channel.
+    (Other implementations keep one basis for each axis of a kernel, 3x3 pixels apart, and lists
+    in their state.) All of the state are tensors, per parameter, so that safetensors can store
+    them. The first step only computes the first basis.
+
+    Args:
+        parameters: tensors of two or more axes.
+        lr: learning rate.
+        betas: decay of the mean gradient, and of its square in the eigenbasis.
+        preconditioner_beta: decay of the two matrices whose eigenvectors are the basis.
+        eps: keeps the division finite.
+        precondition_frequency: steps from one update of the basis to the next.
+        broadcast_: replaces a tensor, in place, by that of the main process. Each process takes
+            the same steps, but bases differ by the rounding of their processors, and more and
+            more so: the eigenvectors of small eigenvalues are rounding noise.
+
+    Example:
+        >>> weight = nn.Parameter(torch.ones(3, 2))
+        >>> optimizer = Soap([weight], lr=0.1)
+        >>> for _ in range(20):
+        ...     optimizer.zero_grad()
+        ...     weight.square().sum().backward()
+        ...     optimizer.step()
+        >>> bool(weight.square().sum() < 1)
+        True
+    """
+
+    def __init__(
+        self,
+        parameters: Iterable[nn.Parameter],
+        lr: float = 1e-3,
+        betas: tuple[float, float] = (0.95, 0.95),
+        preconditioner_beta: float = 0.95,
+        eps: float = 1e-8,
+        precondition_frequency: int = 10,
+        broadcast_: Broadcast = lambda tensor: None,
+    ) -> None:
+        super().__init__(parameters, {"lr": lr})
+        self.betas, self.preconditioner_beta, self.eps = betas, preconditioner_beta, eps
+        self.precondition_frequency = precondition_frequency
+        self.broadcast_ = broadcast_
+
+    @torch.no_grad()
+    def step(self) -> None:  # type: ignore[override]  # takes no closure
+        """Make one step along the gradients of the parameters."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    self._step(parameter, parameter.grad, group["lr"])
+
+    def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:
+        gradient = gradient.reshape(len(parameter), -1).float().contiguous()
+        state = self.state[parameter]
+        if not state:
+            state.update(_initial_state(gradient))
+            for side in ("left", "right"):
+                self.broadcast_(state[f"{side}_basis"])
+            return
+        state["step"] = state["step"].cpu() + 1  # a checkpoint restores it on the GPU
+        left, right = state["left_basis"], state["right_basis"]
+        mean, square = state["exp_avg"], state["exp_avg_sq"]
+        mean.lerp_(gradient, 1 - self.betas[0])
+        square.lerp_((left.T @ gradient @ right).square_(), 1 - self.betas[1])
+        step = int(state["step"])
+        rotated = left.T @ mean @ right / (1 - self.betas[0] ** step)
+        scale = (square / (1 - self.betas[1] ** step)).sqrt_().add_(self.eps)
+        change = left @ (rotated / scale) @ right.T
+        parameter.add_(change.reshape(parameter.shape), alpha=-learning_rate)
+        state["left"].lerp_(gradient @ gradient.T, 1 - self.preconditioner_beta)
+        state["right"].lerp_(gradient.T @ gradient, 1 - self.preconditioner_beta)
+        if step % self.precondition_frequency == 0:
+            for axis, side in enumerate(("left", "right")):
+                self._update_basis(state, side, axis)
+
+    def _update_basis(self, state: dict[str, Tensor], side: str, axis: int) -> None:
+        """Follow the eigenvectors of one side by a step of the power iteration."""
+        matrix, basis = state[side], state[f"{side}_basis"]
+        order = (basis.T @ matrix @ basis).diagonal().argsort(descending=True)
+        self.broadcast_(order)
+        state["exp_avg_sq"].copy_(state["exp_avg_sq"].index_select(axis, order))
+        basis.copy_(torch.linalg.qr(matrix @ basis[:, order])[0])
+        self.broadcast_(basis)
+
+
+def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
+    """Return the state of a parameter at its first gradient, a matrix."""
+    state = {
+        "step": torch.zeros(()),
+        "exp_avg": torch.zeros_like(gradient),
+        "exp_avg_sq": torch.zeros_like(gradient),
+        "left": gradient @ gradient.T,
+        "right": gradient.T @ gradient,
+    }
+    for side in ("left", "right"):
+        basis = torch.eye(len(state[side]), device=gradient.device)
+        for _ in range(INITIAL_POWER_ITERATIONS):
+            basis = torch.linalg.qr(state[side] @ basis)[0]
+        # Stored by rows, as a checkpoint restores it: rounding depends on the layout.
+        state[f"{side}_basis"] = basis.contiguous()
+    return state

@@ -1,0 +1,348 @@
+"""Images with their labels in shards, for sets much larger than the memory or on slow disks.
+
+A shard is a tar file in the layout of WebDataset: of every image the file as it was, its name,
+and the labels of its views. Nothing in it is compressed, so any image can be read by itself; the
+sampler reads a few shards at a time, so that a disk or a network delivers each of them in one go.
+"""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+import functools
+import hashlib
+import io
+import itertools
+import json
+import tarfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import DeepDetectError, ImageError, OptionError
+from .._shared.parallel import map_in_processes
+from .._shared.progress import progress
+from ..io.image import load_image
+from ..io.masks import encode_mask, load_mask
+from ..labels import LabelOptions
+from .labels import label_view, settings_digest
+from .recipe import TrainingOptions
+from .views import SourceImage, View, list_images, render, train_val_split, views_of
+
+INDEX = "shards.json"
+Files = tuple[tuple[Path, int], ...]
+
+
+@dataclass(frozen=True)
+class Shards:
+    """A folder of shards.
+
+    Attributes:
+        folder: the folder.
+        training, validation: files, each with the number of its images. Their names
+            hold a digest of what is in them.
+    """
+
+    folder: Path
+    training: Files
+    validation: Files
+
+    @classmethod
+    def open(cls, folder: Path, options: TrainingOptions) -> Shards:
+        """Read the index of a folder of shards.
+
+        Args:
+            folder: the folder.
+            options: the recipe that they are for.
+
+        Raises:
+            OptionError: the shards were made with other options.
+            ImageError: the index is damaged, or a shard is missing.
+        """
+        index = _read_index(folder)
+        try:
+            training, validation = (
+                tuple((folder / Path(row["file"]).name, int(row["images"])) for row in index[kind])
+                for kind in ("training", "validation")
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise _damaged(folder / INDEX, error) from None
+        _check_options(folder, index, options)
+        for path, _ in training + validation:
+            if not path.is_file():
+                raise ImageError(f"the shard {path} is missing: write the shards again")
+        return cls(folder, training, validation)
+
+    @property
+    def digest(self) -> str:
+        """A digest of which images there are, and how they are packed."""
+        rows = [[path.name, count] for path, count in self.training + self.validation]
+        return hashlib.sha256(json.dumps(rows).encode()).hexdigest()[:16]
+
+
+class ShardSource:
+    """Images in shards.
+
+    Args:
+        files: the shards, each with the number of its images.
+        options: the recipe, which decides the views.
+    """
+
+    def __init__(self, files: Files, options: TrainingOptions) -> None:
+        self.files, self.options = files, options
+        self.ends = list(itertools.accumulate(count for _, count in files))
+
+    def __len__(self) -> int:
+        return self.ends[-1] if self.ends else 0
+
+    def __getitem__(self, index: int) -> SourceImage:
+        """Return an image, whose path is its name in the folder it came from."""
+        shard, key, sample = self._sample(index)
+        name = _read(shard, sample["name.txt"]).decode()
+        return SourceImage(Path(name), key.rpartition("_")[2], *views_of(name, self.options))
+
+    def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool.
+
+        Raises:
+            ImageError: the image or its label is damaged or missing.
+        """
+        shard, _, sample = self._sample(index)
+        try:
+            (place,) = (place for name, place in sample.items() if name.startswith("image."))
+            image = render(_read(shard, place), view)
+            mask = load_mask(_read(shard, sample[f"label.{view.name}.png"]))
+        except (ImageError, KeyError, ValueError) as error:
+            raise _damaged(shard, f"{self[index].path}: {error}") from None
+        if mask.shape != image.shape[:2]:
+            raise _damaged(shard, f"the label of {self[index].path} has another size")
+        return image, mask
+
+    def _sample(self, index: int) -> tuple[Path, str, Mapping[str, tuple[int, int]]]:
+        """Return the shard of an image, its key, and the places of its files."""
+        number = bisect.bisect_right(self.ends, index)
+        path, count = self.files[number]
+        samples = _read_members(path)
+        if len(samples) != count:
+            raise _damaged(path, f"{len(samples)} images instead of {count}")
+        key, sample = samples[index - self.ends[number] + count]
+        return path, key, sample
+
+
+def has_shards(folder: Path) -> bool:
+    """Return whether a folder holds shards.
+
+    Raises:
+        ImageError: it holds some, but not all of them are written.
+    """
+    if (folder / INDEX).is_file():
+        return True
+    if any(folder.glob("training-*-*.tar")):
+        raise ImageError(f"the shards in {folder} are not complete: write the shards again")
+    return False
+
+
+def write_shards(
+    images: Path,
+    output: Path,
+    options: TrainingOptions,
+    *,
+    shard_size: int = 256,
+    workers: int | None = None,
+    quiet: bool = True,
+) -> Shards:
+    """Write images with their labels into shards, in parallel over processes.
+
+    Shards that exist already with the same content stay: an interrupted call resumes, and when
+    some images have changed, only their shards are written again.
+
+    Args:
+        images: folder of images.
+        output: another folder, for the shards.
+        options: the recipe of the runs to come; it decides which images are for validation.
+        shard_size: about this many images go into a shard.
+        workers: number of processes; default one per processor.
+        quiet: show no progress bar.
+
+    Raises:
+        ImageError: the folder is missing, or has too few images.
+        OptionError: the folder has shards that were made with other options.
+        DeepDetectError: images cannot be read; the other shards are kept.
+
+    Example:
+        >>> write_shards(Path("images"), Path("shards"), TrainingOptions())  # doctest: +SKIP
+    """
+    if shard_size < 1:
+        raise OptionError(f"shard_size must be at least 1, not {shard_size}")
+    if images.resolve() == output.resolve():
+        raise OptionError(f"{output} holds the images: choose another output folder")
+    if (output / INDEX).exists():
+        _check_options(output, _read_index(output), options)
+    listed = list_images(images, options, (output,), options.max_images)
+    files: dict[str, list[tuple[Path, int]]] = {"training": [], "validation": []}
+    tasks = []
+    for kind, part in zip(files, train_val_split(listed, options.val_fraction), strict=True):
+        for number, chosen in enumerate(_deal(part, images, shard_size)):
+            if chosen:
+                task = _ShardTask(
+                    images, tuple(chosen), kind == "validation", options.label_options
+                )
+                path = output / f"{kind}-{number:06d}-{task.digest}.tar"
+                files[kind].append((path, len(chosen)))
+                if not path.exists():
+                    tasks.append((path, task))
+    failures = []
+    total = sum(len(task.images) for _, task in tasks)
+    with progress(total, "shards", "image", quiet) as bar:
+        for count, failure in map_in_processes(_write_shard, tasks, workers):
+            bar.update(count)
+            if failure is not None:
+                failures.append(failure)
+    if failures:
+        raise DeepDetectError(
+            f"{len(failures)} of {len(tasks)} shards cannot be written, the others are kept; "
+            f"the first: {failures[0]}"
+        )
+    index: dict[str, Any] = {"options": _fixed_options(options)}
+    for kind, rows in files.items():
+        index[kind] = [{"file": path.name, "images": count} for path, count in rows]
+    with atomic_path(output / INDEX) as temporary:  # after all shards
+        temporary.write_text(json.dumps(index, indent=1))
+    return Shards(output, tuple(files["training"]), tuple(files["validation"]))
+
+
+@dataclass(frozen=True)
+class _ShardTask:
+    """A shard to be written."""
+
+    root: Path
+    images: tuple[SourceImage, ...]
+    for_validation: bool
+    options: LabelOptions
+
+    def name(self, image: SourceImage) -> str:
+        """The path of an image in the folder, from which its views are drawn."""
+        return image.path.relative_to(self.root).as_posix()
+
+    def views(self, image: SourceImage) -> tuple[View, ...]:
+        """The views whose labels are needed."""
+        return image.validation_views if self.for_validation else image.normal + image.dark
+
+    @property
+    def digest(self) -> str:
+        """A digest of everything the shard's content depends on."""
+        parts = [settings_digest(self.options)]
+        for image in self.images:
+            parts += [self.name(image), image.digest, *(view.name for view in self.views(image))]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+
+
+def _deal(images: Sequence[SourceImage], root: Path, shard_size: int) -> list[list[SourceImage]]:
+    """Deal images to shards by the checksums of their names.
+
+    So no shard holds one kind of image only, and most shards stay as they are when an image is
+    added or removed.
+    """
+    shards: list[list[SourceImage]] = [[] for _ in range(-(-len(images) // shard_size))]
+    for image in images:
+        name = image.path.relative_to(root).as_posix()
+        checksum = hashlib.sha256(name.encode()).digest()
+        shards[int.from_bytes(checksum[:8], "big") % len(shards)].append(image)
+    return shards
+
+
+def _write_shard(job: tuple[Path, _ShardTask]) -> tuple[int, str | None]:
+    """Write one shard; return the number of its images, and what went wrong or None."""
+    path, task = job
+    try:
+        with atomic_path(path) as temporary, tarfile.open(temporary, "w") as tar:
+            for k, image in enumerate(task.images):
+                for ending, content in _files_of(image, task).items():
+                    # No time of writing: the same images give the same file.
+                    member = tarfile.TarInfo(f"{k:06d}_{image.digest}.{ending}")
+                    member.size = len(content)
+                    tar.addfile(member, io.BytesIO(content))
+    except DeepDetectError as error:
+        return len(task.images), str(error)
+    return len(task.images), None
+
+
+def _files_of(image: SourceImage, task: _ShardTask) -> dict[str, bytes]:
+    """Return the files of an image by their endings."""
+    path = image.path
+    try:
+        content = path.read_bytes()
+        rgb = load_image(content)
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check its rights") from None
+    except ImageError as error:
+        raise ImageError(str(error).replace("the image", str(path), 1)) from None
+    files = {"name.txt": task.name(image).encode(), f"image{path.suffix.lower()}": content}
+    for view in task.views(image):
+        mask = label_view(rgb, view, task.options)
+        files[f"label.{view.name}.png"] = encode_mask(mask)
+    return files
+
+
+@functools.lru_cache(maxsize=64)
+def _read_members(path: Path) -> list[tuple[str, dict[str, tuple[int, int]]]]:
+    """List the images of a shard: the key of each, and where its files begin and how long they are.
+
+    Raises:
+        ImageError: it is damaged.
+    """
+    samples: dict[str, dict[str, tuple[int, int]]] = {}
+    try:
+        with tarfile.open(path, "r:") as tar:
+            for member in tar:
+                key, _, ending = member.name.partition(".")
+                samples.setdefault(key, {})[ending] = member.offset_data, member.size
+    except (OSError, tarfile.TarError) as error:
+        raise _damaged(path, error) from None
+    return list(samples.items())
+
+
+def _read(path: Path, place: tuple[int, int]) -> bytes:
+    offset, size = place
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            return file.read(size)
+    except OSError as error:
+        raise _damaged(path, error) from None
+
+
+def _read_index(folder: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads((folder / INDEX).read_text()))
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise _damaged(folder / INDEX, error) from None
+
+
+def _damaged(path: Path, reason: object) -> ImageError:
+    return ImageError(f"{path} is damaged ({reason}): delete it and write the shards again")
+
+
+def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
+    """Return what of a recipe is fixed once the labels are made, as JSON would give it back."""
+    names = ("short_sides", "square", "max_images", "val_fraction", "dark_variants")
+    fixed = {name: getattr(options, name) for name in (*names, "augmentations")}
+    fixed["darkening"] = dataclasses.asdict(options.darkening)
+    fixed["labels"] = settings_digest(options.label_options)
+    return dict(json.loads(json.dumps(fixed)))
+
+
+def _check_options(folder: Path, index: dict[str, Any], options: TrainingOptions) -> None:
+    fixed, found = _fixed_options(options), index.get("options")
+    if not isinstance(found, dict):
+        raise _damaged(folder / INDEX, "it has no options")
+    other = [name for name in fixed if found.get(name) != fixed[name]]
+    if other:
+        raise OptionError(
+            f"the shards in {folder} were made with other options ({', '.join(other)}): "
+            "make the shards and train with the same, or write to another folder"
+        )
