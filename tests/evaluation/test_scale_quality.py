@@ -10,7 +10,7 @@ from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.evaluation.scale_quality import scale_quality
 from deepdetect.io.image import luma
 from deepdetect.labels import fuse
-from deepdetect.training.darkening import Darkening
+from deepdetect.training.augmentation import Darkening
 from deepdetect.training.views import View, render
 
 

@@ -15,7 +15,14 @@ from PIL import EpsImagePlugin, Image, ImageOps
 from PIL.PngImagePlugin import PngInfo
 
 from deepdetect._shared.errors import ImageError
-from deepdetect.io.image import IMAGE_SUFFIXES, MINIMUM_SIDE, find_images, load_image, luma
+from deepdetect.io.image import (
+    IMAGE_SUFFIXES,
+    MINIMUM_SIDE,
+    find_images,
+    load_image,
+    luma,
+    scale_short_side,
+)
 
 OneLine = Callable[[BaseException], str]
 
@@ -480,3 +487,43 @@ def test_every_exif_orientation_is_that_of_pillow(tmp_path: Path) -> None:
         with Image.open(path) as opened:
             expected = np.asarray(ImageOps.exif_transpose(opened))
         np.testing.assert_array_equal(load_image(path), expected)
+
+
+@pytest.mark.parametrize(
+    ("size", "side", "expected"),
+    [
+        ((480, 640), 240, (240, 320)),
+        ((640, 480), 240, (320, 240)),
+        ((100, 100), 50, (50, 50)),
+        ((30, 45), 60, (60, 90)),
+        ((101, 203), 50, (50, 100)),
+        ((16, 16), 17, (17, 17)),
+    ],
+)
+def test_scaled_sizes(size: tuple[int, int], side: int, expected: tuple[int, int]) -> None:
+    assert scale_short_side(np.zeros((*size, 3), np.uint8), side).shape == (*expected, 3)
+
+
+@given(height=st.integers(16, 300), width=st.integers(16, 300), side=st.integers(16, 300))
+def test_the_short_side_is_exact_and_the_shape_is_kept(height: int, width: int, side: int) -> None:
+    scaled = scale_short_side(np.zeros((height, width, 3), np.uint8), side)
+    assert min(scaled.shape[:2]) == side
+    factor = side / min(height, width)
+    assert scaled.shape[0] == pytest.approx(height * factor, abs=0.5)
+    assert scaled.shape[1] == pytest.approx(width * factor, abs=0.5)
+
+
+def test_shrinking_averages_areas(photo: np.ndarray) -> None:
+    sums = photo.astype(int).reshape(64, 4, 64, 4, 3).sum((1, 3))
+    assert np.abs(scale_short_side(photo, 64) - sums / 16).max() <= 0.5
+
+
+def test_an_image_of_the_right_size_is_not_touched(photo: np.ndarray) -> None:
+    np.testing.assert_array_equal(scale_short_side(photo, 256), photo)
+
+
+def test_enlarging_and_shrinking_gives_the_image_back(photo: np.ndarray) -> None:
+    twice = scale_short_side(photo, 512)
+    assert twice.shape == (512, 512, 3)
+    back = scale_short_side(twice, 256)
+    assert np.abs(back.astype(int) - photo).mean() < 2

@@ -1,18 +1,44 @@
 from __future__ import annotations
 
+import io
 import math
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from PIL import Image, ImageEnhance
 
-from deepdetect.io.image import luma
-from deepdetect.labels import DETECTOR_NAMES, LabelOptions, fuse
-from deepdetect.training.augmentation import flip, transpose, turn_hue, without_color
+from deepdetect import OptionError
+from deepdetect.io.image import load_image, luma
+from deepdetect.labels import (
+    DETECTOR_NAMES,
+    LOW_VISIBILITY_RANGE,
+    LabelOptions,
+    fuse,
+    luma_range,
+    visibility_of,
+)
+from deepdetect.training import augmentation
+from deepdetect.training.augmentation import (
+    AugmentationRanges,
+    Darkening,
+    DarkeningRange,
+    augment,
+    darken,
+    flip,
+    jitter_color,
+    rotate_hue,
+    to_gray,
+    transpose,
+)
 
 IMAGES = arrays(np.uint8, (6, 7, 3))
+FACTORS = st.floats(0.01, 1) | st.integers(1, 1000).map(lambda n: n / 1000)
+RANGE = DarkeningRange()
+RANGES = AugmentationRanges()
 
 
 def test_mirrors_move_image_and_label_together() -> None:
@@ -42,7 +68,6 @@ def test_a_transposed_photograph_has_the_transposed_label(name: str, photo: np.n
     ).sum()
 
 
-@pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(
     ("name", "least", "most"),
     [
@@ -58,18 +83,19 @@ def test_a_transposed_photograph_has_the_transposed_label(name: str, photo: np.n
     ],
 )
 def test_a_mirrored_photograph_has_another_label(
-    name: str, least: float, most: float, axis: int, photo: np.ndarray
+    name: str, least: float, most: float, photo: np.ndarray
 ) -> None:
     """Why crops are not flipped: OpenCV's Shi-Tomasi, for one, marks the pixel beside."""
     options = LabelOptions((name,))
-    flipped, expected = flip(photo, fuse(luma(photo), options).mask, axis)
-    found = fuse(luma(flipped), options).mask
-    assert least <= (found & expected).sum() / (found | expected).sum() <= most
+    for axis in (0, 1):
+        flipped, expected = flip(photo, fuse(luma(photo), options).mask, axis)
+        found = fuse(luma(flipped), options).mask
+        assert least <= (found & expected).sum() / (found | expected).sum() <= most
 
 
 @given(image=IMAGES)
-def test_without_color_the_luma_is_the_same(image: np.ndarray) -> None:
-    gray = without_color(image)
+def test_to_gray_the_luma_is_the_same(image: np.ndarray) -> None:
+    gray = to_gray(image)
     np.testing.assert_array_equal(luma(gray), luma(image))
     assert (gray == gray[..., :1]).all()
 
@@ -78,21 +104,254 @@ def test_without_color_the_luma_is_the_same(image: np.ndarray) -> None:
 def test_other_colors_have_the_same_luma(
     image: np.ndarray, angle: float, saturation: float
 ) -> None:
-    turned = turn_hue(image, angle, saturation)
+    turned = rotate_hue(image, angle, saturation)
     assert turned.dtype == np.uint8
     assert np.abs(luma(turned).astype(int) - luma(image)).max() <= 1
 
 
+def test_color_jitter_is_exact_where_it_must_be(photo: np.ndarray) -> None:
+    made = [jitter_color(photo, np.random.default_rng(seed), exact=False) for seed in range(12)]
+    gray = [np.array_equal(image, to_gray(photo)) for image in made]
+    assert 2 < sum(gray) < 10
+    for seed in range(4):
+        exact = jitter_color(photo, np.random.default_rng(seed), exact=True)
+        np.testing.assert_array_equal(exact, to_gray(photo))
+
+
 def test_a_turn_of_nothing_changes_nothing_and_a_half_turn_complements(photo: np.ndarray) -> None:
-    assert np.abs(turn_hue(photo, 0, 1).astype(int) - photo).max() <= 1
-    assert np.abs(turn_hue(photo, 0, 0).astype(int) - without_color(photo)).max() <= 1
+    assert np.abs(rotate_hue(photo, 0, 1).astype(int) - photo).max() <= 1
+    assert np.abs(rotate_hue(photo, 0, 0).astype(int) - to_gray(photo)).max() <= 1
     pale = (photo // 4 + 96).astype(np.uint8)
-    twice = turn_hue(turn_hue(pale, math.pi, 1), math.pi, 1)
+    twice = rotate_hue(rotate_hue(pale, math.pi, 1), math.pi, 1)
     assert np.abs(twice.astype(int) - pale).max() <= 3
-    assert np.abs(turn_hue(pale, math.pi, 1).astype(int) - pale).max() > 20
+    assert np.abs(rotate_hue(pale, math.pi, 1).astype(int) - pale).max() > 20
 
 
 def test_the_label_hardly_changes_with_the_colors(photo: np.ndarray) -> None:
     mask = fuse(luma(photo)).mask
-    found = fuse(luma(turn_hue(photo, 2.0, 1.0))).mask
+    found = fuse(luma(rotate_hue(photo, 2.0, 1.0))).mask
     assert (found & mask).sum() > 0.97 * (found | mask).sum()
+
+
+def by_pillow(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
+    dim = ImageEnhance.Brightness(Image.fromarray(rgb)).enhance(darkening.brightness)
+    return np.asarray(ImageEnhance.Contrast(dim).enhance(darkening.contrast))
+
+
+@pytest.fixture(scope="module")
+def photos() -> dict[str, np.ndarray]:
+    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    return {
+        "astronaut": np.ascontiguousarray(data.astronaut()[::4, ::4]),
+        "chelsea": np.ascontiguousarray(data.chelsea()[::3, ::3]),
+        "coffee": np.ascontiguousarray(data.coffee()[::5, ::5]),
+    }
+
+
+PHOTOS = ("astronaut", "chelsea", "coffee")
+
+
+@pytest.mark.parametrize("name", PHOTOS)
+@pytest.mark.parametrize(
+    ("brightness", "contrast"),
+    [
+        (0.3, 0.4),
+        (1, 1),
+        (0.45, 0.55),
+        (0.001, 0.001),
+    ],
+)
+def test_equals_pillow(name: str, brightness: float, contrast: float, photos: dict) -> None:
+    darkening = Darkening(brightness, contrast)
+    dark = darken(photos[name], darkening)
+    assert dark.dtype == np.uint8
+    assert dark.shape == photos[name].shape
+    np.testing.assert_array_equal(dark, by_pillow(photos[name], darkening))
+
+
+@pytest.mark.parametrize("name", PHOTOS)
+@given(brightness=FACTORS, contrast=FACTORS)
+def test_equals_pillow_for_any_factors(
+    name: str, photos: dict, brightness: float, contrast: float
+) -> None:
+    darkening = Darkening(brightness, contrast)
+    np.testing.assert_array_equal(
+        darken(photos[name], darkening), by_pillow(photos[name], darkening)
+    )
+
+
+def test_equals_pillow_where_the_mean_is_near_a_half(photos: dict) -> None:
+    # Pillow's luma and OpenCV's differ in a few colours, which can move the rounded mean.
+    darkening = Darkening(0.519637822662576, 0.11474348861540308)
+    np.testing.assert_array_equal(
+        darken(photos["coffee"], darkening), by_pillow(photos["coffee"], darkening)
+    )
+
+
+@pytest.mark.parametrize(
+    ("colour", "brightness", "contrast"),
+    [((146, 139, 247), 0.73, 0.49), ((0, 207, 35), 1, 0.4), ((200, 200, 200), 0.3, 0.4)],
+)
+def test_equals_pillow_on_one_colour(
+    colour: tuple[int, int, int], brightness: float, contrast: float
+) -> None:
+    rgb = np.broadcast_to(np.array(colour, np.uint8), (16, 16, 3)).copy()
+    darkening = Darkening(brightness, contrast)
+    np.testing.assert_array_equal(darken(rgb, darkening), by_pillow(rgb, darkening))
+
+
+@given(
+    rgb=arrays(np.uint8, st.tuples(st.integers(1, 6), st.integers(1, 6), st.just(3))),
+    brightness=FACTORS,
+    contrast=FACTORS,
+)
+def test_equals_pillow_on_any_image(rgb: np.ndarray, brightness: float, contrast: float) -> None:
+    darkening = Darkening(brightness, contrast)
+    np.testing.assert_array_equal(darken(rgb, darkening), by_pillow(rgb, darkening))
+
+
+@pytest.mark.parametrize("name", PHOTOS)
+@pytest.mark.parametrize(
+    ("brightness", "contrast"), [(0.2, 0.55), (0.3, 0.4), (0.45, 0.3), (0.45, 0.55)]
+)
+def test_a_darkened_photograph_is_of_low_visibility(
+    name: str, brightness: float, contrast: float, photos: dict
+) -> None:
+    dark = darken(photos[name], Darkening(brightness, contrast))
+    assert visibility_of(luma(photos[name])) == "normal"
+    assert visibility_of(luma(dark)) == "low"
+    assert dark.mean() < photos[name].mean() / 2
+
+
+def test_darkened_training_photographs_are_of_low_visibility(shared: object) -> None:
+    generator = np.random.default_rng(0)
+    paths = sorted((shared / "data" / "photos" / "val").glob("*.jpg"))[::25]
+    assert len(paths) > 5
+    for path in paths:
+        dark = darken(load_image(path), RANGE.draw(generator))
+        assert visibility_of(luma(dark)) == "low", path.name
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_widest_image_is_of_low_visibility_too(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    extreme = generator.choice(np.array([0, 255], np.uint8), (16, 16, 3))
+    dark = darken(extreme, RANGE.draw(generator))
+    assert luma_range(luma(dark)) < LOW_VISIBILITY_RANGE
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_drawn_factors(seed: int) -> None:
+    drawn = RANGE.draw(np.random.default_rng(seed))
+    assert RANGE.brightness[0] <= drawn.brightness <= RANGE.brightness[1]
+    assert RANGE.contrast[0] <= drawn.contrast <= RANGE.contrast[1]
+    assert drawn.brightness * drawn.contrast < 0.25
+    assert drawn == Darkening(float(f"{drawn.brightness:.3f}"), float(f"{drawn.contrast:.3f}"))
+    assert RANGE.draw(np.random.default_rng(seed)) == drawn
+
+
+def test_draws_fill_the_ranges() -> None:
+    generator = np.random.default_rng(0)
+    drawn = [RANGE.draw(generator) for _ in range(400)]
+    for name in ("brightness", "contrast"):
+        low, high = getattr(RANGE, name)
+        values = [getattr(one, name) for one in drawn]
+        assert min(values) < low + 0.05 * (high - low)
+        assert max(values) > high - 0.05 * (high - low)
+
+
+@pytest.mark.parametrize("factor", [0, -0.1, 1.001, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["brightness", "contrast"])
+def test_factors_out_of_range(name: str, factor: float) -> None:
+    with pytest.raises(OptionError, match=f"{name} must be above 0 and at most 1"):
+        Darkening(**{"brightness": 0.5, "contrast": 0.5} | {name: factor})
+
+
+def test_the_photograph_is_left_as_it_was(photos: dict) -> None:
+    before = photos["coffee"].copy()
+    darken(photos["coffee"], Darkening(0.3, 0.4))
+    np.testing.assert_array_equal(photos["coffee"], before)
+
+
+@given(
+    height=st.integers(20, 200),
+    width=st.integers(20, 200),
+    side=st.integers(16, 160),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_any_photograph_gives_a_square(height: int, width: int, side: int, seed: int) -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    view = augment(rgb, side, seed)
+    assert view.shape == (side, side, 3)
+    assert view.dtype == np.uint8
+    np.testing.assert_array_equal(view, augment(rgb, side, seed))
+
+
+def test_seeds_give_other_views(photo: np.ndarray) -> None:
+    views = {augment(photo, 64, seed).tobytes() for seed in range(20)}
+    assert len(views) == 20
+
+
+def test_all_of_it_comes_from_inside() -> None:
+    """The places that a view is sampled from, seen in two ramps."""
+    rows, columns = np.mgrid[0:200, 0:240].astype(np.uint8)
+    ramps = np.dstack([columns, rows, np.zeros_like(rows)])
+    edges = []
+    for seed in range(200):
+        generator = np.random.default_rng(seed)
+        view = augmentation._rotated_crop(ramps, 100, RANGES, generator).astype(float)
+        across = view[50, 75, :2] - view[50, 25, :2]
+        down = view[75, 50, :2] - view[25, 50, :2]
+        # Turned and scaled alike along both axes, and not mirrored.
+        assert np.linalg.norm(across) == pytest.approx(np.linalg.norm(down), rel=0.06)
+        assert across @ down == pytest.approx(0, abs=0.06 * (across @ across))
+        assert across[0] * down[1] - across[1] * down[0] > 0
+        # The corners go on where the centre points to: nothing is reflected at a border.
+        centre = view[49:51, 49:51, :2].mean((0, 1))
+        corner = centre + (across + down) * 49.5 / 50
+        inside = np.clip(corner, 0, [239, 199])
+        assert np.abs(corner - inside).max() < 2
+        edges.append(np.linalg.norm(across) / 50)
+    assert min(edges) < 1.1
+    assert max(edges) > 1.6
+
+
+def sharpness(view: np.ndarray) -> float:
+    return float(cv2.Laplacian(cv2.cvtColor(view, cv2.COLOR_RGB2GRAY), cv2.CV_64F).std())
+
+
+def test_some_views_are_blurred_and_some_relit(photo: np.ndarray) -> None:
+    small = cv2.resize(photo, (200, 200), interpolation=cv2.INTER_AREA)
+    views = [augment(small, 128, seed) for seed in range(60)]
+    sharp = [sharpness(view) for view in views]
+    assert max(sharp) > 8 * min(sharp)
+    assert np.std([view.mean() for view in views]) > 10
+
+
+def test_some_views_have_noise() -> None:
+    flat = np.full((80, 80, 3), 128, np.uint8)
+    noise = [augment(flat, 64, seed).std() for seed in range(60)]
+    assert 5 < sum(deviation > 0.5 for deviation in noise) < 30
+    assert 3 < max(noise) < 12
+
+
+def test_relighting_is_one_rising_curve_for_all_channels() -> None:
+    levels = np.arange(256, dtype=np.uint8)[None, :, None].repeat(3, 2)
+    generators = map(np.random.default_rng, range(30))
+    curves = [augmentation._relight(levels, RANGES, generator)[0] for generator in generators]
+    for curve in curves:
+        assert (curve == curve[:, :1]).all()
+        assert (np.diff(curve[:, 0].astype(int)) >= 0).all()
+    middles = [int(curve[128, 0]) for curve in curves]
+    assert min(middles) < 110
+    assert max(middles) > 145
+
+
+def test_compression_is_that_of_pillow(photo: np.ndarray) -> None:
+    """Channels in their order: with red and blue swapped the luma would lose more."""
+    file = io.BytesIO()
+    Image.fromarray(photo).save(file, "JPEG", quality=30)
+    expected = np.asarray(Image.open(file)).astype(int)
+    found = augmentation._compress(photo, 30).astype(int)
+    assert np.abs(found - expected).mean() < 2
+    assert np.abs(found - photo).mean() > 2

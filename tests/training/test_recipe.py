@@ -1,15 +1,16 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.options import replace_options
-from deepdetect.training.recipe import Stage, TrainingOptions
-from deepdetect.training.schedule import Schedule
+from deepdetect.cli.recipe import chosen_recipe
+from deepdetect.labels import find_label_settings
+from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions, training_preset
+from deepdetect.training.sampler import Schedule
 
 
 @pytest.mark.parametrize(
@@ -56,65 +57,62 @@ def test_options_are_kept_as_json() -> None:
     assert json.loads(TrainingOptions(seed=7).to_json())["seed"] == 7
 
 
-def test_learning_rate_is_a_cosine_from_first_to_final() -> None:
-    schedule = Schedule(TrainingOptions(stages=(Stage(64, 2, 10),), short_sides=(64,)), 20)
-    assert schedule.steps == 100
+def test_the_papers_recipe() -> None:
+    """33,000 + 8,000 images, a quarter darkened, 100 epochs, batch 64, Adam 0.001, 480x480."""
+    paper = training_preset("paper")
+    assert paper.stages == (Stage(480, 64, 100),)
+    assert (paper.short_sides, paper.square) == ((480,), True)
+    assert paper.dark_fraction == 0.25
+    assert paper.max_images * paper.val_fraction == pytest.approx(8_000)
+    schedule = Schedule(paper, 33_000)
+    assert schedule.steps == 51_562
     assert schedule.learning_rate(0) == pytest.approx(1e-3)
-    assert schedule.learning_rate(50) == pytest.approx((1e-3 + 1e-6) / 2)
-    assert schedule.learning_rate(100) == pytest.approx(1e-6)
+    assert schedule.learning_rate(schedule.steps) == pytest.approx(1e-6)
 
 
-def test_the_warm_up_rises_evenly_into_the_cosine() -> None:
-    stages = (Stage(64, 2, 10),)
-    plain = Schedule(TrainingOptions(stages=stages, short_sides=(64,)), 20)
-    warm = Schedule(TrainingOptions(stages=stages, short_sides=(64,), warm_up=9), 20)
-    shares = [warm.learning_rate(step) / plain.learning_rate(step) for step in range(12)]
-    assert shares == pytest.approx([k / 10 for k in range(1, 11)] + [1, 1])
+def test_the_recipe_for_geometry() -> None:
+    """Normal light only, and the labels of the name."""
+    geometry = training_preset("dense")
+    assert geometry.dark_fraction == 0
+    assert geometry.label_changes == find_label_settings("dense").changes
+    assert Schedule(geometry, 2_705).steps > 1_000
 
 
-@given(
-    photos=st.integers(1, 50),
-    stages=st.lists(st.tuples(st.integers(1, 8), st.integers(1, 4)), min_size=1, max_size=3),
+def test_a_preset_keeps_its_label_settings_unless_others_are_given(tmp_path: Path) -> None:
+    changes = training_preset("dense").label_changes
+    assert chosen_recipe("dense", None, None, {}).label_changes == changes
+    assert chosen_recipe("dense", "sobel,fast", None, {}).label_changes == changes
+    assert chosen_recipe("dense", "fast", None, {}).label_changes == ()
+    assert chosen_recipe("dense", None, "paper", {}).label_changes == ()
+    assert chosen_recipe("paper", None, "dense", {}).label_changes == changes
+    (tmp_path / "mine.toml").write_text("[fast]\nnormal = { threshold = 20 }\n")
+    (change,) = chosen_recipe("dense", None, str(tmp_path / "mine.toml"), {}).label_changes
+    assert change.detector == "fast"
+
+
+def test_the_default_is_that_of_the_options() -> None:
+    assert training_preset("default") == TrainingOptions()
+
+
+def test_an_unknown_preset_is_refused() -> None:
+    with pytest.raises(OptionError, match="did you mean 'paper'"):
+        training_preset("papers")
+
+
+@pytest.mark.parametrize(
+    ("bad", "hint"),
+    [
+        ({"device": "cpuu"}, "cpu"),
+        ({"precision": "float16"}, "bfloat16"),
+        ({"threads": 0}, "1"),
+        ({"num_workers": -1}, "0"),
+    ],
 )
-def test_positions_run_through_the_stages(photos: int, stages: list[tuple[int, int]]) -> None:
-    made = tuple(Stage(16, batch, epochs) for batch, epochs in stages)
-    schedule = Schedule(TrainingOptions(stages=made, short_sides=(16,)), photos)
-    step = 0
-    for k, stage in enumerate(made):
-        for within in range(schedule.steps_of_stage[k]):
-            position = schedule.position(step)
-            assert position.stage == stage
-            assert position.sample == within * stage.batch
-            step += 1
-    assert step == schedule.steps
-    with pytest.raises(IndexError):
-        schedule.position(step)
+def test_bad_device_options_are_refused(bad: dict, hint: str) -> None:
+    with pytest.raises(OptionError, match=hint):
+        DeviceOptions(**bad)
 
 
-@given(steps=st.integers(1, 40), count=st.integers(1, 60))
-def test_the_last_step_is_a_milestone(steps: int, count: int) -> None:
-    options = TrainingOptions(stages=(Stage(16, 1, 1),), short_sides=(16,))
-    milestones = Schedule(options, steps).milestones(count)
-    assert max(milestones) == steps
-    assert min(milestones) > 0
-
-
-@given(
-    photos=st.integers(1, 50),
-    stages=st.lists(st.tuples(st.integers(1, 8), st.integers(1, 4)), min_size=1, max_size=3),
-)
-def test_interleaved_stages_advance_together(photos: int, stages: list[tuple[int, int]]) -> None:
-    made = tuple(Stage(16, batch, epochs) for batch, epochs in stages)
-    options = TrainingOptions(stages=made, short_sides=(16,))
-    mixed = Schedule(replace_options(options, interleave=True), photos)
-    plain = Schedule(options, photos)
-    positions = [mixed.position(step) for step in range(mixed.steps)]
-    expected = [plain.position(step) for step in range(plain.steps)]
-    key = lambda position: (position.number, position.sample)  # noqa: E731
-    assert sorted(positions, key=key) == sorted(expected, key=key)
-    done = [0] * len(made)
-    for step, position in enumerate(positions, start=1):
-        assert position.sample == done[position.number] * position.stage.batch
-        done[position.number] += 1
-        for number, total in enumerate(mixed.steps_of_stage):
-            assert abs(done[number] - total * step / mixed.steps) < len(made) + 1
+def test_a_cpu_that_trains_has_no_other_loading_processes() -> None:
+    assert DeviceOptions("cpu").worker_count() == 0
+    assert DeviceOptions("cpu", num_workers=3).worker_count(2) == 3

@@ -1,17 +1,33 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.training.darkening import Darkening, DarkeningRange, darken
-from deepdetect.training.variation import vary
-from deepdetect.training.views import View, render, scale_short_side, views_of
+from deepdetect import ImageError
+from deepdetect.io.image import scale_short_side
+from deepdetect.training.augmentation import Darkening, augment, darken
+from deepdetect.training.recipe import Stage, TrainingOptions
+from deepdetect.training.views import (
+    SourceImage,
+    View,
+    list_images,
+    render,
+    train_val_split,
+    views_of,
+)
 
-RANGE = DarkeningRange()
+OPTIONS = TrainingOptions(stages=(Stage(64, 2, 1),), short_sides=(96, 64), dark_variants=2)
+RANGE = OPTIONS.darkening
+
+
+def images(count: int) -> list[SourceImage]:
+    return [SourceImage(Path(f"photo{k}.jpg"), f"{k:08x}", (), ()) for k in range(count)]
 
 
 @pytest.mark.parametrize(
@@ -30,11 +46,12 @@ def test_names(view: View, name: str) -> None:
 
 @given(
     name=st.text("abcAB/._äß0", max_size=20),
-    short_sides=st.lists(st.integers(16, 999), min_size=1, max_size=4, unique=True).map(tuple),
-    variants=st.integers(0, 4),
+    short_sides=st.lists(st.integers(64, 999), min_size=1, max_size=4, unique=True).map(tuple),
+    variants=st.integers(1, 4),
 )
 def test_views_of_a_photograph(name: str, short_sides: tuple[int, ...], variants: int) -> None:
-    normal, dark = views_of(name, short_sides, RANGE, variants)
+    options = TrainingOptions(OPTIONS.stages, False, short_sides, dark_variants=variants)
+    normal, dark = views_of(name, options)
     assert normal == tuple(View(side) for side in short_sides)
     assert [view.short_side for view in dark] == [
         side for side in short_sides for _ in range(variants)
@@ -42,75 +59,36 @@ def test_views_of_a_photograph(name: str, short_sides: tuple[int, ...], variants
     for view in dark:
         assert RANGE.brightness[0] <= view.darkening.brightness <= RANGE.brightness[1]
         assert RANGE.contrast[0] <= view.darkening.contrast <= RANGE.contrast[1]
-        # The name tells all: a view made anew from it is the same.
+        # The name holds the exact factors.
         light = view.name.partition("_b")[2].partition("c")
         assert Darkening(float(light[0]), float(light[2])) == view.darkening
-    assert views_of(name, short_sides, RANGE, variants) == (normal, dark)
+    assert views_of(name, options) == (normal, dark)
 
 
-def test_varied_views_come_last_and_leave_the_others_alone() -> None:
-    plain = views_of("a.jpg", (96, 64), RANGE, 2)
-    normal, dark = views_of("a.jpg", (96, 64), RANGE, 2, augmentations=3)
+def test_augmented_views_come_last_and_leave_the_others_alone() -> None:
+    plain = views_of("a.jpg", OPTIONS)
+    options = dataclasses.replace(OPTIONS, augmentations=3)
+    normal, dark = views_of("a.jpg", options)
     assert (normal[:2], dark[:4]) == plain
     assert [view.short_side for view in normal[2:] + dark[4:]] == [96] * 6
-    assert [view.variation for view in normal[2:]] == [view.variation for view in dark[4:]]
-    assert len({view.variation for view in normal}) == 4
-    other, _ = views_of("b.jpg", (96, 64), RANGE, 2, augmentations=3)
-    assert {view.variation for view in other[2:]}.isdisjoint(v.variation for v in normal[2:])
+    assert [view.augmentation for view in normal[2:]] == [view.augmentation for view in dark[4:]]
+    assert len({view.augmentation for view in normal}) == 4
+    other, _ = views_of("b.jpg", options)
+    assert {view.augmentation for view in other[2:]}.isdisjoint(v.augmentation for v in normal[2:])
     assert len({view.name for view in normal + dark}) == 5 + 7
 
 
-def test_a_varied_view_is_darkened_after_it_is_varied(photo: np.ndarray) -> None:
+def test_an_augmented_view_is_darkened_last(photo: np.ndarray) -> None:
     bright = render(photo, View(80, None, False, 7))
-    np.testing.assert_array_equal(bright, vary(photo, 80, 7))
+    np.testing.assert_array_equal(bright, augment(photo, 80, 7))
     dark = render(photo, View(80, Darkening(0.3, 0.4), False, 7))
     np.testing.assert_array_equal(dark, darken(bright, Darkening(0.3, 0.4)))
 
 
 def test_photographs_differ_in_their_dark_views() -> None:
     names = [f"photo{number}.jpg" for number in range(30)]
-    dark = [views_of(name, (480,), RANGE, 2)[1] for name in names]
-    assert len({view.darkening for views in dark for view in views}) > 55
-
-
-@pytest.mark.parametrize(
-    ("size", "side", "expected"),
-    [
-        ((480, 640), 240, (240, 320)),
-        ((640, 480), 240, (320, 240)),
-        ((100, 100), 50, (50, 50)),
-        ((30, 45), 60, (60, 90)),
-        ((101, 203), 50, (50, 100)),
-        ((16, 16), 17, (17, 17)),
-    ],
-)
-def test_scaled_sizes(size: tuple[int, int], side: int, expected: tuple[int, int]) -> None:
-    assert scale_short_side(np.zeros((*size, 3), np.uint8), side).shape == (*expected, 3)
-
-
-@given(height=st.integers(16, 300), width=st.integers(16, 300), side=st.integers(16, 300))
-def test_the_short_side_is_exact_and_the_shape_is_kept(height: int, width: int, side: int) -> None:
-    scaled = scale_short_side(np.zeros((height, width, 3), np.uint8), side)
-    assert min(scaled.shape[:2]) == side
-    factor = side / min(height, width)
-    assert scaled.shape[0] == pytest.approx(height * factor, abs=0.5)
-    assert scaled.shape[1] == pytest.approx(width * factor, abs=0.5)
-
-
-def test_shrinking_averages_areas(photo: np.ndarray) -> None:
-    sums = photo.astype(int).reshape(64, 4, 64, 4, 3).sum((1, 3))
-    assert np.abs(scale_short_side(photo, 64) - sums / 16).max() <= 0.5
-
-
-def test_an_image_of_the_right_size_is_not_touched(photo: np.ndarray) -> None:
-    np.testing.assert_array_equal(scale_short_side(photo, 256), photo)
-
-
-def test_enlarging_and_shrinking_gives_the_image_back(photo: np.ndarray) -> None:
-    twice = scale_short_side(photo, 512)
-    assert twice.shape == (512, 512, 3)
-    back = scale_short_side(twice, 256)
-    assert np.abs(back.astype(int) - photo).mean() < 2
+    dark = [views_of(name, OPTIONS)[1] for name in names]
+    assert len({view.darkening for views in dark for view in views}) > 110
 
 
 @pytest.mark.parametrize("kind", ["array", "path", "float"])
@@ -124,3 +102,49 @@ def test_rendering(
     expected = small if darkening is None else darken(small, darkening)
     assert view.dtype == np.uint8
     np.testing.assert_array_equal(view, expected)
+
+
+def test_a_square_view_is_squashed(photo: np.ndarray) -> None:
+    wide = photo[:128]
+    expected = cv2.resize(wide, (64, 64), interpolation=cv2.INTER_CUBIC)
+    np.testing.assert_array_equal(render(wide, View(64, square=True)), expected)
+    np.testing.assert_array_equal(render(photo, View(256, square=True)), photo)
+
+
+def test_views_are_all_sizes_in_both_lights(photographs: Path) -> None:
+    listed = list_images(photographs, OPTIONS)
+    assert len(listed) == 12
+    for image in listed:
+        assert [view.short_side for view in image.normal] == [96, 64]
+        assert [view.short_side for view in image.dark] == [96, 96, 64, 64]
+        assert all(view.darkening is None for view in image.normal)
+        assert len({view.name for view in image.normal + image.dark}) == 6
+    assert list_images(photographs, OPTIONS) == listed, "the same on every call"
+
+
+def test_one_in_twenty_is_held_out_and_nothing_is_in_both() -> None:
+    kept, held = train_val_split(images(4000))
+    assert 150 < len(held) < 250
+    assert len(kept) + len(held) == 4000
+    assert not {image.path for image in kept} & {image.path for image in held}
+
+
+def test_photographs_keep_their_side_when_others_come() -> None:
+    _, before = train_val_split(images(500))
+    _, after = train_val_split(images(1000))
+    assert {image.path for image in before} <= {image.path for image in after}
+
+
+def test_few_photographs_still_give_one_for_validation() -> None:
+    kept, held = train_val_split(images(2))
+    assert (len(kept), len(held)) == (1, 1)
+    with pytest.raises(ImageError, match="too few"):
+        train_val_split(images(1))
+
+
+def test_results_below_the_photographs_are_left_out(photographs: Path, tmp_path: Path) -> None:
+    (tmp_path / "run" / "labels").mkdir(parents=True)
+    for place in ("a.png", "run/curves.png", "run/labels/b.png"):
+        (tmp_path / place).write_bytes((photographs / "photo00.png").read_bytes())
+    listed = list_images(tmp_path, OPTIONS, exclude=(tmp_path / "run",))
+    assert [image.path.name for image in listed] == ["a.png"]

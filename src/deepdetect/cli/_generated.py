@@ -33,6 +33,7 @@ class FieldOptions:
         skip: fields that are left out.
         flags: flags of fields whose flag is not their name, as {"short_sides": "--short-side"}, or
             {"guided": "--guided/--unguided"}.
+        metavars: what stands for the value in the help, where it is not the type.
         types: click's types of fields whose annotation does not say it.
         defaults: what is used unless the option is given, where it is not the field's default; for
             the help.
@@ -42,6 +43,7 @@ class FieldOptions:
     names: Sequence[str] = ()
     skip: Sequence[str] = ()
     flags: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    metavars: Mapping[str, str] = dataclasses.field(default_factory=dict)
     types: Mapping[str, click.ParamType[Any]] = dataclasses.field(default_factory=dict)
     defaults: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
@@ -57,6 +59,7 @@ class FieldOptions:
     def _option(self, field: dataclasses.Field[Any], hint: Any, text: str) -> click.Option:
         flag = self.flags.get(field.name, "--" + field.name.replace("_", "-"))
         settings = _type_settings(hint, flag) | {"help": text}
+        settings["metavar"] = self.metavars.get(field.name)
         if field.name in self.types:
             settings["type"] = self.types[field.name]
         if settings.pop("switch", False) and "/" not in flag:
@@ -106,6 +109,30 @@ def given_only(values: Mapping[str, Any]) -> dict[str, Any]:
         {'density': 0.1}
     """
     return {name: value for name, value in values.items() if value is not None and value != ()}
+
+
+def with_flags(message: str, command: click.Command | None) -> str:
+    """Name a command's options where a message of the library names parameters, as `focal_px`.
+
+    The library puts parameters between backticks, alone or with a value: `rectified=False`.
+
+    Example:
+        >>> option = click.Option(["--rectified/--not-rectified"])
+        >>> with_flags("give `rectified=False`", click.Command("reconstruct", params=[option]))
+        'give --not-rectified'
+    """
+    options = {option.name: option for option in command.params} if command else {}
+
+    def flag(match: re.Match[str]) -> str:
+        name, value = match.groups()
+        option = options.get(name)
+        if not isinstance(option, click.Option):
+            return match[0].strip("`")
+        if option.is_flag:
+            return (option.secondary_opts if value == "False" else option.opts)[-1]
+        return option.opts[-1] if value is None else f"{option.opts[-1]} {value.strip(chr(34))}"
+
+    return re.sub(r"`(\w+)(?:=([^`]+))?`", flag, message)
 
 
 def attribute_helps(doc: str) -> dict[str, str]:

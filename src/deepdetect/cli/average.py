@@ -16,9 +16,9 @@ from .shared import PATH, json_option, print_json, print_table
 @click.option("-o", "--output", type=PATH, required=True, help="Folder for both files.")
 @json_option
 def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
-    """Write the mean of WEIGHTS: best.safetensors and deepdetect.onnx.
+    """Average WEIGHTS (a model soup) into best.safetensors and deepdetect.onnx.
 
-    The mean of runs that went on from one another is often better than each of them; name one
+    The mean of runs that continue each other is often better than each of them; name one
     twice to give it twice the weight. WEIGHTS are .safetensors files, or default or dense.
 
     \b
@@ -45,7 +45,7 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
     from ..detector.pretrained import resolve_weights
 
     if len(weights) < 2:
-        raise OptionError("name two weights at least: the mean of one is itself")
+        raise OptionError("give at least two weights: the mean of one is itself")
     paths = [resolve_weights(name, ".safetensors") for name in weights]
     network = average_weights(paths)
     parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]

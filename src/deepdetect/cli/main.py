@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import difflib
-import re
 import sys
 from typing import Any
 
 import click
 
 from .._shared.errors import DeepDetectError
+from ._generated import with_flags
 from .average import average
 from .benchmark import benchmark
 from .datasets import datasets
@@ -50,30 +50,6 @@ class Commands(click.Group):
         except BrokenPipeError:
             sys.stderr.close()
             context.exit(1)
-
-
-def with_flags(message: str, command: click.Command | None) -> str:
-    """Name a command's options where a message of the library names parameters, as `focal_px`.
-
-    The library puts parameters between backticks, alone or with a value: `rectified=False`.
-
-    Example:
-        >>> option = click.Option(["--rectified/--not-rectified"])
-        >>> with_flags("give `rectified=False`", click.Command("reconstruct", params=[option]))
-        'give --not-rectified'
-    """
-    options = {option.name: option for option in command.params} if command else {}
-
-    def flag(match: re.Match[str]) -> str:
-        name, value = match.groups()
-        option = options.get(name)
-        if not isinstance(option, click.Option):
-            return match[0].strip("`")
-        if option.is_flag:
-            return (option.secondary_opts if value == "False" else option.opts)[-1]
-        return option.opts[-1] if value is None else f"{option.opts[-1]} {value.strip(chr(34))}"
-
-    return re.sub(r"`(\w+)(?:=([^`]+))?`", flag, message)
 
 
 @click.group(

@@ -6,35 +6,49 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .shared import chosen_label_settings
+from ._generated import FieldOptions, given_only
+from .shared import chosen_label_settings, combined, label_settings_option
 
 if TYPE_CHECKING:
-    from ..training.recipe import TrainingOptions
+    from ..training import TrainingOptions
 
-preset_option = click.option(
-    "--preset",
-    default="default",
-    show_default=True,
-    help="Recipe that the other options change: default (its values are shown below), paper "
-    "(the paper's own), or dense (normal light only, denser labels).",
+RECIPE = FieldOptions(
+    "training.recipe:TrainingOptions",
+    skip=("darkening", "detectors", "label_changes"),
+    flags={
+        "stages": "--stage",
+        "short_sides": "--short-side",
+        "frozen_batch_norm": "--frozen-batch-norm/--batch-norm",
+    },
+    metavars={"stages": "CROPxBATCHxEPOCHS[@SIDE,...]"},
+    defaults={
+        "stages": "240x16x44 480x8x10",
+        "max_images": "all",
+        "frozen_batch_norm": "with --init",
+        "low_light_pos_weight": "that of --pos-weight",
+    },
 )
-short_sides_option = click.option(
-    "--short-side",
-    "short_sides",
-    type=int,
-    multiple=True,
-    help="Size of the photographs' shorter side in pixels; may be repeated, validation takes "
-    "the first.  "
-    "[default: 480 360 240]",
+
+SHARDS = FieldOptions(
+    RECIPE.path,
+    names=("short_sides", "square", "max_images", "val_fraction", "dark_variants", "augmentations"),
+    flags=RECIPE.flags,
+    defaults=RECIPE.defaults,
 )
-augmentations_option = click.option(
-    "--augmentations",
-    type=int,
-    help="Varied views of each photograph at the first size, in normal and in dark light: turned, "
-    "relit, blurred, noisy or compressed; each is taken as often as the plain one.  [default: 0]",
-)
-detectors_option = click.option(
-    "--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]"
+"""What of a recipe is fixed once the labels are made."""
+
+recipe_options = combined(
+    click.option(
+        "--preset",
+        default="default",
+        show_default=True,
+        help="Recipe that the other options change: default (its values are shown here), paper "
+        "(the paper's own), or dense (normal light only, denser labels).",
+    ),
+    click.option(
+        "--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]"
+    ),
+    label_settings_option,
 )
 
 
@@ -48,15 +62,20 @@ def chosen_recipe(
         detectors, label_settings: as of `chosen_label_settings`.
         values: the others, by name; None and () stand for what is not given.
     """
-    from .._shared.options import replace_options
-    from ..training.presets import training_preset
+    import dataclasses
 
-    given = {name: value for name, value in values.items() if value not in (None, ())}
+    from ..training import Stage, training_preset
+
+    given = given_only(values)
+    if "stages" in given:
+        given["stages"] = tuple(
+            Stage.parse(stage) if isinstance(stage, str) else stage for stage in given["stages"]
+        )
     recipe = training_preset(preset)
     if detectors is not None or label_settings is not None:
         settings = chosen_label_settings(detectors, label_settings)
         given["detectors"], given["label_changes"] = settings.detectors, settings.changes
-    if label_settings is None:  # the preset's, as far as its detectors are taken
+    if label_settings is None:  # the preset's, for the detectors that are used
         chosen = given.get("detectors", recipe.detectors)
         given["label_changes"] = tuple(c for c in recipe.label_changes if c.detector in chosen)
-    return replace_options(recipe, **given)
+    return dataclasses.replace(recipe, **given)

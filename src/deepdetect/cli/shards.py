@@ -1,4 +1,4 @@
-"""`deepdetect shards`: photographs with their labels in files that training can stream."""
+"""`deepdetect shards`: images with their labels in files."""
 
 from __future__ import annotations
 
@@ -7,42 +7,26 @@ from typing import Any
 
 import click
 
-from .recipe import (
-    augmentations_option,
-    chosen_recipe,
-    detectors_option,
-    preset_option,
-    short_sides_option,
-)
-from .shared import (
-    PATH,
-    json_option,
-    label_settings_option,
-    print_json,
-    print_table,
-    workers_option,
-)
+from ._generated import generated_command
+from .recipe import SHARDS, chosen_recipe, recipe_options
+from .shared import PATH, json_option, print_json, print_table, workers_option
 
 
-@click.command(short_help="Pack photographs for training on sets too big for the memory.")
-@click.argument("photos", type=PATH)
+@generated_command(SHARDS, short_help="Pack images for training on sets too big for the memory.")
+@click.argument("images", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="Folder for the shards.")
-@preset_option
-@short_sides_option
-@augmentations_option
-@detectors_option
-@label_settings_option
+@recipe_options
 @click.option(
     "--shard-size",
     type=click.IntRange(min=1),
     default=256,
     show_default=True,
-    help="About so many; each process holds eight shards in memory.",
+    help="About this many images go into a shard.",
 )
 @workers_option
 @json_option
 def shards(
-    photos: Path,
+    images: Path,
     output: Path,
     preset: str,
     detectors: str | None,
@@ -52,24 +36,23 @@ def shards(
     as_json: bool,
     **values: Any,
 ) -> None:
-    """Pack the photographs in the folder PHOTOS with their labels into tar files.
+    """Pack the images in the folder IMAGES with their labels into tar files.
 
-    They are in WebDataset's layout. Training reads them one after the other, so they may lie
-    on a slow disk or a network. Give both commands the same options. Given again, the
-    command goes on where it was broken off.
+    They are in WebDataset's layout. Training reads a few of them at a time, so they may be
+    on a slow disk or a network. Give both commands the same options. When it is interrupted,
+    the same command resumes.
 
     \b
     deepdetect shards --preset paper data/coco -o data/shards
     deepdetect train --preset paper data/shards -o run
     """
-    from ..training.recipe import Stage
-    from ..training.shards import write_shards
+    from ..training import Stage, write_shards
 
     # Shards are for any stages: one that fits every size stands for them.
     values["stages"] = (Stage(16, 1, 1),)
     options = chosen_recipe(preset, detectors, label_settings, values)
     made = write_shards(
-        photos,
+        images,
         output,
         options,
         shard_size=shard_size,
@@ -86,8 +69,8 @@ def shards(
         return
     print_table(
         [
-            ("to train on", f"{counts['training']:,} photographs in {len(made.training)} shards"),
-            ("to validate with", f"{counts['validation']:,} photographs"),
+            ("to train on", f"{counts['training']:,} images in {len(made.training)} shards"),
+            ("to validate with", f"{counts['validation']:,} images"),
             ("written", f"{output}, {size / 1e6:,.1f} MB"),
         ]
     )

@@ -1,1 +1,8 @@
-"""Training: photographs -> views -> labels -> batches -> weights."""
+"""Training: images -> views -> labels -> crops -> weights.
+
+A `CropDataset` and a seeded `CropSampler` make a torch `DataLoader`; `train` does it all.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -172,7 +172,7 @@ def _like(value: Tensor, parameter: Tensor) -> Tensor:
 
 def _number(values: Mapping[str, Any], name: str, kind: type) -> Any:
     """Return a finite number of a mapping, not negative if it is an integer."""
-    value = values.get(name)
+    value: Any = values.get(name)
     whole = isinstance(value, int) and not isinstance(value, bool)
     if kind is int and whole and value >= 0:
         return value

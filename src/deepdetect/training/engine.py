@@ -13,19 +13,18 @@ import logging
 import os
 import shutil
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from .._shared.errors import OptionError, unknown_name
-from .._shared.parallel import disable_malloc_trim, processor_count
+from .._shared.errors import OptionError
+from .._shared.parallel import disable_malloc_trim
+from .recipe import DeviceOptions
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
 
-DEVICES = ("auto", "cpu", "cuda")
-PRECISIONS = ("auto", "float32", "bfloat16")
 BARRIER_TIMEOUT = datetime.timedelta(hours=24)
 Value = TypeVar("Value")
 _barriers = itertools.count()  # each has its own name in the store
@@ -93,7 +92,7 @@ class DistributedContext:
         if count % self.world_size:
             raise OptionError(
                 f"a batch of {count} cannot be divided evenly among {self.world_size} processes: "
-                "choose stages whose batches are multiples of that number"
+                "choose `stages` whose batches are multiples of that number"
             )
         part = count // self.world_size
         return slice(self.rank * part, (self.rank + 1) * part)
@@ -106,62 +105,13 @@ class DistributedContext:
         """
         if self.world_size == 1:
             return
-        from torch.distributed import PrefixStore, rendezvous
+        from torch.distributed import PrefixStore, rendezvous  # type: ignore[attr-defined]
 
         store, _, _ = next(iter(rendezvous("env://", self.rank, self.world_size)))
         restart = os.environ.get("TORCHELASTIC_RESTART_COUNT", "0")
         barrier = PrefixStore(f"deepdetect-{restart}-{next(_barriers)}", store)
         barrier.set(str(self.rank), "here")
         barrier.wait([str(rank) for rank in range(self.world_size)], BARRIER_TIMEOUT)
-
-
-@dataclass(frozen=True)
-class DeviceOptions:
-    """How the network is run; the recipe does not depend on it.
-
-    Attributes:
-        device: "auto" (CUDA if there is a GPU, else the CPU), "cpu" or "cuda".
-        precision: "float32", "bfloat16", or "auto", which is bfloat16 where the processor
-            computes with it.
-        compile: use torch.compile; None: if there is a C++ compiler.
-        threads: CPU threads of torch; None leaves torch's choice.
-        num_workers: processes that load and augment crops (of a torch DataLoader), 0 for none
-            but the one that trains. None: 0 when training on a CPU, which has no time to spare,
-            and all processors but one when training on a GPU.
-    """
-
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    compile: bool | None = None
-    threads: int | None = None
-    num_workers: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.device not in DEVICES:
-            raise unknown_name("device", self.device, DEVICES)
-        if self.precision not in PRECISIONS:
-            raise unknown_name("precision", self.precision, PRECISIONS)
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise OptionError("there is no CUDA device: choose the device cpu")
-        for name, least in (("threads", 1), ("num_workers", 0)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise OptionError(f"{name} must be at least {least}, not {value}")
-
-    @property
-    def accelerator(self) -> str:
-        """The device, with "auto" resolved: "cpu" or "cuda"."""
-        if self.device != "auto":
-            return self.device
-        return "cuda" if torch.cuda.is_available() else "cpu"
-
-    def worker_count(self, context: DistributedContext) -> int:
-        """Return the number of loading processes beside this one."""
-        if self.num_workers is not None:
-            return self.num_workers
-        if self.accelerator == "cpu":
-            return 0
-        return max(1, processor_count() // context.local_world_size - 1)
 
 
 class Engine:
@@ -186,7 +136,8 @@ class Engine:
             torch.set_num_threads(options.threads)  # launching sets its own
         self.device = self.fabric.device
         # channels_last is faster by 40 % on CPUs, and what tensor cores want.
-        self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.network = network.to(self.device)
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if self.context.world_size > 1:
             synchronize_batch_norm(self.network, self.device)
         compiled = options.compile
@@ -202,7 +153,7 @@ class Engine:
         network = self.network
         if self.compiled:
             # Not dynamic: there are only as many shapes as stages, and each gets its own code.
-            network = torch.compile(network, dynamic=False)  # type: ignore[assignment]
+            network = torch.compile(network, dynamic=False)
         return self.fabric.setup_module(network, move_to_device=False)
 
     def to_device(self, values: Tensor) -> Tensor:
@@ -232,7 +183,7 @@ class Engine:
             if not self._may_fall_back:
                 reason = str(error).strip().splitlines()[0]
                 raise OptionError(
-                    f"torch.compile does not work here ({reason}): set compile to False"
+                    f"torch.compile does not work here ({reason}): set `compile=False`"
                 ) from None
             self.compiled = False
             self._forward = self._set_up()
@@ -304,9 +255,9 @@ class SynchronizedBatchNorm(nn.BatchNorm2d):
         values = x.float()  # sums in bfloat16 would lose too much
         world_size = torch.distributed.get_world_size()
         count = values.numel() // values.shape[1] * world_size
-        mean = _AllReduceSum.apply(values.mean((0, 2, 3))) / world_size
+        mean = _all_reduce_sum(values.mean((0, 2, 3))) / world_size
         centred = values - mean[:, None, None]
-        variance = _AllReduceSum.apply(centred.square().mean((0, 2, 3))) / world_size
+        variance = _all_reduce_sum(centred.square().mean((0, 2, 3))) / world_size
         with torch.no_grad():
             self.running_mean.lerp_(mean, self.momentum)
             self.running_var.lerp_(variance * (count / (count - 1)), self.momentum)
@@ -329,6 +280,10 @@ class _AllReduceSum(torch.autograd.Function):
         total = gradients[0].clone(memory_format=torch.contiguous_format)
         torch.distributed.all_reduce(total)
         return total
+
+
+def _all_reduce_sum(x: Tensor) -> Tensor:
+    return _AllReduceSum.apply(x)  # type: ignore[no-untyped-call]
 
 
 def synchronize_batch_norm(network: nn.Module, device: torch.device) -> None:
@@ -357,8 +312,9 @@ def freeze_batch_norm(network: nn.Module) -> None:
 
 def _fabric(kind: str, context: DistributedContext) -> Fabric:
     from lightning_fabric import Fabric
-    from lightning_fabric.plugins.environments import LightningEnvironment, TorchElasticEnvironment
-    from lightning_fabric.strategies import DDPStrategy
+    from lightning_fabric.plugins.environments.lightning import LightningEnvironment
+    from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
+    from lightning_fabric.strategies.ddp import DDPStrategy
 
     if kind == "cuda" and context.local_world_size > torch.cuda.device_count():
         raise OptionError(

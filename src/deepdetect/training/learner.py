@@ -14,9 +14,9 @@ from .._shared.errors import OptionError
 from ..evaluation.mask_scores import MaskScore, score_heatmap
 from ..io.image import luma
 from ..labels import visibility_of
-from .engine import DeviceOptions, Engine, freeze_batch_norm
+from .engine import Engine, freeze_batch_norm
 from .optim import make_optimizers
-from .recipe import TrainingOptions
+from .recipe import DeviceOptions, TrainingOptions
 
 
 class Learner:
@@ -75,8 +75,8 @@ class Learner:
         # A finite loss can have gradients that are not, in bfloat16.
         if not (math.isfinite(value) and torch.nn.utils.get_total_norm(gradients).isfinite()):
             raise OptionError(
-                f"the loss or its gradients are not finite at step {step}: start again with the "
-                "precision float32, or with a lower learning_rate"
+                f"the loss or its gradients are not finite at step {step}: start again with "
+                "`precision=float32`, or with a lower `learning_rate`"
             )
         for optimizer in self.optimizers:
             optimizer.step()

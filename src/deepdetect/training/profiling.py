@@ -14,8 +14,7 @@ import torch
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from .dataset import loading
-from .engine import DeviceOptions
-from .recipe import Stage, TrainingOptions
+from .recipe import DeviceOptions, Stage, TrainingOptions
 from .trainer import InitWeights, Trainer, make_trainer
 
 WARM_UP_STEPS = 5  # compilation, memory, the first views

@@ -1,17 +1,21 @@
-"""Training recipes: the options that decide which weights come out, and presets of them."""
+"""Training recipes, the options that decide which weights come out; presets; device options."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from dataclasses import dataclass, field
+from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.parallel import processor_count
 from .._shared.registry import look_up
 from ..labels import DETECTOR_NAMES, LABEL_SETTINGS, LabelOptions, SettingChange
 from .augmentation import DarkeningRange
 
 OPTIMIZERS = ("adam", "soap")
+DEVICES = ("auto", "cpu", "cuda")
+PRECISIONS = ("auto", "float32", "bfloat16")
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ class TrainingOptions:
         short_sides: sizes in pixels that the shorter side of the images is scaled to. Crops are
             taken from those that are large enough. The first is that of the validation.
         square: squash the images to squares, as the paper does, instead.
-        max_images: use at most this many images, including those for validation; None uses all.
+        max_images: use at most this many images, including those for validation.
         val_fraction: fraction of the images held out for validation, when no folder is given.
         dark_fraction: fraction of darkened crops (paper: a quarter).
         dark_variants: darkened versions of each image at each size.
@@ -89,7 +93,8 @@ class TrainingOptions:
             luma, the only thing that labels depend on.
         optimizer: "adam", or "soap", which learns more per image (docs/history.md has the
             measurements).
-        learning_rate, final_learning_rate: start and end of the cosine annealing.
+        learning_rate: at the start of the cosine annealing.
+        final_learning_rate: at its end.
         warm_up: steps over which the learning rate rises from zero. A run that starts from
             trained weights needs them: the first steps of Adam, whose moments are not known
             yet, would undo much.
@@ -99,7 +104,7 @@ class TrainingOptions:
         pos_weight: weight of marked pixels in the loss. With 1 the network marks too little
             where it is uncertain, since most pixels are not marked; above 1 it finds more
             keypoints at a probability of 0.5.
-        low_light_pos_weight: the same in crops of low visibility; None: `pos_weight`.
+        low_light_pos_weight: weight of marked pixels in crops of low visibility. None: the same.
         pos_weight_uncertain: scale these weights by the uncertainty p(1 - p): they hold at a
             probability of one half and fall to 1 where the network is certain. So certain
             probabilities hardly move.
@@ -148,46 +153,46 @@ class TrainingOptions:
             raise unknown_name("optimizer", self.optimizer, OPTIMIZERS)
         self._check_sizes()
         if self.max_images is not None and self.max_images < 2:
-            raise OptionError(f"max_images must be at least 2, not {self.max_images}")
+            raise OptionError(f"`max_images` must be at least 2, not {self.max_images}")
         if not 0 < self.val_fraction < 1:
-            raise OptionError(f"val_fraction must lie in (0, 1), not {self.val_fraction}")
+            raise OptionError(f"`val_fraction` must lie in (0, 1), not {self.val_fraction}")
         for name in ("dark_fraction", "color_jitter"):
             if not 0 <= getattr(self, name) <= 1:
-                raise OptionError(f"{name} must lie in [0, 1], not {getattr(self, name)}")
+                raise OptionError(f"`{name}` must lie in [0, 1], not {getattr(self, name)}")
         for name, least in (("augmentations", 0), ("warm_up", 0), ("dark_variants", 1)):
             if getattr(self, name) < least:
-                raise OptionError(f"{name} must be at least {least}, not {getattr(self, name)}")
+                raise OptionError(f"`{name}` must be at least {least}, not {getattr(self, name)}")
         if self.val_count < 1:
-            raise OptionError(f"val_count must be at least 1, not {self.val_count}")
+            raise OptionError(f"`val_count` must be at least 1, not {self.val_count}")
         for name in ("pos_weight", "low_light_pos_weight"):
             weight = getattr(self, name)
             if weight is not None and not 0.1 <= weight <= 10:
-                raise OptionError(f"{name} must lie in [0.1, 10], not {weight}")
+                raise OptionError(f"`{name}` must lie in [0.1, 10], not {weight}")
         if self.pos_weight_uncertain and {self.pos_weight, self.low_light_pos_weight or 1} == {1}:
-            raise OptionError("pos_weight_uncertain needs a pos_weight other than 1")
+            raise OptionError("`pos_weight_uncertain` needs a `pos_weight` other than 1")
         if not 0 <= self.seed < 2**31:
-            raise OptionError(f"seed must lie in [0, 2147483647], not {self.seed}")
+            raise OptionError(f"`seed` must lie in [0, 2147483647], not {self.seed}")
         if not 0 <= self.final_learning_rate <= self.learning_rate:
             raise OptionError(
-                "learning_rate must be at least final_learning_rate, and that must not be negative"
+                "`learning_rate` must be at least `final_learning_rate`, and that must not be negative"
             )
 
     def _check_sizes(self) -> None:
         if not self.stages:
-            raise OptionError("stages must name at least one stage")
+            raise OptionError("`stages` must name at least one stage")
         if not self.short_sides or min(self.short_sides) < 16:
-            raise OptionError("short_sides must be at least 16 pixels")
+            raise OptionError("`short_sides` must be at least 16 pixels")
         for side in (side for stage in self.stages for side in stage.sides):
             if side not in self.short_sides:
                 raise OptionError(
-                    f"a stage takes views of {side} pixels, which are not among short_sides "
+                    f"a stage takes views of {side} pixels, which are not among `short_sides` "
                     f"({', '.join(map(str, self.short_sides))}): add them"
                 )
         largest = max(stage.crop for stage in self.stages)
         if largest > max(self.short_sides):
             raise OptionError(
                 f"a crop of {largest} pixels does not fit into images of "
-                f"{max(self.short_sides)}: make short_sides larger or the crops smaller"
+                f"{max(self.short_sides)}: make `short_sides` larger or the crops smaller"
             )
 
     @property
@@ -198,6 +203,59 @@ class TrainingOptions:
     def to_json(self) -> str:
         """Return the options as JSON text, which is stored with the weights."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
+
+
+@dataclass(frozen=True)
+class DeviceOptions:
+    """How the network is run, which does not change the recipe.
+
+    Attributes:
+        device: "auto" (CUDA if there is a GPU, else the CPU), "cpu" or "cuda".
+        precision: "float32", "bfloat16", or "auto", which is bfloat16 where the processor
+            computes with it.
+        compile: use torch.compile; by default if there is a C++ compiler.
+        threads: CPU threads of torch; by default torch's choice.
+        num_workers: processes that load and augment crops (of a torch DataLoader), 0 for none
+            but the one that trains; by default 0 when training on a CPU, which has no time to
+            spare, and one per processor but one when training on a GPU.
+    """
+
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    compile: bool | None = None
+    threads: int | None = None
+    num_workers: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, known in (("device", DEVICES), ("precision", PRECISIONS)):
+            if getattr(self, name) not in known:
+                raise unknown_name(name, getattr(self, name), known)
+        if self.device == "cuda":
+            from torch.cuda import is_available
+
+            if not is_available():
+                raise OptionError("there is no CUDA device: use `device=cpu`")
+        for name, least in (("threads", 1), ("num_workers", 0)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise OptionError(f"`{name}` must be at least {least}, not {value}")
+
+    @property
+    def accelerator(self) -> str:
+        """The device, with "auto" resolved: "cpu" or "cuda"."""
+        if self.device != "auto":
+            return self.device
+        from torch.cuda import is_available
+
+        return "cuda" if is_available() else "cpu"
+
+    def worker_count(self, local_world_size: int = 1) -> int:
+        """Return the number of loading processes, given the training processes of this machine."""
+        if self.num_workers is not None:
+            return self.num_workers
+        if self.accelerator == "cpu":
+            return 0
+        return max(1, processor_count() // local_world_size - 1)
 
 
 PRESETS: dict[str, TrainingOptions] = {

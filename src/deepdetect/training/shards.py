@@ -177,9 +177,9 @@ def write_shards(
         >>> write_shards(Path("images"), Path("shards"), TrainingOptions())  # doctest: +SKIP
     """
     if shard_size < 1:
-        raise OptionError(f"shard_size must be at least 1, not {shard_size}")
+        raise OptionError(f"`shard_size` must be at least 1, not {shard_size}")
     if images.resolve() == output.resolve():
-        raise OptionError(f"{output} holds the images: choose another output folder")
+        raise OptionError(f"{output} holds the images: choose another `output`")
     if (output / INDEX).exists():
         _check_options(output, _read_index(output), options)
     listed = list_images(images, options, (output,), options.max_images)
@@ -340,7 +340,7 @@ def _check_options(folder: Path, index: dict[str, Any], options: TrainingOptions
     fixed, found = _fixed_options(options), index.get("options")
     if not isinstance(found, dict):
         raise _damaged(folder / INDEX, "it has no options")
-    other = [name for name in fixed if found.get(name) != fixed[name]]
+    other = [f"`{name}`" for name in fixed if found.get(name) != fixed[name]]
     if other:
         raise OptionError(
             f"the shards in {folder} were made with other options ({', '.join(other)}): "

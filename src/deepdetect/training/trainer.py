@@ -30,10 +30,10 @@ from ..detector.pretrained import resolve_weights
 from ..evaluation.mask_scores import MaskScore, mean_score
 from .checkpoint import Checkpoint, TrainingState, read_checkpoint, restore, save_checkpoint
 from .dataset import CropDataset, TrainingData, ValidationDataset, loading, prepare_data
-from .engine import DeviceOptions, DistributedContext
+from .engine import DistributedContext
 from .learner import Learner
 from .model_card import CurvePoint, save_curves, write_model_card
-from .recipe import TrainingOptions
+from .recipe import DeviceOptions, TrainingOptions
 from .sampler import CropSampler, Schedule
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -145,7 +145,7 @@ def make_trainer(
         validation=None if validation is None else Path(validation),
         labels=None if labels is None else Path(labels),
         workers=workers,
-        num_workers=device.worker_count(context),
+        num_workers=device.worker_count(context.local_world_size),
         quiet=log is None,
     )
     return Trainer(data, Path(output), options, device, network, log, resume)
@@ -184,7 +184,7 @@ class Trainer:
         self.learner = Learner(network, device, options)
         self.engine, self.network = self.learner.engine, self.learner.network
         self.context = self.engine.context
-        self.num_workers = device.worker_count(self.context)
+        self.num_workers = device.worker_count(self.context.local_world_size)
         self.log = log if self.context.is_main else None
         self.run = {
             "options": options.to_json(),
@@ -347,21 +347,22 @@ class Trainer:
         except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
             raise checkpoint.unfit(error) from None
         other_start = before.get("start") != self.run["start"]
+        names = ", ".join(f"`{name}`" for name in others)
         # Whether the statistics are frozen follows from the initial weights, which come last.
         if others and not (other_start and others == ["frozen_batch_norm"]):
             raise OptionError(
-                f"{self.folder} holds a run with other options ({', '.join(others)}): "
-                "use the same options to resume it, or another output folder"
+                f"{self.folder} holds a run with other options ({names}): "
+                "use the same options to resume it, or another `output`"
             )
         if before.get("photographs") != self.data.digest:
             raise OptionError(
                 f"{self.folder} holds a run over other images: use the same ones, to train "
-                "on and to validate with, or another output folder"
+                "on and to validate with, or another `output`"
             )
         if other_start:
             raise OptionError(
                 f"{self.folder} holds a run that started from other weights: "
-                "start from the same ones to resume it, or use another output folder"
+                "start from the same ones to resume it, or use another `output`"
             )
 
 
@@ -383,8 +384,8 @@ def _initial_network(
     for name, what in (("frozen_batch_norm", "batch statistics"), ("freeze_encoder", "encoder")):
         if getattr(options, name):
             raise OptionError(
-                f"{name} would keep the {what} of random weights: "
-                "give trained ones as init_weights, or leave it out"
+                f"`{name}` would keep the {what} of random weights: "
+                "give trained ones as `init_weights`, or leave it out"
             )
     torch.manual_seed(options.seed)
     return dataclasses.replace(options, frozen_batch_norm=False), ESPNet()

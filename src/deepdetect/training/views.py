@@ -170,7 +170,7 @@ def train_val_split(
         training, validation = training[:-1], training[-1:]
     if not validation or not training:
         raise ImageError(
-            "one image is too few to train on: add more, or name a folder for validation"
+            "one image is too few to train on: add more, or give a folder for `validation`"
         )
     return training, validation
 

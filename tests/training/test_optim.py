@@ -8,8 +8,7 @@ torch = pytest.importorskip("torch", reason="needs torch, which is for training 
 
 from deepdetect import OptionError  # noqa: E402
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
-from deepdetect.training.optimizers import make_optimizers  # noqa: E402
-from deepdetect.training.soap import Soap  # noqa: E402
+from deepdetect.training.optim import Soap, make_optimizers, state_shapes  # noqa: E402
 
 
 def ill_conditioned(size: int = 6) -> tuple[torch.Tensor, torch.Tensor]:
@@ -46,7 +45,7 @@ def test_with_a_fixed_basis_of_the_axes_it_is_adam() -> None:
     start = torch.randn(4, 3, generator=generator)
     gradients = torch.randn(12, 4, 3, generator=generator)
     ours, theirs = torch.nn.Parameter(start.clone()), torch.nn.Parameter(start.clone())
-    soap = Soap([ours], lr=0.01, basis_every=1000)
+    soap = Soap([ours], lr=0.01, precondition_frequency=1000)
     adam = torch.optim.Adam([theirs], lr=0.01, betas=(0.95, 0.95))
     for k, gradient in enumerate(gradients):
         ours.grad = gradient.clone()
@@ -115,14 +114,14 @@ def test_an_unknown_optimiser_is_an_error() -> None:
 
 
 def test_processes_with_other_rounding_stay_together() -> None:
-    """What the first one's `share` sends, the second one takes."""
+    """What the first one's `broadcast_` sends, the second one takes."""
     sent: list[torch.Tensor] = []
     generator = torch.Generator().manual_seed(8)
     gradients = torch.randn(60, 8, 20, generator=generator)
     gradients[:10] = gradients[0]  # of rank one: most of the basis is rounding
     weights = [torch.nn.Parameter(torch.zeros(8, 20)) for _ in range(3)]
-    first = Soap([weights[0]], lr=0.01, share=lambda tensor: sent.append(tensor.clone()))
-    second = Soap([weights[1]], lr=0.01, share=lambda tensor: tensor.copy_(sent.pop(0)))
+    first = Soap([weights[0]], lr=0.01, broadcast_=lambda tensor: sent.append(tensor.clone()))
+    second = Soap([weights[1]], lr=0.01, broadcast_=lambda tensor: tensor.copy_(sent.pop(0)))
     alone = Soap([weights[2]], lr=0.01)
     for k, gradient in enumerate(gradients):
         weights[0].grad = gradient.clone()
@@ -141,3 +140,17 @@ def test_processes_with_other_rounding_stay_together() -> None:
     together = (ends[1] - ends[0]).norm() / ends[0].norm()
     assert 10 * together < apart
     assert together < 1e-3
+
+
+@pytest.mark.parametrize("name", ["adam", "soap"])
+def test_the_shapes_of_the_state_are_known(name: str) -> None:
+    """A checkpoint is compared with them before an optimiser gets it."""
+    network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.PReLU(4))
+    optimizers = make_optimizers(name, network)
+    network(torch.rand(1, 3, 8, 8)).sum().backward()
+    for optimizer in optimizers:
+        optimizer.step()
+        for parameter, state in optimizer.state.items():
+            found = {moment: tuple(value.shape) for moment, value in state.items()}
+            assert found == state_shapes(optimizer, parameter)
+            assert {value.dtype for value in state.values()} == {torch.float32}

@@ -15,11 +15,11 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
+from deepdetect.training.cluster import DistributedContext, distributed_context  # noqa: E402
 from hypothesis import given  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
 from deepdetect import OptionError  # noqa: E402
-from deepdetect.training.cluster import DistributedContext, distributed_context  # noqa: E402
 
 # Eight steps; at higher rates Adam makes much of the rounding in tiny gradients.
 ARGUMENTS = [

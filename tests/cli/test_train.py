@@ -1,0 +1,101 @@
+"""`deepdetect train` and `deepdetect shards`: options, output, and errors in terms of flags."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+pytest.importorskip("torch", reason="needs torch, which is for training only")
+
+from deepdetect.cli import main
+from deepdetect.training import training_preset
+
+TINY = [
+    *("--stage", "64x4x1", "--short-side", "64", "--detectors", "fast", "--val-count", "1"),
+    *("--device", "cpu", "--precision", "float32", "--no-compile", "--threads", "1"),
+]
+
+
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of six small photographs."""
+    from PIL import Image
+    from skimage import data
+
+    folder = tmp_path_factory.mktemp("images")
+    for k in range(6):
+        Image.fromarray(data.chelsea()[20 * k : 20 * k + 96, 60:180]).save(folder / f"{k}.png")
+    return folder
+
+
+def test_train_and_shards(run, images: Path, tmp_path: Path) -> None:
+    fixed = ["--short-side", "64", "--detectors", "fast", "--workers", "1"]
+    packed = run("shards", images, "-o", "packed", "--shard-size", "3", *fixed)
+    assert packed.exit_code == 0, packed.output
+    assert "5 images in 2 shards" in packed.output
+    packed = run("shards", images, "-o", "packed", "--shard-size", "3", *fixed, "--json")
+    assert json.loads(packed.output)["validation"] == 1
+    trained = run("train", "packed", "-o", "run", *TINY, "--workers", "1", "--json")
+    assert trained.exit_code == 0, trained.output
+    told = json.loads(trained.output)
+    assert Path(told["onnx"]).is_file()
+    assert told["validation_loss"] > 0
+    again = run("train", "packed", "-o", "run", *TINY, "--workers", "1")
+    assert "best after epoch" in again.output
+    other = run("train", "packed", "-o", "run", *TINY, "--short-side", "96")
+    assert other.exit_code == 2
+    assert "other options (--short-side)" in other.stderr
+    timed = run("train", images, "-o", "timed", *TINY, "--workers", "1", "--profile")
+    assert "waiting for data" in timed.output, timed.output
+    assert "4 crops of 64x64 pixels per step" in timed.output
+    timed = run("train", images, "-o", "timed", *TINY, "--workers", "1", "--profile", "--json")
+    assert json.loads(timed.output)[0]["stage"]["crop"] == 64
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--freeze-encoder"], "give trained ones as --init"),
+        (["--frozen-batch-norm"], "--frozen-batch-norm would keep"),
+        (["--val-count", "0"], "--val-count must be at least 1"),
+        (["--num-workers", "-1"], "--num-workers must be at least 0"),
+        (["--pos-weight-uncertain"], "--pos-weight-uncertain needs a --pos-weight"),
+        (["--stage", "480x8x1@720"], "not among --short-side"),
+        (["--learning-rate", "-1"], "--learning-rate must be at least --final-learning-rate"),
+        (["--optimizer", "sopa"], "did you mean 'soap'"),
+    ],
+)
+def test_errors_speak_of_flags(
+    run, images: Path, arguments: list[str], message: str, one_line
+) -> None:
+    result = run("train", images, "-o", "out", *arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert not Path("out").exists()
+
+
+def test_a_preset_is_changed_by_options(
+    images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import deepdetect.training.trainer as trainer
+
+    seen: list[tuple] = []
+
+    def make_trainer(*arguments: object) -> None:
+        seen.append(arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trainer, "make_trainer", make_trainer)
+    words = ["train", str(images), "-o", str(tmp_path), "--preset", "paper", "--stage", "480x64x9"]
+    words += ["--no-interleave", "--flips", "--batch-norm", "--init", "default", "--init", "dense"]
+    assert CliRunner().invoke(main, words).exit_code == 130
+    ((_, _, options, _, _, init_weights, *_),) = seen
+    assert [stage.epochs for stage in options.stages] == [9]
+    assert options.flips
+    assert options.frozen_batch_norm is False
+    assert options.max_images == training_preset("paper").max_images
+    assert init_weights == ("default", "dense")

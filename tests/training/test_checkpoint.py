@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
+
+from safetensors.torch import save_file  # noqa: E402
+
+from deepdetect import DeepDetectError, WeightsError  # noqa: E402
+from deepdetect.training.checkpoint import (  # noqa: E402
+    Checkpoint,
+    TrainingState,
+    read_checkpoint,
+    restore,
+    save_checkpoint,
+)
+from deepdetect.training.model_card import CurvePoint  # noqa: E402
+from deepdetect.training.optim import make_optimizers  # noqa: E402
+
+POINT = CurvePoint(10, 1.0, 40, 1e-3, 0.5, 0.45, 0.4, 0.6, 0.6, 0.3)
+STATE = TrainingState(12, 48, 0.7, 2, [POINT])
+
+
+def small_network(channels: int = 4) -> torch.nn.Module:
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(
+        torch.nn.Conv2d(3, channels, 3), torch.nn.BatchNorm2d(channels), torch.nn.PReLU(channels)
+    )
+    return network.to(memory_format=torch.channels_last)
+
+
+def trained(
+    optimizer: str = "adam", steps: int = 1
+) -> tuple[torch.nn.Module, list[torch.optim.Optimizer]]:
+    network = small_network()
+    optimizers = make_optimizers(optimizer, network)
+    for _ in range(steps):
+        network(torch.rand(2, 3, 8, 8)).square().mean().backward()
+        for each in optimizers:
+            each.step()
+    return network, optimizers
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "soap"])
+def test_a_checkpoint_gives_everything_back(tmp_path: Path, optimizer: str) -> None:
+    network, optimizers = trained(optimizer)
+    path = tmp_path / "c.safetensors"
+    save_checkpoint(path, network, optimizers, {"step": 1})
+    other, other_optimizers = trained(optimizer, steps=0)
+    found = read_checkpoint(path)
+    assert found.metadata == {"step": 1}
+    restore(found, other, other_optimizers)
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name])
+    for ours, theirs in zip(optimizers, other_optimizers, strict=True):
+        for a, b in zip(
+            ours.param_groups[0]["params"], theirs.param_groups[0]["params"], strict=True
+        ):
+            assert ours.state[a].keys() == theirs.state[b].keys()
+            for moment, value in ours.state[a].items():
+                assert torch.equal(value, theirs.state[b][moment])
+                if value.shape == a.shape:
+                    assert theirs.state[b][moment].stride() == b.stride()
+
+
+@pytest.mark.parametrize("content", [b"", b"no checkpoint", b"\x80\x04K\x01."])
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes, one_line) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(WeightsError, match="delete it") as caught:
+        read_checkpoint(path)
+    one_line(caught.value)
+
+
+@pytest.mark.parametrize("state", ["null", "[]", "{", "[" * 100_000, "3"])
+def test_a_checkpoint_with_a_damaged_state_is_refused(tmp_path: Path, state: str, one_line) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    save_file({"a": torch.zeros(1)}, path, metadata={"state": state})
+    with pytest.raises(WeightsError, match="delete it") as caught:
+        read_checkpoint(path)
+    one_line(caught.value)
+
+
+def _shorter(tensors: dict[str, torch.Tensor], name: str) -> None:
+    tensors[name] = torch.zeros(3)
+
+
+def _doubled(tensors: dict[str, torch.Tensor], name: str) -> None:
+    tensors[name] = tensors[name].double()
+
+
+def _missing(tensors: dict[str, torch.Tensor], name: str) -> None:
+    del tensors[name]
+
+
+@pytest.mark.parametrize("change", [_shorter, _doubled, _missing])
+@pytest.mark.parametrize(
+    ("optimizer", "name"),
+    [
+        ("adam", "optimizer.exp_avg.0.weight"),
+        ("adam", "optimizer.step.0.weight"),
+        ("soap", "optimizer.right_basis.0.weight"),
+        ("adam", "network.0.weight"),
+    ],
+)
+def test_a_tensor_that_does_not_fit_is_refused_before_an_optimizer_sees_it(
+    tmp_path: Path, optimizer: str, name: str, change: Callable[..., None], one_line
+) -> None:
+    """A fused optimiser writes beyond a moment of another shape, and crashes Python."""
+    path = tmp_path / "c.safetensors"
+    network, optimizers = trained(optimizer)
+    save_checkpoint(path, network, optimizers, {})
+    tensors = dict(read_checkpoint(path).tensors)
+    change(tensors, name)
+    other, other_optimizers = trained(optimizer, steps=0)
+    before = {key: value.clone() for key, value in other.state_dict().items()}
+    with pytest.raises(WeightsError, match=name) as caught:
+        restore(Checkpoint(path, {}, tensors), other, other_optimizers)
+    one_line(caught.value)
+    assert all(torch.equal(value, before[key]) for key, value in other.state_dict().items())
+    assert not any(each.state for each in other_optimizers)
+
+
+def test_a_checkpoint_of_another_network_or_optimizer_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "c.safetensors"
+    network, optimizers = trained()
+    for other in (small_network(5), small_network()):  # the second without moments
+        save_checkpoint(path, other, make_optimizers("adam", other), {})
+        with pytest.raises(WeightsError, match="delete it"):
+            restore(read_checkpoint(path), network, optimizers)
+    save_checkpoint(path, *trained("soap"), {})
+    with pytest.raises(WeightsError, match="delete it"):
+        restore(read_checkpoint(path), network, optimizers)
+
+
+def test_the_state_of_a_run_is_given_back() -> None:
+    stored = json.loads(json.dumps(asdict(STATE)))
+    assert TrainingState.from_json(stored, last_step=12) == STATE
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"step": -1},
+        {"step": 10**9},
+        {"step": 1.5},
+        {"step": True},
+        {"images": None},
+        {"loss_sum": float("nan")},
+        {"loss_sum": "0.7"},
+        {"loss_count": "2"},
+        {"points": None},
+        {"points": [None]},
+        {"points": [{"step": 1}]},
+        {"points": [{**asdict(POINT), "epoch": "1"}]},
+    ],
+)
+def test_an_impossible_state_is_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"step|images|loss|point|epoch"):
+        TrainingState.from_json({**asdict(STATE), **change}, last_step=12)
+    missing = {name: value for name, value in asdict(STATE).items() if name not in change}
+    with pytest.raises(ValueError, match=next(iter(change))):
+        TrainingState.from_json(missing, last_step=12)
+
+
+def test_a_full_disk_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_line
+) -> None:
+    from safetensors import SafetensorError
+
+    def full(*arguments: object, **named: object) -> None:
+        raise SafetensorError("No space left on device")
+
+    monkeypatch.setattr("deepdetect.training.checkpoint.save_file", full)
+    with pytest.raises(DeepDetectError, match="No space left") as caught:
+        save_checkpoint(tmp_path / "c.safetensors", small_network(), [], {})
+    one_line(caught.value)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,301 @@
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
+
+import cv2  # noqa: E402
+from torch import Tensor  # noqa: E402
+from torch.utils.data import DataLoader  # noqa: E402
+
+from deepdetect import ImageError  # noqa: E402
+from deepdetect._shared.options import replace_options  # noqa: E402
+from deepdetect.io.image import luma  # noqa: E402
+from deepdetect.labels import visibility_of  # noqa: E402
+from deepdetect.training.dataset import (  # noqa: E402
+    CropDataset,
+    FolderSource,
+    ValidationDataset,
+    loading,
+    prepare_data,
+)
+from deepdetect.training.engine import DistributedContext  # noqa: E402
+from deepdetect.training.labels import LabelCache  # noqa: E402
+from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
+from deepdetect.training.sampler import CropSampler, Schedule  # noqa: E402
+from deepdetect.training.views import SourceImage, View, list_images, render  # noqa: E402
+
+OPTIONS = TrainingOptions(
+    stages=(Stage(64, 4, 6), Stage(96, 2, 1)),
+    short_sides=(96, 64),
+    flips=True,
+    color_jitter=0.0,
+    augmentations=1,
+    detectors=("fast", "harris", "sobel"),
+)
+Batch = tuple[np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def source(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> FolderSource:
+    cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.label_options)
+    images = list_images(photographs, OPTIONS)
+    cache.make([(image, image.normal + image.dark) for image in images], workers=1)
+    return FolderSource(images, cache, 2**30)
+
+
+def loader(source, options: TrainingOptions = OPTIONS, workers: int = 0, **steps) -> DataLoader:
+    sampler = CropSampler(Schedule(options, len(source)), **steps)
+    return DataLoader(CropDataset(source, options), batch_sampler=sampler, num_workers=workers)
+
+
+def batches(source, options: TrainingOptions = OPTIONS, first: int = 0, last=None) -> list[Batch]:
+    made = loader(source, options, first_step=first, last_step=last)
+    return [(images.numpy(), masks.numpy()) for images, masks in made]
+
+
+def same(found: Iterable[Batch], expected: Iterable[Batch]) -> None:
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(ours[0], theirs[0])
+        np.testing.assert_array_equal(ours[1], theirs[1])
+
+
+def all_views(source: FolderSource) -> list[Batch]:
+    return [
+        (render(image.path, view), source.labels.load(image, view))
+        for image in source.images
+        for view in image.normal + image.dark
+    ]
+
+
+def test_a_batch_is_a_pure_function_of_the_step(source: FolderSource) -> None:
+    whole = batches(source)
+    assert len(whole) == 12 * 6 // 4 + 12 // 2
+    fresh = FolderSource(source.images, source.labels)
+    for first, last in ((7, 8), (0, 1), (5, None)):
+        same(batches(fresh, first=first, last=last), whole[first:last])
+    assert not np.array_equal(whole[0][0], whole[1][0])
+
+
+def test_shapes_follow_the_stage(source: FolderSource) -> None:
+    images, masks = batches(source, last=1)[0]
+    assert images.shape == (4, 64, 64, 3)
+    assert (images.dtype, masks.dtype) == (np.uint8, np.bool_)
+    images, masks = batches(source)[-1]
+    assert images.shape == (2, 96, 96, 3)
+    assert masks.shape == (2, 96, 96)
+
+
+def test_about_a_quarter_is_dark(source: FolderSource) -> None:
+    made = [image for images, _ in batches(source, last=18) for image in images]
+    dark = [visibility_of(luma(image)) == "low" for image in made]
+    assert 0.1 < np.mean(dark) < 0.45
+
+
+def test_crops_and_labels_belong_together(source: FolderSource) -> None:
+    """Each crop lies in one of the views, and its mask at the same place of the view's label."""
+    views = all_views(source)
+    for image, mask in zip(*batches(source, first=2, last=3)[0], strict=True):
+        assert any(_found(image, mask, *view) for view in views)
+
+
+def _found(image: np.ndarray, mask: np.ndarray, view: np.ndarray, label: np.ndarray) -> bool:
+    side = len(image)
+    for flipped, flipped_mask in (
+        (turned[::a, ::b], turned_mask[::a, ::b])
+        for turned, turned_mask in ((image, mask), (image.transpose(1, 0, 2), mask.T))
+        for a in (1, -1)
+        for b in (1, -1)
+    ):
+        corner = (view[: len(view) - side + 1, : view.shape[1] - side + 1] == flipped[0, 0]).all(2)
+        for top, left in np.argwhere(corner):
+            place = np.s_[top : top + side, left : left + side]
+            if np.array_equal(view[place], flipped) and np.array_equal(label[place], flipped_mask):
+                return True
+    return False
+
+
+def test_mirrors_come_only_when_asked_for(source: FolderSource) -> None:
+    """Without flips and transpositions each crop is a part of a view as it is."""
+    options = replace_options(OPTIONS, flips=False, transpositions=False)
+    views = all_views(source)
+    for image in batches(source, options, first=1, last=2)[0][0]:
+        assert any(
+            (view[top : top + 64, left : left + 64] == image).all()
+            for view, _ in views
+            for top, left in np.argwhere((view[:-63, :-63] == image[0, 0]).all(2))
+        )
+
+
+class Corners:
+    """One image for all views, with another value at each corner."""
+
+    def __len__(self) -> int:
+        return 12
+
+    def __getitem__(self, index: int) -> SourceImage:
+        return SourceImage(Path("corners.png"), "", (View(64),), ())
+
+    def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
+        image = np.zeros((64, 64, 3), np.uint8)
+        image[0, 0], image[0, -1], image[-1, 0] = 1, 2, 3
+        return image, image[..., 0] > 0
+
+
+@pytest.mark.parametrize(
+    ("flips", "transpositions", "count"), [(True, True, 8), (True, False, 4), (False, True, 2)]
+)
+def test_all_mirrors_come_when_asked_for(flips: bool, transpositions: bool, count: int) -> None:
+    """Crops of an image that every mirror changes: each of the eight is seen."""
+    options = TrainingOptions(
+        stages=(Stage(64, 4, 60),),
+        short_sides=(64,),
+        dark_fraction=0.0,
+        flips=flips,
+        transpositions=transpositions,
+    )
+    seen = set()
+    for images, masks in batches(Corners(), options, last=40):
+        np.testing.assert_array_equal(masks, images[..., 0] > 0)
+        seen |= {tuple(i[[0, 0, -1, -1], [0, -1, 0, -1], 0].tolist()) for i in images}
+    assert len(seen) == count
+
+
+def test_dark_crops_keep_their_luma_to_the_level(source: FolderSource) -> None:
+    plain, gray = (
+        batches(source, replace_options(OPTIONS, dark_fraction=1.0, color_jitter=share), last=1)[0]
+        for share in (0.0, 1.0)
+    )
+    for image, other in zip(plain[0], gray[0], strict=True):
+        np.testing.assert_array_equal(luma(image), luma(other))
+        assert (other == other[..., :1]).all()
+
+
+def test_colors_change_and_labels_do_not(source: FolderSource) -> None:
+    colored = replace_options(OPTIONS, color_jitter=1.0)
+    gray = 0
+    for (images, masks), (others, same_masks) in zip(
+        batches(source, last=4), batches(source, colored, last=4), strict=True
+    ):
+        np.testing.assert_array_equal(masks, same_masks)
+        for image, other in zip(images, others, strict=True):
+            assert np.abs(luma(other).astype(int) - luma(image)).max() <= 1
+            gray += int((other == other[..., :1]).all())
+    assert 4 < gray < 16
+
+
+def test_a_stage_can_take_some_views_only(source: FolderSource) -> None:
+    options = replace_options(OPTIONS, stages=(Stage(64, 12, 1, sides=(64,)),))
+    small = [view for view, _ in all_views(source) if min(view.shape[:2]) == 64]
+    for image in batches(source, options)[0][0]:
+        turned = (image, image.transpose(1, 0, 2))
+        crops = [each[::a, ::b] for each in turned for a in (1, -1) for b in (1, -1)]
+        assert any(
+            np.array_equal(view[:64, left : left + 64], crop)
+            for view in small
+            for crop in crops
+            for left in range(view.shape[1] - 63)
+        )
+
+
+def test_interleaved_batches_are_those_of_the_stages_in_turn(source: FolderSource) -> None:
+    mixed = batches(source, replace_options(OPTIONS, interleave=True))
+    sums = sorted(int(images.sum()) for images, _ in mixed)
+    assert sums == sorted(int(images.sum()) for images, _ in batches(source))
+    sizes = [len(masks[0]) for _, masks in mixed]
+    assert set(sizes[:6]) == set(sizes[-6:]) == {64, 96}
+
+
+def test_processes_share_each_batch(source: FolderSource) -> None:
+    parts = [
+        loader(source, context=DistributedContext(rank, 2, rank, 2), last_step=3)
+        for rank in range(2)
+    ]
+    for (images, _), *halves in zip(batches(source, last=3), *parts, strict=True):
+        np.testing.assert_array_equal(images, np.concatenate([half[0] for half in halves]))
+
+
+def test_a_limit_of_the_memory_changes_nothing_but_the_time(source: FolderSource) -> None:
+    frugal = FolderSource(source.images, source.labels, memory_bytes=20_000)
+    same(batches(frugal, last=4), batches(source, last=4))
+    assert 0 < len(frugal._kept) < 3
+    assert frugal.memory_bytes >= 0
+    copy = pickle.loads(pickle.dumps(frugal))
+    assert not copy._kept, "images are not sent to other processes"
+    same(batches(copy, last=1), batches(source, last=1))
+
+
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_worker_processes_give_the_same_batches(source: FolderSource) -> None:
+    threads = cv2.getNumThreads()
+    with loading(loader(source, workers=2, last_step=4)) as made:
+        if multiprocessing.get_start_method() == "fork":
+            assert cv2.getNumThreads() == 1
+        found = [(images.numpy(), masks.numpy()) for images, masks in made]
+    assert cv2.getNumThreads() == threads
+    same(found, batches(source, last=4))
+
+
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_of_a_worker_is_one_sentence(
+    source: FolderSource, tmp_path: Path, workers: int, one_line
+) -> None:
+    lost = FolderSource(source.images, LabelCache(tmp_path, OPTIONS.label_options))
+    with pytest.raises(ImageError) as caught, loading(loader(lost, workers=workers)) as made:
+        next(made)
+    assert one_line(caught.value).startswith("there is no mask")
+
+
+def test_a_label_of_another_size_is_refused(photographs: Path, tmp_path: Path) -> None:
+    from deepdetect.io.masks import save_mask
+
+    image = list_images(photographs, OPTIONS)[0]
+    cache = LabelCache(tmp_path, OPTIONS.label_options)
+    save_mask(np.zeros((8, 8), bool), cache.path(image, image.normal[0]))
+    with pytest.raises(ImageError, match="another size"):
+        FolderSource([image], cache).load(0, image.normal[0])
+
+
+def test_validation_is_whole_images_first_normal_then_dark(source: FolderSource) -> None:
+    whole = ValidationDataset(source)
+    assert len(whole) == 24
+    for index in (0, 11, 12, 23):
+        image = source.images[index % 12]
+        view = image.dark[0] if index >= 12 else image.normal[0]
+        rgb, mask = whole[index]
+        np.testing.assert_array_equal(rgb, render(image.path, view))
+        np.testing.assert_array_equal(mask, source.labels.load(image, view))
+    parts = [ValidationDataset(source, DistributedContext(rank, 5, rank, 5)) for rank in range(5)]
+    assert [len(part) for part in parts] == [6, 6, 4, 4, 4]
+    assert torch.equal(parts[3][2][0], whole[15][0])
+    assert isinstance(parts[3][2][1], Tensor)
+
+
+def test_preparation_makes_only_the_labels_that_are_needed(
+    photographs: Path, tmp_path: Path
+) -> None:
+    options = TrainingOptions(
+        stages=(Stage(64, 2, 1),), short_sides=(64, 96), detectors=("fast",), val_fraction=0.3
+    )
+    data = prepare_data(photographs, options, tmp_path, workers=1)
+    names = [path.name for path in (tmp_path / "labels").rglob("*.png")]
+    held_out = {data.validation[k].digest for k in range(len(data.validation))}
+    assert held_out
+    assert len(data.training) + len(held_out) == 12
+    for name in names:
+        if name.split("_")[1] in held_out:
+            assert name.split("_")[2] == "64", "validation takes the first size only"
+    assert len(names) == 4 * len(data.training) + 2 * len(held_out)
+    image, mask = data.validation.load(0, data.validation[0].normal[0])
+    assert min(image.shape[:2]) == 64
+    assert mask.shape == image.shape[:2]
+    again = prepare_data(photographs, options, tmp_path, validation=photographs, workers=1)
+    assert len(again.validation) == len(again.training) == 12
+    assert again.digest != data.digest
