@@ -416,20 +416,20 @@ def test_without_a_detector_the_pretrained_weights_are_used(
 # Images
 
 
-def test_the_same_images_in_other_clothes(photo: np.ndarray, photo_path: Path) -> None:
+def test_the_same_image_in_other_forms(photo: np.ndarray, photo_path: Path) -> None:
     from PIL import Image
 
-    expected = match_images(photo, photo, Corners(), max_keypoints=200)
-    clothes = [
+    expected = unguided(photo, photo, Corners(), max_keypoints=200)
+    forms = [
         photo_path,
         str(photo_path),
         Image.fromarray(photo),
         photo.astype(np.float64) / 255,
         photo.astype(np.uint16) * 257,
     ]
-    for image in clothes:
-        assert_same(match_images(image, photo, Corners(), max_keypoints=200), expected)
-        assert_same(match_images(photo, image, Corners(), max_keypoints=200), expected)
+    for image in forms:
+        assert_same(unguided(image, photo, Corners(), max_keypoints=200), expected)
+        assert_same(unguided(photo, image, Corners(), max_keypoints=200), expected)
 
 
 @pytest.mark.parametrize("place", [0, 1])

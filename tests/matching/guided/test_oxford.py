@@ -15,6 +15,8 @@ from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
 from deepdetect.matching.guided.homography import nearest_keypoint
 
+pytestmark = pytest.mark.slow
+
 BARS = {
     ("graf", 6): (0.80, 0.95),
     ("leuven", 6): (0.88, 0.95),

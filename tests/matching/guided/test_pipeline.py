@@ -102,7 +102,8 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
     detector = DeepDetect("dense")
     guided, unguided = (
-        match_images(pair.left, pair.right, detector, guided=guided) for guided in (True, False)
+        match_images(pair.left, pair.right, detector, guided=guided, matcher="patchmatch")
+        for guided in (True, False)
     )
     assert guided.guided
     assert guided.model == guided.guide.model == "fundamental"
@@ -116,6 +117,7 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
     assert score.share > plain.share + 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["art", "cones"])
 def test_a_plane_that_is_asked_for_guides(shared: Path, name: str) -> None:
     """In scenes with depth, where nothing else would choose a plane."""

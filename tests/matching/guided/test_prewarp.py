@@ -55,7 +55,15 @@ def upright(cones: StereoPair, match: Callable[[np.ndarray], Matches]) -> tuple[
     return right_ones(match(cones.right), cones, np.eye(3))
 
 
-@pytest.mark.parametrize(("degrees", "scale"), [(20, 1), (90, 1), (0, 1.3), (30, 1.3)])
+@pytest.mark.parametrize(
+    ("degrees", "scale"),
+    [
+        (30, 1.3),
+        pytest.param(20, 1, marks=pytest.mark.slow),
+        pytest.param(90, 1, marks=pytest.mark.slow),
+        pytest.param(0, 1.3, marks=pytest.mark.slow),
+    ],
+)
 def test_a_turned_and_scaled_view_is_matched_nearly_as_well(
     degrees: float,
     scale: float,
@@ -73,6 +81,7 @@ def test_a_turned_and_scaled_view_is_matched_nearly_as_well(
     assert share > upright[1] - 0.1
 
 
+@pytest.mark.slow
 def test_a_turned_view_under_a_photograph_is_not_matched(
     photo: np.ndarray, cones: StereoPair, match: Callable[[np.ndarray], Matches]
 ) -> None:

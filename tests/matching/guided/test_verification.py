@@ -65,14 +65,20 @@ def test_the_same_image_agrees_nearly_everywhere(photo: np.ndarray) -> None:
     assert verify_matches(gray, seen_again(gray), everywhere(gray), pixels).mean() > 0.95
 
 
-@pytest.mark.parametrize("other", ["rocket", "coffee", "astronaut", "chelsea", "brick"])
-@pytest.mark.parametrize("name", ["camera", "astronaut"])
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [
+        ("camera", "rocket"),
+        ("astronaut", "coffee"),
+        pytest.param("camera", "astronaut", marks=pytest.mark.slow),
+        pytest.param("astronaut", "chelsea", marks=pytest.mark.slow),
+        pytest.param("camera", "brick", marks=pytest.mark.slow),
+    ],
+)
 def test_under_another_photograph_next_to_nothing_agrees(
     picture: Callable[..., np.ndarray], name: str, other: str
 ) -> None:
     """It is pasted over one quarter of the second image after the other."""
-    if name == other:
-        pytest.skip("the same photograph")
     gray, strange = picture(name, 2 * HALF), picture(other, HALF)
     pixels = edges(gray)
     under_it, others = [], []
@@ -91,7 +97,7 @@ def test_under_another_photograph_next_to_nothing_agrees(
     assert np.concatenate(under_it).mean() < OPTIONS.false_positive_rate
 
 
-@pytest.mark.parametrize("name", ["astronaut", "camera", "coffee"])
+@pytest.mark.parametrize("name", ["astronaut", "coffee"])
 def test_few_null_pairs_pass(picture: Callable[..., np.ndarray], name: str) -> None:
     """Of an image shifted by other shares of its size than those of the null pairs."""
     gray = picture(name, 2 * HALF)
@@ -160,6 +166,7 @@ def test_takes_keypoints_in_single_precision(photo: np.ndarray) -> None:
     np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.slow
 def test_the_seed_decides_and_hardly_matters(photo: np.ndarray) -> None:
     """More blocks than are taken: the choice of null pairs differs."""
     gray = cv2.resize(luma(photo), (1472, 1280))
@@ -232,7 +239,7 @@ def test_flat_images_tell_nothing(photo: np.ndarray) -> None:
         )
 
 
-@pytest.mark.parametrize("width", range(120, 280, 20))
+@pytest.mark.parametrize("width", [120, 180, 260])
 def test_images_that_are_flat_for_a_large_part_tell_nothing(width: int) -> None:
     """A hundredth of the null pairs are equal, flat ones: nothing can be more similar."""
     gray = np.full((300, 400), 235, np.uint8)
