@@ -14,6 +14,13 @@ from deepdetect import (
     SelectionOptions,
 )
 from deepdetect._shared.options import option_names, replace_options
+from deepdetect.matching.guided import GuidedOptions
+from deepdetect.matching.guided.options import (
+    EpipolarMatchingOptions,
+    InitialGeometryOptions,
+    PrewarpOptions,
+    VerificationOptions,
+)
 from deepdetect.matching.options import PRESETS, get_preset
 
 MATRIX = np.array([[1, 0, 7], [0, 1, 0], [0, 0, 1]], float)
@@ -131,8 +138,8 @@ def test_every_option_is_in_the_table_above() -> None:
     marks = test_a_single_option_finds_its_place_and_leaves_the_others.pytestmark
     named = {row[0] for mark in marks for row in mark.args[1]}
     groups = {"heatmap", "selection", "geometry", "guided_options"}
-    guided = set(option_names(get_preset("published").guided_options))
-    assert set(option_names(get_preset("published"))) - guided == (named | groups) - guided
+    guided = set(option_names(GuidedOptions()))
+    assert set(option_names(get_preset("published"))) == named | groups | guided
 
 
 @pytest.mark.parametrize(
@@ -218,3 +225,43 @@ def test_the_ends_of_the_ranges_are_taken(values: dict[str, Any]) -> None:
 def test_presets_cannot_be_changed_in_place(name: str) -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         get_preset(name).ratio = 0.5
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: MatchingOptions(guide="plane"), "unknown guide 'plane'"),
+        (
+            lambda: MatchingOptions(guide="fundamental", geometry=GeometryOptions("homography")),
+            "the guide fundamental contradicts the model homography",
+        ),
+        (lambda: InitialGeometryOptions(ratio=1.2), "ratio must lie in [0, 1], not 1.2"),
+        (lambda: VerificationOptions(keypoint_sizes_px=()), "keypoint_sizes_px must be above 0"),
+        (lambda: VerificationOptions(false_positive_rate=-0.1), "false_positive_rate must lie"),
+        (lambda: EpipolarMatchingOptions(max_cycle_error_px=0), "max_cycle_error_px must be above"),
+        (lambda: PrewarpOptions(max_anisotropy=float("nan")), "max_anisotropy must be above 0"),
+        (lambda: GuidedOptions(min_matched_fraction=2), "min_matched_fraction must lie"),
+    ],
+)
+def test_wrong_options_of_guided_matching(make: Any, message: str) -> None:
+    with pytest.raises(OptionError) as caught:
+        make()
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("model", "guide", "expected"),
+    [
+        ("auto", "auto", "auto"),
+        ("none", "auto", "auto"),
+        ("homography", "auto", "homography"),
+        ("fundamental", "auto", "fundamental"),
+        ("none", "fundamental", "fundamental"),
+        ("auto", "homography", "homography"),
+    ],
+)
+def test_the_model_chooses_the_guide_unless_it_is_named(
+    model: str, guide: str, expected: str
+) -> None:
+    options = MatchingOptions(guide=guide, geometry=GeometryOptions(model))
+    assert options.guiding_model == expected
