@@ -110,7 +110,7 @@ def test_notes_are_shown_and_escaped(small: PointCloud, tmp_path: Path) -> None:
 def test_unit_and_step_are_told(small: PointCloud, tmp_path: Path) -> None:
     page = saved(small, tmp_path / "page.html")
     step = page_points(small).step.max() / 2
-    assert f"{step:.2g} mm (16 bits an axis)" in page.texts
+    assert f"{step:.2g} mm (16 bits per axis)" in page.texts
     scaleless = PointCloud(small.points, small.colors, "baseline")
     texts = saved(scaleless, tmp_path / "page.html").texts
     assert any("no scale" in text for text in texts)

@@ -112,27 +112,30 @@ def given_only(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_flags(message: str, command: click.Command | None) -> str:
-    """Name a command's options where a message of the library names parameters, as `focal_px`.
+    """Name a command's options where a message of the library names parameters.
 
-    The library puts parameters between backticks, alone or with a value: `rectified=False`.
+    These are words with an underscore, or words between backticks, alone or with a value.
 
     Example:
-        >>> option = click.Option(["--rectified/--not-rectified"])
-        >>> with_flags("give `rectified=False`", click.Command("reconstruct", params=[option]))
-        'give --not-rectified'
+        >>> names = "--rectified/--not-rectified", "--nms-radius"
+        >>> options = [click.Option([name]) for name in names]
+        >>> with_flags("set nms_radius, or `rectified=False`", click.Command("x", params=options))
+        'set --nms-radius, or --not-rectified'
     """
     options = {option.name: option for option in command.params} if command else {}
 
     def flag(match: re.Match[str]) -> str:
-        name, value = match.groups()
-        option = options.get(name)
+        option = options.get(match[1] or match[3])
+        value = match[2]
         if not isinstance(option, click.Option):
             return match[0].strip("`")
         if option.is_flag:
             return (option.secondary_opts if value == "False" else option.opts)[-1]
         return option.opts[-1] if value is None else f"{option.opts[-1]} {value.strip(chr(34))}"
 
-    return re.sub(r"`(\w+)(?:=([^`]+))?`", flag, message)
+    quoted = r"`(\w+)(?:=([^`]+))?`"
+    bare = r"(?<![\w./\\\"'-])([a-z0-9]+(?:_[a-z0-9]+)+)(?![\w./\\\"'-])"
+    return re.sub(f"{quoted}|{bare}", flag, message)
 
 
 def attribute_helps(doc: str) -> dict[str, str]:

@@ -60,7 +60,7 @@ def write_html_page(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) 
         "Points": f"{len(stored.levels):,}",
         **({"Left out, far away": f"{stored.left_out:,}"} if stored.left_out else {}),
         "Unit": UNIT_NAMES[cloud.unit],
-        "Positions to": f"{stored.step.max() / 2:.2g} {SHORT_UNITS[cloud.unit]} (16 bits an axis)",
+        "Positions to": f"{stored.step.max() / 2:.2g} {SHORT_UNITS[cloud.unit]} (16 bits per axis)",
         **{name: text for name, text in metadata.items() if name != "title"},
     }
     values = {
