@@ -62,24 +62,10 @@ def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarra
     order = np.argsort(tile, kind="stable")
     starts = np.searchsorted(tile[order], np.arange(across * down + 1))
     out = np.empty((len(xy), 128), np.uint8)
-
-    def work(first: int, last: int) -> None:
-        describe_tiles(
-            first,
-            last,
-            magnitude,
-            orientation,
-            columns,
-            rows,
-            order,
-            starts,
-            across,
-            taps,
-            spans,
-            out,
-        )
-
-    parallel_for(across * down, work)
+    keypoints = columns, rows, order, starts, across
+    parallel_for(
+        across * down, describe_tiles, magnitude, orientation, *keypoints, taps, spans, out
+    )
     return out
 
 

@@ -87,7 +87,7 @@ def to_root_sift(descriptors: np.ndarray, overwrite: bool = False) -> np.ndarray
     from .descriptor_kernels import square_root
 
     result = descriptors if overwrite else descriptors.copy()
-    parallel_for(len(result), lambda first, last: square_root(first, last, result))
+    parallel_for(len(result), square_root, result)
     return result
 
 
@@ -120,11 +120,7 @@ def correlation_distance(
     rows0, rows1 = (np.ascontiguousarray(rows, np.int64) for rows in (rows0, rows1))
     mean = np.ascontiguousarray(mean, np.float32)
     out = np.empty(len(rows0), np.float32)
-
-    def work(start: int, stop: int) -> None:
-        correlation_distances(start, stop, first, rows0, second, rows1, mean, out)
-
-    parallel_for(len(out), work)
+    parallel_for(len(out), correlation_distances, first, rows0, second, rows1, mean, out)
     return out
 
 

@@ -124,42 +124,19 @@ def _search(
     offsets = np.array(options.offsets_px)
     radii = _radii(max(at1.shape), options.search_shrink)
 
-    def start(first: int, last: int) -> None:
-        if fundamental is None:
-            kernel.start(first, last, queries, base, seed, rows, distances)
-        else:
-            tries = options.line_tries
-            kernel.start_on_lines(
-                first, last, queries, base, xy0, at1, matrix, tries, seed, rows, distances
-            )
-
-    parallel_for(len(queries), start)
+    if fundamental is None:
+        parallel_for(len(queries), kernel.start, queries, base, seed, rows, distances)
+    else:
+        lines = matrix, options.line_tries, seed
+        parallel_for(
+            len(queries), kernel.start_on_lines, queries, base, xy0, at1, *lines, rows, distances
+        )
+    images = queries, base, xy0, xy1, at0, at1
+    epipolar = matrix, float(max_epipolar_distance)
     for turn in range(options.sweeps):
-        before = rows.copy()
-
-        def sweep(first: int, last: int, turn: int = turn, before: np.ndarray = before) -> None:
-            kernel.sweep(
-                first,
-                last,
-                bands,
-                queries,
-                base,
-                xy0,
-                xy1,
-                at0,
-                at1,
-                offsets,
-                turn,
-                seed,
-                radii,
-                before,
-                rows,
-                distances,
-                matrix,
-                float(max_epipolar_distance),
-            )
-
-        parallel_for(len(bands) - 1, sweep)
+        tries = offsets, turn, seed, radii
+        found = rows.copy(), rows, distances
+        parallel_for(len(bands) - 1, kernel.sweep, bands, *images, *tries, *found, *epipolar)
     gaps = np.sqrt(distances.astype(np.float32))
     gaps[distances == kernel.FAR] = np.inf
     if order is not None:
