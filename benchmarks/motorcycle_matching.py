@@ -15,7 +15,7 @@ import numpy as np
 
 from deepdetect import DeepDetect, match_images
 from deepdetect.datasets.middlebury import load_motorcycle
-from deepdetect.evaluation.metrics import stereo_score
+from deepdetect.evaluation.metrics.stereo import stereo_score
 
 WAYS: dict[str, dict[str, Any]] = {
     "guided": {"guided": True},
@@ -42,7 +42,7 @@ def main() -> None:
         cells = []
         for kept in (np.ones(len(found), bool), found.inliers):
             score = stereo_score(found.points0[kept], found.points1[kept], pair.disparity)
-            cells.append(f"{score.matches:,}, {score.share:.1%}")
+            cells.append(f"{score.matches:,}, {score.precision:.1%}")
         print(f"| `{name}` | {' | '.join(cells)} |", flush=True)
 
 

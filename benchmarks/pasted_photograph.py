@@ -22,8 +22,8 @@ from skimage import data
 from deepdetect import DeepDetect, HeatmapOptions, Matches, match_images
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.datasets.oxford import load_oxford
-from deepdetect.evaluation.metrics import stereo_score
-from deepdetect.evaluation.protocols.oxford import GUIDED_PAIRS, chosen_pairs
+from deepdetect.evaluation.benchmarks import GUIDED_PAIRS, select_pairs
+from deepdetect.evaluation.metrics.stereo import stereo_score
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
 
@@ -45,7 +45,7 @@ def main() -> None:
     detector = DeepDetect(arguments.weights)
     if arguments.oxford is not None:
         squashed = detector.configured(HeatmapOptions(480))
-        for pair in chosen_pairs(load_oxford(arguments.oxford, "refined"), GUIDED_PAIRS):
+        for pair in select_pairs(load_oxford(arguments.oxford, "refined"), GUIDED_PAIRS):
             if arguments.pair and pair.name not in arguments.pair:
                 continue
             first, second = (load_image(image) for image in (pair.first, pair.second))
@@ -65,7 +65,8 @@ def main() -> None:
 
         told = under_photographs(scene.left, scene.right, by_depth, detector, arguments.seeds)
         print(
-            f"{name}: {score.right:,} right ({score.share:.3f}), matched under {told}", flush=True
+            f"{name}: {score.correct:,} right ({score.precision:.3f}), matched under {told}",
+            flush=True,
         )
 
 

@@ -32,8 +32,8 @@ import numpy as np
 from deepdetect import DeepDetect
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_motorcycle
+from deepdetect.evaluation.protocols.stereo import ground_truths
 from deepdetect.evaluation.protocols.stereo_pipelines import sgbm_disparity
-from deepdetect.evaluation.protocols.stereo_truth import truths
 from deepdetect.io.image import load_image
 from deepdetect.reconstruction.stereo import DENSE, DisparityOptions, match_rectified
 
@@ -86,7 +86,7 @@ def scenes(
     yield pair.name, pair.left, pair.right, {"": pair.disparity}
     for folder in sorted(path.parent for path in data.glob("*/left.png")):
         try:
-            found: dict[str, np.ndarray | None] = dict(truths(folder))
+            found: dict[str, np.ndarray | None] = dict(ground_truths(folder))
         except ImageError:
             found = {"": None}
         yield (

@@ -129,6 +129,44 @@ def facade() -> Callable[[float], Facade]:
     return draw
 
 
+def _write_view(
+    path: Path, source: np.ndarray, to_view: np.ndarray, size: tuple[int, int], light: float = 1
+) -> None:
+    import cv2
+    from PIL import Image
+
+    view = cv2.warpPerspective(source, to_view, size, flags=cv2.INTER_LINEAR)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.rint(view * light).astype(np.uint8)).save(path)
+
+
+@pytest.fixture(scope="session")
+def write_scene() -> Callable[..., None]:
+    """Write images 1 to `count` of a scene and the homographies between them."""
+    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    photograph = data.astronaut()
+
+    def write(
+        folder: Path,
+        size: tuple[int, int],
+        move: np.ndarray,
+        names: tuple[str, str] = ("img{}.png", "H1to{}p"),
+        count: int = 6,
+        corner: tuple[int, int] = (150, 60),
+        fading: float = 0.06,
+    ) -> None:
+        first = np.array([[1.0, 0, -corner[0]], [0, 1, -corner[1]], [0, 0, 1]])
+        total = np.eye(3)
+        for number in range(1, count + 1):
+            light = 1 - fading * (number - 1)
+            _write_view(folder / names[0].format(number), photograph, total @ first, size, light)
+            if number > 1:
+                np.savetxt(folder / names[1].format(number), total)
+            total = move @ total
+
+    return write
+
+
 @pytest.fixture
 def photo_path(photo: np.ndarray, tmp_path: Path) -> Path:
     """The photograph as a PNG file."""

@@ -12,9 +12,9 @@ from skimage import data
 
 from deepdetect.cli import main
 from deepdetect.cli.benchmark import NAMES
-from deepdetect.evaluation.protocols import BENCHMARKS
+from deepdetect.evaluation.benchmarks import BENCHMARKS
 
-FILES = {"index.html", "report.md", "report.json", "tables/foreground.csv"}
+FILES = {"report.md", "report.json", "tables/foreground.csv"}
 
 
 @pytest.fixture(scope="module")
@@ -34,13 +34,13 @@ def made(folder: Path, tmp_path_factory: pytest.TempPathFactory):
     """The first run, whose results the others find."""
     output = tmp_path_factory.mktemp("output")
     arguments = ["benchmark", "foreground", "--data", str(folder), "-o", str(output)]
-    result = CliRunner().invoke(main, [*arguments, "--only", "fast, harris"])
+    result = CliRunner().invoke(main, [*arguments, "--baselines", "fast, harris"])
     assert result.exit_code == 0, result.output
     return result, output
 
 
-def test_the_names_are_those_of_the_benchmarks_and_two_more() -> None:
-    assert set(NAMES) == {*BENCHMARKS, "all", "refine-oxford"}
+def test_the_names_are_those_of_the_benchmarks_and_all() -> None:
+    assert set(NAMES) == {*BENCHMARKS, "all"}
 
 
 def test_the_report_is_written_and_printed(made, folder: Path) -> None:
@@ -48,7 +48,7 @@ def test_the_report_is_written_and_printed(made, folder: Path) -> None:
     written = {path.relative_to(output).as_posix() for path in output.rglob("*") if path.is_file()}
     assert {path for path in written if not path.startswith("cache/")} == FILES
     assert any(path.startswith("cache/keypoints/") for path in written)
-    assert f"report: {output / 'index.html'}" in result.stdout
+    assert f"report: {output / 'report.md'}" in result.stdout
     assert "| FAST |" in result.stdout
     assert "Traceback" not in result.output
     gray = cv2.cvtColor(cv2.imread(str(folder / "foreground" / "cat.png")), cv2.COLOR_BGR2GRAY)
@@ -57,14 +57,14 @@ def test_the_report_is_written_and_printed(made, folder: Path) -> None:
     rows = (output / "tables" / "foreground.csv").read_text().splitlines()
     (fast,) = [row.split(",") for row in rows if row.startswith("FAST,")]
     assert float(fast[1]) == pytest.approx(share)
-    assert float(fast[3]) == pytest.approx(len(points) / gray.size)
+    assert float(fast[4]) == pytest.approx(len(points) / gray.size)
     assert [row.split(",")[0] for row in rows[:3]] == ["method", "FAST", "Harris"]
 
 
 def test_json_can_be_parsed_and_names_the_files(made, folder: Path, run) -> None:
     _, output = made
     result = run(
-        *("benchmark", "foreground", "--data", folder, "-o", "out", "--only", "fast,harris"),
+        *("benchmark", "foreground", "--data", folder, "-o", "out", "--baselines", "fast,harris"),
         *("--cache", output / "cache", "--json"),
     )
     assert result.exit_code == 0, result.output
@@ -74,8 +74,8 @@ def test_json_can_be_parsed_and_names_the_files(made, folder: Path, run) -> None
     assert [row["method"] for row in values["tables"]["foreground"]["rows"]][:2] == [
         *("FAST", "Harris"),
     ]
-    assert values["origin"]["results made, not found in the cache"] == "0"
-    assert values["left_out"] == []
+    assert values["metadata"]["results made, not found in the cache"] == "0"
+    assert values["skipped"] == []
 
 
 def test_a_further_method_is_one_more_row_and_the_rest_is_found(made, folder: Path, run) -> None:
@@ -85,22 +85,22 @@ def test_a_further_method_is_one_more_row_and_the_rest_is_found(made, folder: Pa
     )
     result = run(
         *("benchmark", "foreground", "--data", folder / "foreground", "-o", "out"),
-        *("--only", "fast", "--method", "own_corner_finder:find", "--method", "agast"),
+        *("--baselines", "fast", "--method", "own_corner_finder:find", "--method", "agast"),
         *("--cache", output / "cache", "--json"),
     )
     assert result.exit_code == 0, result.output
     values = json.loads(result.stdout)
     rows = {row["method"]: row for row in values["tables"]["foreground"]["rows"]}
     assert list(rows)[:3] == ["FAST", "own_corner_finder:find", "AGAST"]
-    assert rows["own_corner_finder:find"]["share on the foreground"] == 0.5
+    assert rows["own_corner_finder:find"]["fraction on the foreground"] == 0.5
     # Keypoints and shares of the two new methods.
-    assert values["origin"]["results made, not found in the cache"] == "4"
+    assert values["metadata"]["results made, not found in the cache"] == "4"
 
 
 def test_no_classical_method_may_be_wanted(made, folder: Path, run) -> None:
     _, output = made
     result = run(
-        *("benchmark", "foreground", "--data", folder, "-o", "out", "--only", "none"),
+        *("benchmark", "foreground", "--data", folder, "-o", "out", "--baselines", "none"),
         *("--cache", output / "cache"),
     )
     assert result.exit_code == 0, result.output
@@ -116,8 +116,8 @@ def test_no_classical_method_may_be_wanted(made, folder: Path, run) -> None:
         ("low_visibility", "'low-visibility'"),
         ("foreground --protocol papers", "'paper'"),
         ("foreground --protocol paper --protocol standart", "'standard'"),
-        ("foreground --only siift", "'sift'"),
-        ("foreground --only fast,fast-lo", "'fast-low'"),
+        ("foreground --baselines siift", "'sift'"),
+        ("foreground --baselines fast,fast-lo", "'fast-low'"),
         ("foreground --method shi-tomas", "'shi-tomasi'"),
         ("foreground --method none.onnx", "none.onnx"),
         ("foreground --method no_such_module:find", "no_such_module"),
@@ -152,7 +152,7 @@ def test_an_output_that_is_a_file_ends_with_one_line(run, folder: Path, made) ->
     _, output = made
     Path("taken").write_text("")
     result = run(
-        *("benchmark", "foreground", "--data", folder, "-o", "taken", "--only", "none"),
+        *("benchmark", "foreground", "--data", folder, "-o", "taken", "--baselines", "none"),
         *("--cache", output / "cache"),
     )
     assert result.exit_code == 2

@@ -4,12 +4,18 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from deepdetect import DeepDetectError
-from deepdetect.evaluation import cache as cache_module
-from deepdetect.evaluation.cache import StageCache, file_digest
+from deepdetect.evaluation.cache import (
+    STAGES,
+    StageCache,
+    file_digest,
+    matrix_digest,
+    stage_versions,
+)
 
 ARRAYS = {
     "rows": np.arange(50, dtype=np.int16),
@@ -44,17 +50,17 @@ def only_file(folder: Path) -> Path:
 def test_the_second_time_nothing_is_made(tmp_path: Path) -> None:
     make = Maker()
     cache = StageCache(tmp_path)
-    assert_whole(cache.get("stage", {"k": 1}, make))
-    assert_whole(cache.get("stage", {"k": 1}, make))
-    assert_whole(StageCache(tmp_path).get("stage", {"k": 1}, make))
+    assert_whole(cache.get("matches", {"k": 1}, make))
+    assert_whole(cache.get("matches", {"k": 1}, make))
+    assert_whole(StageCache(tmp_path).get("matches", {"k": 1}, make))
     assert (make.calls, cache.made) == (1, 1)
 
 
 def test_the_order_of_the_key_plays_no_part(tmp_path: Path) -> None:
     make = Maker()
     cache = StageCache(tmp_path)
-    cache.get("stage", {"a": 1, "b": [2, None]}, make)
-    cache.get("stage", {"b": [2, None], "a": 1}, make)
+    cache.get("matches", {"a": 1, "b": [2, None]}, make)
+    cache.get("matches", {"b": [2, None], "a": 1}, make)
     assert make.calls == 1
 
 
@@ -62,7 +68,7 @@ def test_any_change_of_the_key_or_the_stage_makes_it_anew(tmp_path: Path) -> Non
     make = Maker()
     cache = StageCache(tmp_path)
     keys = [{"k": 1}, {"k": 2}, {"k": "1"}, {"k": None}, {"k": 1, "l": 0}, {"k": [1]}, {}]
-    for stage in ("stage", "other"):
+    for stage in ("matches", "keypoints"):
         for key in keys:
             cache.get(stage, key, make)
     assert make.calls == cache.made == 2 * len(keys)
@@ -72,7 +78,7 @@ def test_without_a_folder_nothing_is_kept() -> None:
     make = Maker()
     cache = StageCache(None)
     for _ in range(3):
-        assert_whole(cache.get("stage", {"k": 1}, make))
+        assert_whole(cache.get("matches", {"k": 1}, make))
     assert (make.calls, cache.made) == (3, 3)
 
 
@@ -93,28 +99,28 @@ def test_a_damaged_file_is_made_anew_and_repaired(
 ) -> None:
     make = Maker()
     cache = StageCache(tmp_path)
-    cache.get("stage", {"k": 1}, make)
+    cache.get("matches", {"k": 1}, make)
     path = only_file(tmp_path)
     raw = path.read_bytes()
     path.write_bytes(damage(raw))
-    assert_whole(cache.get("stage", {"k": 1}, make))
+    assert_whole(cache.get("matches", {"k": 1}, make))
     assert make.calls == cache.made == 2
-    assert_whole(cache.get("stage", {"k": 1}, make))
+    assert_whole(cache.get("matches", {"k": 1}, make))
     assert make.calls == 2
 
 
-@pytest.mark.parametrize("part", range(8))
+@pytest.mark.parametrize("part", range(4))
 def test_a_flipped_byte_anywhere_changes_nothing(tmp_path: Path, part: int) -> None:
     """Compressed data, names and the directory of the archive are all struck in turn."""
     cache = StageCache(tmp_path)
-    cache.get("stage", {"k": 1}, Maker())
+    cache.get("matches", {"k": 1}, Maker())
     path = only_file(tmp_path)
     raw = path.read_bytes()
-    for place in range(part * len(raw) // 8, (part + 1) * len(raw) // 8, 9):
+    for place in range(part * len(raw) // 4, (part + 1) * len(raw) // 4, 17):
         struck = bytearray(raw)
         struck[place] ^= 0xFF
         path.write_bytes(struck)
-        assert_whole(cache.get("stage", {"k": 1}, Maker()))
+        assert_whole(cache.get("matches", {"k": 1}, Maker()))
 
 
 def test_a_result_that_fails_is_neither_kept_nor_counted(tmp_path: Path) -> None:
@@ -123,21 +129,21 @@ def test_a_result_that_fails_is_neither_kept_nor_counted(tmp_path: Path) -> None
 
     for cache in (StageCache(tmp_path), StageCache(None)):
         with pytest.raises(ValueError, match="no result"):
-            cache.get("stage", {"k": 1}, fail)
+            cache.get("matches", {"k": 1}, fail)
         assert cache.made == 0
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
-    assert_whole(StageCache(tmp_path).get("stage", {"k": 1}, Maker()))
+    assert_whole(StageCache(tmp_path).get("matches", {"k": 1}, Maker()))
 
 
 def test_no_temporary_files_stay(tmp_path: Path) -> None:
-    StageCache(tmp_path).get("stage", {"k": 1}, Maker())
-    assert only_file(tmp_path).parent.name == "stage"
+    StageCache(tmp_path).get("matches", {"k": 1}, Maker())
+    assert only_file(tmp_path).parent.name == "matches"
 
 
 def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path, one_line) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DeepDetectError, match="cannot write") as caught:
-        StageCache(tmp_path / "file").get("stage", {"k": 1}, Maker())
+        StageCache(tmp_path / "file").get("matches", {"k": 1}, Maker())
     one_line(caught.value)
 
 
@@ -170,8 +176,47 @@ def test_the_same_relative_path_in_another_folder_is_another_file(
     assert len(digests) == 2
 
 
-def test_what_only_draws_and_writes_does_not_make_results_old() -> None:
-    root = Path(cache_module.__file__).parents[1]
-    for name in cache_module.UNRELATED:
-        assert (root / name).exists(), name
-    assert "benchmark/stages.py" not in cache_module.UNRELATED
+@pytest.mark.parametrize(
+    ("raised", "again"),
+    [("matches", ["matches", "corner_errors"]), ("keypoints", list(STAGES)[:2])],
+)
+def test_a_raised_version_makes_a_stage_again_and_what_is_made_from_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, raised: str, again: list[str]
+) -> None:
+    cache = StageCache(tmp_path)
+
+    def made() -> list[str]:
+        stages = []
+        for stage in STAGES:
+            before = cache.made
+            cache.get(stage, {"k": 1}, Maker())
+            stages += [stage] if cache.made > before else []
+        return stages
+
+    assert made() == list(STAGES)
+    assert made() == []
+    monkeypatch.setitem(STAGES, raised, (2, STAGES[raised][1]))
+    found = made()
+    assert found[: len(again)] == again
+    assert "stereo" not in found
+    assert all(raised in stage_versions(stage) for stage in found)
+
+
+def test_other_versions_of_opencv_and_numpy_make_all_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = StageCache(tmp_path)
+    for k, module in enumerate((None, cv2, np)):
+        if module is not None:
+            monkeypatch.setattr(module, "__version__", "0.0.0")
+        cache.get("matches", {"k": 1}, Maker())
+        assert cache.made == k + 1
+
+
+def test_a_matrix_is_known_by_its_numbers() -> None:
+    matrix = np.arange(9.0).reshape(3, 3)
+    assert matrix_digest(matrix) == matrix_digest(matrix.T.copy().T)
+    assert matrix_digest(matrix) == matrix_digest(matrix.astype(np.float32))
+    moved = matrix.copy()
+    moved[0, 2] = np.nextafter(moved[0, 2], 9)
+    assert len({matrix_digest(m) for m in (matrix, matrix.T, moved)}) == 3

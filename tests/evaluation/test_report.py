@@ -1,10 +1,19 @@
 from __future__ import annotations
 
+import csv
+import io
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
 import pytest
+from PIL import Image
 
 from deepdetect import OptionError
-from deepdetect.evaluation.protocols import Table
-from deepdetect.evaluation.report import Column
+from deepdetect.evaluation.charts import picture
+from deepdetect.evaluation.report import Column, Figure, Report, Section, Table
 
 
 @pytest.mark.parametrize(
@@ -39,3 +48,131 @@ def test_two_columns_of_one_title_are_refused(one_line) -> None:
     with pytest.raises(OptionError, match="share a title") as caught:
         Table("t", "T", (Column("a"), Column("a")), ())
     one_line(caught.value)
+
+
+EVIL = "<b>Tom & \"Jerry\"</b> | 'x' <script src=http://evil.example/a.js>"
+THIRD = 1 / 3
+
+
+def png(value: int) -> bytes:
+    return picture(np.full((4, 5, 3), value, np.uint8))
+
+
+@pytest.fixture(scope="module")
+def report() -> Report:
+    columns = (Column("method"), Column("a|b <c>", ".2f"), Column("count", ",d"))
+    rows = (
+        (EVIL, THIRD, 1234567),
+        ("nothing", None, None),
+        ("no number", float("nan"), 0),
+        ("endless", float("inf"), -1),
+        ("small, with comma", np.nextafter(0.1, 1), 2),
+    )
+    first = Table("first", f"Title {EVIL}", columns, rows, f"Note {EVIL}")
+    second = Table("second", "Second", (Column("method"),), (("one",),))
+    return Report(
+        f"Report {EVIL}",
+        {"command": EVIL, "weights": "w.onnx"},
+        (
+            Section(f"One {EVIL}", (f"Text {EVIL}",), (first,), (Figure("fig", EVIL, png(9)),)),
+            Section("Two", (), (second,), (Figure("other", "Other", png(200)),)),
+        ),
+        (f"left {EVIL}",),
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(report: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("report")
+    report.save(root)
+    return root
+
+
+def test_all_files_are_written_and_named_with_the_report_first(
+    report: Report, tmp_path: Path
+) -> None:
+    paths = report.save(tmp_path)
+    assert paths[0] == tmp_path / "report.md"
+    assert len(set(paths)) == len(paths)
+    assert set(paths) == {path for path in tmp_path.rglob("*") if path.is_file()}
+    assert {path.relative_to(tmp_path).as_posix() for path in paths} == {
+        *("report.md", "figures/fig.png", "figures/other.png"),
+        *("tables/first.csv", "tables/second.csv", "report.json"),
+    }
+
+
+def test_a_report_of_nothing_says_so(tmp_path: Path) -> None:
+    Report("Empty", {}, ()).save(tmp_path)
+    assert "- nothing" in (tmp_path / "report.md").read_text("utf-8")
+    assert json.loads((tmp_path / "report.json").read_text("utf-8"))["skipped"] == []
+
+
+def test_csv_has_every_digit_and_empty_cells(report: Report, folder: Path) -> None:
+    with (folder / "tables" / "first.csv").open(newline="", encoding="utf-8") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["method", "a|b <c>", "count"]
+    assert rows[0] == [EVIL, repr(THIRD), "1234567"]
+    assert rows[1] == ["nothing", "", ""]
+    assert rows[4][0] == "small, with comma"
+    assert float(rows[4][1]) == np.nextafter(0.1, 1) != 0.1
+    assert len(rows) == 5
+
+
+def test_what_is_not_a_number_is_an_empty_cell_of_csv_too(folder: Path) -> None:
+    """It is what is not known, and a dash in the other formats."""
+    with (folder / "tables" / "first.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    assert rows[3] == ["no number", "", "0"]
+
+
+def test_json_has_every_digit_and_no_word_that_json_lacks(folder: Path) -> None:
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    text = (folder / "report.json").read_text("utf-8")
+    values = json.loads(text, parse_constant=refuse)
+    rows = values["tables"]["first"]["rows"]
+    assert rows[0] == {"method": EVIL, "a|b <c>": THIRD, "count": 1234567}
+    assert [row["a|b <c>"] for row in rows[1:4]] == [None, None, None]
+    assert rows[4]["a|b <c>"] == np.nextafter(0.1, 1)
+    assert values["figures"] == {"fig": EVIL, "other": "Other"}
+    assert values["metadata"]["command"] == EVIL
+    assert values["skipped"] == [f"left {EVIL}"]
+
+
+def test_the_values_do_not_lose_a_table(report: Report) -> None:
+    assert list(report.values()["tables"]) == [table.key for table in report.tables()]
+
+
+def test_markdown_tables_have_as_many_cells_in_each_line(report: Report) -> None:
+    lines = report.tables()[0].to_markdown().splitlines()
+    assert len(lines) == 2 + 5
+    for line in lines:
+        assert line.startswith("|")
+        assert line.endswith("|")
+        assert len(re.findall(r"(?<!\\)\|", line)) == 4
+    assert lines[1] == "|---|---:|---:|"
+    assert lines[3] == "| nothing | – | – |"
+    assert "a\\|b <c>" in lines[0]
+
+
+def test_markdown_shows_its_figures_from_files_beside_it(report: Report, folder: Path) -> None:
+    text = (folder / "report.md").read_text("utf-8")
+    for figure in report.figures():
+        assert f"](figures/{figure.key}.png)" in text
+        assert (folder / "figures" / f"{figure.key}.png").read_bytes() == figure.png
+        Image.open(io.BytesIO(figure.png)).verify()
+    assert text.startswith("# Report ")
+    assert "## Skipped\n\n- left " in text
+
+
+def test_a_second_report_takes_the_place_of_the_first(report: Report, tmp_path: Path) -> None:
+    report.save(tmp_path)
+    Report("New", {}, report.sections).save(tmp_path)
+    assert json.loads((tmp_path / "report.json").read_text("utf-8"))["title"] == "New"
+    assert not [path for path in tmp_path.rglob(".*") if path.is_file()]
+
+
+def test_infinity_survives_in_csv(folder: Path) -> None:
+    with (folder / "tables" / "first.csv").open(newline="", encoding="utf-8") as file:
+        assert math.isinf(float(list(csv.reader(file))[4][1]))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
 from deepdetect.datasets.types import read_homography
-from deepdetect.evaluation.metrics.homography_accuracy import corner_error
+from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry.homography_refinement import (
     RefinementOptions,
     aligned_fraction,

@@ -11,7 +11,7 @@ from PIL import Image
 
 from deepdetect import DeepDetectError, OptionError
 from deepdetect.cli import main
-from deepdetect.evaluation.metrics.homography_accuracy import corner_error
+from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.matching.registration import register
 
 WARP = np.array([[0.92, -0.1, 25.0], [0.08, 0.97, -6.0], [1e-4, 2e-4, 1.0]])

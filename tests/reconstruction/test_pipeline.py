@@ -18,7 +18,7 @@ from deepdetect import DeepDetect, OptionError, ReconstructionError
 from deepdetect._shared import parallel
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.evaluation.controls import EveryPixel
+from deepdetect.evaluation.baselines.random import AllPixels
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.point_cloud import PointCloud
 from deepdetect.reconstruction.outliers import PointFilterOptions
@@ -270,7 +270,7 @@ def test_is_the_same_for_any_number_of_threads(
             results.append(
                 [
                     reconstruct(
-                        *(pair.left, pair.right, EveryPixel()),
+                        *(pair.left, pair.right, AllPixels()),
                         calibration=pair.calibration,
                         max_keypoints=15_000,
                     ).points
@@ -374,13 +374,13 @@ def test_an_unknown_option_names_the_nearest(
     level: Any, options: dict[str, Any], nearest: str, one_line: Any
 ) -> None:
     with pytest.raises(OptionError, match=f"did you mean '{nearest}'") as error:
-        reconstruct(level.left, level.right, EveryPixel(), focal_px=500, **options)
+        reconstruct(level.left, level.right, AllPixels(), focal_px=500, **options)
     one_line(error.value)
 
 
 def refusal(one_line: Any, *pair: Any, **options: Any) -> str:
     with pytest.raises(ReconstructionError) as error:
-        reconstruct(*pair, EveryPixel(), **{"focal_px": 497.5, **options})
+        reconstruct(*pair, AllPixels(), **{"focal_px": 497.5, **options})
     return one_line(error.value)
 
 
@@ -417,7 +417,7 @@ def test_a_pair_taken_in_the_dark_has_depth(level: Any) -> None:
     """Of a mean of 6 grey levels."""
     factor = 6 / level.left.mean()
     dark = [np.rint(view * factor).astype(np.uint8) for view in (level.left, level.right)]
-    found = reconstruct(*dark, EveryPixel(), calibration=level.calibration, rectified=True)
+    found = reconstruct(*dark, AllPixels(), calibration=level.calibration, rectified=True)
     column, row = found.pixels.astype(int).T
     off = np.abs(found.disparity - level.disparity[row, column])
     assert len(found) > 10_000
@@ -493,7 +493,7 @@ def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> Non
         one_line, level.left, narrow, focal_px=None, calibration=level.calibration
     )
     with pytest.raises(ImageError, match="must have one size"):
-        reconstruct(level.left, narrow, EveryPixel(), focal_px=500, rectified=True)
+        reconstruct(level.left, narrow, AllPixels(), focal_px=500, rectified=True)
 
 
 def test_the_representation_is_one_short_line(found: Any, posed: Any) -> None:

@@ -18,7 +18,7 @@ from .shared import PATH, json_option, print_json
     "--weights",
     multiple=True,
     metavar="NAME|FILE",
-    help="default or dense, the bundled weights, or a file; may be repeated.",
+    help="default or dense, the pretrained weights, or a file; may be repeated.",
 )
 @click.option(
     "--label-settings",
@@ -32,44 +32,42 @@ from .shared import PATH, json_option, print_json
 def evaluate_stereo(
     scenes: tuple[Path, ...], weights: tuple[str, ...], labels: tuple[str, ...], as_json: bool
 ) -> None:
-    """Match the rectified stereo pairs SCENES, and judge the matches by their true disparity.
+    """Match the rectified stereo pairs SCENES, and evaluate the matches by their true disparity.
 
-    A scene is a folder with left.png, right.png, disparity.png and calib.json. Matching knows
-    neither the rows nor the truth; a match is right within 1 px. Random points at the same
-    density and every pixel stand beside as controls.
+    A scene is a folder with left.png, right.png, disparity.png and calib.json. Matching uses
+    neither the rows nor the truth; a match is correct within 1 px. Random points of the same
+    density and all pixels are the baselines.
 
     \b
     deepdetect evaluate-stereo cones/ teddy/ --weights default --weights dense
     deepdetect evaluate-stereo cones/ teddy/ --label-settings paper --label-settings mine.toml
     """
-    from .._shared.progress import progress
     from ..datasets.middlebury import load_middlebury
-    from ..detector.detector import DeepDetect
+    from ..detector.detector import DeepDetect, HeatmapDetector
     from ..detector.pretrained import PRETRAINED
-    from ..evaluation.stereo_quality import LabelKeypoints, stereo_quality
+    from ..evaluation.protocols.masks import LabelDetector
+    from ..evaluation.protocols.stereo import score_stereo_matches
     from ..labels import LabelOptions, find_label_settings
 
     pairs = [load_middlebury(scene) for scene in scenes]
-    sources = {}
+    sources: dict[str, HeatmapDetector] = {}
     for name in labels:
         chosen = find_label_settings(name)
         options = LabelOptions(chosen.detectors, changes=chosen.changes)
-        sources[f"labels {name}"] = LabelKeypoints(options)
+        sources[f"labels {name}"] = LabelDetector(options)
     for name in weights if weights or labels else tuple(PRETRAINED):
         sources[f"weights {name}"] = DeepDetect(name)
-    total = len(pairs) * (2 * len(sources) + 1)
-    with progress(total, "matching", "pair", as_json) as bar:
-        rows = stereo_quality(sources, pairs, bar.update)
+    rows = score_stereo_matches(sources, pairs, quiet=as_json)
     if as_json:
-        print_json([{**asdict(row), "share": row.score.share} for row in rows])
+        print_json([{**asdict(row), "precision": row.score.precision} for row in rows])
         return
     width = max(len(row.source) for row in rows)
     click.echo(
         f"{'keypoints':<{width}}  {'pair':<12}{'density':>8}{'matches':>10}"
-        f"{'right':>10}{'share':>7}"
+        f"{'correct':>10}{'precision':>11}"
     )
     for row in rows:
         click.echo(
             f"{row.source:<{width}}  {row.pair:<12}{row.density:>8.3f}{row.score.matches:>10,}"
-            f"{row.score.right:>10,}{row.score.share:>7.3f}"
+            f"{row.score.correct:>10,}{row.score.precision:>11.3f}"
         )

@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from .._shared.atomic import atomic_path
@@ -16,24 +17,25 @@ from .._shared.errors import DeepDetectError
 
 Arrays = Mapping[str, np.ndarray]
 
+STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
+    "keypoints": (1, ()),
+    "matches": (1, ("keypoints",)),
+    "guided": (1, ("keypoints",)),
+    "stereo": (1, ()),
+    "repeatability_paper": (1, ("keypoints",)),
+    "repeatability_mutual_nn": (1, ("keypoints",)),
+    "coverage": (1, ("keypoints",)),
+    "corner_errors": (1, ("matches",)),
+    "foreground": (1, ("keypoints",)),
+}
+"""Version of each stage, and the stages it is made from.
 
-UNRELATED = frozenset(
-    {
-        *("cli", "training", "pictures.py", "progress.py", "provenance.py", "stereo_demo.py"),
-        *(
-            f"benchmark/{name}"
-            for name in (
-                *("formats", "cache.py", "charts.py", "paper_figures.py", "paper_numbers.py"),
-                *("registry.py", "report.py", "run.py", "refine_oxford.py", "planar_sections.py"),
-                *("standard_tables.py", "oxford.py", "hpatches.py", "low_visibility.py"),
-            )
-        ),
-    }
-)
-"""Packages and modules that no cached result goes through: command line, drawing, writing."""
+Raise the version when a change of the code changes the stage's results: cached ones of another
+version are not used, nor what was made from them.
+"""
 
 NAMES = "names of the arrays"
-"""Key of the list of all others, by which a file that lost some is known."""
+"""Key of the list of all others, by which a file that lost some is recognised."""
 
 
 class CacheError(DeepDetectError):
@@ -41,21 +43,21 @@ class CacheError(DeepDetectError):
 
 
 class StageCache:
-    """Arrays by what they were made of.
+    """Arrays by what they were made from.
 
-    A result is kept under the digest of its stage and of all that it depends on; when one of
-    these changes it is made anew. A damaged file is made anew too. Old files are never removed:
-    delete the folder to free its room.
+    A result is kept under the digest of its stage, of the stage's version and of all that it
+    depends on; when one of these changes it is computed again, and so it is when its file is
+    damaged. Old files are never removed: delete the folder to free its space.
 
     Args:
         folder: where the files are; None keeps nothing.
 
     Attributes:
-        made: number of results that were made, not found.
+        made: number of results that were computed, not found.
 
     Example:
         >>> cache = StageCache(None)
-        >>> cache.get("sum", {"of": [1, 2]}, lambda: {"value": np.array(3)})["value"].item()
+        >>> cache.get("matches", {"of": [1, 2]}, lambda: {"value": np.array(3)})["value"].item()
         3
     """
 
@@ -67,7 +69,7 @@ class StageCache:
         """Find a result, or make and keep it.
 
         Args:
-            stage: name of the stage, as "keypoints".
+            stage: one of `STAGES`.
             key: all that the result depends on, as plain values.
             make: makes the arrays.
 
@@ -78,7 +80,7 @@ class StageCache:
             made = make()
             self.made += 1
             return made
-        text = json.dumps(key, sort_keys=True)
+        text = json.dumps({**key, **stage_versions(stage)}, sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:32]
         path = self.folder / stage / f"{digest}.npz"
         found = _read(path)
@@ -88,10 +90,25 @@ class StageCache:
         self.made += 1
         try:
             with atomic_path(path) as temporary, temporary.open("wb") as file:
-                np.savez_compressed(file, **arrays, **{NAMES: np.array(sorted(arrays))})
+                contents: dict[str, Any] = {**arrays, NAMES: np.array(sorted(arrays))}
+                np.savez_compressed(file, **contents)
         except DeepDetectError as error:
             raise CacheError(str(error)) from None
         return arrays
+
+
+def stage_versions(stage: str) -> dict[str, Any]:
+    """Return the versions that a stage's results depend on: its own, its sources', the packages'.
+
+    Example:
+        >>> sorted(stage_versions("matches"))
+        ['keypoints', 'matches', 'numpy', 'opencv']
+    """
+    version, sources = STAGES[stage]
+    versions = {"numpy": np.__version__, "opencv": cv2.__version__, stage: version}
+    for source in sources:
+        versions |= stage_versions(source)
+    return versions
 
 
 def _read(path: Path) -> Arrays | None:
@@ -110,22 +127,12 @@ def file_digest(path: Path) -> str:
     return _digest(path.resolve(), state.st_mtime_ns, state.st_size)
 
 
-@lru_cache(maxsize=1)
-def source_digest() -> str:
-    """Return a digest of the package's own sources but for `UNRELATED`.
-
-    A result that was made by other code is not used: no number that is raised by hand is forgotten.
-    """
-    root = Path(__file__).parents[1]
-    digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        inside = path.relative_to(root)
-        if UNRELATED.isdisjoint(part.as_posix() for part in (inside, *inside.parents)):
-            digest.update(inside.as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
 @lru_cache(maxsize=4096)
 def _digest(path: Path, changed: int, size: int) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def matrix_digest(matrix: np.ndarray) -> str:
+    """Return a digest of a matrix's numbers."""
+    return hashlib.sha256(np.ascontiguousarray(matrix, np.float64).tobytes()).hexdigest()[:16]

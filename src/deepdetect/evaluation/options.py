@@ -1,29 +1,28 @@
-"""What a benchmark is asked for."""
+"""What a benchmark compares."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
 from ..features.selection import SelectionOptions
-from .baselines import (
-    CLASSICAL,
+from .baselines.method import (
     COMMON_DESCRIPTOR,
-    STANDARD,
-    Method,
-    deepdetect_method,
-    every_pixel_method,
-    random_method,
+    LocalFeature,
+    deepdetect_feature,
+    with_common_descriptor,
 )
+from .baselines.opencv import CLASSICAL, STANDARD
+from .baselines.random import all_pixels_feature, random_feature
 
 PROTOCOLS = ("paper", "standard", "guided")
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
-LOW = ("sift-low", "orb-low", "brisk-low", "fast-low", "agast-low", "harris-low", "shi-tomasi-low")
-DEFAULT = ("sift", "orb", "brisk", "fast", "agast", "harris", "shi-tomasi")
+PAPER_RESOLUTION_PX = 480
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +30,13 @@ class BenchmarkOptions:
     """What is compared, and how.
 
     Attributes:
-        detector: DeepDetect, with the weights that are judged.
+        detector: DeepDetect, with the weights that are evaluated.
         protocols: one or more of "paper", "standard" and "guided".
-        classical: names of the classical methods.
-        others: further methods.
+        classical: names of the classical baselines.
+        others: further local features.
         channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
             feeds its own weights.
-        geometry_weights: the weights for stereo pairs, one or more; time is measured with the
-            first.
+        geometry_weights: the weights for stereo pairs, one or more.
 
     Raises:
         OptionError: a name is unknown, or nothing is left to do.
@@ -46,81 +44,92 @@ class BenchmarkOptions:
 
     detector: DeepDetect
     protocols: tuple[str, ...] = PROTOCOLS
-    classical: tuple[str, ...] = (*DEFAULT, *LOW)
-    others: tuple[Method, ...] = ()
-    channels: str = "rgb"
+    classical: tuple[str, ...] = tuple(CLASSICAL)
+    others: tuple[LocalFeature, ...] = ()
+    channels: Literal["rgb", "bgr"] = "rgb"
     geometry_weights: tuple[str | Path, ...] = ("dense",)
 
     def __post_init__(self) -> None:
         for protocol in self.protocols:
             if protocol not in PROTOCOLS:
                 raise unknown_name("protocol", protocol, PROTOCOLS)
+        if not self.protocols:
+            raise OptionError(f"choose a protocol: {' or '.join(PROTOCOLS)}")
         if not self.geometry_weights:
-            raise OptionError("name the weights for stereo pairs, as geometry")
+            raise OptionError("geometry_weights must name at least one weights file")
         stems = [Path(weights).stem for weights in self.geometry_weights]
         if len(set(stems)) < len(stems):
             raise OptionError(
-                f"two weights for stereo pairs are named alike ({', '.join(stems)}): rename a file"
+                f"two weights for stereo pairs have the same name ({', '.join(stems)}): rename a "
+                "file"
             )
-        if not self.protocols:
-            raise OptionError(f"choose a protocol: {' or '.join(PROTOCOLS)}")
         for name in self.classical:
             if name not in CLASSICAL:
-                raise unknown_name("classical method", name, CLASSICAL)
+                raise unknown_name("classical baseline", name, CLASSICAL)
 
-    def own(self, threshold: float = 0.5) -> Method:
+    def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
         """Return DeepDetect as the paper runs it: images squashed to 480x480, SIFT of size 3."""
-        squashing = self.detector.configured(HeatmapOptions(480, self.channels))
-        return deepdetect_method(
-            squashing,
+        heatmap = HeatmapOptions(PAPER_RESOLUTION_PX, self.channels)
+        return deepdetect_feature(
+            self.detector.configured(heatmap),
             SelectionOptions(threshold),
             name=f"deepdetect-{threshold:g}",
             title=f"DeepDetect, threshold {threshold:g}",
         )
 
-    def controls(self) -> tuple[Method, Method]:
-        """Return as many random points as DeepDetect finds, and every pixel."""
-        return random_method(self.own()), every_pixel_method()
+    def deepdetect_native(self) -> LocalFeature:
+        """Return DeepDetect at the image's own size, all pixels over 0.5."""
+        title = "DeepDetect, native resolution, all pixels over 0.5"
+        return deepdetect_feature(self._native(), name="deepdetect-native", title=title)
 
-    def density_methods(self) -> tuple[Method, ...]:
-        """Return the rows of Table I and of the repeatability, controls last."""
+    def chance_baselines(self) -> tuple[LocalFeature, LocalFeature]:
+        """Return random points of the number that `deepdetect_480` finds, and all pixels."""
+        return random_feature(self.deepdetect_480()), all_pixels_feature()
+
+    def density_features(self) -> tuple[LocalFeature, ...]:
+        """Return the rows of Table I and of the repeatability, chance baselines last."""
         classical = [CLASSICAL[name] for name in self.classical]
-        own = [self.own(threshold) for threshold in THRESHOLDS]
-        return without_repeats((*classical, *self.others, *own, *self.controls()))
+        own = [self.deepdetect_480(threshold) for threshold in THRESHOLDS]
+        return without_repeats((*classical, *self.others, *own, *self.chance_baselines()))
 
-    def matching_methods(self) -> tuple[Method, ...]:
-        """Return the rows of Table II: the low settings, DeepDetect, controls."""
-        low = [CLASSICAL[name] for name in self.classical if name in LOW]
-        return without_repeats((*low, *self.others, self.own(), *self.controls()))
+    def matching_features(self) -> tuple[LocalFeature, ...]:
+        """Return the rows of Table II: the low settings, DeepDetect, chance baselines."""
+        low = [CLASSICAL[name] for name in self.classical if name.endswith("-low")]
+        return without_repeats(
+            (*low, *self.others, self.deepdetect_480(), *self.chance_baselines())
+        )
 
-    def standard_methods(self) -> tuple[Method, ...]:
-        """Return the rows of the standard protocol: default settings, ours sparse, controls."""
+    def standard_features(self) -> tuple[LocalFeature, ...]:
+        """Return the rows of the standard protocol: default settings, ours sparse, chance."""
         chosen = [name for name in STANDARD if name in self.classical]
-        classical = [common(STANDARD[name]) for name in chosen]
-        others = [method for method in self.others if method.name not in CLASSICAL]
-        named = {method.name: method for method in self.others if method.name in CLASSICAL}
-        named |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
-        systems = [
-            replace(method, name=f"{method.name}-own", title=f"{method.title}, as it is")
-            for method in named.values()
-        ]
-        own = deepdetect_method(
+        classical = [with_common_descriptor(STANDARD[name]) for name in chosen]
+        others = [feature for feature in self.others if feature.name not in CLASSICAL]
+        systems = {f.name: f for f in self.others if f.name in CLASSICAL}
+        systems |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
+        own = deepdetect_feature(
             self._native(),
             SelectionOptions(nms_radius=1, subpixel=True),
             name="deepdetect-sparse",
             title="DeepDetect, native resolution, suppression 3x3, sub-pixel",
             descriptor=COMMON_DESCRIPTOR,
         )
-        dense = common(self.native())
-        controls = (common(method) for method in self.native_controls())
-        return without_repeats((*classical, *systems, *others, own, dense, *controls))
+        native = self.deepdetect_native()
+        chance = random_feature(native, name="random-native"), all_pixels_feature()
+        return without_repeats(
+            (
+                *classical,
+                *(
+                    replace(f, name=f"{f.name}-own", title=f"{f.title}, own descriptors")
+                    for f in systems.values()
+                ),
+                *others,
+                own,
+                with_common_descriptor(native),
+                *(with_common_descriptor(feature) for feature in chance),
+            )
+        )
 
-    def native(self) -> Method:
-        """Return DeepDetect at the image's own size, all pixels over 0.5."""
-        title = "DeepDetect, native resolution, all pixels over 0.5"
-        return deepdetect_method(self._native(), name="deepdetect-native", title=title)
-
-    def geometry_detectors(self) -> dict[str, DeepDetect]:
+    def stereo_detectors(self) -> dict[str, DeepDetect]:
         """Return detectors with the weights for stereo pairs, at the image's own size, by name."""
         native = HeatmapOptions("native", self.channels)
         return {
@@ -128,40 +137,20 @@ class BenchmarkOptions:
             for weights in self.geometry_weights
         }
 
-    def native_controls(self) -> tuple[Method, Method]:
-        """Return as many random points as `native` finds, and every pixel."""
-        return random_method(self.native(), name="random-native"), every_pixel_method()
-
     def _native(self) -> DeepDetect:
         return self.detector.configured(HeatmapOptions("native", self.channels))
 
 
-def common(method: Method) -> Method:
-    """Return a method with the descriptor that all detectors get in the standard protocol.
-
-    That knows positions only, so each is taken once: SIFT doubles some for their directions.
-    """
-    return replace(
-        method,
-        name=f"{method.name}-common",
-        detect=lambda rgb: method.detect(rgb).distinct(),
-        describe=COMMON_DESCRIPTOR.describe,
-        binary=False,
-        version=f"{method.version} {COMMON_DESCRIPTOR}",
-        detection=f"{method.detection}, distinct",
-    )
-
-
-def without_repeats(methods: Sequence[Method]) -> tuple[Method, ...]:
-    """Return the methods, each once.
+def without_repeats(features: Sequence[LocalFeature]) -> tuple[LocalFeature, ...]:
+    """Return the features, each once.
 
     Raises:
         OptionError: two that are not the same have one name.
     """
-    by_name: dict[str, Method] = {}
-    for method in methods:
-        if by_name.setdefault(method.name, method).version != method.version:
+    by_name: dict[str, LocalFeature] = {}
+    for feature in features:
+        if by_name.setdefault(feature.name, feature).version != feature.version:
             raise OptionError(
-                f"two methods are named {method.name}: rename one of the files they come from"
+                f"two methods are named {feature.name}: rename one of the files they come from"
             )
     return tuple(by_name.values())

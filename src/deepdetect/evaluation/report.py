@@ -1,9 +1,15 @@
-"""A report: sections of text, tables and figures, before it takes any format."""
+"""A report: sections of text, tables and figures; written as Markdown, CSV and JSON."""
 
 from __future__ import annotations
 
+import csv
+import json
+import math
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
+from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 
 Cell = str | int | float | None
@@ -23,13 +29,13 @@ class Column:
     style: str = ""
 
     def show(self, cell: Cell) -> str:
-        """Write a cell as text; what is not known, not a number or nothing is a dash.
+        """Write a cell as text; an unknown value, NaN or None, is a dash.
 
         Example:
             >>> Column("density", ".3f").show(0.5), Column("matches", ",d").show(None)
             ('0.500', '–')
         """
-        if cell is None or (isinstance(cell, float) and cell != cell):
+        if cell is None or (isinstance(cell, float) and math.isnan(cell)):
             return "–"
         return cell if isinstance(cell, str) else format(cell, self.style)
 
@@ -73,6 +79,16 @@ class Table:
             for row in self.rows
         ]
 
+    def to_markdown(self) -> str:
+        """Write the table in Markdown: names to the left, numbers to the right."""
+
+        def line(cells: list[str]) -> str:
+            return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+        rule = "|---|" + "---:|" * (len(self.columns) - 1)
+        heads = line([column.title for column in self.columns])
+        return "\n".join([heads, rule, *map(line, self.shown())])
+
 
 @dataclass(frozen=True)
 class Figure:
@@ -111,15 +127,15 @@ class Report:
 
     Attributes:
         title: the heading.
-        origin: how it was made: command, versions, commit, machine, data.
+        metadata: how it was made: command, versions, commit, machine, data.
         sections: in order.
-        left_out: what was not measured, each with the reason.
+        skipped: what was not measured, each with the reason.
     """
 
     title: str
-    origin: dict[str, str]
+    metadata: dict[str, str]
     sections: tuple[Section, ...]
-    left_out: tuple[str, ...] = ()
+    skipped: tuple[str, ...] = ()
 
     def tables(self) -> list[Table]:
         """Return the tables of all sections."""
@@ -128,3 +144,81 @@ class Report:
     def figures(self) -> list[Figure]:
         """Return the figures of all sections."""
         return [figure for section in self.sections for figure in section.figures]
+
+    def values(self) -> dict[str, Any]:
+        """Return the report as plain values: each row a dict by the columns' titles."""
+        tables = {
+            table.key: {
+                "title": table.title,
+                "note": table.note,
+                "rows": [
+                    {c.title: _finite(cell) for c, cell in zip(table.columns, row, strict=True)}
+                    for row in table.rows
+                ],
+            }
+            for table in self.tables()
+        }
+        return {
+            "title": self.title,
+            "metadata": self.metadata,
+            "tables": tables,
+            "figures": {figure.key: figure.title for figure in self.figures()},
+            "skipped": list(self.skipped),
+        }
+
+    def save(self, folder: Path) -> list[Path]:
+        """Write report.md, figures/KEY.png, tables/KEY.csv and report.json.
+
+        Returns:
+            The files, report.md first.
+        """
+        return [
+            *_save_markdown(self, folder),
+            *(_save_csv(table, folder) for table in self.tables()),
+            _save_text(folder / "report.json", json.dumps(self.values(), indent=1) + "\n"),
+        ]
+
+
+def _finite(cell: Cell) -> Cell:
+    """JSON has no word for infinity and NaN."""
+    return None if isinstance(cell, float) and not math.isfinite(cell) else cell
+
+
+def _save_text(path: Path, text: str) -> Path:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
+
+
+def _save_markdown(report: Report, folder: Path) -> list[Path]:
+    parts = [f"# {report.title}"]
+    for section in report.sections:
+        parts += [f"## {section.title}", *section.text]
+        for table in section.tables:
+            parts += [f"**{table.title}**", table.to_markdown(), *filter(None, [table.note])]
+        parts += [f"![{f.title}](figures/{f.key}.png)\n\n{f.title}" for f in section.figures]
+    parts += ["## Skipped", "\n".join(f"- {reason}" for reason in report.skipped) or "- nothing"]
+    parts += ["## How this was made"]
+    parts += ["\n".join(f"- {name}: {text}" for name, text in report.metadata.items())]
+    paths = [_save_text(folder / "report.md", "\n\n".join(parts) + "\n")]
+    for figure in report.figures():
+        paths.append(folder / "figures" / f"{figure.key}.png")
+        with atomic_path(paths[-1]) as temporary:
+            temporary.write_bytes(figure.png)
+    return paths
+
+
+def _save_csv(table: Table, folder: Path) -> Path:
+    """Write all digits; an unknown value is an empty cell."""
+    path = folder / "tables" / f"{table.key}.csv"
+    with (
+        atomic_path(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file)
+        writer.writerow(column.title for column in table.columns)
+        writer.writerows(
+            ["" if isinstance(cell, float) and math.isnan(cell) else cell for cell in row]
+            for row in table.rows
+        )
+    return path

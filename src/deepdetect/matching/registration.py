@@ -88,11 +88,11 @@ def register(
         DeepDetectError: no homography between the images can be trusted.
 
     Example:
-        >>> from deepdetect.evaluation.controls import RandomPoints
+        >>> from deepdetect.evaluation.baselines.random import RandomDetector
         >>> rng = np.random.default_rng(0)
         >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (160, 200)).astype(np.uint8), (0, 0), 2)
         >>> scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
-        >>> found = register(scene[:, :180], scene[:, 12:], RandomPoints())
+        >>> found = register(scene[:, :180], scene[:, 12:], RandomDetector())
         >>> found.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, pad
 
 from .._shared.errors import OptionError
-from ..evaluation.mask_scores import MaskScore, score_heatmap
+from ..evaluation.metrics.masks import MaskScore, score_heatmap
 from ..io.image import luma
 from ..labels import visibility_of
 from .engine import Engine, freeze_batch_norm

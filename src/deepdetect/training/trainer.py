@@ -27,7 +27,7 @@ from ..detector.network.weights import (
     weights_digest,
 )
 from ..detector.pretrained import resolve_weights
-from ..evaluation.mask_scores import MaskScore, mean_score
+from ..evaluation.metrics.masks import MaskScore, mean_score
 from .checkpoint import Checkpoint, TrainingState, read_checkpoint, restore, save_checkpoint
 from .dataset import CropDataset, TrainingData, ValidationDataset, loading, prepare_data
 from .engine import DistributedContext

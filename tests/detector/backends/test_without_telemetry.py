@@ -37,9 +37,9 @@ assert sys.modules.get("openvino_telemetry", before) is not None
 ONNX_METHOD = """
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect._shared.errors import WeightsError
-from deepdetect.evaluation.baselines.onnx_file import onnx_method
+from deepdetect.evaluation.baselines.onnx import onnx_feature
 try:
-    onnx_method(pretrained_weights())
+    onnx_feature(pretrained_weights())
 except WeightsError as error:
     assert "outputs keypoints and scores" in str(error), error
 """

@@ -11,7 +11,7 @@ from deepdetect import DeepDetect, WeightsError  # noqa: E402
 from deepdetect.detector.network.espnet import DilatedConvolution, ESPNet, ResidualPyramid  # noqa: E402
 from deepdetect.detector.network.onnx_export import export_onnx  # noqa: E402
 from deepdetect.detector.network.weights import load_network, save_weights  # noqa: E402
-from deepdetect.evaluation.mask_scores import score_samples  # noqa: E402
+from deepdetect.evaluation.protocols.masks import sample_images, score_samples  # noqa: E402
 
 
 def test_has_exactly_the_published_number_of_parameters() -> None:
@@ -53,7 +53,9 @@ def test_published_weights_load(shared: Path, name: str) -> None:
 @pytest.mark.slow
 def test_published_weights_score_as_published(shared: Path) -> None:
     weights = shared / "reference" / "published_matching.safetensors"
-    scores = score_samples(DeepDetect(weights).heatmap, shared / "data" / "label-samples" / "val")
+    scores = score_samples(
+        DeepDetect(weights).heatmap, sample_images(shared / "data" / "label-samples" / "val")
+    )
     # BCE and IoU of notes/published-system.md.
     assert scores["normal"].loss == pytest.approx(0.1028, abs=0.002)
     assert scores["normal"].iou == pytest.approx(0.854, abs=0.002)

@@ -1,77 +1,74 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from deepdetect.evaluation.baselines import CLASSICAL
-from deepdetect.evaluation.baselines.method import describe_with
-from deepdetect.features.keypoints import Keypoints
+from deepdetect import DeepDetect, SelectionOptions
+from deepdetect.detector.heatmap import HeatmapOptions
+from deepdetect.detector.pretrained import pretrained_weights
+from deepdetect.evaluation.baselines.method import (
+    COMMON_DESCRIPTOR,
+    PointDescriptor,
+    deepdetect_feature,
+    with_common_descriptor,
+)
+from deepdetect.evaluation.baselines.opencv import CLASSICAL
+from deepdetect.features.sift import root_sift_descriptors, sift_descriptors
 from deepdetect.io.image import luma
-
-HOME = cv2 if hasattr(cv2, "BRISK_create") else cv2.xfeatures2d
 
 
 @pytest.fixture(scope="module")
 def crop(photo: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(photo[60:180, 60:200])
+    return np.ascontiguousarray(photo[60:140, 100:200])
 
 
-def grid(size: tuple[int, int], step: int) -> np.ndarray:
-    """Points from corner to corner, by columns, so that no descriptor's own order is theirs."""
-    columns, rows = np.meshgrid(np.arange(0, size[0], step), np.arange(0, size[1], step))
-    return np.column_stack([columns.ravel(order="F"), rows.ravel(order="F")])
+@pytest.fixture(scope="module")
+def detector() -> DeepDetect:
+    return DeepDetect(backend="onnxruntime", threads=1)
 
 
-@pytest.mark.parametrize("name", ["orb", "brisk", "sift"])
-def test_each_keypoint_keeps_its_row_also_near_the_border(crop: np.ndarray, name: str) -> None:
-    make = {"orb": cv2.ORB_create, "brisk": HOME.BRISK_create, "sift": cv2.SIFT_create}[name]
-    xy = grid((140, 120), 9)
-    octaves = (np.arange(len(xy)) % 3).astype(np.int32) if name == "orb" else None
-    sizes = np.full(len(xy), 12, np.float32)
-    angles = (np.arange(len(xy)) * 7 % 360).astype(np.float32)
-    features = Keypoints(xy, np.ones(len(xy)), (140, 120), sizes, angles, octaves)
-    rows = describe_with(make, crop, features)
-    assert len(rows) == len(features)
-    kept, opened = 0, make()
-    for row, keypoint in zip(rows, features.to_opencv(), strict=True):
-        _, alone = opened.compute(luma(crop), [keypoint])
-        if alone is None or not len(alone):
-            assert not row.any()
-        else:
-            kept += 1
-            np.testing.assert_array_equal(row, alone[0])
-    assert kept == len(xy) if name == "sift" else 0 < kept < len(xy)
+def test_points_equal_those_of_the_detector(detector: DeepDetect, crop: np.ndarray) -> None:
+    method = deepdetect_feature(detector, SelectionOptions(0.4, max_keypoints=300, nms_radius=1))
+    expected = detector.detect(crop, 0.4, max_keypoints=300, nms_radius=1)
+    found = method.detect(crop)
+    assert len(found) > 50
+    np.testing.assert_array_equal(found.xy, expected.xy)
+    np.testing.assert_array_equal(found.logits, expected.logits)
+    assert found.image_size == (100, 80)
 
 
-def test_orb_leaves_out_31_pixels_at_each_border(crop: np.ndarray) -> None:
-    xy = grid((140, 120), 1)
-    features = Keypoints(xy, np.ones(len(xy)), (140, 120))
-    described = describe_with(cv2.ORB_create, crop, features).any(1)
-    inside = ((xy >= 31) & (xy < (140 - 31, 120 - 31))).all(1)
-    np.testing.assert_array_equal(described, inside)
+def test_descriptors_are_sift_of_size_3_with_the_angle_unset(
+    detector: DeepDetect, crop: np.ndarray
+) -> None:
+    method = deepdetect_feature(detector)
+    found = method.detect(crop).best(100)
+    expected = sift_descriptors(luma(crop), found.xy, 3.0, -1.0)
+    np.testing.assert_array_equal(method.describe(crop, found), expected)
+    other = deepdetect_feature(detector, descriptor=PointDescriptor("rootsift", 4.0, 0.0))
+    expected = root_sift_descriptors(luma(crop), found.xy, 4.0, 0.0)
+    np.testing.assert_array_equal(other.describe(crop, found), expected)
 
 
-@pytest.mark.parametrize(
-    ("make", "columns", "dtype"),
-    [
-        (cv2.SIFT_create, 128, np.float32),
-        (cv2.ORB_create, 32, np.uint8),
-        (HOME.BRISK_create, 64, np.uint8),
-    ],
-)
-def test_no_keypoints_have_no_descriptors(crop: np.ndarray, make, columns: int, dtype) -> None:
-    rows = describe_with(make, crop, Keypoints(np.empty((0, 2)), np.empty(0), (140, 120)))
-    assert (rows.shape, rows.dtype) == ((0, columns), dtype)
-
-
-@pytest.mark.parametrize("make", [cv2.ORB_create, HOME.BRISK_create])
-def test_keypoints_at_the_border_only_get_zeros(crop: np.ndarray, make) -> None:
-    rows = describe_with(make, crop, Keypoints([[0, 0], [139, 119]], [1, 1], (140, 120)))
-    assert rows.shape[0] == 2
-    assert not rows.any()
+def test_the_version_follows_all_that_the_points_depend_on(
+    detector: DeepDetect, tmp_path: Path
+) -> None:
+    changed = tmp_path / "other.onnx"
+    changed.write_bytes(pretrained_weights("dense").read_bytes())
+    methods = [
+        deepdetect_feature(detector),
+        deepdetect_feature(detector, SelectionOptions(0.7)),
+        deepdetect_feature(detector, SelectionOptions(nms_radius=1)),
+        deepdetect_feature(detector.configured(HeatmapOptions(480))),
+        deepdetect_feature(detector.configured(HeatmapOptions("native", "bgr"))),
+        deepdetect_feature(DeepDetect(changed, backend="onnxruntime", threads=1)),
+        deepdetect_feature(detector, descriptor=PointDescriptor(size_px=4.0)),
+    ]
+    assert len({method.version for method in methods}) == len(methods)
+    again = deepdetect_feature(DeepDetect(backend="onnxruntime", threads=1))
+    assert again.version == methods[0].version
 
 
 def test_what_keypoints_depend_on_is_the_name_and_the_version_unless_they_are_shared() -> None:
@@ -81,3 +78,15 @@ def test_what_keypoints_depend_on_is_the_name_and_the_version_unless_they_are_sh
     assert newer.detection == "fast 2"
     other = dataclasses.replace(method, name="fast-common", version="1 rootsift")
     assert other.detection == "fast 1"
+
+
+def test_the_common_descriptor_replaces_any(photo: np.ndarray) -> None:
+    crop = np.ascontiguousarray(photo[60:160, 60:160])
+    for name in ("orb", "sift", "fast"):
+        method = with_common_descriptor(CLASSICAL[name])
+        assert not method.binary
+        assert method.version != CLASSICAL[name].version
+        found = method.detect(crop)[:40]
+        expected = root_sift_descriptors(luma(crop), found.xy, 4.0, 0.0)
+        np.testing.assert_array_equal(method.describe(crop, found), expected)
+    assert PointDescriptor("rootsift", 4.0, 0.0) == COMMON_DESCRIPTOR

@@ -9,9 +9,12 @@ import pytest
 from PIL import Image
 
 from deepdetect.datasets.foreground import MaskedPhotograph, load_foreground
-from deepdetect.evaluation.baselines import CLASSICAL, every_pixel_method
-from deepdetect.evaluation.protocols.foreground import foreground_table
-from deepdetect.evaluation.workspace import Workspace
+from deepdetect.evaluation.baselines.method import LocalFeature
+from deepdetect.evaluation.baselines.opencv import CLASSICAL
+from deepdetect.evaluation.baselines.random import all_pixels_feature
+from deepdetect.evaluation.cache import StageCache
+from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.protocols.foreground import foreground_part
 
 
 @pytest.fixture
@@ -24,8 +27,21 @@ def photographs(tmp_path: Path, photo: np.ndarray) -> list[MaskedPhotograph]:
     return load_foreground(tmp_path)
 
 
+def measured(
+    context: BenchmarkContext, feature: LocalFeature, photographs: list[MaskedPhotograph]
+) -> list[float]:
+    """Return fraction on the foreground, fraction over that of random points, and density."""
+    part = foreground_part(context, [feature], photographs)
+    found = {k: context.try_run(task.name, task.run) for k, task in part.tasks.items()}
+    (table,) = part.summarize({k: value for k, value in found.items() if value is not None})
+    titles = [column.title for column in table.columns]
+    assert titles[1:3] == ["fraction on the foreground", "fraction on the foreground, in the paper"]
+    (row,) = table.rows
+    return [row[1], row[3], row[4]]
+
+
 def test_the_share_equals_a_count_under_the_mask(photographs, tmp_path: Path) -> None:
-    table = foreground_table(Workspace(tmp_path), [CLASSICAL["fast"]], photographs)
+    found = measured(BenchmarkContext(tmp_path), CLASSICAL["fast"], photographs)
     shares, densities, covered = [], [], []
     for photograph in photographs:
         gray = cv2.cvtColor(cv2.imread(str(photograph.image)), cv2.COLOR_BGR2GRAY)
@@ -34,42 +50,40 @@ def test_the_share_equals_a_count_under_the_mask(photographs, tmp_path: Path) ->
         shares.append(np.mean([mask[int(p.pt[1]), int(p.pt[0])] > 0 for p in points]))
         densities.append(len(points) / gray.size)
         covered.append((mask > 0).mean())
-    (row,) = table.rows
     expected = (np.mean(shares), np.mean(shares) / np.mean(covered), np.mean(densities))
-    np.testing.assert_allclose(row[1:], expected)
+    np.testing.assert_allclose(found, expected)
 
 
-def test_every_pixel_reaches_what_random_points_do(photographs, tmp_path: Path) -> None:
-    (row,) = foreground_table(Workspace(tmp_path), [every_pixel_method()], photographs).rows
-    np.testing.assert_allclose(row[1:], (40 * 40 / 4800, 1, 1))
+def test_all_pixels_reach_what_random_points_do(photographs, tmp_path: Path) -> None:
+    found = measured(BenchmarkContext(tmp_path), all_pixels_feature(), photographs)
+    np.testing.assert_allclose(found, (40 * 40 / 4800, 1, 1))
 
 
-def test_photographs_without_a_keypoint_are_left_out_and_said(photographs, tmp_path: Path) -> None:
+def test_photographs_without_a_keypoint_are_skipped_and_said(photographs, tmp_path: Path) -> None:
     Image.fromarray(np.full((60, 80, 3), 90, np.uint8)).save(photographs[0].image)
-    workspace = Workspace(tmp_path)
-    (row,) = foreground_table(workspace, [CLASSICAL["fast"]], photographs).rows
-    alone = foreground_table(Workspace(tmp_path), [CLASSICAL["fast"]], photographs[1:]).rows[0]
-    assert row[1] == alone[1]
-    assert row[3] == alone[3] / 2
-    (note,) = workspace.left_out
+    context = BenchmarkContext(tmp_path)
+    found = measured(context, CLASSICAL["fast"], photographs)
+    alone = measured(BenchmarkContext(tmp_path), CLASSICAL["fast"], photographs[1:])
+    assert found[:2] == alone[:2]
+    assert found[2] == alone[2] / 2
+    (note,) = context.skipped
     assert "1 photographs without a keypoint" in note
 
 
-def test_another_mask_is_judged_anew(photographs, tmp_path: Path) -> None:
-    from deepdetect.evaluation.cache import StageCache
+def test_another_mask_is_evaluated_again(photographs, tmp_path: Path) -> None:
 
-    workspace = Workspace(tmp_path, StageCache(tmp_path / "cache"))
-    every = every_pixel_method()
-    (before,) = foreground_table(workspace, [every], photographs[:1]).rows
+    context = BenchmarkContext(tmp_path, StageCache(tmp_path / "cache"))
+    every = all_pixels_feature()
+    before = measured(context, every, photographs[:1])
     swapped = dataclasses.replace(photographs[0], mask=photographs[1].mask)
-    (after,) = foreground_table(workspace, [every], [swapped]).rows
-    assert before[1] == pytest.approx(40 * 30 / 4800)
-    assert after[1] == pytest.approx(40 * 50 / 4800)
+    after = measured(context, every, [swapped])
+    assert before[0] == pytest.approx(40 * 30 / 4800)
+    assert after[0] == pytest.approx(40 * 50 / 4800)
 
 
-def test_a_mask_of_another_size_is_left_out(photographs, tmp_path: Path) -> None:
+def test_a_mask_of_another_size_is_skipped(photographs, tmp_path: Path) -> None:
     """It would be read at the wrong places."""
     Image.fromarray(np.full((30, 40), 255, np.uint8)).save(photographs[0].mask)
-    workspace = Workspace(tmp_path)
-    foreground_table(workspace, [CLASSICAL["fast"]], photographs)
-    assert any("a.png" in note for note in workspace.left_out)
+    context = BenchmarkContext(tmp_path)
+    measured(context, CLASSICAL["fast"], photographs)
+    assert any("a.png" in note for note in context.skipped)

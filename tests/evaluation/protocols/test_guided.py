@@ -11,16 +11,18 @@ import pytest
 from deepdetect import DeepDetect, match_images
 from deepdetect.datasets.types import PlanarPair
 from deepdetect.evaluation.cache import StageCache
-from deepdetect.evaluation.protocols import BenchmarkOptions, run_benchmarks
+from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.options import BenchmarkOptions
+from deepdetect.evaluation.profiling import Profile
 from deepdetect.evaluation.protocols.guided import (
     SEEDS,
-    FoundGuided,
+    GuidedPair,
     _guided_cells,
-    find_guided,
     guided_section,
-    guided_steps,
+    match_guided,
 )
-from deepdetect.evaluation.workspace import Workspace
+from deepdetect.evaluation.report import Section
+from deepdetect.evaluation.runner import run_benchmarks
 
 MOVE = np.array([[1.0, 0.02, -6], [-0.01, 1, 4], [0, 0, 1]])
 
@@ -43,15 +45,14 @@ def options(edge_detector: DeepDetect) -> BenchmarkOptions:
 
 
 @pytest.fixture(scope="module")
-def section(options: BenchmarkOptions, pair: PlanarPair):
-    done: list[int] = []
-    workspace = Workspace(pair.first.parent, done=lambda steps, text: done.append(steps))
+def section(options: BenchmarkOptions, pair: PlanarPair, no_bar) -> Section:
+    context = BenchmarkContext(pair.first.parent)
     elsewhere = MOVE + [[0, 0, 40], [0, 0, 0], [0, 0, 0]]
     wrong = dataclasses.replace(pair, homography=elsewhere)
-    truths = {"true": [pair], "wrong": [wrong]}
-    found = guided_section(workspace, options, truths, "key", "Scenes")
-    assert sum(done) == guided_steps(options, [pair]) == 3
-    assert not workspace.left_out
+    plan = guided_section(context, options, {"true": [pair], "wrong": [wrong]}, "key", "Scenes")
+    assert len(plan) == 3
+    found = plan.run(context, no_bar)
+    assert not context.skipped
     return found
 
 
@@ -61,19 +62,19 @@ def rows(section, key: str) -> dict[str, dict[str, object]]:
     return {str(row[1]): dict(zip(titles, row, strict=True)) for row in table.rows}
 
 
-def test_both_ways_and_both_controls_have_counts_and_precision(section) -> None:
+def test_both_ways_and_both_baselines_have_counts_and_precision(section) -> None:
     found = rows(section, "key_true")
     assert len(found) == 3
-    assert sum(name.startswith("control") for name in found) == 2
+    assert sum(name.startswith("baseline") for name in found) == 2
     for row in found.values():
         assert row["guided by"] == "homography"
-        for way in ("unguided", "guided"):
+        for way in ("descriptors alone", "guided"):
             assert row[f"{way}: correct"] > 0
             assert 0 < row[f"{way}: precision"] <= 1
-        assert row["guided: one to one"] <= row["guided: correct"] <= row["could be matched"]
-        assert row["guided: of what could be"] == row["guided: correct"] / row["could be matched"]
-        assert 0 < row["least"] <= row["guided: of what could be"]
-        assert row["guided: corners off, px"] < 0.5
+        assert row["guided: unique"] <= row["guided: correct"] <= row["matchable"]
+        assert row["guided: of the matchable"] == row["guided: correct"] / row["matchable"]
+        assert 0 < row["lowest"] <= row["guided: of the matchable"]
+        assert row["guided: corner error, px"] < 0.5
 
 
 def test_the_counts_are_those_of_match_images(
@@ -87,7 +88,7 @@ def test_the_counts_are_those_of_match_images(
         gaps = np.linalg.norm(mapped[:, :2] / mapped[:, 2:] - found.points1, axis=1)
         counts.append(int((gaps < 1).sum()))
     assert row["guided: correct"] == sorted(counts)[SEEDS // 2]
-    assert row["least"] == min(counts) / row["could be matched"]
+    assert row["lowest"] == min(counts) / row["matchable"]
 
 
 def test_a_wrong_truth_finds_nothing_right(section) -> None:
@@ -95,7 +96,7 @@ def test_a_wrong_truth_finds_nothing_right(section) -> None:
     true, wrong = rows(section, "key_true"), rows(section, "key_wrong")
     for name, row in wrong.items():
         assert row["guided: precision"] < 0.01
-        assert row["guided: corners off, px"] == pytest.approx(40, abs=1)
+        assert row["guided: corner error, px"] == pytest.approx(40, abs=1)
         assert row["guided: seconds"] == true[name]["guided: seconds"]
 
 
@@ -103,19 +104,19 @@ def test_a_second_run_reads_what_the_first_has_kept(
     options: BenchmarkOptions, pair: PlanarPair, tmp_path: Path
 ) -> None:
     cache = StageCache(tmp_path)
-    workspace = Workspace(pair.first.parent, cache)
-    first = find_guided(workspace, options.own(), pair, 0)
+    context = BenchmarkContext(pair.first.parent, cache)
+    first = match_guided(context, options.deepdetect_480(), pair, 0)
     made = cache.made
-    again = find_guided(workspace, options.own(), pair, 0)
+    again = match_guided(context, options.deepdetect_480(), pair, 0)
     assert cache.made == made
     np.testing.assert_array_equal(first.points1, again.points1)
     np.testing.assert_array_equal(first.matrix, again.matrix)
-    find_guided(workspace, options.own(), pair, 1)
+    match_guided(context, options.deepdetect_480(), pair, 1)
     assert cache.made == made + 1
 
 
-def test_strangers_are_said_to_be_unguided(
-    options: BenchmarkOptions, tmp_path: Path, write_scene
+def test_unrelated_images_are_said_to_be_unguided(
+    options: BenchmarkOptions, tmp_path: Path, write_scene, no_bar
 ) -> None:
     write_scene(tmp_path, (100, 80), np.eye(3), count=2)
     noise = np.random.default_rng(0).integers(0, 256, (80, 100, 3), np.uint8)
@@ -123,15 +124,17 @@ def test_strangers_are_said_to_be_unguided(
 
     Image.fromarray(noise).save(tmp_path / "img2.png")
     pair = PlanarPair("none", 2, tmp_path / "img1.png", tmp_path / "img2.png", np.eye(3))
-    found = guided_section(Workspace(tmp_path), options, {"true": [pair]}, "key", "None")
+    context = BenchmarkContext(tmp_path)
+    plan = guided_section(context, options, {"true": [pair]}, "key", "None")
+    found = plan.run(context, no_bar)
     for row in rows(found, "key_true").values():
         assert row["guided by"] == "none"
-        assert row["guided: corners off, px"] is None
+        assert row["guided: corner error, px"] is None
         assert row["guided: seconds"] > 0
-        assert row["unguided: correct"] is not None
-    workspace = Workspace(tmp_path)
+        assert row["descriptors alone: correct"] is not None
+    context = BenchmarkContext(tmp_path)
     for seed in range(2):
-        counted = find_guided(workspace, options.own(), pair, seed)
+        counted = match_guided(context, options.deepdetect_480(), pair, seed)
         given = match_images(pair.first, pair.second, options.detector, seed=seed)
         assert not given.guided
         assert len(given) > 0
@@ -151,14 +154,14 @@ def test_strangers_are_said_to_be_unguided(
 def test_seeds_that_fall_back_count(
     pair: PlanarPair, found: tuple, said: str, middle: int, least: int
 ) -> None:
-    """Of ten matches each so many are right."""
+    """Of ten matches each this many are correct."""
     still = dataclasses.replace(pair, homography=np.eye(3))
     points0 = np.arange(20.0).reshape(10, 2)
     seeds = []
     for kind, right in found:
         points1 = points0 + np.where(np.arange(10) < right, 0, 5)[:, None]
         matrix = np.eye(3) if kind == "homography" else None
-        seeds.append(FoundGuided(kind, matrix, points0, points1, 1.0, 0))
+        seeds.append(GuidedPair(kind, matrix, points0, points1, Profile(1.0, 0)))
     cells = _guided_cells(seeds, still, 20, (240, 200))
     assert cells[0] == (f"{said} seeds guided" if "of" in said.split() else said)
     assert cells[1] == middle

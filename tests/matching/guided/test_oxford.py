@@ -10,7 +10,7 @@ import pytest
 
 from deepdetect import DeepDetect, HeatmapOptions, match_images
 from deepdetect.datasets.oxford import find_scene, load_oxford
-from deepdetect.evaluation.metrics.homography_accuracy import corner_error
+from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
 from deepdetect.matching.guided.homography import nearest_keypoint

@@ -15,7 +15,7 @@ from PIL import Image
 from deepdetect import DeepDetect, OptionError, match_images
 from deepdetect.cli import main
 from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.evaluation.metrics import stereo_score
+from deepdetect.evaluation.metrics.stereo import stereo_score
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches
@@ -113,8 +113,8 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
     plain = stereo_score(
         unguided.points0[unguided.inliers], unguided.points1[unguided.inliers], pair.disparity
     )
-    assert score.right > plain.right
-    assert score.share > plain.share + 0.03
+    assert score.correct > plain.correct
+    assert score.precision > plain.precision + 0.03
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.evaluation.metrics.homography_accuracy import corner_error
+from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.matching.stitching.joint_fit import Correspondences, fit_jointly
 

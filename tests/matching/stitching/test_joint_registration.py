@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, DeepDetectError
-from deepdetect.evaluation.metrics.homography_accuracy import corner_error
+from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.matching.stitching.joint_registration import register_jointly
 
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError, ImageError, OptionError
-from deepdetect.evaluation.metrics.homography_accuracy import corner_error
+from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.matching.stitching import Panorama, stitch
 

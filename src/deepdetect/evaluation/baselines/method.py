@@ -1,20 +1,28 @@
-"""What a benchmark compares: a detector with the descriptor that is used for its points."""
+"""What a benchmark compares: a detector with the descriptor that is used for its keypoints."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
-import cv2
 import numpy as np
 
-from ..._shared.errors import OptionError
+from ..._shared.errors import DeepDetectError, OptionError
+from ...detector.detector import DeepDetect, find_keypoints
 from ...features.keypoints import Keypoints
+from ...features.selection import SelectionOptions
+from ...features.sift import get_descriptor
 from ...io.image import luma
 
 
+class BaselineError(DeepDetectError):
+    """A detector or descriptor from outside the package failed, or returned something unusable."""
+
+
 @dataclass(frozen=True)
-class Method:
+class LocalFeature:
     """A detector and its descriptor.
 
     Attributes:
@@ -24,9 +32,9 @@ class Method:
         describe: function from the image and its features to (N, D) descriptors.
         binary: the descriptors are compared by Hamming's distance, else by Euclid's.
         learned: the descriptors were learned for their detector and need no ratio test.
-        control: the points know nothing of the image; the time they take tells nothing.
+        chance: the points know nothing about the image, and the time they take means nothing.
         version: what results depend on besides the name: cached ones of another are not used.
-        detection: what the keypoints depend on, where several methods share them.
+        detection: what the keypoints depend on, where several features share them.
     """
 
     name: str
@@ -35,7 +43,7 @@ class Method:
     describe: Callable[[np.ndarray, Keypoints], np.ndarray]
     binary: bool = False
     learned: bool = False
-    control: bool = False
+    chance: bool = False
     version: str = "1"
     detection: str = ""
 
@@ -44,51 +52,124 @@ class Method:
             object.__setattr__(self, "detection", f"{self.name} {self.version}")
 
 
-def opencv_method(
-    name: str,
-    title: str,
-    make_detector: Callable[[], cv2.Feature2D],
-    make_descriptor: Callable[[], cv2.Feature2D] | None = None,
-) -> Method:
-    """Make a method of an OpenCV detector.
+@dataclass(frozen=True)
+class PointDescriptor:
+    """How keypoints that have no size and orientation of their own are described.
+
+    Attributes:
+        name: "sift", "rootsift" or "sift-opencv".
+        size_px: diameter (paper: 3).
+        angle_deg: orientation; -1 is OpenCV's "unset", as the paper's code leaves it.
+    """
+
+    name: str = "sift"
+    size_px: float = 3.0
+    angle_deg: float = -1.0
+
+    def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
+        """Describe keypoints by their positions alone; (N, D) float32."""
+        return get_descriptor(self.name)(luma(rgb), features.xy, self.size_px, self.angle_deg)
+
+
+PAPER_DESCRIPTOR = PointDescriptor()
+
+COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
+"""Of all detectors without descriptors of their own in the standard protocol."""
+
+
+def with_common_descriptor(feature: LocalFeature) -> LocalFeature:
+    """Return a feature with the descriptor that all detectors get in the standard protocol.
+
+    It depends on positions only, so each is taken once: SIFT has some for several orientations.
+    """
+    return replace(
+        feature,
+        name=f"{feature.name}-common",
+        detect=lambda rgb: feature.detect(rgb).distinct(),
+        describe=COMMON_DESCRIPTOR.describe,
+        binary=False,
+        version=f"{feature.version} {COMMON_DESCRIPTOR}",
+        detection=f"{feature.detection}, distinct",
+    )
+
+
+def deepdetect_feature(
+    detector: DeepDetect,
+    selection: SelectionOptions = SelectionOptions(),
+    *,
+    name: str = "deepdetect",
+    title: str = "DeepDetect",
+    descriptor: PointDescriptor = PAPER_DESCRIPTOR,
+) -> LocalFeature:
+    """Make a local feature of a detector with weights and its selection of pixels.
 
     Args:
-        name, title: as of `Method`.
-        make_detector: opens the detector; it is opened anew for each image.
-        make_descriptor: opens what describes its points; default SIFT, as in the paper.
+        detector: with its resolution and order of channels.
+        selection: threshold, suppression and number.
+        name, title: as of `LocalFeature`.
+        descriptor: of the keypoints.
     """
+    digest = hashlib.sha256(detector.weights.read_bytes()).hexdigest()[:16]
+    version = f"{digest} {detector.backend} {detector.heatmap_options} {selection} {descriptor}"
+    return heatmap_feature(
+        detector, selection, name=name, title=title, descriptor=descriptor, version=version
+    )
+
+
+def heatmap_feature(
+    detector: Any,
+    selection: SelectionOptions,
+    *,
+    name: str,
+    title: str,
+    version: str,
+    descriptor: PointDescriptor = PAPER_DESCRIPTOR,
+) -> LocalFeature:
+    """Make a local feature of anything with a method `heatmap`; arguments as of `LocalFeature`."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
-        found = make_detector().detect(luma(rgb), None)
-        return Keypoints.from_opencv(found, (rgb.shape[1], rgb.shape[0]))
+        return find_keypoints(detector, rgb, selection)
+
+    return LocalFeature(name, title, detect, descriptor.describe, version=version)
+
+
+def external_feature(
+    name: str,
+    detect: Callable[[np.ndarray], Any],
+    *,
+    binary: bool = False,
+    learned: bool = False,
+    version: str,
+) -> LocalFeature:
+    """Make a local feature of a function from outside the package.
+
+    Args:
+        name, binary, learned, version: as of `LocalFeature`.
+        detect: maps a (H, W, 3) uint8 RGB image to a dict of `keypoints` (N, 2), `scores` (N,) and
+            optionally `descriptors` (N, D). Whatever it raises becomes a `BaselineError`.
+    """
+
+    def run(rgb: np.ndarray) -> Keypoints:
+        try:
+            found = detect(rgb)
+        except DeepDetectError:
+            raise
+        except Exception as error:  # anyone's code
+            reason = (str(error).splitlines() or ["it failed"])[0]
+            raise BaselineError(f"{name}: {reason} ({type(error).__name__})") from error
+        if not isinstance(found, Mapping) or not {"keypoints", "scores"} <= set(found):
+            raise BaselineError(f"{name} must return a dict with 'keypoints' and 'scores'")
+        size = (rgb.shape[1], rgb.shape[0])
+        try:
+            return Keypoints(
+                found["keypoints"], found["scores"], size, descriptors=found.get("descriptors")
+            )
+        except (OptionError, TypeError, ValueError) as error:
+            raise BaselineError(f"{name} returned keypoints that do not fit: {error}") from error
 
     def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        return describe_with(make_descriptor or cv2.SIFT_create, rgb, features)
+        if features.descriptors is None:
+            return COMMON_DESCRIPTOR.describe(rgb, features)
+        return features.descriptors
 
-    return Method(name, title, detect, describe, binary=make_descriptor is not None)
-
-
-def describe_with(
-    make_descriptor: Callable[[], cv2.Feature2D], rgb: np.ndarray, features: Keypoints
-) -> np.ndarray:
-    """Compute OpenCV's descriptors, a row for each keypoint.
-
-    A descriptor that cannot be computed, as of ORB near the border, is 0 throughout: such a row
-    finds a partner by chance only, and no keypoint is lost from the count.
-
-    Raises:
-        OptionError: the descriptor moved or doubled keypoints.
-    """
-    descriptor = make_descriptor()
-    dtype = np.uint8 if descriptor.descriptorType() == cv2.CV_8U else np.float32
-    rows = np.zeros((len(features), descriptor.descriptorSize()), dtype)
-    keypoints = features.to_opencv()
-    for row, keypoint in enumerate(keypoints):
-        keypoint.class_id = row
-    described, found = descriptor.compute(luma(rgb), keypoints)
-    if not len(described):
-        return rows
-    if len(described) > len(features):
-        raise OptionError("the descriptor returned more keypoints than it was given")
-    rows[[keypoint.class_id for keypoint in described]] = found
-    return rows
+    return LocalFeature(name, name, run, describe, binary=binary, learned=learned, version=version)

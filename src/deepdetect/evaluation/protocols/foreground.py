@@ -1,81 +1,87 @@
-"""Table I's second half: which share of the keypoints lies on the foreground."""
+"""Table I's second half: which fraction of the keypoints lies on the foreground."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from ..._shared.errors import ImageError
 from ...datasets.foreground import MaskedPhotograph
-from ..baselines import Method
-from ..metrics.spread import foreground_share
-from ..report import Cell, Column, Table
-from ..workspace import Workspace
+from ..baselines.method import LocalFeature
+from ..context import BenchmarkContext
+from ..metrics.coverage import foreground_fraction
+from ..report import Cell, Column, Figure, Table
+from ..tasks import Part, Task
+from .paper_numbers import FOREGROUND, with_paper_column
+
+FRACTION = "fraction on the foreground"
+
+CAUSE = {"": "measured on 18 photographs of the authors' own, which are not published"}
 
 
-def foreground_table(
-    workspace: Workspace, methods: Sequence[Method], photographs: Sequence[MaskedPhotograph]
-) -> Table:
-    """Tabulate the share on the foreground, mean over the photographs, and the density."""
-    covered = {each.image: float(each.foreground().mean()) for each in photographs}
-    rows: list[tuple[Cell, ...]] = []
-    for method in methods:
-        shares, by_chance, densities = [], [], []
-        for photograph in photographs:
-            found = workspace.attempt(
-                f"foreground of {method.title} on {photograph.image.name}",
-                _measure,
-                workspace,
-                method,
-                photograph,
-            )
-            workspace.done(1, f"{method.name}, {photograph.image.name}")
-            if found is not None:
-                shares.append(found[0])
-                by_chance.append(covered[photograph.image])
-                densities.append(found[1])
-        known = [share for share in shares if share == share]
-        # Random points, on the same photographs.
-        chance = [c for c, share in zip(by_chance, shares, strict=True) if share == share]
-        if len(known) < len(shares):
-            workspace.left_out.append(
-                f"foreground of {method.title}: {len(shares) - len(known)} photographs without "
-                "a keypoint"
-            )
-        rows.append(
-            (
-                method.title,
-                float(np.mean(known)) if known else None,
-                float(np.mean(known) / np.mean(chance)) if known else None,
-                float(np.mean(densities)) if densities else None,
-            )
+def foreground_part(
+    context: BenchmarkContext,
+    features: Sequence[LocalFeature],
+    photographs: Sequence[MaskedPhotograph],
+) -> Part:
+    """Tabulate the fraction on the foreground, mean over the photographs, and the density."""
+    tasks = {
+        (feature.name, photograph.image): Task(
+            f"foreground of {feature.title} on {photograph.image.name}",
+            partial(_measure, context, feature, photograph),
         )
-    columns = (
-        Column("method"),
-        Column("share on the foreground", ".4f"),
-        Column("over that of random points", ".2f"),
-        Column("keypoints a pixel", ".4f"),
-    )
-    mean = np.mean(list(covered.values()))
-    note = (
-        f"{len(photographs)} photographs; their foreground is {mean:.1%} of the pixels, "
-        "which is what random points reach."
-    )
-    return Table("foreground", "Keypoints on the foreground", columns, tuple(rows), note)
+        for feature in features
+        for photograph in photographs
+    }
+
+    def summarize(found: Mapping[Any, tuple[float, float]]) -> Sequence[Table | Figure]:
+        covered = {each.image: float(each.foreground().mean()) for each in photographs}
+        rows: list[tuple[Cell, ...]] = []
+        for feature in features:
+            images = [image for image in covered if (feature.name, image) in found]
+            values = {image: found[feature.name, image] for image in images}
+            # NaN where there is no keypoint; chance is of the same photographs.
+            known = [image for image in images if values[image][0] == values[image][0]]
+            if len(known) < len(images):
+                context.skipped.append(
+                    f"foreground of {feature.title}: {len(images) - len(known)} photographs "
+                    "without a keypoint"
+                )
+            fraction = np.mean([values[image][0] for image in known]) if known else np.nan
+            chance = np.mean([covered[image] for image in known]) if known else np.nan
+            density = np.mean([density for _, density in values.values()]) if values else np.nan
+            rows.append((feature.title, *map(float, (fraction, fraction / chance, density))))
+        columns = (
+            Column("method"),
+            Column(FRACTION, ".4f"),
+            Column("over that of random points", ".2f"),
+            Column("keypoints per pixel", ".4f"),
+        )
+        mean = np.mean(list(covered.values()))
+        note = (
+            f"{len(photographs)} photographs; their foreground is {mean:.1%} of the pixels, "
+            "which is what random points reach."
+        )
+        table = Table("foreground", "Keypoints on the foreground", columns, tuple(rows), note)
+        return [with_paper_column(table, FRACTION, FOREGROUND, CAUSE)]
+
+    return Part(tasks, summarize)
 
 
 def _measure(
-    workspace: Workspace, method: Method, photograph: MaskedPhotograph
+    context: BenchmarkContext, feature: LocalFeature, photograph: MaskedPhotograph
 ) -> tuple[float, float]:
     def make() -> dict[str, np.ndarray]:
-        features = workspace.keypoints(method, photograph.image).features
+        features = context.keypoints(feature, photograph.image).features
         foreground = photograph.foreground()
         if foreground.shape[::-1] != features.image_size:
             raise ImageError(f"{photograph.mask.name} is not of the photograph's size")
-        share = foreground_share(features.xy, foreground)
-        return {"values": np.array([share, features.density])}
+        fraction = foreground_fraction(features.xy, foreground)
+        return {"values": np.array([fraction, features.density])}
 
     images = (photograph.image, photograph.mask)
-    share, density = workspace.metric("foreground 1", method, images, {}, make)["values"].tolist()
-    return share, density
+    fraction, density = context.metric("foreground", feature, images, {}, make)["values"].tolist()
+    return fraction, density

@@ -1,6 +1,6 @@
-"""What reconstructs a rectified pair: ours, the published pipeline, SIFT, OpenCV's SGBM.
+"""What reconstructs a rectified pair: ours, the paper's pipeline, SIFT, OpenCV's SGBM.
 
-Each is a function from a scene to its points with their disparities, and meters its stages under
+Each is a function from a scene to its points with their disparities, and profiles its stages under
 three names: keypoints, matching, geometry.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
@@ -16,28 +16,22 @@ import numpy as np
 from ...datasets.types import CalibratedStereoPair
 from ...detector.detector import DeepDetect, HeatmapDetector
 from ...detector.heatmap import HeatmapOptions
+from ...features.matchers import match_descriptors
+from ...features.matchers.approximate import flann_neighbours
+from ...matching.pipeline import check_memory
 from ...reconstruction.pipeline import reconstruct
 from ...reconstruction.stereo.matching import find_disparity_range
-from ..baselines import CLASSICAL
-from ..baselines.sift import low_sift
+from ..baselines.method import LocalFeature, deepdetect_feature
+from ..baselines.opencv import self_described
+from ..baselines.random import AllPixels, RandomDetector
 from ..cache import file_digest
-from ..controls import EveryPixel
-from ..metering import Meter, StageMeters
-from ..options import BenchmarkOptions
-from .paper_numbers import SIFT_LOW_POINTS, STEREO_POINTS
-from .published_pipeline import published_detector
-from .published_stereo import (
-    StereoSettings,
-    published_points,
-    sift_points,
-    stereo_settings,
-)
+from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
+from ..profiling import Profile, StageProfiler
+from .paper_numbers import FIGURE_8
 
 STAGES = ("keypoints", "matching", "geometry")
 ROUNDS = 3
-"""Runs of what takes seconds; the one of median time is told."""
-
-PUBLISHED = "published pipeline"
+"""Runs of what takes seconds; the one of median time is reported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,27 +42,25 @@ class StereoPoints:
         pixels: (N, 2) float32 positions in the left image.
         disparity: (N,) float32 in pixels.
         filled: how many of them were not matched, but filled in.
-        meters: of each of `STAGES` that the pipeline has.
-        memory: bytes that the process grew by at the most, over all stages.
-        run: the run that measured them; results in the cache keep theirs.
+        profiles: of each of `STAGES` that the pipeline has.
+        memory: bytes that the process grew by at most, over all stages.
     """
 
     pixels: np.ndarray
     disparity: np.ndarray
     filled: int
-    meters: Mapping[str, Meter]
+    profiles: Mapping[str, Profile]
     memory: int
-    run: int = 0
 
     @property
     def seconds(self) -> float:
         """Of all stages."""
-        return sum(meter.seconds for meter in self.meters.values())
+        return sum(profile.seconds for profile in self.profiles.values())
 
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """A way from two images to points.
+    """What turns two images into points.
 
     Attributes:
         title: how tables name it.
@@ -87,33 +79,69 @@ class Pipeline:
     paper: Mapping[str, int] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class PaperSettings:
+    """What the authors' notebooks chose for a scene.
+
+    Attributes:
+        ratio: of the ratio test.
+        focal_px: focal length.
+        center_px: (x, y) of the principal point.
+    """
+
+    ratio: float
+    focal_px: float
+    center_px: tuple[float, float]
+
+    @property
+    def camera_matrix(self) -> np.ndarray:
+        """(3, 3) camera matrix of both images."""
+        (x, y), focal = self.center_px, self.focal_px
+        return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]], float)
+
+
+PAPER_SETTINGS: dict[str, PaperSettings] = {
+    "cones": PaperSettings(0.9, 360, (225, 188)),
+    "dolls": PaperSettings(0.85, 1512, (695, 555)),
+    "moebius": PaperSettings(0.77, 1512, (695, 555)),
+    "rocks": PaperSettings(0.9, 1512, (638, 555)),
+    "cloth": PaperSettings(0.9, 1050, (641, 555)),
+}
+"""Of the paper's five scenes, from the authors' notebooks."""
+
+PAPER_FLANN_TREES = 10
+PAPER_FLANN_CHECKS = 100
+PAPER_RANSAC_CONFIDENCE = 0.99999
+PAPER_RANSAC_THRESHOLD_PX = 0.5
+PAPER_RANSAC_ITERATIONS = 100_000
+
+
 def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
-    """Return what is compared, controls last."""
-    found = []
-    for name, detector in options.geometry_detectors().items():
+    """Return what is compared, chance baselines last."""
+    detectors = options.stereo_detectors()
+    found: list[Pipeline] = []
+    for name, detector in detectors.items():
         version = (
             f"{file_digest(detector.weights)[:16]} {detector.backend} {detector.heatmap_options}"
         )
-        drawn = "ours" if not found else ""
+        drawn = "" if found else "ours"
         found.append(Pipeline(f"ours, weights {name}", _ours(detector), version, drawn=drawn))
-    for name, detector in options.geometry_detectors().items():
-        squashing = detector.configured(HeatmapOptions(480, "bgr"))
-        title, version = f"{PUBLISHED}, weights {name}", file_digest(detector.weights)[:16]
-        run = _published(squashing)
-        found.append(Pipeline(title, run, version, 1, paper=STEREO_POINTS))
-    for name, make, drawn, paper in (
-        ("sift", cv2.SIFT_create, "SIFT default", {}),
-        ("sift-low", low_sift, "SIFT low", SIFT_LOW_POINTS),
+    for name, detector in detectors.items():
+        squashed = detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, "bgr"))
+        feature = deepdetect_feature(squashed, title=f"the paper's pipeline, weights {name}")
+        found.append(_paper(feature, paper=FIGURE_8["DeepDetect"]))
+    for name, title, drawn in (
+        ("sift", "SIFT", "SIFT default"),
+        ("sift-low", "SIFT, low settings", "SIFT low"),
     ):
         if name in options.classical:
-            method = CLASSICAL[name]
-            found.append(Pipeline(method.title, _sift(make), method.version, 1, drawn, paper))
+            found.append(_paper(self_described(name, title), drawn, FIGURE_8[title]))
     found.append(Pipeline("OpenCV's SGBM", sgbm))
-    detector = next(iter(options.geometry_detectors().values()))
+    detector = next(iter(detectors.values()))
     version = file_digest(detector.weights)[:16]
-    found.append(Pipeline("control: as many random pixels as ours", _random(detector), version, 1))
-    found.append(Pipeline("control: every pixel", _ours(EveryPixel())))
-    found.append(Pipeline("every pixel, --density 1", _ours(EveryPixel(), density=1)))
+    found.append(Pipeline("baseline: as many random pixels as ours", _random(detector), version, 1))
+    found.append(Pipeline("baseline: all pixels", _ours(AllPixels())))
+    found.append(Pipeline("all pixels, --density 1", _ours(AllPixels(), density=1)))
     return found
 
 
@@ -121,106 +149,150 @@ def _ours(
     detector: HeatmapDetector, density: float | None = None
 ) -> Callable[[CalibratedStereoPair], StereoPoints]:
     def run(scene: CalibratedStereoPair) -> StereoPoints:
-        _compiled()
-        return _reconstructed(scene, detector, density)
+        _compile_kernels()
+        return _reconstruct(scene, detector, density)
 
     return run
-
-
-def _reconstructed(
-    scene: CalibratedStereoPair, detector: HeatmapDetector, density: float | None
-) -> StereoPoints:
-    meters = StageMeters()
-
-    def done(stage: str) -> None:
-        meters.lap(stage if stage in STAGES else "geometry")
-
-    found = reconstruct(
-        scene.left,
-        scene.right,
-        detector,
-        calibration=scene.calibration,
-        rectified=True,
-        density=density,
-        progress=done,
-    )
-    meters.lap("geometry")
-    assert found.disparity is not None
-    filled = int(np.count_nonzero(~found.matched))
-    return StereoPoints(found.pixels, found.disparity, filled, meters.stages, meters.memory)
 
 
 def _random(like: DeepDetect) -> Callable[[CalibratedStereoPair], StereoPoints]:
     def run(scene: CalibratedStereoPair) -> StereoPoints:
-        _compiled()
+        _compile_kernels()
         density = float((like.heatmap(scene.left) > 0.5).mean())
-        generator = np.random.default_rng(0)
-
-        class Points:
-            def heatmap(self, image: np.ndarray) -> np.ndarray:
-                return generator.random(image.shape[:2], dtype=np.float32)
-
-        return _reconstructed(scene, Points(), density)
+        return _reconstruct(scene, RandomDetector(), density)
 
     return run
 
 
-def _published(detector: DeepDetect) -> Callable[[CalibratedStereoPair], StereoPoints]:
+def _reconstruct(
+    scene: CalibratedStereoPair, detector: HeatmapDetector, density: float | None
+) -> StereoPoints:
+    with StageProfiler() as profiler:
+        found = reconstruct(
+            scene.left,
+            scene.right,
+            detector,
+            calibration=scene.calibration,
+            rectified=True,
+            density=density,
+            progress=lambda stage: profiler.record(stage if stage in STAGES else "geometry"),
+        )
+        profiler.record("geometry")
+    assert found.disparity is not None
+    filled = int(np.count_nonzero(~found.matched))
+    return StereoPoints(found.pixels, found.disparity, filled, profiler.stages, profiler.memory)
+
+
+def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, int] = {}) -> Pipeline:
+    """Make the paper's pipeline with the keypoints and descriptors of a local feature."""
+
     def run(scene: CalibratedStereoPair) -> StereoPoints:
-        network = published_detector(detector)
-        network.heatmap(scene.left)  # the first run of a size takes longer
-        meters = StageMeters()
-        found = published_points((scene.left, scene.right), network, _settings(scene), meters.lap)
-        return _from_matches(*found, meters)
+        feature.detect(scene.left)  # the first run of a size takes longer
+        with StageProfiler() as profiler:
+            points0, points1 = paper_points(feature, scene, profiler)
+        disparity = (points0[:, 0] - points1[:, 0]).astype(np.float32)
+        return StereoPoints(
+            points0.astype(np.float32), disparity, 0, profiler.stages, profiler.memory
+        )
 
-    return run
-
-
-def _sift(make: Callable[[], cv2.SIFT]) -> Callable[[CalibratedStereoPair], StereoPoints]:
-    def run(scene: CalibratedStereoPair) -> StereoPoints:
-        meters = StageMeters()
-        found = sift_points((scene.left, scene.right), make(), _settings(scene), meters.lap)
-        return _from_matches(*found, meters)
-
-    return run
+    return Pipeline(feature.title, run, feature.version, 1, drawn, paper)
 
 
-def _settings(scene: CalibratedStereoPair) -> StereoSettings:
-    return stereo_settings(scene.name, scene.calibration.camera0.matrix)
+def paper_points(
+    feature: LocalFeature, scene: CalibratedStereoPair, profiler: StageProfiler
+) -> tuple[np.ndarray, np.ndarray]:
+    """Match a stereo pair and keep what the essential matrix leaves: the paper's "voxels".
+
+    FLANN with 10 trees and 100 checks, a ratio chosen for each scene, and the essential matrix by
+    RANSAC; pose and triangulation are computed for the time they take.
+
+    Returns:
+        (M, 2) and (M, 2) float64 positions of the matches that are left.
+    """
+    images = scene.left, scene.right
+    settings = paper_settings(scene)
+    features = [feature.detect(rgb) for rgb in images]
+    profiler.record("keypoints")
+    check_memory([len(one) for one in features])
+    first, second = (feature.describe(rgb, one) for rgb, one in zip(images, features, strict=True))
+    flann = partial(flann_neighbours, trees=PAPER_FLANN_TREES, checks=PAPER_FLANN_CHECKS)
+    found = match_descriptors(first, second, flann, ratio=settings.ratio)
+    profiler.record("matching")
+    kept = essential_inliers(
+        features[0].xy[found.rows0].astype(np.float64),
+        features[1].xy[found.rows1].astype(np.float64),
+        settings.camera_matrix,
+    )
+    profiler.record("geometry")
+    return kept
+
+
+def paper_settings(scene: CalibratedStereoPair) -> PaperSettings:
+    """Return the authors' settings; for other scenes their most frequent ratio."""
+    camera = scene.calibration.camera0.matrix
+    center = float(camera[0, 2]), float(camera[1, 2])
+    return PAPER_SETTINGS.get(scene.name, PaperSettings(0.9, float(camera[0, 0]), center))
+
+
+def essential_inliers(
+    points0: np.ndarray, points1: np.ndarray, camera_matrix: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keep the inliers of the essential matrix; triangulate them for the time that takes."""
+    if len(points0) < 6:
+        return points0[:0], points1[:0]
+    essential, inliers = cv2.findEssentialMat(
+        points0,
+        points1,
+        camera_matrix,
+        method=cv2.RANSAC,
+        prob=PAPER_RANSAC_CONFIDENCE,
+        threshold=PAPER_RANSAC_THRESHOLD_PX,
+        maxIters=PAPER_RANSAC_ITERATIONS,
+    )
+    if essential is None:
+        return points0[:0], points1[:0]
+    kept = inliers.ravel() > 0
+    points0, points1 = points0[kept], points1[kept]
+    _, rotation, translation, _ = cv2.recoverPose(essential[:3], points0, points1, camera_matrix)
+    poses = np.eye(3, 4), np.column_stack([rotation, translation])
+    cv2.triangulatePoints(*(camera_matrix @ pose for pose in poses), points0.T, points1.T)
+    return points0, points1
 
 
 def sgbm(scene: CalibratedStereoPair) -> StereoPoints:
     """Run OpenCV's semi-global matching on every pixel.
 
-    With the range that ours finds, made a multiple of 16. Both views are continued on the left by
+    With the range that ours finds, made a multiple of 16. Both views are extended on the left by
     that range, so that it gives values at the left margin, too.
     """
-    meters = StageMeters()
-    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
-    search = find_disparity_range(*gray)
-    largest = 64 if search is None else search.max_disparity
-    count = max(16, -(-(largest + 1) // 16) * 16)
-    disparity = sgbm_disparity(scene.left, scene.right, count, count)
-    rows, columns = np.nonzero(np.isfinite(disparity))
-    meters.lap("matching")
+    with StageProfiler() as profiler:
+        gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
+        search = find_disparity_range(*gray)
+        largest = 64 if search is None else search.max_disparity
+        count = max(16, -(-(largest + 1) // 16) * 16)
+        disparity = sgbm_disparity(scene.left, scene.right, count, count)
+        rows, columns = np.nonzero(np.isfinite(disparity))
+        profiler.record("matching")
     pixels = np.column_stack([columns, rows]).astype(np.float32)
-    return StereoPoints(pixels, disparity[rows, columns], 0, meters.stages, meters.memory)
+    return StereoPoints(pixels, disparity[rows, columns], 0, profiler.stages, profiler.memory)
 
 
-def sgbm_disparity(left: np.ndarray, right: np.ndarray, count: int, frame: int) -> np.ndarray:
+def sgbm_disparity(
+    left: np.ndarray, right: np.ndarray, num_disparities: int, border_px: int
+) -> np.ndarray:
     """Run OpenCV's semi-global matching: block 5, three ways, uniqueness 10, speckle filter.
 
     Args:
         left, right: (H, W, 3) uint8 RGB.
-        count: disparities that are tried, from 0; a multiple of 16.
-        frame: columns by which both views are continued on the left.
+        num_disparities: disparities that are tried, from 0; a multiple of 16.
+        border_px: columns by which both views are extended on the left.
 
     Returns:
         (H, W) float32 in pixels, NaN where it gives none.
     """
     matcher = cv2.StereoSGBM_create(
         minDisparity=0,
-        numDisparities=count,
+        numDisparities=num_disparities,
         blockSize=5,
         P1=8 * 3 * 25,
         P2=32 * 3 * 25,
@@ -231,24 +303,19 @@ def sgbm_disparity(left: np.ndarray, right: np.ndarray, count: int, frame: int) 
     )
     views = [
         cv2.copyMakeBorder(
-            cv2.cvtColor(image, cv2.COLOR_RGB2BGR), 0, 0, frame, 0, cv2.BORDER_REPLICATE
+            cv2.cvtColor(image, cv2.COLOR_RGB2BGR), 0, 0, border_px, 0, cv2.BORDER_REPLICATE
         )
         for image in (left, right)
     ]
-    disparity = matcher.compute(*views)[:, frame:].astype(np.float32) / 16
+    disparity = matcher.compute(*views)[:, border_px:].astype(np.float32) / 16
     return np.where(disparity >= 0, disparity, np.nan)
 
 
-def _from_matches(points0: np.ndarray, points1: np.ndarray, meters: StageMeters) -> StereoPoints:
-    disparity = (points0[:, 0] - points1[:, 0]).astype(np.float32)
-    return StereoPoints(points0.astype(np.float32), disparity, 0, meters.stages, meters.memory)
-
-
 @lru_cache(maxsize=1)
-def _compiled() -> None:
-    """Run once on little, so that no scene's time holds the compilation."""
+def _compile_kernels() -> None:
+    """Run once on a small scene, so that no scene's time includes the compilation."""
     scene = np.random.default_rng(0).integers(0, 256, (96, 160), np.uint8)
     scene = cv2.GaussianBlur(scene, (0, 0), 1)
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (160, 96)))
     right = cv2.remap(scene, column + 4 + row / 12, row, cv2.INTER_LINEAR)
-    reconstruct(scene, right, EveryPixel(), focal_px=100, rectified=True)
+    reconstruct(scene, right, AllPixels(), focal_px=100, rectified=True)

@@ -88,12 +88,12 @@ def stitch(
         DeepDetectError: no two images overlap, or one reaches the horizon of the reference.
 
     Example:
-        >>> from deepdetect.evaluation.controls import RandomPoints
+        >>> from deepdetect.evaluation.baselines.random import RandomDetector
         >>> import cv2
         >>> rng = np.random.default_rng(0)
         >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (160, 240)).astype(np.uint8), (0, 0), 2)
         >>> scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
-        >>> panorama = stitch([scene[:, :160], scene[:, 80:]], detector=RandomPoints())
+        >>> panorama = stitch([scene[:, :160], scene[:, 80:]], detector=RandomDetector())
         >>> panorama.image.shape
         (160, 240, 3)
     """

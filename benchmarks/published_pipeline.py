@@ -1,0 +1,272 @@
+"""The pipeline as the authors' notebooks run it, and ours: seconds, memory and correct matches.
+
+    python benchmarks/published_pipeline.py DATA [--geometry-weights dense] [--rounds 5]
+
+DATA holds oxford/ and middlebury/. End to end, from two images in memory to the count of correct
+matches (wall 1-6, graf 1-3, cones), and to the points of a stereo scene (all of middlebury/).
+
+Published: torch without compilation, lists of `cv2.KeyPoint`, OpenCV's SIFT, FLANN, loops in
+Python. Ours: the default backend, dense RootSIFT, patchmatch, descriptors alone; `reconstruct` for
+stereo. Both sides run the same weights in turn, matching on images squashed to 480x480; the first
+round compiles and is not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from deepdetect import (
+    DeepDetect,
+    HeatmapOptions,
+    MissingExtraError,
+    WeightsError,
+    load_image,
+    match_images,
+    reconstruct,
+)
+from deepdetect.datasets.middlebury import load_calibrated_pair, load_middlebury
+from deepdetect.datasets.oxford import load_oxford
+from deepdetect.datasets.types import CalibratedStereoPair, PlanarPair, StereoPair
+from deepdetect.detector.pretrained import PRETRAINED
+from deepdetect.evaluation.benchmarks import select_pairs
+from deepdetect.evaluation.profiling import Profile, profiled
+from deepdetect.evaluation.protocols.paper import CORRECT_PX
+from deepdetect.evaluation.protocols.stereo_pipelines import (
+    PAPER_FLANN_CHECKS,
+    PAPER_FLANN_TREES,
+    essential_inliers,
+    paper_settings,
+)
+from deepdetect.evaluation.report import Cell, Column, Table
+from deepdetect.geometry import disparity_errors, transform_points
+
+PLANAR = (("wall", 6), ("graf", 3))
+STEREO = "cones"
+RATIO = 0.99
+TREES = 5
+CHECKS = 50
+
+Images = Sequence[np.ndarray]
+Judge = Callable[[float, float, float, float], bool]
+"""Returns whether the match of (x, y) and (u, v) is correct."""
+
+
+def main() -> None:
+    """Print a table of matches, and one of stereo points."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--weights", default="default")
+    parser.add_argument("--geometry-weights", default="dense", help="for stereo pairs")
+    parser.add_argument("--rounds", type=int, default=5)
+    arguments = parser.parse_args()
+    scenes = load_oxford(arguments.data / "oxford")
+    weights = DeepDetect(arguments.weights).configured(HeatmapOptions(480))
+    dense = DeepDetect(arguments.geometry_weights)
+    sides = {pair.name: planar_sides(pair, weights) for pair in select_pairs(scenes, PLANAR)}
+    stereo = load_middlebury(arguments.data / "middlebury" / STEREO)
+    sides[STEREO] = stereo_sides(stereo, dense.configured(HeatmapOptions(480)))
+    rows = [(name, *compare(*both, arguments.rounds)) for name, both in sides.items()]
+    print(table("matches", "End to end: correct matches", "correct", rows).to_markdown())
+    rows = []
+    for folder in sorted(
+        path.parent for path in (arguments.data / "middlebury").glob("*/calib.json")
+    ):
+        scene = load_calibrated_pair(folder)
+        rows.append((folder.name, *compare(*reconstruction_sides(scene, dense), 1)))
+    print("\n" + table("points", "Stereo: points", "points", rows).to_markdown())
+
+
+def table(key: str, title: str, counted: str, rows: Sequence[tuple[Cell, ...]]) -> Table:
+    """Tabulate what `compare` returns."""
+    columns = (
+        Column("pair"),
+        *(Column(f"{side}, s", ".2f") for side in ("published", "ours")),
+        *(Column(name, ".1f") for name in ("times faster", "lowest", "highest")),
+        *(Column(f"{side}: {counted}", ",d") for side in ("published", "ours")),
+        *(Column(f"{side}: MB", ",.0f") for side in ("published", "ours")),
+    )
+    return Table(key, title, columns, tuple(rows))
+
+
+def compare(published: Callable[[], int], ours: Callable[[], int], rounds: int) -> tuple[Cell, ...]:
+    """Run both sides in turn; return medians of seconds, their ratios, counts, largest memory."""
+    profiles: list[tuple[Profile, Profile]] = []
+    counts: list[tuple[int, int]] = []
+    for turn in range(rounds + 1):
+        with profiled() as first:
+            found = published()
+        with profiled() as second:
+            both = found, ours()
+        if turn:
+            profiles.append((first, second))
+            counts.append(both)
+    seconds = np.array([[profile.seconds for profile in both] for both in profiles])
+    memory = np.array([[profile.memory for profile in both] for both in profiles])
+    ratios = seconds[:, 0] / seconds[:, 1]
+    return (
+        *map(float, np.median(seconds, axis=0)),
+        *map(float, (np.median(ratios), ratios.min(), ratios.max())),
+        *map(int, np.median(counts, axis=0)),
+        *map(float, memory.max(axis=0) / 1e6),
+    )
+
+
+def planar_sides(
+    pair: PlanarPair, detector: DeepDetect
+) -> tuple[Callable[[], int], Callable[[], int]]:
+    """Return both sides' counts of correct matches of a pair with a homography."""
+    matrix = pair.homography
+
+    def one(x: float, y: float, u: float, v: float) -> bool:
+        mapped = matrix @ np.array([x, y, 1.0])
+        return bool(np.linalg.norm(mapped[:2] / mapped[2] - (u, v)) < CORRECT_PX)
+
+    def every(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(transform_points(first, matrix) - second, axis=1) < CORRECT_PX
+
+    return _sides((load_image(pair.first), load_image(pair.second)), detector, one, every)
+
+
+def stereo_sides(
+    pair: StereoPair, detector: DeepDetect
+) -> tuple[Callable[[], int], Callable[[], int]]:
+    """Return both sides' counts of correct matches of a rectified pair."""
+    disparity = pair.disparity
+
+    def one(x: float, y: float, u: float, v: float) -> bool:
+        true = disparity[round(y), round(x)]
+        return bool(np.isfinite(true) and np.hypot(x - true - u, y - v) < CORRECT_PX)
+
+    def every(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        return disparity_errors(first, second, disparity) < CORRECT_PX
+
+    return _sides((pair.left, pair.right), detector, one, every)
+
+
+def _sides(
+    images: Images,
+    detector: DeepDetect,
+    one: Judge,
+    every: Callable[[np.ndarray, np.ndarray], np.ndarray],
+) -> tuple[Callable[[], int], Callable[[], int]]:
+    torch_detector = published_detector(detector)
+
+    def ours() -> int:
+        found = match_images(
+            *images,
+            detector,
+            guided=False,
+            matcher="patchmatch",
+            descriptor="rootsift",
+            ratio=RATIO,
+            model="none",
+        )
+        return int(np.count_nonzero(every(found.points0, found.points1)))
+
+    return partial(published_pipeline, images, torch_detector, one), ours
+
+
+def reconstruction_sides(
+    scene: CalibratedStereoPair, detector: DeepDetect
+) -> tuple[Callable[[], int], Callable[[], int]]:
+    """Return both sides' counts of points of a stereo scene."""
+    squashed = published_detector(detector.configured(HeatmapOptions(480, "bgr")))
+
+    def ours() -> int:
+        images = scene.left, scene.right
+        return len(reconstruct(*images, detector, calibration=scene.calibration, rectified=True))
+
+    return lambda: len(published_points(scene, squashed)[0]), ours
+
+
+def published_detector(detector: DeepDetect) -> DeepDetect:
+    """Return a detector of the same weights run by torch without compilation.
+
+    Raises:
+        WeightsError: there is no safetensors file beside the weights.
+        MissingExtraError: torch is not installed.
+    """
+    weights = detector.weights.with_suffix(".safetensors")
+    if not weights.is_file():
+        raise WeightsError(
+            f"the published pipeline runs in torch and needs {weights}, which is not there: name "
+            f"a safetensors file, or one of {', '.join(PRETRAINED)}"
+        )
+    try:
+        found = DeepDetect(weights, backend="torch")
+    except MissingExtraError as error:
+        raise MissingExtraError(f"the published pipeline cannot be run: {error}") from None
+    return found.configured(detector.heatmap_options)
+
+
+def published_pipeline(images: Images, detector: DeepDetect, correct: Judge) -> int:
+    """Detect, describe and match two (H, W, 3) uint8 RGB images, and count the correct matches."""
+    first, second, good = published_matches(images, detector)
+    count = 0
+    for match in good:
+        count += correct(*first[match.queryIdx].pt, *second[match.trainIdx].pt)
+    return count
+
+
+def published_matches(
+    images: Images,
+    detector: DeepDetect,
+    ratio: float = RATIO,
+    trees: int = TREES,
+    checks: int = CHECKS,
+) -> tuple[Sequence[cv2.KeyPoint], Sequence[cv2.KeyPoint], list[cv2.DMatch]]:
+    """Detect, describe and match two images.
+
+    Args:
+        images: two, (H, W, 3) uint8 RGB.
+        detector: of `published_detector`.
+        ratio: of the ratio test.
+        trees, checks: of FLANN.
+
+    Returns:
+        The keypoints of both images and the matches that pass.
+    """
+    sift = cv2.SIFT_create()
+    keypoints = []
+    for image in images:
+        mask = detector.heatmap(image) > 0.5
+        keypoints.append([cv2.KeyPoint(float(x), float(y), 3) for y, x in np.argwhere(mask)])
+    (first, descriptors0), (second, descriptors1) = (
+        sift.compute(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), own)
+        for image, own in zip(images, keypoints, strict=True)
+    )
+    if not first or not second:
+        return first, second, []
+    matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": trees}, {"checks": checks})
+    good = []
+    for best, next_best in matcher.knnMatch(descriptors0, descriptors1, k=2):
+        if best.distance / (next_best.distance + 1e-12) < ratio:
+            good.append(best)
+    return first, second, good
+
+
+def published_points(
+    scene: CalibratedStereoPair, detector: DeepDetect
+) -> tuple[np.ndarray, np.ndarray]:
+    """Match a stereo pair and keep what the essential matrix leaves, with the authors' settings.
+
+    Returns:
+        (M, 2) and (M, 2) float64 positions of the matches that are left.
+    """
+    settings = paper_settings(scene)
+    first, second, good = published_matches(
+        (scene.left, scene.right), detector, settings.ratio, PAPER_FLANN_TREES, PAPER_FLANN_CHECKS
+    )
+    points0 = np.array([first[match.queryIdx].pt for match in good]).reshape(-1, 2)
+    points1 = np.array([second[match.trainIdx].pt for match in good]).reshape(-1, 2)
+    return essential_inliers(points0, points1, settings.camera_matrix)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,454 @@
+"""The benchmarks: data sets with the protocols that are run on them.
+
+To add a benchmark, write the function that plans its sections, and add its line to `BENCHMARKS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
+
+from .._shared.errors import ImageError
+from ..datasets.foreground import load_foreground
+from ..datasets.hpatches import in_d2net_subset, is_illumination, load_hpatches
+from ..datasets.low_visibility import load_low_visibility
+from ..datasets.oxford import find_scene, load_oxford
+from ..datasets.types import PlanarPair, PlanarScene
+from ..detector.pretrained import pretrained_weights
+from .baselines.method import LocalFeature
+from .baselines.opencv import CLASSICAL
+from .charts import bar_chart
+from .context import BenchmarkContext
+from .options import BenchmarkOptions
+from .protocols.foreground import foreground_part
+from .protocols.guided import guided_section
+from .protocols.paper import (
+    OXFORD_PAIRS,
+    density_part,
+    keypoint_figure,
+    loss_figure,
+    mask_figure,
+    match_figure,
+    matches_part,
+    repeatability_part,
+)
+from .protocols.paper_numbers import (
+    DENSITY,
+    FIGURE_2,
+    FIGURE_6,
+    HPATCHES_REPEATABILITY,
+    MATCHES,
+    MATCHES_CAUSES,
+    MAX_MATCHES,
+    NOTEBOOK_MATCHES,
+    OXFORD_REPEATABILITY,
+    with_paper_column,
+    with_paper_rows,
+)
+from .protocols.speed import PAIR, speed_part
+from .protocols.standard import standard_part
+from .protocols.stereo import STEREO_TEXT, stereo_parts
+from .report import Cell, Column, Figure, Table
+from .tasks import Part, SectionPlan, figure_part
+
+KEYPOINT_SCENES = ("graf", "bikes", "leuven")
+"""Of Figure 2."""
+
+GUIDED_PAIRS = (*OXFORD_PAIRS, ("boat", 6), ("bark", 6))
+
+NUM_OXFORD_PAIRS = 40
+
+FIGURE_7_SCENES = 4
+"""Half of each kind."""
+
+Truth = Literal["published", "refined"]
+
+OXFORD_TRUTHS: dict[Truth, str] = {
+    "published": (
+        "Evaluated by the homographies that the data set ships, for comparison with papers. They "
+        "are wrong by up to 26 px in places, so figures at 1 px are limited by them."
+    ),
+    "refined": (
+        "Evaluated by more accurate homographies, estimated from the images by "
+        "`benchmarks/refine_oxford.py` with no detector of ours in the loop."
+    ),
+}
+
+NOTHING_MOVES = "Nothing moves between the two images of a scene."
+
+Plans = list[SectionPlan]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A benchmark.
+
+    Attributes:
+        name: by which users choose it.
+        plan: plans the sections of its report; raises ImageError where its data are missing.
+        weights: which it runs, "default" or "dense" or both.
+    """
+
+    name: str
+    plan: Callable[[BenchmarkContext, BenchmarkOptions], Plans]
+    weights: tuple[str, ...] = ("default",)
+
+
+def plan_oxford(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
+    """Tables I and II, the Oxford half of III, Figures 1, 2, 4, 5 and 6; the other protocols."""
+    folder = context.folder("oxford")
+    scenes = load_oxford(folder)
+    unrefined = [
+        f"{path.parent.name} 1-{path.name[4]}"
+        for path in sorted(folder.glob("*/H1to?p"))
+        if not path.with_name(f"{path.name}.refined").exists()
+    ]
+    truths: list[Truth] = ["published"]
+    if len(unrefined) < NUM_OXFORD_PAIRS:
+        truths.append("refined")
+    plans = []
+    if "paper" in options.protocols:
+        plans.append(_oxford_paper(context, options, scenes))
+    if "standard" in options.protocols:
+        for truth in truths:
+            plans.append(
+                _standard_section(
+                    context,
+                    options,
+                    load_oxford(folder, truth),
+                    f"oxford_{truth}",
+                    f"Oxford, {truth} homographies",
+                    OXFORD_TRUTHS[truth],
+                )
+            )
+        if "refined" not in truths:
+            context.skipped.append(
+                "Oxford evaluated by refined homographies: there are no files H1toKp.refined; "
+                "benchmarks/refine_oxford.py makes them"
+            )
+        elif unrefined:
+            context.skipped.append(
+                f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined"
+                "; these pairs are evaluated by the published one in that section too"
+            )
+    if "guided" in options.protocols:
+        pairs: dict[str, list[PlanarPair]] = {
+            truth: select_pairs(load_oxford(folder, truth), GUIDED_PAIRS)
+            for truth in reversed(truths)
+        }
+        plans.append(guided_section(context, options, pairs, "oxford_guided", "Oxford"))
+    return plans
+
+
+def _oxford_paper(
+    context: BenchmarkContext, options: BenchmarkOptions, scenes: list[PlanarScene]
+) -> SectionPlan:
+    features = options.density_features()
+    pairs = select_pairs(scenes, OXFORD_PAIRS)
+    figure_6 = select_pairs(scenes, (*OXFORD_PAIRS, ("graf", 3)))
+
+    def with_figure_1(table: Table) -> Sequence[Table | Figure]:
+        return [with_paper_rows(table, OXFORD_REPEATABILITY), _repeatability_figure(table)]
+
+    parts = [
+        density_part(
+            context,
+            features,
+            scenes,
+            "oxford_density",
+            lambda table: [with_paper_column(table, "mean", DENSITY)],
+        ),
+        repeatability_part(context, features, scenes, "oxford_repeatability", with_figure_1),
+        matches_part(
+            context,
+            options.matching_features(),
+            pairs,
+            "oxford_matches",
+            finish=lambda table: [
+                _with_notebooks(with_paper_rows(table, MATCHES, MATCHES_CAUSES), pairs)
+            ],
+        ),
+        matches_part(
+            context,
+            _figure_features(options),
+            figure_6,
+            "oxford_figure6",
+            "Figure 6: correct matches",
+            lambda table: [with_paper_rows(table, FIGURE_6, MATCHES_CAUSES)],
+        ),
+        *_keypoint_figures(
+            context, options, [scene for scene in scenes if scene.name in KEYPOINT_SCENES]
+        ),
+        figure_part("Figure 4, the masks", partial(mask_figure, scenes[0])),
+        *_loss_figure(context, options),
+        *_match_figures(context, options.deepdetect_480(), pairs, "Figure 6"),
+    ]
+    text = (
+        "Tables I, II and the Oxford half of III, Figures 1, 2, 4, 5 and 6. DeepDetect sees images "
+        f"squashed to 480x480 as {options.channels.upper()}; the classical detectors see them as "
+        "they are. The paper's numbers are beside ours, and so are those that its authors' public "
+        f"notebooks print. {_figure_2_text()}"
+    )
+    return SectionPlan("Oxford, the paper's protocol", (text,), parts)
+
+
+def _figure_features(options: BenchmarkOptions) -> tuple[LocalFeature, ...]:
+    """Return the methods of Figures 2 and 6."""
+    return CLASSICAL["sift"], CLASSICAL["sift-low"], options.deepdetect_480()
+
+
+def _figure_2_text() -> str:
+    counts = "; ".join(
+        f"{scene} scene {', '.join(f'{count:,}' for count in counts)}"
+        for scene, counts in FIGURE_2.items()
+    )
+    return (
+        "Figure 2 of the paper prints the keypoints of SIFT, SIFT with low settings and DeepDetect "
+        f"in two scenes that it does not name: {counts}."
+    )
+
+
+def _repeatability_figure(table: Table) -> Figure:
+    values = {str(row[0]): float(row[1]) for row in table.rows if isinstance(row[1], float)}
+    ours = [name for name in values if name.startswith("DeepDetect")]
+    png = bar_chart(values, "repeatability as in the paper, mean of the scenes", ours)
+    title = (
+        "Figure 1: average repeatability, with baselines; in the paper DeepDetect has "
+        f"{OXFORD_REPEATABILITY['DeepDetect, threshold 0.5']['mean']}"
+    )
+    return Figure("oxford_repeatability", title, png)
+
+
+def _with_notebooks(table: Table, pairs: Sequence[PlanarPair]) -> Table:
+    rows = []
+    for title, known in NOTEBOOK_MATCHES.items():
+        cells: list[Cell] = []
+        for pair in pairs:
+            found = known.get(pair.name)
+            cells += [None, None] if found is None else [found[0], found[0] / found[1]]
+        rows.append((f"{title}, in the authors' notebook", *cells))
+    return replace(table, rows=(*table.rows, *rows))
+
+
+def _keypoint_figures(
+    context: BenchmarkContext, options: BenchmarkOptions, scenes: Sequence[PlanarScene]
+) -> list[Part]:
+    features = _figure_features(options)
+    return [
+        figure_part(
+            f"Figure 2, keypoints of {scene.name}",
+            partial(keypoint_figure, context, features, scene),
+        )
+        for scene in scenes
+    ]
+
+
+def _loss_figure(context: BenchmarkContext, options: BenchmarkOptions) -> list[Part]:
+    if options.detector.weights == pretrained_weights("default"):
+        return [figure_part("Figure 5, the losses", loss_figure)]
+    context.skipped.append("Figure 5, the losses: the package has those of its own weights only")
+    return []
+
+
+def _match_figures(
+    context: BenchmarkContext, feature: LocalFeature, pairs: Sequence[PlanarPair], number: str
+) -> list[Part]:
+    return [
+        figure_part(
+            f"{number}, matches of {pair.name}",
+            partial(match_figure, context, feature, pair, number),
+        )
+        for pair in pairs
+    ]
+
+
+def plan_hpatches(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
+    """Table III and Figure 7, and the other protocols on 116 scenes and on the D2-Net subset."""
+    scenes = load_hpatches(context.folder("hpatches"))
+    last = [list(scene.pairs())[-1] for scene in scenes]
+    plans = []
+    if "paper" in options.protocols:
+        plans.append(_hpatches_paper(context, options, scenes, last))
+    if "standard" in options.protocols:
+        for name, subset in hpatches_subsets(scenes):
+            plans.append(
+                _standard_section(
+                    context,
+                    options,
+                    subset,
+                    f"hpatches_{len(subset)}",
+                    f"HPatches, {name}",
+                    "Evaluated by its own files.",
+                )
+            )
+    if "guided" in options.protocols:
+        truths = {"published": last}
+        plans.append(guided_section(context, options, truths, "hpatches_guided", "HPatches"))
+    return plans
+
+
+def hpatches_subsets(scenes: Sequence[PlanarScene]) -> list[tuple[str, list[PlanarScene]]]:
+    """Return all scenes, and the D2-Net subset of them where it is smaller."""
+    subset = [scene for scene in scenes if in_d2net_subset(scene)]
+    subsets = [(f"all {len(scenes)} scenes", list(scenes))]
+    if 0 < len(subset) < len(scenes):
+        subsets.append((f"the {len(subset)} scenes of D2-Net", subset))
+    return subsets
+
+
+def _hpatches_paper(
+    context: BenchmarkContext,
+    options: BenchmarkOptions,
+    scenes: Sequence[PlanarScene],
+    last: Sequence[PlanarPair],
+) -> SectionPlan:
+    features = options.density_features()
+
+    def with_table_3(by_scene: Table) -> Sequence[Table | Figure]:
+        return [_table_3(by_scene, scenes), by_scene]
+
+    drawn = [
+        pair
+        for kind in (True, False)
+        for pair in [p for p, s in zip(last, scenes, strict=True) if is_illumination(s) is kind][
+            : FIGURE_7_SCENES // 2
+        ]
+    ]
+    parts = [
+        repeatability_part(context, features, scenes, "hpatches_repeatability", with_table_3),
+        density_part(context, features, scenes, "hpatches_density"),
+        matches_part(context, options.matching_features(), last, "hpatches_matches"),
+        *_match_figures(context, options.deepdetect_480(), drawn, "Figure 7"),
+    ]
+    text = (
+        f"{len(scenes)} scenes, of 116 in the whole set. Matches of images 1 and 6. The paper "
+        f"reports {MAX_MATCHES:,} as the most correct matches of a pair."
+    )
+    return SectionPlan("HPatches, the paper's protocol", (text,), parts)
+
+
+def _table_3(by_scene: Table, scenes: Sequence[PlanarScene]) -> Table:
+    """Average the repeatability by kind of scene."""
+    groups = {
+        kind: [scene.name for scene in scenes if is_illumination(scene) is light]
+        for kind, light in (("illumination", True), ("viewpoint", False))
+    }
+    rows: list[tuple[Cell, ...]] = []
+    for row in by_scene.rows:
+        values = dict(zip([scene.name for scene in scenes], row[2:], strict=True))
+        cells: list[Cell] = [row[0]]
+        for names in groups.values():
+            known = [v for name in names if isinstance(v := values[name], float)]
+            cells.append(sum(known) / len(known) if known else None)
+        rows.append(tuple(cells))
+    titles = {kind: f"{kind}, {len(names)} scenes" for kind, names in groups.items()}
+    table = Table(
+        "hpatches_table3",
+        "Table III: repeatability as in the paper, by kind of scene",
+        (Column("method"), *(Column(title, ".4f") for title in titles.values())),
+        tuple(rows),
+        by_scene.note,
+    )
+    paper = {
+        title: {titles[kind]: value for kind, value in numbers.items()}
+        for title, numbers in HPATCHES_REPEATABILITY.items()
+    }
+    counts = " and ".join(str(len(names)) for names in groups.values())
+    cause = f"the paper's are of 57 and 59 scenes, ours of {counts}"
+    return with_paper_rows(table, paper, {"": cause})
+
+
+def plan_low_visibility(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
+    """Run all protocols on the dusty and the smoky pair (Figure 6)."""
+    scenes = load_low_visibility(context.folder("low-visibility"))
+    pairs = [pair for scene in scenes for pair in scene.pairs()]
+    key = "low_visibility"
+    plans = []
+    if "paper" in options.protocols:
+        features = options.density_features()
+        parts = [
+            density_part(context, features, scenes, f"{key}_density"),
+            repeatability_part(context, features, scenes, f"{key}_repeatability"),
+            matches_part(context, options.matching_features(), pairs, f"{key}_matches"),
+            matches_part(
+                context,
+                _figure_features(options),
+                pairs,
+                f"{key}_figure6",
+                "Figure 6: correct matches",
+                lambda table: [with_paper_rows(table, FIGURE_6, MATCHES_CAUSES)],
+            ),
+            *_keypoint_figures(context, options, scenes),
+            *_match_figures(context, options.deepdetect_480(), pairs, "Figure 6"),
+        ]
+        title = "Low visibility, the paper's protocol"
+        plans.append(SectionPlan(title, (NOTHING_MOVES, _figure_2_text()), parts))
+    if "standard" in options.protocols:
+        plans.append(
+            _standard_section(context, options, scenes, key, "Low visibility", NOTHING_MOVES)
+        )
+    if "guided" in options.protocols:
+        truths = {"published": pairs}
+        plans.append(guided_section(context, options, truths, f"{key}_guided", "Low visibility"))
+    return plans
+
+
+def _standard_section(
+    context: BenchmarkContext,
+    options: BenchmarkOptions,
+    scenes: Sequence[PlanarScene],
+    key: str,
+    title: str,
+    text: str,
+) -> SectionPlan:
+    pairs = [pair for scene in scenes for pair in scene.pairs()]
+    what = f"{title} ({len(pairs)} pairs)"
+    part = standard_part(context, options.standard_features(), pairs, key, what)
+    return SectionPlan(f"{title}, the standard protocol", (text,), [part])
+
+
+def select_pairs(
+    scenes: Sequence[PlanarScene], chosen: Sequence[tuple[str, int]]
+) -> list[PlanarPair]:
+    """Return the pairs of scenes and numbers, as those of Table II."""
+    return [list(find_scene(list(scenes), name).pairs())[number - 2] for name, number in chosen]
+
+
+def plan_middlebury(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
+    """Reconstruct the stereo pairs by all pipelines (Figure 8)."""
+    folder = context.folder("middlebury")
+    scenes = sorted(path.parent for path in folder.glob("*/left.png"))
+    if not scenes:
+        raise ImageError(
+            f"there are no stereo scenes in {folder}: it must hold SCENE/left.png and right.png"
+        )
+    parts = stereo_parts(context, options, scenes)
+    return [SectionPlan("Middlebury stereo, and Figure 8", (STEREO_TEXT,), parts)]
+
+
+def plan_foreground(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
+    """Table I's second half."""
+    photographs = load_foreground(context.folder("foreground"))
+    part = foreground_part(context, options.density_features(), photographs)
+    return [SectionPlan("Foreground (Table I)", (), [part])]
+
+
+def plan_speed(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
+    """Time the stages on one pair of Oxford."""
+    (pair,) = select_pairs(load_oxford(context.folder("oxford")), [PAIR])
+    return [SectionPlan("Speed", (), [speed_part(options.matching_features(), pair)])]
+
+
+BENCHMARKS: dict[str, Benchmark] = {
+    benchmark.name: benchmark
+    for benchmark in (
+        Benchmark("oxford", plan_oxford),
+        Benchmark("hpatches", plan_hpatches),
+        Benchmark("middlebury", plan_middlebury, ("dense",)),
+        Benchmark("foreground", plan_foreground),
+        Benchmark("low-visibility", plan_low_visibility),
+        Benchmark("speed", plan_speed),
+    )
+}

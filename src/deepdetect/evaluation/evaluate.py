@@ -1,0 +1,173 @@
+"""How good weights are: known masks, labels at several scales, and the paper's protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
+from .._shared.progress import progress
+from ..datasets.oxford import load_oxford
+from ..datasets.types import PlanarScene
+from ..detector.detector import DeepDetect
+from ..detector.heatmap import HeatmapOptions
+from ..features.selection import SelectionOptions
+from ..io.image import load_image
+from .baselines.method import heatmap_feature
+from .benchmarks import select_pairs
+from .context import BenchmarkContext
+from .metrics.masks import MaskScore
+from .options import PAPER_RESOLUTION_PX, THRESHOLDS
+from .protocols.masks import (
+    ScaleScore,
+    check_scales,
+    sample_images,
+    score_at_scale,
+    score_samples,
+)
+from .protocols.paper import OXFORD_PAIRS, mean_correct_matches, pair_repeatability
+
+
+@dataclass(frozen=True)
+class OxfordScore:
+    """What weights give on the Oxford scenes, images squashed to 480x480 and RGB.
+
+    Attributes:
+        density: keypoints per pixel at each of the paper's thresholds, mean over all images.
+        repeatability: by scene, mean over its five pairs, as in the paper, clipped.
+        correct: correct matches (FLANN, ratio 0.99, under 1 px by the published
+            homography) by pair, means over several seeds of FLANN.
+        matches: all matches that pass the ratio test, likewise.
+    """
+
+    density: dict[float, float]
+    repeatability: dict[str, float]
+    correct: dict[str, int]
+    matches: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How good weights are.
+
+    Attributes:
+        masks: against the known masks of samples, by visibility, "normal" and "low".
+        scales: against the labels of scaled images, a row for each scale and visibility.
+        oxford: by the paper's protocol.
+    """
+
+    masks: dict[str, MaskScore] = field(default_factory=dict)
+    scales: tuple[ScaleScore, ...] = ()
+    oxford: OxfordScore | None = None
+
+
+@suggest_keywords
+def evaluate(
+    detector: DeepDetect | None = None,
+    *,
+    samples: str | Path | None = None,
+    scales: Sequence[float] = (),
+    oxford: str | Path | None = None,
+    quiet: bool = True,
+) -> Evaluation:
+    """Evaluate weights.
+
+    Args:
+        detector: with the weights; default `DeepDetect()`. The known masks are compared at the
+            detector's own resolution, the rest at the resolution of the protocol.
+        samples: folder of images `image_NAME.png` with known masks `mask_image_NAME.png`.
+        scales: factors above 0: the samples scaled by each are compared with labels of their own.
+        oxford: folder of the eight Oxford scenes: density, repeatability and correct matches by
+            the paper's protocol.
+        quiet: show no progress bars.
+
+    Raises:
+        ImageError: an image, a mask or a homography is missing.
+        OptionError: a scale is not above 0, or there are no samples to scale.
+        MissingExtraError: `oxford` needs the extra "benchmark".
+
+    Example:
+        >>> import tempfile
+        >>> from PIL import Image
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> for name in ("image_1.png", "mask_image_1.png"):
+        ...     Image.fromarray(np.zeros((64, 64), np.uint8)).save(folder / name)
+        >>> list(evaluate(samples=folder).masks)
+        ['low']
+    """
+    check_scales(scales)
+    if scales and samples is None:
+        raise OptionError("scales are of the images in samples: name their folder, too")
+    detector = DeepDetect() if detector is None else detector
+    masks: dict[str, MaskScore] = {}
+    rows: list[ScaleScore] = []
+    if samples is not None:
+        images = sample_images(samples)
+        masks = score_samples(detector.heatmap, _shown(images, "scoring", quiet))
+        for scale in scales:
+            rows += score_at_scale(detector, _shown(images, f"scale {scale:g}", quiet), scale)
+    return Evaluation(
+        masks,
+        tuple(rows),
+        None if oxford is None else evaluate_oxford(detector, load_oxford(oxford), quiet=quiet),
+    )
+
+
+def _shown(images: Sequence[Path], title: str, quiet: bool) -> Iterator[Path]:
+    """Yield the images, with a progress bar."""
+    with progress(len(images), title, "image", quiet) as bar:
+        for image in images:
+            yield image
+            bar.update(1)
+
+
+def evaluate_oxford(detector: Any, scenes: list[PlanarScene], *, quiet: bool = True) -> OxfordScore:
+    """Evaluate weights, or anything with a method `heatmap`, by the paper's protocol.
+
+    Args:
+        detector: a DeepDetect sees images squashed to 480x480, whatever its own resolution.
+        scenes: of `load_oxford`.
+        quiet: show no progress bar.
+    """
+    if isinstance(detector, DeepDetect):
+        detector = detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX))
+    feature = heatmap_feature(
+        detector, SelectionOptions(THRESHOLDS[0]), name="evaluated", title="evaluated", version="1"
+    )
+    images = [image for scene in scenes for image in scene.images]
+    pairs = [pair for scene in scenes for pair in scene.pairs()]
+    matched = select_pairs(scenes, OXFORD_PAIRS)
+    context = BenchmarkContext(Path())
+    with progress(len(images) + len(pairs) + len(matched), "Oxford", "step", quiet) as bar:
+
+        def over(items: Sequence[Any], measure: Callable[[Any], Any]) -> list[Any]:
+            found = []
+            for item in items:
+                found.append(measure(item))
+                bar.update(1)
+            return found
+
+        densities = over(images, lambda image: _densities(detector, image))
+        repeatability = over(pairs, lambda pair: pair_repeatability(context, feature, pair))
+        counts = over(matched, lambda pair: mean_correct_matches(context, feature, pair))
+    by_scene: dict[str, list[float]] = {scene.name: [] for scene in scenes}
+    for pair, value in zip(pairs, repeatability, strict=True):
+        by_scene[pair.scene].append(value)
+    names = [pair.name for pair in matched]
+    return OxfordScore(
+        {t: float(np.mean(of_t)) for t, *of_t in zip(THRESHOLDS, *densities, strict=True)},
+        {name: float(np.mean(values)) for name, values in by_scene.items()},
+        dict(zip(names, [correct for correct, _ in counts], strict=True)),
+        dict(zip(names, [matches for _, matches in counts], strict=True)),
+    )
+
+
+def _densities(detector: Any, image: Path) -> list[float]:
+    """Return the keypoints per pixel at each of the paper's thresholds."""
+    heatmap = detector.heatmap(load_image(image))
+    return [float((heatmap > threshold).mean()) for threshold in THRESHOLDS]

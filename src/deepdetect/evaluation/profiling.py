@@ -1,0 +1,141 @@
+"""Seconds and memory of a piece of work."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+from .._shared.errors import MissingExtraError
+
+SAMPLING_INTERVAL_S = 0.005
+
+
+@dataclass
+class Profile:
+    """What a piece of work took.
+
+    Attributes:
+        seconds: wall time.
+        memory: bytes that the process grew by at most while it ran.
+    """
+
+    seconds: float = 0.0
+    memory: int = 0
+
+
+class StageProfiler:
+    """Measures stages that follow each other, in a `with` block: `record` ends one.
+
+    A thread samples the memory of the process; a peak that it misses counts where it is the highest
+    of the process so far.
+
+    Attributes:
+        stages: by name; stages of one name add up their seconds, the largest memory counts.
+        memory: bytes that the process grew by at most since the first stage began, including what
+            an earlier stage still holds.
+
+    Example:
+        >>> with StageProfiler() as profiler:
+        ...     _ = sum(range(1000))
+        ...     profiler.record("summing")
+        >>> profiler.stages["summing"].seconds > 0
+        True
+    """
+
+    def __init__(self) -> None:
+        self.stages: dict[str, Profile] = {}
+        self.memory = 0
+        self._process = _process()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._sample, daemon=True)
+
+    def __enter__(self) -> StageProfiler:
+        self._begin()
+        self._first = self._before
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def record(self, name: str) -> None:
+        """End a stage, and begin the next one."""
+        seconds = time.perf_counter() - self._started
+        peak = max(self._peak, self._resident())
+        if peak_memory() > self._peak_before:
+            peak = max(peak, peak_memory())
+        profile = self.stages.setdefault(name, Profile())
+        profile.seconds += seconds
+        profile.memory = max(profile.memory, peak - self._before, 0)
+        self.memory = max(self.memory, peak - self._first)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._before = self._peak = self._resident()
+        self._peak_before = peak_memory()
+        self._started = time.perf_counter()
+
+    def _resident(self) -> int:
+        return int(self._process.memory_info().rss)
+
+    def _sample(self) -> None:
+        while not self._stop.wait(SAMPLING_INTERVAL_S):
+            self._peak = max(self._peak, self._resident())
+
+
+@contextmanager
+def profiled() -> Iterator[Profile]:
+    """Measure the time and the growth of memory of the block.
+
+    Example:
+        >>> with profiled() as profile:
+        ...     _ = sum(range(1000))
+        >>> profile.seconds > 0
+        True
+    """
+    profile = Profile()
+    with StageProfiler() as profiler:
+        try:
+            yield profile
+        finally:
+            profiler.record("block")
+            recorded = profiler.stages["block"]
+            profile.seconds, profile.memory = recorded.seconds, recorded.memory
+
+
+def peak_memory() -> int:
+    """Return the most memory that the process has held so far, in bytes; 0 where unknown.
+
+    Example:
+        >>> peak_memory() > 1_000_000
+        True
+    """
+    try:
+        import resource
+    except ImportError:  # on Windows
+        return int(getattr(_process().memory_info(), "peak_wset", 0))
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def _process() -> Any:
+    try:
+        import psutil
+    except ImportError:
+        raise MissingExtraError(
+            "measuring memory needs the package psutil, which is not installed: "
+            "run pip install 'deepdetect[benchmark]'"
+        ) from None
+    return psutil.Process()

@@ -1,0 +1,192 @@
+"""How well weights predict known masks, and the labels of images at several scales."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..._shared.errors import ImageError, OptionError
+from ...detector.detector import DeepDetect
+from ...detector.heatmap import HeatmapOptions, compute_heatmap
+from ...io.image import MINIMUM_SIDE, load_image, luma, scale_short_side
+from ...io.masks import load_mask
+from ...labels import LabelOptions, fuse, visibility_of
+from ..metrics.masks import MaskScore, mean_score, score_heatmap
+
+
+def sample_images(folder: str | Path) -> list[Path]:
+    """List the images of a folder of samples `image_*.png` with masks `mask_image_*.png`.
+
+    Raises:
+        ImageError: there is none.
+    """
+    images = sorted(Path(folder).glob("image_*.png"))
+    if not images:
+        raise ImageError(
+            f"there are no samples in {folder}: it must hold image_NAME.png and mask_image_NAME.png"
+        )
+    return images
+
+
+def score_samples(
+    heatmap: Callable[[np.ndarray], np.ndarray], images: Iterable[Path]
+) -> dict[str, MaskScore]:
+    """Score a detector on samples with known masks.
+
+    Args:
+        heatmap: maps a (H, W, 3) uint8 RGB image to a (H, W) probability.
+        images: of `sample_images`.
+
+    Returns:
+        The means by visibility, "normal" and "low", where there are images of it.
+
+    Raises:
+        ImageError: a mask is missing or of another size.
+    """
+    scores: dict[str, list[MaskScore]] = {"normal": [], "low": []}
+    for path in images:
+        rgb = load_image(path)
+        mask = load_mask(path.with_name(f"mask_{path.name}"))
+        if mask.shape != rgb.shape[:2]:
+            raise ImageError(f"the mask of {path} has another size than the image")
+        scores[visibility_of(luma(rgb))].append(score_heatmap(heatmap(rgb), mask))
+    return {name: mean_score(listed) for name, listed in scores.items() if listed}
+
+
+CERTAIN_LOGIT = 200.0
+"""Float32 rounds its probability to 1, and that of its negative to 0."""
+
+
+class LabelDetector:
+    """A detector whose keypoints are the fusion label itself, without a network.
+
+    Its numbers are those of weights without any error: they say how much of a metric learning the
+    labels better can give. Weights that exceed them do so by their errors.
+
+    Args:
+        options: how labels are made.
+        heatmap_options: the image is labelled as a network with these options sees it; default the
+            image as it is.
+
+    Example:
+        >>> image = np.zeros((32, 32), np.uint8)
+        >>> image[8:24, 8:24] = 255
+        >>> float(LabelDetector().heatmap(image)[8, 8])
+        1.0
+    """
+
+    def __init__(
+        self,
+        options: LabelOptions = LabelOptions(),
+        heatmap_options: HeatmapOptions | None = None,
+    ) -> None:
+        self.options = options
+        self.heatmap_options = heatmap_options
+
+    def heatmap(self, image: Any) -> np.ndarray:
+        """Return the label as (H, W) float32, 0 or 1."""
+        rgb = load_image(image)
+        if self.heatmap_options is not None:
+            return compute_heatmap(rgb, self._network, self.heatmap_options)
+        return fuse(luma(rgb), self.options).mask.astype(np.float32)
+
+    def _network(self, image: np.ndarray) -> np.ndarray:
+        """Do what the network is trained for: (1, 3, H, W) RGB in [0, 1] to (1, 1, H, W) logits."""
+        rgb = np.rint(image[0].transpose(1, 2, 0) * 255).astype(np.uint8)
+        mask = fuse(luma(rgb), self.options).mask[None, None]
+        return np.where(mask, np.float32(CERTAIN_LOGIT), np.float32(-CERTAIN_LOGIT))
+
+
+@dataclass(frozen=True)
+class ScaleScore:
+    """What weights give at one scale.
+
+    Attributes:
+        scale: factor that the images were scaled by.
+        visibility: of the images, "normal" or "low".
+        score: against the labels of the scaled images.
+        label_density: marked pixels of the labels per pixel, mean over images.
+        density: keypoints per pixel at threshold 0.5, mean over images.
+    """
+
+    scale: float
+    visibility: str
+    score: MaskScore
+    label_density: float
+    density: float
+
+
+def check_scales(scales: Sequence[float]) -> None:
+    """Make sure that images can be scaled by these factors.
+
+    Raises:
+        OptionError: one is not above 0, or not finite.
+    """
+    for scale in scales:
+        if not (math.isfinite(scale) and scale > 0):
+            raise OptionError(f"a scale must be a number above 0, not {scale:g}")
+
+
+def score_at_scale(
+    detector: DeepDetect,
+    images: Iterable[Any],
+    scale: float,
+    options: LabelOptions = LabelOptions(),
+) -> list[ScaleScore]:
+    """Score a detector on images scaled by a factor, against the labels of the scaled images.
+
+    Args:
+        detector: its weights are measured, at native resolution, whatever theirs is.
+        images: anything `load_image` takes.
+        scale: above 0; images are downscaled by area averaging and upscaled cubically.
+        options: how labels are made; the visibility of each image decides the settings.
+
+    Returns:
+        A row for each visibility that occurs.
+
+    Raises:
+        OptionError: the scale is not above 0.
+        ImageError: an image cannot be read, or is downscaled to under 16 pixels.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> image = rng.integers(0, 256, (64, 64, 3), np.uint8)
+        >>> (row,) = score_at_scale(DeepDetect(), [image], 0.5)
+        >>> row.visibility, 0 < row.density < 1
+        ('normal', True)
+    """
+    check_scales([scale])
+    native = detector.configured(HeatmapOptions())
+    found: dict[str, list[tuple[MaskScore, float, float]]] = {}
+    for image in images:
+        rgb = _scaled(load_image(image), scale)
+        label = fuse(luma(rgb), options)
+        heatmap = native.heatmap(rgb)
+        densities = float(label.mask.mean()), float((heatmap > 0.5).mean())
+        score = score_heatmap(heatmap, label.mask)
+        found.setdefault(label.visibility, []).append((score, *densities))
+    return [
+        ScaleScore(
+            scale,
+            visibility,
+            mean_score(score for score, _, _ in found[visibility]),
+            float(np.mean([density for _, density, _ in found[visibility]])),
+            float(np.mean([density for _, _, density in found[visibility]])),
+        )
+        for visibility in sorted(found, reverse=True)
+    ]
+
+
+def _scaled(rgb: np.ndarray, scale: float) -> np.ndarray:
+    short_side = round(scale * min(rgb.shape[:2]))
+    if short_side < MINIMUM_SIDE:
+        raise ImageError(
+            f"an image scaled by {scale:g} has a side of {short_side} pixels: "
+            f"it needs at least {MINIMUM_SIDE}, use larger scales"
+        )
+    return scale_short_side(rgb, short_side)

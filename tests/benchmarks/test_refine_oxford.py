@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from deepdetect.datasets.oxford import SCENES, load_oxford
+from deepdetect.datasets.types import read_homography
+
+MOVE = np.array([[1.01, 0.02, 3.0], [-0.02, 0.99, 2.0], [1e-4, 0, 1.0]])
+WRONG = np.array([[1.0, 0, 1.6], [0, 1, -1.2], [0, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, write_scene: Callable[..., None]) -> Path:
+    """Eight scenes, whose published homographies are 2 px off in graf and true elsewhere."""
+    root = tmp_path_factory.mktemp("refine") / "oxford"
+    write_scene(root / "graf", (180, 140), MOVE, fading=0.03)
+    for scene in SCENES:
+        if scene != "graf":
+            write_scene(root / scene, (48, 40), np.eye(3))
+    for number in range(2, 7):
+        path = root / "graf" / f"H1to{number}p"
+        shutil.copy(path, path.with_name(f"true{number}"))
+        np.savetxt(path, WRONG @ read_homography(path))
+    return root
+
+
+@pytest.fixture(scope="module")
+def script(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    return load_script("refine_oxford")
+
+
+@pytest.fixture(scope="module")
+def refined(
+    script: ModuleType, folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list, Path]:
+    output = tmp_path_factory.mktemp("refined")
+    results = script.refine_oxford(folder, output)
+    assert len(results) == 40
+    return results, output
+
+
+def test_wrong_homographies_become_true(
+    script: ModuleType, folder: Path, refined: tuple[list, Path]
+) -> None:
+    for number in range(2, 5):  # later ones share little with the first
+        true = read_homography(folder / "graf" / f"true{number}")
+        found = read_homography(refined[1] / "graf" / f"H1to{number}p.refined")
+        published = read_homography(folder / "graf" / f"H1to{number}p")
+        assert script.displacement(true, published, (180, 140), (180, 140))[0] > 1.5
+        assert script.displacement(true, found, (180, 140), (180, 140))[0] < 0.3
+
+
+def test_true_homographies_are_left_alone(refined: tuple[list, Path]) -> None:
+    written = {path.parent.name for path in refined[1].rglob("*.refined")}
+    assert written == {"graf"}
+    for result in refined[0]:
+        assert result.refinement.zncc >= result.published
+        assert (result.written is not None) == (result.pair.scene == "graf")
+
+
+def test_the_data_set_finds_the_files(folder: Path, refined: tuple[list, Path]) -> None:
+    copy = refined[1] / "copy"
+    shutil.copytree(folder, copy)
+    for path in refined[1].glob("graf/*.refined"):
+        shutil.copy(path, copy / "graf")
+    scene = next(scene for scene in load_oxford(copy, "refined") if scene.name == "graf")
+    expected = read_homography(refined[1] / "graf" / "H1to2p.refined")
+    np.testing.assert_array_equal(scene.homographies[0], expected)
+
+
+def test_the_table_tells_what_moved(script: ModuleType, refined: tuple[list, Path]) -> None:
+    table = script.refinement_table(refined[0])
+    rows = {row[0]: row for row in table.rows}
+    assert len(rows) == 40
+    assert rows["graf 1-2"][3] == pytest.approx(2, abs=0.4)
+    assert rows["bark 1-2"][3] == pytest.approx(0, abs=0.05)
+
+
+def test_a_file_that_is_there_already_is_compared(
+    script: ModuleType, folder: Path, refined: tuple[list, Path], tmp_path: Path
+) -> None:
+    shutil.copytree(folder, tmp_path / "oxford")
+    shutil.copy(refined[1] / "graf" / "H1to2p.refined", tmp_path / "oxford" / "graf")
+    # Written over the very file that it is compared with.
+    rows = {
+        row[0]: row
+        for row in script.refinement_table(
+            script.refine_oxford(tmp_path / "oxford", tmp_path / "oxford")
+        ).rows
+    }
+    assert rows["graf 1-2"][5:7] == pytest.approx((0, 0), abs=1e-6)
+    assert rows["graf 1-3"][5:7] == (None, None)
+
+
+def test_the_script_writes_the_files_and_a_report(
+    script: ModuleType,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["refine_oxford", str(folder), str(tmp_path)])
+    script.main()
+    assert (tmp_path / "refinement" / "report.md").exists()
+    assert (tmp_path / "graf" / "H1to2p.refined").exists()
+    printed = capsys.readouterr().out
+    assert "graf 1-2" in printed
+    assert "files written to" in printed

@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from deepdetect.cli.demo import run_demo
+from deepdetect.datasets import StereoPair
+
+
+class FakeDetector:
+    """Every fourth pixel of the texture."""
+
+    def heatmap(self, image: np.ndarray) -> np.ndarray:
+        heatmap = np.zeros(image.shape[:2], np.float32)
+        heatmap[8:-8:2, 8:-8:2] = 0.9
+        return heatmap
+
+
+def test_a_shifted_copy_is_matched_right(tmp_path: Path) -> None:
+    """The right view is the left one moved by 6 pixels: the truth is exact."""
+    import cv2
+
+    noise = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8)
+    texture = cv2.resize(noise, (180, 120), interpolation=cv2.INTER_CUBIC)
+    pair = StereoPair(
+        "noise", texture[:, :-6], texture[:, 6:], np.full((120, 174), 6.0, np.float32)
+    )
+    result = run_demo(pair, FakeDetector(), tmp_path)
+    assert result.all_matches.precision > 0.9
+    assert result.inliers.precision >= result.all_matches.precision
+    assert result.random.precision < result.all_matches.precision
+    assert result.all_matches.evaluated == result.all_matches.matches
+    assert result.values()["all_matches"]["precision"] == result.all_matches.precision
+    assert {path.name for path in result.pictures} == {path.name for path in tmp_path.iterdir()}
+    wrong = StereoPair(pair.name, pair.left, pair.right, pair.disparity + 3)
+    assert run_demo(wrong, FakeDetector(), tmp_path).all_matches.precision < 0.1

@@ -1,0 +1,204 @@
+"""Tiny networks that find the bright pixels of a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import WeightsError
+from deepdetect.evaluation.baselines.onnx import onnx_feature
+from deepdetect.evaluation.baselines.plugin import find_feature
+from deepdetect.features.sift import root_sift_descriptors
+from deepdetect.io.image import luma
+
+Make = Callable[..., Path]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Make:
+    """Write a network whose keypoints are the pixels with a red over 0.5."""
+    onnx = pytest.importorskip("onnx", reason="needs onnx to make networks")
+    helper, types = onnx.helper, onnx.TensorProto
+
+    def write(
+        size: tuple[object, object] = ("height", "width"),
+        *,
+        leading: bool = False,
+        descriptors: bool = False,
+        integers: bool = False,
+        channels: int = 3,
+        rank: int = 4,
+        rename: str = "keypoints",
+        name: str = "bright.onnx",
+    ) -> Path:
+        after = "_flat" if leading else ""
+        nodes = [
+            helper.make_node("Gather", ["image", "first"], ["red"], axis=1),
+            helper.make_node("Greater", ["red", "half"], ["bright"]),
+            helper.make_node("NonZero", ["bright"], ["where"]),
+            helper.make_node("Transpose", ["where"], ["at"]),
+            helper.make_node("Gather", ["at", "order"], ["whole"], axis=1),
+            helper.make_node(
+                "Cast", ["whole"], [rename + after], to=types.INT64 if integers else types.FLOAT
+            ),
+            helper.make_node("GatherND", ["red", "at"], ["scores" + after]),
+        ]
+        outputs = [rename, "scores"]
+        if descriptors:
+            nodes.append(helper.make_node("Cast", ["at"], ["descriptors" + after], to=types.FLOAT))
+            outputs.append("descriptors")
+        if leading:
+            nodes += [
+                helper.make_node("Unsqueeze", [f"{output}_flat", "first"], [output])
+                for output in outputs
+            ]
+        kinds = [
+            types.INT64 if integers and output == rename else types.FLOAT for output in outputs
+        ]
+        graph = helper.make_graph(
+            nodes,
+            "bright",
+            [helper.make_tensor_value_info("image", types.FLOAT, [1, channels, *size][:rank])],
+            [
+                helper.make_tensor_value_info(output, kind, None)
+                for output, kind in zip(outputs, kinds, strict=True)
+            ],
+            [
+                helper.make_tensor("first", types.INT64, [1], [0]),
+                helper.make_tensor("half", types.FLOAT, [], [0.5]),
+                helper.make_tensor("order", types.INT64, [2], [3, 2]),
+            ],
+        )
+        opset = [helper.make_opsetid("", 13)]
+        path = tmp_path / name
+        path.write_bytes(
+            helper.make_model(graph, opset_imports=opset, ir_version=8).SerializeToString()
+        )
+        return path
+
+    return write
+
+
+def picture(width: int, height: int, *blocks: tuple[int, int, int, int], red: int = 255):
+    """Black, with red blocks: column, row, width and height."""
+    rgb = np.zeros((height, width, 3), np.uint8)
+    for column, row, wide, high in blocks:
+        rgb[row : row + high, column : column + wide, 0] = red
+    return rgb
+
+
+@pytest.mark.parametrize("leading", [False, True])
+@pytest.mark.parametrize("integers", [False, True])
+def test_a_network_of_any_size_sees_the_pixels_as_they_are(
+    make: Make, leading: bool, integers: bool
+) -> None:
+    method = onnx_feature(make(leading=leading, integers=integers))
+    rgb = picture(40, 30, (7, 3, 1, 1), (39, 29, 1, 1), (0, 0, 1, 1), red=204)
+    rgb[10, 10] = (0, 255, 0)  # green and blue are other channels
+    rgb[11, 10] = (0, 0, 255)
+    found = method.detect(rgb)
+    assert found.xy.tolist() == [[0, 0], [7, 3], [39, 29]]
+    np.testing.assert_allclose(found.scores, 0.8, rtol=1e-6)
+    assert found.image_size == (40, 30)
+    assert found.xy.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "block", "centre"),
+    [
+        (96, 64, (20, 10, 2, 2), (20.5, 10.5)),  # two of the image's pixels are one
+        (96, 64, (0, 0, 2, 2), (0.5, 0.5)),
+        (96, 64, (94, 62, 2, 2), (94.5, 62.5)),
+        (144, 64, (30, 10, 3, 2), (31, 10.5)),  # each side by its own factor
+        (48, 96, (5, 30, 1, 3), (5, 31)),
+    ],
+)
+def test_keypoints_of_a_shrunk_image_are_the_centres_of_what_became_one_pixel(
+    make: Make, width: int, height: int, block: tuple[int, ...], centre: tuple[float, float]
+) -> None:
+    found = onnx_feature(make((32, 48))).detect(picture(width, height, block))
+    np.testing.assert_allclose(found.xy, [centre], atol=1e-5)
+    assert found.image_size == (width, height)
+
+
+def test_keypoints_of_an_enlarged_image_lie_around_their_pixel(make: Make) -> None:
+    found = onnx_feature(make((32, 48))).detect(picture(24, 16, (5, 7, 1, 1)))
+    np.testing.assert_allclose(found.xy.mean(0), (5, 7), atol=1e-5)
+    assert np.abs(found.xy - (5, 7)).max() < 0.5
+
+
+def test_only_the_fixed_side_is_stretched(make: Make) -> None:
+    found = onnx_feature(make((32, "width"))).detect(picture(50, 64, (9, 20, 1, 2)))
+    np.testing.assert_allclose(found.xy, [(9, 20.5)], atol=1e-5)
+
+
+@pytest.mark.parametrize("leading", [False, True])
+def test_no_keypoints_are_no_error(make: Make, leading: bool) -> None:
+    method = onnx_feature(make(leading=leading, descriptors=True))
+    rgb = picture(40, 30)
+    found = method.detect(rgb)
+    assert len(found) == 0
+    assert len(method.describe(rgb, found)) == 0
+
+
+@pytest.mark.parametrize("leading", [False, True])
+def test_descriptors_of_the_network_are_kept_and_count_as_learned(
+    make: Make, leading: bool
+) -> None:
+    method = onnx_feature(make(descriptors=True, leading=leading))
+    assert method.learned
+    rgb = picture(40, 30, (7, 3, 1, 1), (20, 9, 1, 1))
+    found = method.detect(rgb)
+    # This network describes a pixel by its place: batch, channel, row and column.
+    assert method.describe(rgb, found).tolist() == [[0, 0, 3, 7], [0, 0, 9, 20]]
+    best = found[np.array([1])]
+    assert method.describe(rgb, best).tolist() == [[0, 0, 9, 20]]
+
+
+def test_points_without_descriptors_get_upright_rootsift_of_size_4(
+    make: Make, photo: np.ndarray
+) -> None:
+    method = onnx_feature(make())
+    assert not method.learned
+    crop = np.ascontiguousarray(photo[:60, :80])
+    found = method.detect(crop)[:50]
+    expected = root_sift_descriptors(luma(crop), found.xy, 4.0, 0.0)
+    np.testing.assert_array_equal(method.describe(crop, found), expected)
+
+
+def test_the_name_is_the_files_and_the_version_its_content(make: Make) -> None:
+    path = make(name="Bright one.onnx")
+    method = onnx_feature(path)
+    assert method.name == method.title == "Bright one"
+    assert onnx_feature(path, "mine").name == "mine"
+    moved = path.rename(path.with_name("moved.onnx"))
+    assert onnx_feature(moved).version == method.version
+    assert onnx_feature(make(descriptors=True)).version != method.version
+    assert find_feature(str(moved)).name == "moved"
+
+
+def test_what_is_no_network_is_said(make: Make, tmp_path: Path, one_line) -> None:
+    text = tmp_path / "text.onnx"
+    text.write_text("no network")
+    half = tmp_path / "half.onnx"
+    half.write_bytes(make().read_bytes()[:200])
+    for path in (tmp_path / "none.onnx", tmp_path, text, half):
+        with pytest.raises(WeightsError) as caught:
+            onnx_feature(path)
+        assert str(path) in one_line(caught.value)
+
+
+def test_other_outputs_are_said_when_the_file_is_opened(make: Make, one_line) -> None:
+    with pytest.raises(WeightsError, match="keypoints and scores") as caught:
+        onnx_feature(make(rename="points"))
+    one_line(caught.value)
+
+
+@pytest.mark.parametrize("change", [{"channels": 1}, {"rank": 3}], ids=["grey", "no batch"])
+def test_another_input_is_said_when_the_file_is_opened(make: Make, change, one_line) -> None:
+    with pytest.raises(WeightsError) as caught:
+        onnx_feature(make(**change))
+    one_line(caught.value)

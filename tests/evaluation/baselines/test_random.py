@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from deepdetect import match_images
+from deepdetect.evaluation.baselines.method import LocalFeature
+from deepdetect.evaluation.baselines.opencv import CLASSICAL
+from deepdetect.evaluation.baselines.random import (
+    AllPixels,
+    RandomDetector,
+    all_pixels_feature,
+    random_feature,
+)
+from deepdetect.evaluation.metrics.coverage import coverage
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.features.sift import sift_descriptors
+from deepdetect.io.image import luma
+
+
+@pytest.fixture(scope="module")
+def crop(photo: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(photo[60:140, 100:200])
+
+
+def blank(width: int, height: int) -> np.ndarray:
+    return np.zeros((height, width, 3), np.uint8)
+
+
+def test_random_points_are_even_and_follow_the_seed(photo: np.ndarray) -> None:
+    points = RandomDetector(3)
+    first, second = points.heatmap(photo), points.heatmap(photo)
+    assert first.shape == photo.shape[:2]
+    assert first.dtype == np.float32
+    assert not np.array_equal(first, second)
+    np.testing.assert_array_equal(first, RandomDetector(3).heatmap(photo))
+    for part in np.array_split(first, 4):
+        assert abs((part > 0.5).mean() - 0.5) < 0.02
+
+
+def test_every_pixel_is_a_keypoint(photo: np.ndarray) -> None:
+    small = photo[:40, :50]
+    found = match_images(small, small, AllPixels(), model="none")
+    assert len(found.keypoints0) == small.shape[0] * small.shape[1]
+
+
+@pytest.mark.parametrize("name", ["fast", "sift", "harris-low"])
+def test_random_points_are_as_many_as_those_of_the_method(crop: np.ndarray, name: str) -> None:
+    baseline = random_feature(CLASSICAL[name])
+    for image in (crop, crop[::-1].copy(), crop[:, ::-1].copy()):
+        found = baseline.detect(image)
+        assert len(found) == len(CLASSICAL[name].detect(image)) > 0
+        # They are distinct pixels of the image.
+        assert len(np.unique(found.xy, axis=0)) == len(found)
+        assert (found.xy == np.rint(found.xy)).all()
+        assert ((found.xy >= 0) & (found.xy < (100, 80))).all()
+
+
+def test_random_points_are_the_same_again_and_others_in_another_image(crop: np.ndarray) -> None:
+    baseline = random_feature(CLASSICAL["harris"])
+    first = baseline.detect(crop)
+    np.testing.assert_array_equal(first.xy, random_feature(CLASSICAL["harris"]).detect(crop).xy)
+    darker = crop.copy()
+    darker[0, 0] //= 2  # a pixel is enough
+    second = baseline.detect(darker)
+    share = len(first) / (100 * 80)
+    common = len({tuple(p) for p in first.xy} & {tuple(p) for p in second.xy}) / len(first)
+    assert common < share + 0.1
+    other_seed = random_feature(CLASSICAL["harris"], seed=1).detect(crop)
+    assert not np.array_equal(first.xy, other_seed.xy)
+
+
+def test_random_points_are_spread_like_dice(crop: np.ndarray) -> None:
+    """Counts by quarter of the image are within five standard deviations."""
+    found = random_feature(CLASSICAL["fast-low"]).detect(crop)
+    quarters = np.bincount((found.xy[:, 0] >= 50) * 2 + (found.xy[:, 1] >= 40).astype(int))
+    expected = len(found) / 4
+    assert np.abs(quarters - expected).max() < 5 * np.sqrt(expected)
+
+
+def test_random_points_of_nothing_are_nothing() -> None:
+    found = random_feature(CLASSICAL["fast"]).detect(blank(40, 30))
+    assert (len(found), found.image_size) == (0, (40, 30))
+
+
+def test_random_points_follow_the_version_of_their_method() -> None:
+    def nothing(rgb: np.ndarray) -> Keypoints:
+        return Keypoints.empty((1, 1))
+
+    def made(version: str, seed: int) -> str:
+        like = LocalFeature("like", "Like", nothing, lambda rgb, features: rgb, version=version)
+        return random_feature(like, seed).detection
+
+    assert len({made("1", 0), made("2", 0), made("1", 1)}) == 3
+
+
+@pytest.mark.parametrize(("width", "height"), [(17, 16), (150, 131)])
+def test_all_pixels_are_there_once(width: int, height: int) -> None:
+    found = all_pixels_feature().detect(blank(width, height))
+    assert len(found) == width * height
+    assert found.density == 1
+    assert len(np.unique(found.xy, axis=0)) == len(found)
+    np.testing.assert_array_equal(found.xy.max(0), (width - 1, height - 1))
+
+
+@pytest.mark.parametrize("count", [100, 300, 1000, 3000])
+def test_the_best_of_every_pixel_are_spread_evenly(count: int) -> None:
+    """No two are nearer than 0.65 of a square grid's step; random points come together."""
+    width, height = 250, 190
+    found = all_pixels_feature().detect(blank(width, height)).best(count)
+    assert len(found) == count
+    step = np.sqrt(width * height / count)
+    nearest = KDTree(found.xy).query(found.xy, 2)[0][:, 1]
+    assert nearest.min() > 0.65 * step
+    assert nearest.mean() > 0.7 * step  # of random points 0.5
+    generator = np.random.default_rng(0)
+    chance = generator.permutation(all_pixels_feature().detect(blank(width, height)).xy)[:count]
+    assert KDTree(chance).query(chance, 2)[0][:, 1].min() < 0.5 * nearest.min()
+    # The grid's own order shows: halves of the image hold like numbers.
+    for axis, side in ((0, width), (1, height)):
+        share = (found.xy[:, axis] < (side - 1) / 2).mean()
+        assert abs(share - 0.5) < 0.12
+    if count >= 100:
+        assert coverage(found.xy, (width, height)) == 1
+
+
+@pytest.mark.parametrize(("size", "count"), [((640, 480), 12), ((700, 300), 9)])
+def test_few_of_the_pixels_of_a_large_image_reach_all_of_its_parts(
+    size: tuple[int, int], count: int
+) -> None:
+    """A 3x2 grid is coarse enough to be filled by nine even points."""
+    found = all_pixels_feature().detect(blank(*size)).best(count)
+    cell = np.floor(found.xy * (3, 2) / size).astype(int)
+    assert len(np.unique(cell, axis=0)) == 6
+
+
+def test_chance_baselines_get_the_papers_descriptor(crop: np.ndarray) -> None:
+    for method in (all_pixels_feature(), random_feature(CLASSICAL["fast"])):
+        found = method.detect(crop).best(50)
+        expected = sift_descriptors(luma(crop), found.xy, 3.0, -1.0)
+        np.testing.assert_array_equal(method.describe(crop, found), expected)

@@ -1,0 +1,89 @@
+"""Small data sets with known homographies, and a detector that needs no network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect
+from deepdetect.detector.backends import RuntimeOptions
+from deepdetect.detector.heatmap import HeatmapOptions
+from deepdetect.detector.pretrained import pretrained_weights
+from deepdetect.io.image import luma
+
+SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
+MOVES = {
+    "boat": [[1, 0, -5], [0, 1, 3], [0, 0, 1]],
+    "graf": [[0.98, 0.03, 2], [-0.02, 1.01, 1], [2e-4, -1e-4, 1]],
+    "wall": [[1, 0, 2], [0, 1, -4], [0, 0, 1]],
+}
+"""From each image to the next; the other scenes stand still."""
+
+
+class EdgeDetector(DeepDetect):
+    """A stand-in whose heat map is the strength of the edges."""
+
+    def __init__(self) -> None:
+        self.weights = pretrained_weights()
+        self.backend = "none"
+        self.heatmap_options = HeatmapOptions()
+        self._runtime = RuntimeOptions()  # of `with_weights`
+
+    def _run(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        gray = luma(rgb).astype(np.float32)
+        strength = np.hypot(cv2.Sobel(gray, -1, 1, 0), cv2.Sobel(gray, -1, 0, 1))
+        return 1 - np.exp(-strength / 150), strength
+
+
+@pytest.fixture(scope="session")
+def edge_detector() -> DeepDetect:
+    return EdgeDetector()
+
+
+@pytest.fixture(scope="session")
+def oxford_folder(tmp_path_factory: pytest.TempPathFactory, write_scene) -> Path:
+    """Eight scenes of small images: only boat's are large enough for ORB; ubc 6 equals 1."""
+    root = tmp_path_factory.mktemp("data")
+    for index, scene in enumerate(SCENES):
+        size = (100, 92) if scene == "boat" else (48, 36 + index)
+        move = np.array(MOVES.get(scene, np.eye(3)), float)
+        corner = (100 + 17 * index, 30 + 11 * index)
+        write_scene(root / "oxford" / scene, size, move, corner=corner)
+    ubc = root / "oxford" / "ubc"
+    (ubc / "img6.png").write_bytes((ubc / "img1.png").read_bytes())
+    return root
+
+
+@pytest.fixture(scope="session")
+def low_visibility_folder(tmp_path_factory: pytest.TempPathFactory, write_scene) -> Path:
+    """Two pairs: of dusty both images are the same, smoky's second one is darker."""
+    root = tmp_path_factory.mktemp("low") / "low-visibility"
+    for scene, fading in (("dusty", 0.0), ("smoky", 0.4)):
+        write_scene(
+            *(root / scene, (80, 64), np.eye(3), ("img{}.png", "H1to{}p"), 2),
+            corner=(180, 90),
+            fading=fading,
+        )
+    return root
+
+
+class NoBar:
+    """A progress bar that shows nothing and keeps account."""
+
+    def __init__(self) -> None:
+        self.done = 0
+
+    def update(self, n: int) -> None:
+        self.done += n
+
+    def set_postfix_str(self, s: str, refresh: bool) -> None:
+        assert s
+
+
+@pytest.fixture(scope="session")
+def no_bar() -> NoBar:
+    """A progress bar that shows nothing."""
+    return NoBar()

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepdetect.evaluation.metrics.homography import (
+    accuracy_at,
+    area_under_curve,
+    corner_error,
+    inside,
+    project_visible,
+)
+
+ERRORS = st.lists(st.floats(0, 20) | st.just(math.inf), min_size=1, max_size=30)
+
+
+def test_the_truth_has_no_error_and_nothing_has_an_infinite_one() -> None:
+    assert corner_error(np.eye(3), np.eye(3), (640, 480)) == 0
+    assert corner_error(-3 * np.eye(3), np.eye(3), (640, 480)) == 0  # the scale is free
+    assert corner_error(None, np.eye(3), (640, 480)) == math.inf
+
+
+def test_the_corners_are_the_centres_of_the_corner_pixels() -> None:
+    stretch = np.diag([2.0, 1, 1])
+    # Two corners stay, two move by width - 1.
+    assert corner_error(stretch, np.eye(3), (11, 7)) == 5
+
+
+def test_agrees_with_opencv() -> None:
+    homography = np.array([[1.1, 0.05, -7], [-0.03, 0.95, 4], [1e-4, -2e-4, 1]])
+    corners = np.array([[0, 0], [639, 0], [639, 479], [0, 479]], np.float64)
+    moved = cv2.perspectiveTransform(corners[None], homography)[0]
+    expected = np.linalg.norm(moved - corners, axis=1).mean()
+    assert corner_error(homography, np.eye(3), (640, 480)) == pytest.approx(expected)
+
+
+def test_a_corner_at_infinity_is_infinitely_far() -> None:
+    homography = np.array([[1.0, 0, 0], [0, 1, 0], [-0.1, 0, 1]])  # x = 10 goes to infinity
+    assert corner_error(homography, np.eye(3), (11, 5)) == math.inf
+
+
+def test_shares_and_areas_of_known_errors() -> None:
+    errors = [0.5, 1.0, 2.0, math.inf]
+    assert accuracy_at(errors, 1) == 0.5
+    assert area_under_curve(errors, 1) == pytest.approx(0.5 / 4)
+    assert area_under_curve(errors, 4) == pytest.approx((3.5 + 3 + 2) / 16)
+    assert accuracy_at([], 1) == area_under_curve([], 1) == 0
+
+
+@given(errors=ERRORS, threshold=st.floats(0.5, 10))
+def test_the_area_is_the_mean_of_the_shares_up_to_the_threshold(
+    errors: list[float], threshold: float
+) -> None:
+    steps = (np.arange(4000) + 0.5) / 4000 * threshold
+    mean = np.mean([accuracy_at(errors, step) for step in steps])
+    assert area_under_curve(errors, threshold) == pytest.approx(mean, abs=1e-3)
+
+
+HOMOGRAPHIES = st.builds(
+    lambda angle, scale, shift, tilt: np.array(
+        [
+            [scale * math.cos(angle), -scale * math.sin(angle), shift[0]],
+            [scale * math.sin(angle), scale * math.cos(angle), shift[1]],
+            [tilt[0], tilt[1], 1],
+        ]
+    ),
+    st.floats(-3, 3),
+    st.floats(0.5, 2),
+    st.tuples(st.floats(-50, 50), st.floats(-50, 50)),
+    st.tuples(st.floats(-5e-4, 5e-4), st.floats(-5e-4, 5e-4)),
+)
+
+
+@given(homography=HOMOGRAPHIES, factor=st.floats(0.1, 10), sign=st.sampled_from([-1, 1]))
+def test_the_scale_and_sign_of_a_homography_do_not_matter(
+    homography: np.ndarray, factor: float, sign: int
+) -> None:
+    other = sign * factor * homography
+    assert corner_error(other, homography, (200, 150)) == pytest.approx(0, abs=1e-6)
+    shift = np.array([[1.0, 0, 3], [0, 1, -4], [0, 0, 1]])
+    assert corner_error(shift @ other, homography, (200, 150)) == pytest.approx(5)
+
+
+def test_an_image_reaches_half_a_pixel_beyond_its_outer_centres() -> None:
+    points = np.array([[-0.5, -0.5], [-0.51, 0], [9.49, 4.49], [9.5, 0], [0, 4.5], [np.nan, 0]])
+    assert inside(points, (10, 5)).tolist() == [True, False, True, False, False, False]
+    assert inside(np.array([[np.inf, 0]]), (10, 5)).tolist() == [False]
+
+
+def test_points_outside_the_other_image_become_nan() -> None:
+    shift = np.array([[1.0, 0, 3], [0, 1, 0], [0, 0, 1]])
+    mapped = project_visible(np.array([[0, 0], [6, 4], [7, 4]]), shift, (10, 5))
+    np.testing.assert_array_equal(mapped, [[3, 0], [9, 4], [np.nan, np.nan]])
+
+
+@pytest.mark.parametrize("scale", [1.0, -2.5])
+def test_beyond_the_horizon_nothing_is_seen(scale: float) -> None:
+    # The depth is 1 - x / 100: the horizon is at x = 100.
+    homography = scale * np.array([[1.0, 0, 0], [0, 1, 0], [-0.01, 0, 1]])
+    points = np.array([[0.0, 0], [99, 0], [101, 0], [150, 0]])
+    mapped = project_visible(points, homography, (10_000, 10))
+    assert np.isfinite(mapped[:2]).all()
+    assert np.isnan(mapped[2:]).all()
+    # x = -300 + ... at 150 maps to -300, at 50 to 100.
+    assert np.isnan(project_visible(np.array([[150.0, 0]]), homography, (1000, 10))).all()
+    np.testing.assert_allclose(
+        project_visible(np.array([[50.0, 0]]), homography, (1000, 10)), [[100, 0]]
+    )
+
+
+@given(
+    angle=st.floats(-3, 3),
+    scale=st.floats(0.5, 2),
+    shift=st.tuples(st.floats(-30, 30), st.floats(-30, 30)),
+    tilt=st.floats(-1e-3, 1e-3),
+)
+def test_what_is_seen_there_is_found_back(
+    angle: float, scale: float, shift: tuple[float, float], tilt: float
+) -> None:
+    c, s = scale * np.cos(angle), scale * np.sin(angle)
+    homography = np.array([[c, -s, shift[0]], [s, c, shift[1]], [tilt, 0, 1]])
+    points = np.stack(np.meshgrid(np.arange(0, 64, 7), np.arange(0, 48, 7)), -1).reshape(-1, 2)
+    there = project_visible(points, homography, (64, 48))
+    seen = np.isfinite(there[:, 0])
+    assert inside(there[seen], (64, 48)).all()
+    back = project_visible(there[seen], np.linalg.inv(homography), (64, 48))
+    np.testing.assert_allclose(back, points[seen], atol=1e-6)

@@ -1,0 +1,252 @@
+"""The stereo benchmark on a corner of cones, beside the truth and beside known answers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetect, OptionError
+from deepdetect.datasets.middlebury import load_calibrated_pair, load_middlebury
+from deepdetect.datasets.types import CalibratedStereoPair, StereoPair
+from deepdetect.evaluation.baselines.opencv import self_described
+from deepdetect.evaluation.benchmarks import plan_middlebury
+from deepdetect.evaluation.cache import StageCache
+from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.options import BenchmarkOptions
+from deepdetect.evaluation.profiling import StageProfiler
+from deepdetect.evaluation.protocols.masks import LabelDetector
+from deepdetect.evaluation.protocols.stereo import (
+    AS_IT_IS,
+    SHIFTED,
+    count_voxels,
+    ground_truths,
+    photometric_error,
+    score_stereo_matches,
+    shift_view,
+    view_offset,
+)
+from deepdetect.evaluation.protocols.stereo_pipelines import (
+    STAGES,
+    paper_points,
+    pipelines,
+    sgbm,
+)
+from deepdetect.evaluation.report import Section
+from deepdetect.geometry.camera import Calibration, Camera
+
+TOP, LEFT, HEIGHT, WIDTH = 120, 100, 160, 260
+
+
+@pytest.fixture(scope="module")
+def data(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A corner of cones, and the same without its truth."""
+    root = tmp_path_factory.mktemp("stereo")
+    source = shared / "data" / "middlebury" / "cones"
+    calibration = json.loads((source / "calib.json").read_text())
+    for name in ("cones", "nothing-known"):
+        folder = root / "middlebury" / name
+        folder.mkdir(parents=True)
+        known = dict(calibration, width=WIDTH, height=HEIGHT)
+        if name != "cones":
+            del known["ground_truth"]
+        (folder / "calib.json").write_text(json.dumps(known))
+        for file in ("left.png", "right.png", "disparity.png"):
+            with Image.open(source / file) as image:
+                image.crop((LEFT, TOP, LEFT + WIDTH, TOP + HEIGHT)).save(folder / file)
+    return root
+
+
+@pytest.fixture(scope="module")
+def options() -> BenchmarkOptions:
+    return BenchmarkOptions(DeepDetect(), ("paper",), ("sift", "sift-low"))
+
+
+@pytest.fixture(scope="module")
+def section(
+    data: Path, options: BenchmarkOptions, tmp_path_factory: pytest.TempPathFactory, no_bar
+) -> Section:
+    cache = StageCache(tmp_path_factory.mktemp("cache"))
+    context = BenchmarkContext(data, cache)
+    (plan,) = plan_middlebury(context, options)
+    assert len(plan) == 2 * len(pipelines(options))
+    found = plan.run(context, no_bar)
+    made = cache.made
+    assert plan.run(context, no_bar).tables == found.tables
+    assert cache.made == made
+    assert [note for note in context.skipped if "nothing-known" in note]
+    return found
+
+
+def rows(section: Section, key: str) -> dict[str, dict[str, object]]:
+    (table,) = [table for table in section.tables if table.key == key]
+    titles = [column.title for column in table.columns]
+    return {str(row[0]): dict(zip(titles, row, strict=True)) for row in table.rows}
+
+
+def test_ours_is_exact_and_the_baselines_are_there(section: Section) -> None:
+    found = rows(section, "middlebury_cones")
+    ours = found["ours, weights dense"]
+    assert ours["points"] > 8_000
+    assert ours["1 - bad-1"] > 0.97
+    assert ours["1 - bad-2"] > 0.985
+    assert ours["of them filled"] == 0
+    every = found["all pixels, --density 1"]
+    assert every["completeness at 1 px"] > found["baseline: all pixels"]["completeness at 1 px"]
+    assert every["of them filled"] > 0
+    assert found["baseline: all pixels"]["points"] > ours["points"]
+    random = found["baseline: as many random pixels as ours"]
+    assert random["points"] == pytest.approx(ours["points"], rel=0.3)
+    assert found["OpenCV's SGBM"]["completeness at 1 px"] > 0.6
+    assert found["SIFT, low settings"]["points"] > found["SIFT"]["points"]
+    published = found["the paper's pipeline, weights dense"]
+    assert published["points, in the paper"] == 49_979
+
+
+def test_every_pipeline_tells_what_its_stages_took(section: Section) -> None:
+    for name, row in rows(section, "middlebury_cones").items():
+        seconds = [row[f"{stage}, s"] for stage in STAGES]
+        known = [value for value in seconds if value is not None]
+        assert known, name
+        assert row["seconds"] == pytest.approx(sum(known))
+        assert (row["matching, s"] or 0) > 0, name
+
+
+def test_without_a_truth_nothing_is_judged(section: Section) -> None:
+    judged, blank = (rows(section, f"middlebury_{s}") for s in ("cones", "nothing-known"))
+    for name, row in blank.items():
+        assert row["1 - bad-1"] is None
+        assert row["F-score"] is None
+        if name.startswith(("ours", "all", "baseline: all", "OpenCV")):
+            assert row["points"] == judged[name]["points"]
+
+
+def test_figure_8_is_a_picture_with_counts(section: Section) -> None:
+    figures = {figure.key: figure for figure in section.figures}
+    assert list(figures) == ["figure8_cones", "figure8_nothing-known"]
+    figure = figures["figure8_cones"]
+    points = rows(section, "middlebury_cones")["ours, weights dense"]["points"]
+    assert f"ours {points:,}" in figure.title
+    picture = cv2.imdecode(np.frombuffer(figure.png, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.std() > 20
+
+
+def test_the_weights_are_named_in_rows_of_their_own(data: Path) -> None:
+    second = DeepDetect().weights
+    options = BenchmarkOptions(DeepDetect(), ("paper",), (), geometry_weights=("dense", second))
+    titles = [pipeline.title for pipeline in pipelines(options)]
+    assert titles[:2] == ["ours, weights dense", "ours, weights default"]
+    assert sum(title.startswith("the paper's pipeline") for title in titles) == 2
+    assert len(set(titles)) == len(titles)
+
+
+def test_weights_of_one_name_are_refused(tmp_path: Path, one_line) -> None:
+    """One row would hide the other."""
+    with pytest.raises(OptionError, match="rename") as caught:
+        BenchmarkOptions(DeepDetect(), geometry_weights=("a/model.onnx", "b/model.onnx"))
+    one_line(caught.value)
+
+
+def test_the_weights_for_stereo_are_run_as_the_others() -> None:
+    detector = DeepDetect(backend="onnxruntime", threads=1)
+    found = BenchmarkOptions(detector, ("paper",), ()).stereo_detectors()["dense"]
+    assert found.backend == "onnxruntime"
+    assert found.weights == DeepDetect("dense").weights
+
+
+def test_voxels_are_cubes_with_a_point() -> None:
+    camera = Camera((101, 101), 100.0)
+    calibration = Calibration(camera, camera, baseline_mm=10)
+    # Depth 1000 / disparity; at a depth of 100 mm a pixel is 1 mm.
+    pixels = np.array([[50.2, 50.2], [50.7, 50.2], [53.2, 50.2], [50.2, 50.2], [10, 10]])
+    disparity = np.array([10.0, 10, 10, 5, -1])
+    assert count_voxels(calibration, pixels, disparity, 2.0) == 3
+
+
+def test_sgbm_finds_a_shift() -> None:
+    texture = np.random.default_rng(0).integers(0, 256, (80, 200, 3), np.uint8)
+    texture = cv2.GaussianBlur(texture, (0, 0), 1)
+    left, right = texture[:, :180], texture[:, 9:189]
+    camera = Camera((180, 80), 100.0)
+
+    found = sgbm(
+        CalibratedStereoPair(
+            "shift", left, right, np.full(left.shape[:2], np.nan), Calibration(camera, camera)
+        )
+    )
+    assert (np.abs(found.disparity - 9) < 0.5).mean() > 0.98
+    assert len(found.pixels) > 0.9 * 80 * 171
+
+
+def test_the_papers_pipeline_keeps_what_lies_on_a_row(data: Path) -> None:
+    scene = load_calibrated_pair(data / "middlebury" / "cones")
+    with StageProfiler() as profiler:
+        points0, points1 = paper_points(self_described("sift-low", "SIFT"), scene, profiler)
+    assert list(profiler.stages) == list(STAGES)
+    assert len(points0) == len(points1) > 1_000
+    assert (np.abs(points0[:, 1] - points1[:, 1]) <= 1).mean() > 0.98
+
+
+@pytest.fixture(scope="module")
+def cones(shared: Path) -> StereoPair:
+    return load_middlebury(shared / "data" / "middlebury" / "cones")
+
+
+def test_a_truth_of_its_own_photographs_stays(cones: StereoPair, shared: Path) -> None:
+    assert view_offset(cones) == 0
+    assert list(ground_truths(shared / "data" / "middlebury" / "cones")) == [AS_IT_IS]
+
+
+@pytest.mark.parametrize("offset", [-1, 1])
+def test_a_truth_of_another_view_is_found(cones: StereoPair, offset: int) -> None:
+    """Seen from one baseline to the left, it must be moved one to the right, and back."""
+    elsewhere = StereoPair("x", cones.left, cones.right, shift_view(cones.disparity, -offset))
+    assert view_offset(elsewhere) == offset
+    back = shift_view(elsewhere.disparity, offset)
+    both = np.isfinite(back) & np.isfinite(cones.disparity)
+    assert (np.abs(back - cones.disparity)[both] <= 1).mean() > 0.97
+    assert photometric_error(cones, back) < 1.2 * photometric_error(cones, cones.disparity)
+
+
+def test_the_truth_of_dolls_is_two_view_offset(shared: Path) -> None:
+    found = ground_truths(shared / "data" / "middlebury" / "dolls")
+    assert list(found) == [AS_IT_IS, SHIFTED]
+    pair = load_middlebury(shared / "data" / "middlebury" / "dolls")
+    np.testing.assert_array_equal(found[SHIFTED], shift_view(pair.disparity, 2))
+
+
+def test_the_nearest_place_hides_the_others() -> None:
+    row = np.array([[np.nan, 0.0, 0.0, 2.0, 1.0]])
+    np.testing.assert_array_equal(shift_view(row, 1), [[np.nan, 2.0, 0.0, 1.0, np.nan]])
+    np.testing.assert_array_equal(shift_view(row, 0), row)
+
+
+@pytest.fixture
+def shifted_pair(photo: np.ndarray) -> StereoPair:
+    """A photograph and itself, moved by 6 pixels: the truth is exact."""
+    left, right = photo[:120, :-6], photo[:120, 6:]
+    return StereoPair("moved", left, right, np.full(left.shape[:2], 6.0, np.float32))
+
+
+def test_each_source_is_beside_its_chance_level(shifted_pair: StereoPair) -> None:
+    pair = shifted_pair
+    rows = score_stereo_matches({"labels": LabelDetector()}, [pair, pair])
+    assert [row.source for row in rows] == [
+        *(["labels"] * 2),
+        *(["random, as labels"] * 2),
+        *(["all pixels"] * 2),
+    ]
+    labels, _, chance, _, every, _ = rows
+    assert chance.density == pytest.approx(labels.density, abs=0.001)
+    assert every.density == 1
+    assert labels.score.precision > 0.9
+    assert chance.score.precision < labels.score.precision
+    assert labels.score.evaluated == labels.score.matches
+    wrong = StereoPair(pair.name, pair.left, pair.right, pair.disparity + 3)
+    found = score_stereo_matches({"labels": LabelDetector()}, [wrong])
+    assert found[0].score.precision < 0.1
+    assert found[0].score.matches == labels.score.matches, "the truth is for judging only"

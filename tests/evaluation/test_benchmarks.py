@@ -1,0 +1,62 @@
+"""All 116 scenes and the usual 108, each under its name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect
+from deepdetect.datasets.hpatches import in_d2net_subset
+from deepdetect.datasets.types import PlanarScene
+from deepdetect.evaluation import benchmarks
+from deepdetect.evaluation.benchmarks import hpatches_subsets, plan_hpatches
+from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.options import BenchmarkOptions
+
+LARGE = (
+    *("i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding"),
+    *("v_artisans", "v_astronautis", "v_talent"),
+)
+"""Scenes with images that D2-Net's authors left out, and nearly all papers since."""
+
+
+def scene(name: str) -> PlanarScene:
+    images = tuple(Path(f"{name}/{number}.ppm") for number in range(1, 7))
+    return PlanarScene(name, images, tuple(np.eye(3) for _ in range(5)))
+
+
+@pytest.fixture
+def every() -> list[PlanarScene]:
+    others = [f"i_other{n}" for n in range(52)] + [f"v_other{n}" for n in range(56)]
+    return [scene(name) for name in (*LARGE, *others)]
+
+
+def test_the_d2_net_subset_has_108_scenes(every: list[PlanarScene]) -> None:
+    assert [one.name for one in every if not in_d2net_subset(one)] == list(LARGE)
+    sets = dict(hpatches_subsets(every))
+    assert {name: len(chosen) for name, chosen in sets.items()} == {
+        "all 116 scenes": 116,
+        "the 108 scenes of D2-Net": 108,
+    }
+    assert not {one.name for one in sets["the 108 scenes of D2-Net"]} & set(LARGE)
+
+
+def test_both_sets_are_labelled_sections(
+    every: list[PlanarScene], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(benchmarks, "load_hpatches", lambda folder: every)
+    options = BenchmarkOptions(DeepDetect(), ("standard",), ())
+    plans = plan_hpatches(BenchmarkContext(tmp_path), options)
+    assert [plan.title for plan in plans] == [
+        "HPatches, all 116 scenes, the standard protocol",
+        "HPatches, the 108 scenes of D2-Net, the standard protocol",
+    ]
+    methods = len(options.standard_features())
+    assert [len(plan) for plan in plans] == [methods * 5 * 116, methods * 5 * 108]
+
+
+def test_few_scenes_are_said_to_be_few() -> None:
+    sets = dict(hpatches_subsets([scene("v_dogman"), scene("i_pool")]))
+    assert list(sets) == ["all 2 scenes"]

@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetect, OptionError, SelectionOptions, match_images
+from deepdetect.datasets.oxford import SCENES, load_oxford
+from deepdetect.detector.heatmap import HeatmapOptions
+from deepdetect.evaluation.baselines.method import heatmap_feature
+from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.evaluate import evaluate, evaluate_oxford
+from deepdetect.evaluation.options import PAPER_RESOLUTION_PX, THRESHOLDS
+from deepdetect.evaluation.protocols import paper
+from deepdetect.evaluation.protocols.masks import LabelDetector
+from deepdetect.evaluation.protocols.paper import OXFORD_PAIRS, mean_correct_matches
+from deepdetect.geometry.residuals import transfer_errors
+from deepdetect.io.image import luma
+from deepdetect.labels import fuse
+
+SIZE = 160
+
+
+@pytest.fixture
+def few_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small images have few matches, whose sixty-four seeds would take minutes."""
+    monkeypatch.setattr(paper, "MANY_SEEDS", 4)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight scenes of small crops, each image shifted by whole pixels against the first."""
+    from skimage import data
+
+    root = tmp_path_factory.mktemp("oxford")
+    image = cv2.resize(data.astronaut(), (384, 384), interpolation=cv2.INTER_AREA)
+    for index, scene in enumerate(SCENES):
+        (root / scene).mkdir()
+        for number in range(1, 7):
+            left, top = 8 * index + 2 * (number - 1), 40 + number - 1
+            crop = np.ascontiguousarray(image[top : top + SIZE, left : left + SIZE])
+            Image.fromarray(crop).save(root / scene / f"img{number}.png")
+            if number > 1:
+                shift = f"1 0 {-2 * (number - 1)} 0 1 {-(number - 1)} 0 0 1"
+                (root / scene / f"H1to{number}p").write_text(shift)
+    return root
+
+
+@pytest.mark.usefixtures("few_seeds")
+def test_shifted_images_repeat_and_match(folder: Path) -> None:
+    found = evaluate_oxford(DeepDetect(), load_oxford(folder))
+    densities = [found.density[threshold] for threshold in THRESHOLDS]
+    assert densities == sorted(densities, reverse=True)
+    assert 0.1 < densities[0] < 0.9
+    assert set(found.repeatability) == set(SCENES)
+    assert min(found.repeatability.values()) > 0.8
+    assert set(found.correct) == {f"{scene} 1-{number}" for scene, number in OXFORD_PAIRS}
+    for pair, correct in found.correct.items():
+        assert 0.5 * found.matches[pair] < correct <= found.matches[pair]
+
+
+@pytest.mark.slow
+def test_the_pretrained_weights_are_as_dense_as_the_paper_s(shared: Path) -> None:
+    """All 48 images of Oxford: within 0.04 at each threshold."""
+    pytest.importorskip("torch", reason="needs torch to read the published weights")
+    published = shared / "reference" / "published_matching.safetensors"
+    squashing = [
+        detector.configured(HeatmapOptions(480))
+        for detector in (DeepDetect(), DeepDetect(published))
+    ]
+    images = [path for scene in load_oxford(shared / "data" / "oxford") for path in scene.images]
+    maps = [[detector.heatmap(path) for path in images] for detector in squashing]
+    ours, theirs = (
+        [np.mean([(heatmap > threshold).mean() for heatmap in own]) for threshold in THRESHOLDS]
+        for own in maps
+    )
+    assert ours == sorted(ours, reverse=True)
+    np.testing.assert_allclose(ours, theirs, atol=0.04)
+
+
+@pytest.mark.usefixtures("few_seeds")
+def test_the_command_prints_weights_side_by_side(run_evaluate, folder: Path) -> None:
+    weights = "src/deepdetect/detector/weights/default.onnx"
+    text = run_evaluate("--compare", weights, "--oxford", folder)
+    for word in ("BCE", "tau 0.9", "graf 1-6", "boat 1-2", "mean"):
+        assert word in text
+    for word in ("graf 1-6", "normal (1 images)", "tau 0.9", "bark"):
+        line = next(line for line in text.splitlines() if word in line)
+        cells = line.split(word)[1].replace(" / ", "/").split()
+        assert len(cells) == 2
+        assert cells[0] == cells[1], "the same weights give the same"
+
+
+@pytest.mark.usefixtures("few_seeds")
+def test_the_labels_join_as_weights_without_error(run_evaluate, folder: Path) -> None:
+    text = run_evaluate("--labels", "--oxford", folder)
+    for word in ("graf 1-6", "tau 0.9", "bark"):
+        line = next(line for line in text.splitlines() if word in line)
+        cells = line.split(word)[1].replace(" / ", "/").split()
+        assert len(cells) == 2
+        assert cells[0] != cells[1]
+    densities = [line.split()[-1] for line in text.splitlines() if "tau" in line]
+    assert float(densities[0]) > 0.1
+
+
+def test_labels_without_oxford_are_refused(tmp_path: Path) -> None:
+    from click.testing import CliRunner
+
+    from deepdetect.cli import main
+
+    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--labels"])
+    assert result.exit_code == 2
+    assert "--oxford" in result.output
+    assert "Traceback" not in result.output
+
+
+@pytest.mark.parametrize(("correct", "seeds"), [(1000, 3), (999, 64), (0, 64)])
+def test_few_matches_are_counted_with_many_seeds(
+    correct: int, seeds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[int] = []
+
+    def counted(*_: object) -> tuple[int, int]:
+        tried.append(len(tried))
+        return correct, correct + 20
+
+    monkeypatch.setattr(paper, "correct_matches", counted)
+    assert mean_correct_matches(None, None, None) == (correct, correct + 20)
+    assert tried == list(range(seeds))
+
+
+def test_counts_are_those_of_the_published_matching(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(paper, "MANY_SEEDS", 2)
+    pair = next(iter(load_oxford(folder)[0].pairs()))
+    labels = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
+    feature = heatmap_feature(labels, SelectionOptions(), name="a", title="A", version="1")
+    counts = []
+    for seed in range(2):
+        found = match_images(
+            pair.first, pair.second, labels, preset="published", heatmap=None, seed=seed
+        )
+        errors = transfer_errors(found.points0, found.points1, pair.homography)
+        counts.append([np.count_nonzero(errors < 1), len(found)])
+    expected = np.rint(np.mean(counts, axis=0)).astype(int).tolist()
+    assert expected[1] > 0
+    assert list(mean_correct_matches(BenchmarkContext(folder), feature, pair)) == expected
+
+
+def test_all_weights_see_the_images_alike(run_evaluate, tmp_path: Path) -> None:
+    import json
+
+    found = json.loads(run_evaluate("--compare", "deepdetect.onnx", "--resolution", 160, "--json"))
+    native = json.loads(run_evaluate("--json"))
+    assert found["normal"] == found["compare"][0]["normal"] != native["normal"]
+
+
+def test_samples_and_their_scales(tmp_path: Path, photo: np.ndarray) -> None:
+    Image.fromarray(photo).save(tmp_path / "image_1.png")
+    Image.fromarray(fuse(luma(photo)).mask).save(tmp_path / "mask_image_1.png")
+    found = evaluate(samples=tmp_path, scales=(1, 0.5))
+    assert found.oxford is None
+    assert [row.scale for row in found.scales] == [1, 0.5]
+    assert found.masks == {"normal": found.scales[0].score}
+    assert evaluate().masks == {}
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [({"scales": (0.5,)}, "samples"), ({"sample": "x"}, "'samples'"), ({"scales": (0,)}, "above")],
+)
+def test_wrong_options_are_said(options: dict, named: str, one_line) -> None:
+    with pytest.raises(OptionError) as caught:
+        evaluate(**options)
+    assert named in one_line(caught.value)

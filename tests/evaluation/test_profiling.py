@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from deepdetect import MissingExtraError
+from deepdetect.evaluation.profiling import StageProfiler, peak_memory, profiled
+
+
+def test_the_time_is_that_of_the_block() -> None:
+    started = time.perf_counter()
+    with profiled() as profile:
+        time.sleep(0.05)
+    assert 0.05 <= profile.seconds <= time.perf_counter() - started
+    before = profile.seconds
+    time.sleep(0.01)
+    assert profile.seconds == before
+
+
+def test_memory_that_is_freed_within_the_block_counts() -> None:
+    with profiled() as profile:
+        block = np.ones(16_000_000)
+        time.sleep(0.1)
+        del block
+    assert 120e6 < profile.memory < 300e6
+
+
+def test_what_an_earlier_stage_holds_counts_in_the_whole() -> None:
+    with StageProfiler() as profiler:
+        held = [np.ones(8_000_000)]
+        profiler.record("first")
+        held.append(np.ones(8_000_000))
+        profiler.record("second")
+    assert all(50e6 < profile.memory < 100e6 for profile in profiler.stages.values())
+    assert 110e6 < profiler.memory < 180e6
+    assert len(held) == 2
+
+
+def test_stages_of_one_name_add_up() -> None:
+    with StageProfiler() as profiler:
+        for _ in range(2):
+            time.sleep(0.02)
+            profiler.record("waiting")
+    assert list(profiler.stages) == ["waiting"]
+    assert profiler.stages["waiting"].seconds >= 0.04
+
+
+def test_a_block_that_takes_nothing_grows_by_little() -> None:
+    held = np.ones(8_000_000)
+    with profiled() as profile:
+        time.sleep(0.02)
+    assert 0 <= profile.memory < 30e6
+    with profiled() as profile:
+        del held
+        time.sleep(0.02)
+    assert 0 <= profile.memory < 30e6
+
+
+def test_an_error_passes_through() -> None:
+    with pytest.raises(ValueError, match="inside"), profiled() as profile:
+        raise ValueError("inside")
+    assert profile.seconds > 0
+
+
+def test_blocks_may_be_nested() -> None:
+    with profiled() as outer:
+        with profiled() as inner:
+            time.sleep(0.02)
+        time.sleep(0.02)
+    assert outer.seconds > inner.seconds >= 0.02
+
+
+def test_the_peak_is_at_least_what_is_held() -> None:
+    block = np.ones(30_000_000)
+    assert peak_memory() > block.nbytes
+
+
+def test_the_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
+    monkeypatch.setitem(sys.modules, "psutil", None)
+    with pytest.raises(MissingExtraError, match="psutil") as caught:
+        StageProfiler()
+    assert "pip install" in one_line(caught.value)

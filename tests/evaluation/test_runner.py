@@ -1,0 +1,420 @@
+"""The paper's protocol on eight small scenes, beside counts that are made without this package."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
+
+from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError
+from deepdetect.evaluation import runner
+from deepdetect.evaluation.baselines.method import BaselineError, LocalFeature
+from deepdetect.evaluation.baselines.opencv import CLASSICAL
+from deepdetect.evaluation.benchmarks import BENCHMARKS
+from deepdetect.evaluation.cache import StageCache
+from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.metrics import repeatability
+from deepdetect.evaluation.options import PROTOCOLS, BenchmarkOptions
+from deepdetect.evaluation.protocols.paper_numbers import NOTEBOOK_MATCHES
+from deepdetect.evaluation.report import Report
+from deepdetect.evaluation.runner import run_benchmarks
+from deepdetect.features.keypoints import Keypoints
+
+MADE = "results made, not found in the cache"
+SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
+PAIRS = ("graf 1-6", "wall 1-6", "bikes 1-6", "leuven 1-6", "trees 1-6", "ubc 1-6", "boat 1-2")
+
+
+def gray(path: Path) -> np.ndarray:
+    return cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2GRAY)
+
+
+def broken_feature(error: Exception) -> LocalFeature:
+    def detect(rgb: np.ndarray) -> Keypoints:
+        raise error
+
+    return LocalFeature("broken", "Broken", detect, CLASSICAL["fast"].describe)
+
+
+@dataclass
+class Runs:
+    """One cache, filled by one run after the other; with the steps that the bar saw."""
+
+    first: Report
+    again: Report
+    more: Report
+    total: int
+    done: list[int]
+
+
+@pytest.fixture(scope="module")
+def options(edge_detector: DeepDetect) -> BenchmarkOptions:
+    return BenchmarkOptions(edge_detector, ("paper",), ("fast", "orb-low"))
+
+
+@pytest.fixture(scope="module")
+def more_options(options: BenchmarkOptions) -> BenchmarkOptions:
+    return dataclasses.replace(options, others=(CLASSICAL["orb"],))
+
+
+class Bar:
+    """A progress bar that keeps account."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self.done: list[int] = []
+
+    def __call__(self, total: int, *_: object) -> Bar:
+        self.total = total
+        return self
+
+    def __enter__(self) -> Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def update(self, steps: int) -> None:
+        self.done.append(steps)
+
+    def set_postfix_str(self, text: str, refresh: bool) -> None:
+        assert text
+
+
+@pytest.fixture(scope="module")
+def runs(
+    oxford_folder: Path,
+    options: BenchmarkOptions,
+    more_options: BenchmarkOptions,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Runs:
+    cache = tmp_path_factory.mktemp("cache")
+    bar = Bar()
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(runner, "progress", bar)
+        first = run_benchmarks(["oxford"], oxford_folder, options, cache=cache)
+    again, more = (
+        run_benchmarks(["oxford"], oxford_folder, chosen, cache=cache)
+        for chosen in (options, more_options)
+    )
+    return Runs(first, again, more, bar.total, bar.done)
+
+
+def table(report: Report, key: str) -> dict[str, dict[str, object]]:
+    """Return a table as rows by title, of cells by column."""
+    (found,) = [table for table in report.tables() if table.key == key]
+    titles = [column.title for column in found.columns]
+    return {str(row[0]): dict(zip(titles, row, strict=True)) for row in found.rows}
+
+
+def images(folder: Path, scene: str) -> list[Path]:
+    return [folder / "oxford" / scene / f"img{number}.png" for number in range(1, 7)]
+
+
+def read_matrix(folder: Path, scene: str, number: int) -> np.ndarray:
+    return np.loadtxt(folder / "oxford" / scene / f"H1to{number}p")
+
+
+def moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    return cv2.perspectiveTransform(points[None].astype(np.float64), matrix)[0]
+
+
+OURS = [f"DeepDetect, threshold {t}" for t in (0.5, 0.7, 0.8, 0.9)]
+RANDOM = "baseline: as many random points as DeepDetect, threshold 0.5"
+ALL_PIXELS = "baseline: all pixels (a grid, where there is a budget)"
+
+
+def measured(rows: dict[str, dict[str, object]]) -> list[str]:
+    return [title for title in rows if "in the paper" not in title and "notebook" not in title]
+
+
+def test_all_rows_and_columns_are_there(runs: Runs) -> None:
+    rows = ["FAST", "ORB, low settings", *OURS, RANDOM, ALL_PIXELS]
+    density, repeated = (table(runs.first, f"oxford_{n}") for n in ("density", "repeatability"))
+    assert list(density) == measured(repeated) == rows
+    assert list(density["FAST"])[1:] == ["mean", "mean, in the paper", *SCENES]
+    assert list(repeated["FAST"])[1:] == ["mean", *SCENES]
+    matches = table(runs.first, "oxford_matches")
+    assert measured(matches) == ["ORB, low settings", OURS[0], RANDOM, ALL_PIXELS]
+    for title, known in NOTEBOOK_MATCHES.items():
+        correct, of_all = known["wall 1-6"]
+        cells = matches[f"{title}, in the authors' notebook"]
+        assert cells["wall 1-6"] == correct
+        assert cells["wall 1-6, precision"] == pytest.approx(correct / of_all)
+        assert cells["graf 1-6"] is None
+    columns = [name for pair in PAIRS for name in (pair, f"{pair}, precision")]
+    assert list(matches["ORB, low settings"])[1:] == columns
+    figure_6 = table(runs.first, "oxford_figure6")
+    assert measured(figure_6) == ["SIFT", "SIFT, low settings", OURS[0]]
+    assert runs.first.skipped == ()
+
+
+def test_density_equals_opencvs_count_over_the_pixels(runs: Runs, oxford_folder: Path) -> None:
+    row = table(runs.first, "oxford_density")["FAST"]
+    every = []
+    for scene in SCENES:
+        values = []
+        for path in images(oxford_folder, scene):
+            picture = gray(path)
+            found = cv2.FastFeatureDetector_create().detect(picture, None)
+            values.append(len(found) / picture.size)
+        assert row[scene] == pytest.approx(np.mean(values), abs=1e-12)
+        every += values
+    assert row["mean"] == pytest.approx(np.mean(every), abs=1e-12)
+    everything = table(runs.first, "oxford_density")[ALL_PIXELS]
+    assert {everything[name] for name in ("mean", *SCENES)} == {1}
+
+
+def test_random_points_are_as_dense_as_what_they_stand_beside(runs: Runs) -> None:
+    rows = table(runs.first, "oxford_density")
+    ours = rows["DeepDetect, threshold 0.5"]
+    chance = rows[RANDOM]
+    assert {name: ours[name] for name in SCENES} == {name: chance[name] for name in SCENES}
+
+
+def test_repeatability_equals_a_search_by_trees(runs: Runs, oxford_folder: Path) -> None:
+    row = table(runs.first, "oxford_repeatability")["FAST"]
+    for scene in SCENES:
+        points = [
+            np.array(
+                [p.pt for p in cv2.FastFeatureDetector_create().detect(gray(path), None)]
+            ).reshape(-1, 2)
+            for path in images(oxford_folder, scene)
+        ]
+        values = []
+        for number in range(2, 7):
+            fewest = min(len(points[0]), len(points[number - 1]))
+            if not fewest:
+                values.append(0.0)
+                continue
+            mapped = moved(points[0], read_matrix(oxford_folder, scene, number))
+            distance, _ = KDTree(points[number - 1]).query(mapped)
+            values.append(min((distance < 1).sum() / fewest, 1))
+        assert row[scene] == pytest.approx(np.mean(values), abs=1e-9), scene
+    assert row["mean"] == pytest.approx(np.mean([row[scene] for scene in SCENES]))
+
+
+@pytest.mark.parametrize("title", ["ORB, low settings", "ORB"])
+def test_correct_matches_equal_a_count_of_all_bits(
+    runs: Runs, oxford_folder: Path, title: str
+) -> None:
+    row = table(runs.more, "oxford_matches")[title]
+    detector = cv2.ORB_create(1_000_000, fastThreshold=1) if "low" in title else cv2.ORB_create()
+    first, second = images(oxford_folder, "boat")[:2]
+    points, bits = [], []
+    for path in (first, second):
+        keypoints = detector.detect(gray(path), None)
+        keypoints, described = cv2.ORB_create().compute(gray(path), keypoints)
+        points.append(np.array([p.pt for p in keypoints]))
+        bits.append(np.unpackbits(described, axis=1).astype(float))
+    every = cdist(*bits, "cityblock")
+    ordered = np.sort(every, axis=1)
+    kept = ordered[:, 0] < 0.99 * ordered[:, 1]
+    mapped = moved(points[0][kept], read_matrix(oxford_folder, "boat", 2))
+    errors = np.linalg.norm(mapped - points[1][every.argmin(1)[kept]], axis=1)
+    correct = int((errors < 1).sum())
+    assert correct > 5
+    assert row["boat 1-2"] == correct
+    assert row["boat 1-2, precision"] == pytest.approx(correct / kept.sum())
+    # The other scenes are too small for ORB: no matches, and no precision.
+    assert row["graf 1-6"] == 0
+    assert row["graf 1-6, precision"] is None
+
+
+def test_of_two_equal_images_every_match_is_correct(runs: Runs) -> None:
+    rows = table(runs.first, "oxford_matches")
+    for title in (
+        "DeepDetect, threshold 0.5",
+        ALL_PIXELS,
+    ):
+        assert rows[title]["ubc 1-6"] > 100
+        assert rows[title]["ubc 1-6, precision"] == 1
+    repeated = table(runs.first, "oxford_repeatability")
+    assert repeated[ALL_PIXELS]["ubc"] == 1
+
+
+def test_the_papers_numbers_are_beside_ours(runs: Runs) -> None:
+    density = table(runs.first, "oxford_density")
+    assert density["FAST"]["mean, in the paper"] == 0.0270
+    assert density[OURS[0]]["mean, in the paper"] == 0.5143
+    assert density[RANDOM]["mean, in the paper"] is None
+    paper = table(runs.first, "oxford_matches")[f"{OURS[0]}, in the paper"]
+    assert paper["graf 1-6"] == 102
+    assert paper["boat 1-2"] == 47_447
+    assert paper["graf 1-6, precision"] is None
+    assert table(runs.first, "oxford_repeatability")["R2D2, in the paper"]["wall"] == 0.71
+
+
+def test_the_tasks_done_add_up_to_the_total(runs: Runs) -> None:
+    assert sum(runs.done) == runs.total > 0
+    assert all(steps >= 0 for steps in runs.done)
+
+
+def test_a_second_run_makes_nothing_and_says_the_same(runs: Runs) -> None:
+    assert int(runs.first.metadata[MADE]) > 0
+    assert runs.again.metadata[MADE] == "0"
+    assert runs.again.sections == runs.first.sections
+
+
+def test_one_more_method_makes_only_its_own_results(runs: Runs, oxford_folder: Path) -> None:
+    def digest(path: Path) -> str:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+
+    files = {scene: [digest(path) for path in images(oxford_folder, scene)] for scene in SCENES}
+    keypoints = {name for scene in SCENES for name in files[scene]}
+    repeatability = {
+        (files[scene][0], files[scene][k - 1], read_matrix(oxford_folder, scene, k).tobytes())
+        for scene in SCENES
+        for k in range(2, 7)
+    }
+    expected = len(keypoints) + len(repeatability) + len(PAIRS)
+    assert int(runs.more.metadata[MADE]) == expected
+    # What was there before is as it was.
+    for key in ("oxford_density", "oxford_repeatability", "oxford_matches"):
+        before, after = table(runs.first, key), table(runs.more, key)
+        assert after.pop("ORB")
+        assert before == after
+
+
+def test_the_figures_are_pictures(runs: Runs) -> None:
+    keys = [figure.key for figure in runs.first.figures()]
+    assert len(set(keys)) == len(keys)
+    assert {"oxford_repeatability", "masks", "losses", "keypoints_graf"} <= set(keys)
+    assert {f"matches_{pair.replace(' ', '_')}" for pair in PAIRS} <= set(keys)
+    for figure in runs.first.figures():
+        picture = cv2.imdecode(np.frombuffer(figure.png, np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
+        assert picture.std() > 1
+
+
+def test_a_method_that_fails_is_skipped_and_the_others_stay(
+    low_visibility_folder: Path, options: BenchmarkOptions
+) -> None:
+    few = dataclasses.replace(options, classical=("fast", "fast-low"))
+    broken = broken_feature(BaselineError("it fails, as others' code does"))
+    alone, both = (
+        run_benchmarks(["low-visibility"], low_visibility_folder, chosen)
+        for chosen in (few, dataclasses.replace(few, others=(broken,)))
+    )
+    assert alone.skipped == ()
+    for key in ("density", "repeatability", "matches"):
+        before, after = (table(r, f"low_visibility_{key}") for r in (alone, both))
+        blank = after.pop("Broken")
+        assert set(list(blank.values())[1:]) == {None}
+        assert before == after
+    assert both.skipped
+    for note in both.skipped:
+        assert "Broken" in note
+        assert "it fails," in note
+        assert len(note.splitlines()) == 1
+    assert len(set(both.skipped)) == len(both.skipped)
+
+
+def test_a_bug_of_ours_ends_the_run(low_visibility_folder: Path, options: BenchmarkOptions) -> None:
+    buggy = dataclasses.replace(options, others=(broken_feature(ZeroDivisionError("a bug")),))
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        run_benchmarks(["low-visibility"], low_visibility_folder, buggy)
+
+
+@pytest.fixture
+def write_few(tmp_path: Path, write_scene) -> Callable[[str], Path]:
+    """Write the smallest data set of a benchmark."""
+
+    def write(name: str) -> Path:
+        folder = tmp_path / name
+        if name == "hpatches":
+            for scene in ("i_dc", "v_small"):
+                write_scene(folder / scene, (24, 20), np.eye(3), ("{}.ppm", "H_1_{}"))
+        elif name == "middlebury":
+            write_scene(folder / "cones", (64, 48), np.eye(3), ("{}.png", "H{}"), 2)
+            (folder / "cones" / "1.png").rename(folder / "cones" / "left.png")
+            (folder / "cones" / "2.png").rename(folder / "cones" / "right.png")
+            calibration = {"focal_px": 60, "width": 64, "height": 48}
+            (folder / "cones" / "calib.json").write_text(json.dumps(calibration))
+        else:
+            write_scene(folder, (48, 40), np.eye(3), ("{}.png", "H{}"), 2)
+            for number in (1, 2):
+                mask = np.zeros((40, 48), np.uint8)
+                mask[:, : 10 * number] = 255
+                Image.fromarray(mask).save(folder / f"{number}_mask.png")
+        return tmp_path
+
+    return write
+
+
+@pytest.mark.parametrize("name", ["hpatches", "middlebury", "foreground"])
+def test_every_benchmark_does_all_its_tasks(
+    name: str,
+    write_few: Callable[[str], Path],
+    options: BenchmarkOptions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(repeatability, "CHANCE_POINTS", 200)
+    context = BenchmarkContext(write_few(name), StageCache(tmp_path / "cache"))
+    all_protocols = dataclasses.replace(options, protocols=PROTOCOLS, classical=())
+    plans = BENCHMARKS[name].plan(context, all_protocols)
+    bar = Bar()
+    sections = [plan.run(context, bar) for plan in plans]
+    assert sum(bar.done) == sum(map(len, plans)) > 0
+    keys = [table.key for section in sections for table in section.tables]
+    assert keys
+    assert len(set(keys)) == len(keys)
+
+
+def test_the_speed_reads_nothing_from_the_cache(
+    oxford_folder: Path, options: BenchmarkOptions, tmp_path: Path
+) -> None:
+    few = dataclasses.replace(options, classical=("fast-low",))
+    report = run_benchmarks(["speed"], oxford_folder, few, cache=tmp_path / "cache")
+    assert not (tmp_path / "cache").exists()
+    rows = table(report, "speed")
+    picture = gray(images(oxford_folder, "graf")[0])
+    fast = cv2.FastFeatureDetector_create(1, False).detect(picture, None)
+    assert rows["FAST, low settings"]["keypoints"] == len(fast)
+    assert rows["FAST, low settings"]["slowest over fastest round"] >= 1
+    for name, row in rows.items():
+        assert all(row[f"{stage}, s"] > 0 for stage in ("describe", "match"))
+        # To know how many random points are wanted, the detector runs that they follow.
+        assert (row["detect, s"] is None) == name.startswith("baseline")
+
+
+def test_unknown_names_and_missing_data_are_said(
+    tmp_path: Path, options: BenchmarkOptions, one_line
+) -> None:
+    with pytest.raises(OptionError, match="did you mean 'oxford'") as caught:
+        run_benchmarks(["oxfrod"], tmp_path, options)
+    one_line(caught.value)
+    for name in BENCHMARKS:
+        if name == "speed":
+            continue
+        with pytest.raises(ImageError) as missing:
+            run_benchmarks([name], tmp_path, options)
+        assert str(tmp_path) in one_line(missing.value)
+
+
+def test_the_speed_says_that_its_data_are_missing(
+    tmp_path: Path, options: BenchmarkOptions, one_line
+) -> None:
+    with pytest.raises(ImageError) as missing:
+        run_benchmarks(["speed"], tmp_path, options)
+    one_line(missing.value)
+
+
+def test_a_cache_that_cannot_be_written_ends_the_run(
+    write_few: Callable[[str], Path], options: BenchmarkOptions, tmp_path: Path
+) -> None:
+    data = write_few("foreground")
+    (tmp_path / "cache").write_text("a file")
+    with pytest.raises(DeepDetectError, match="cannot write"):
+        run_benchmarks(["foreground"], data, options, cache=tmp_path / "cache")
