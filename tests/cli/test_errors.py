@@ -85,7 +85,7 @@ CASES = {
     "train label settings": "train {bad} -o {bad}/out --label-settings {bad}/matrix.txt",
     "label settings": "label {bad}/good.png -o {bad}/out --label-settings {bad}/no.toml",
     "evaluate oxford": "evaluate {bad} --oxford {bad}/empty",
-    "evaluate against": "evaluate {bad} --against {bad}/weights.onnx",
+    "evaluate against": "evaluate {bad} --compare {bad}/weights.onnx",
     "data set": "datasets get cocoo",
     "evaluate nothing": "evaluate {bad}/empty",
 }
