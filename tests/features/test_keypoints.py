@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect import OptionError
-from deepdetect.evaluation.baselines import CLASSICAL
+from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.features.keypoints import Keypoints, bayer_order, on_pixels
 from deepdetect.io.image import luma
 
