@@ -78,14 +78,13 @@ CASES = {
     "train nothing": "train {bad}/empty -o {bad}/out",
     "train missing": "train {bad}/nowhere -o {bad}/out",
     "train stage": "train {bad} -o {bad}/out --stage 240",
-    "train device": "train {bad} -o {bad}/out --device tpu",
     "train preset": "train {bad} -o {bad}/out --preset papers",
     "train start": "train {bad} -o {bad}/out --init {bad}/weights.safetensors",
-    "train loaders": "train {bad} -o {bad}/out --num-workers 0",
+    "train loaders": "train {bad} -o {bad}/out --num-workers -1",
     "train label settings": "train {bad} -o {bad}/out --label-settings {bad}/matrix.txt",
     "label settings": "label {bad}/good.png -o {bad}/out --label-settings {bad}/no.toml",
     "evaluate oxford": "evaluate {bad} --oxford {bad}/empty",
-    "evaluate against": "evaluate {bad} --compare {bad}/weights.onnx",
+    "evaluate compare": "evaluate {bad} --compare {bad}/weights.onnx",
     "data set": "datasets get cocoo",
     "evaluate nothing": "evaluate {bad}/empty",
 }
@@ -117,6 +116,7 @@ def test_one_sentence_and_exit_code_2(run, bad: Path, arguments: str) -> None:
         ("detect x.png --threshold high", "high"),
         ("detect x.png --resolution full", "native"),
         ("label x.png -o out --workers 0", "--workers"),
+        ("train x -o out --device tpu", "cuda"),
     ],
 )
 def test_usage_errors_name_the_right_word(run, arguments: str, hint: str) -> None:

@@ -15,11 +15,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-from deepdetect.training.cluster import DistributedContext, distributed_context  # noqa: E402
-from hypothesis import given  # noqa: E402
-from hypothesis import strategies as st  # noqa: E402
-
-from deepdetect import OptionError  # noqa: E402
+pytestmark = pytest.mark.slow  # torchrun starts two interpreters with torch in each test
 
 # Eight steps; at higher rates Adam makes much of the rounding in tiny gradients.
 ARGUMENTS = [
@@ -37,7 +33,7 @@ def launcher(processes: int) -> list[str]:
 
 
 def command(processes: int, photographs: Path, output: Path, labels: Path) -> list[str]:
-    """A tiny run in so many processes (gloo)."""
+    """The command of a tiny run in several processes (gloo)."""
     arguments = ["-m", "deepdetect", "train", str(photographs), "-o", str(output)]
     arguments += ["--labels", str(labels), "--device", "cpu", *ARGUMENTS]
     return [*launcher(processes), *arguments]
@@ -82,7 +78,7 @@ def test_two_processes_have_the_losses_of_one(
     assert max(losses) - min(losses) > 100 * 1e-4, "batches differ by much more than processes"
 
 
-def test_only_the_first_process_speaks(two_processes: tuple[Path, str]) -> None:
+def test_only_the_main_process_prints(two_processes: tuple[Path, str]) -> None:
     output = two_processes[1]
     assert output.count("best after epoch") == 1
     assert "2 processes" in output
@@ -96,22 +92,22 @@ import torch
 from safetensors.torch import save_file
 from torch.nn.functional import binary_cross_entropy_with_logits
 from deepdetect.detector.network.espnet import ESPNet
-from deepdetect.training.batch_norm import freeze_batch_norm
-from deepdetect.training.device import DeviceOptions, Engine
+from deepdetect.training.engine import Engine, freeze_batch_norm
+from deepdetect.training.recipe import DeviceOptions
 
 torch.manual_seed(0)
 network = ESPNet()
 engine = Engine(network, DeviceOptions("cpu", "float32", compile=False, threads=1))
 generator = np.random.default_rng(0)
-rgb = generator.integers(0, 256, (4, 64, 64, 3), np.uint8)
+rgb = torch.from_numpy(generator.integers(0, 256, (4, 64, 64, 3), np.uint8))
 masks = torch.from_numpy(generator.random((4, 1, 64, 64)) > 0.5).float()
-mine = engine.place.local_slice(4)
+mine = engine.context.local_slice(4)
 network.train()
 if sys.argv[2] == "frozen":
     freeze_batch_norm(network)
-loss = binary_cross_entropy_with_logits(engine.logits(engine.images(rgb[mine])), masks[mine])
+loss = binary_cross_entropy_with_logits(engine.logits(engine.to_float(rgb[mine])), masks[mine])
 engine.backward(loss)
-if engine.place.is_first:
+if engine.context.is_main:
     tensors = {f"gradient.{n}": p.grad.contiguous() for n, p in network.named_parameters()}
     tensors |= {n: b.float().contiguous() for n, b in network.named_buffers()}
     save_file(tensors, sys.argv[1])
@@ -143,7 +139,7 @@ def test_gradients_and_statistics_are_those_of_one_process(norm: str, tmp_path: 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds the processes in /proc")
-def test_a_killed_run_of_two_processes_goes_on_with_the_same_losses(
+def test_a_killed_run_of_two_processes_resumes_with_the_same_losses(
     photographs: Path, two_processes: tuple[Path, str], tmp_path: Path
 ) -> None:
     unbroken = two_processes[0]
@@ -181,11 +177,11 @@ def children(parent: int) -> list[int]:
     return found
 
 
-def test_an_uneven_share_is_told_before_any_work(photographs: Path, tmp_path: Path) -> None:
+def test_an_uneven_batch_is_reported_before_any_work(photographs: Path, tmp_path: Path) -> None:
     whole = [*command(2, photographs, tmp_path / "run", tmp_path / "labels"), "--stage", "64x3x1"]
     done = subprocess.run(whole, capture_output=True, text=True, timeout=300)
     assert done.returncode != 0
-    assert "a batch of 3 cannot be shared evenly by 2 processes" in done.stderr
+    assert "a batch of 3 cannot be divided evenly among 2 processes" in done.stderr
     assert "OptionError" not in done.stderr
     assert not (tmp_path / "labels").exists()
 
@@ -210,7 +206,7 @@ def test_processes_without_the_same_photographs_all_stop(photographs: Path, tmp_
     assert not (tmp_path / "run" / "checkpoint.safetensors").exists()
 
 
-def test_an_error_that_nobody_expected_ends_all(photographs: Path, tmp_path: Path) -> None:
+def test_an_unexpected_error_ends_all_processes(photographs: Path, tmp_path: Path) -> None:
     """Out of memory, say, in one process while the other waits for it."""
     script = tmp_path / "broken.py"
     arguments = ["train", str(photographs), "-o", str(tmp_path / "run"), "--device", "cpu"]
@@ -227,35 +223,3 @@ def test_an_error_that_nobody_expected_ends_all(photographs: Path, tmp_path: Pat
     done = subprocess.run([*launcher(2), str(script)], capture_output=True, text=True, timeout=300)
     assert done.returncode != 0
     assert "MemoryError: no more" in done.stderr
-
-
-@given(processes=st.integers(1, 9), part=st.integers(1, 9))
-def test_shares_cover_everything_once(processes: int, part: int) -> None:
-    count = processes * part
-    seen = [
-        k
-        for rank in range(processes)
-        for k in range(count)[
-            DistributedContext(rank, processes, rank, processes).local_slice(count)
-        ]
-    ]
-    assert seen == list(range(count))
-
-
-def test_the_place_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
-    monkeypatch.setenv("RANK", "3")
-    assert distributed_context() == DistributedContext(), (
-        "a variable of another program is no cluster"
-    )
-    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "run")
-    monkeypatch.setenv("WORLD_SIZE", "8")
-    monkeypatch.setenv("LOCAL_RANK", "1")
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "2")
-    place = distributed_context()
-    assert place == DistributedContext(3, 8, 1, 2)
-    assert place.machines == 4
-    assert not place.is_first
-    monkeypatch.setenv("LOCAL_WORLD_SIZE", "3")
-    with pytest.raises(OptionError, match="as many processes on each machine"):
-        distributed_context()

@@ -7,7 +7,7 @@ import pytest
 
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.options import replace_options
-from deepdetect.cli.recipe import chosen_recipe
+from deepdetect.cli._options import chosen_recipe
 from deepdetect.labels import find_label_settings
 from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions, training_preset
 from deepdetect.training.sampler import Schedule

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from .shared import PATH, json_option, print_json, print_table
+from ._options import PATH, json_option, print_json, print_table
 
 
 @click.command(short_help="The mean of several weights.")

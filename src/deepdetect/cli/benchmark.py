@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .shared import PATH, detector_options, json_option, make_detector, print_json
+from ._options import PATH, detector_options, json_option, make_detector, print_json
 
 NAMES = ("oxford", "hpatches", "middlebury", "foreground", "low-visibility", "speed", "all")
 

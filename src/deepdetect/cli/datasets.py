@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from .shared import PATH, json_option, print_json, print_table
+from ._options import PATH, json_option, print_json, print_table
 
 
 @click.group(short_help="Download data sets.")

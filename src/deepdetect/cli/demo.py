@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
-from .shared import (
+from ._options import (
     PATH,
     detector_options,
     json_option,
@@ -20,6 +19,8 @@ from .shared import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..datasets import StereoPair
     from ..detector.detector import HeatmapDetector
     from ..evaluation.metrics.stereo import StereoScore
@@ -137,6 +138,8 @@ def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> DemoR
 def _draw(
     pair: StereoPair, heatmap: np.ndarray, matches: Matches, errors: np.ndarray, folder: Path
 ) -> list[Path]:
+    import numpy as np
+
     from ..evaluation.metrics.stereo import TOLERANCE_PX, score_errors
     from ..viz.draw import (
         add_caption,

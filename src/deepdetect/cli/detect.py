@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from ._generated import generated_command, given_only
-from .shared import (
+from ._options import (
     PATH,
     SELECTION,
     detector_options,

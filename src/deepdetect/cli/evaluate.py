@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .shared import PATH, detector_options, json_option, make_detector, print_json
+from ._options import PATH, detector_options, json_option, make_detector, print_json
 
 if TYPE_CHECKING:
     from ..evaluation.evaluate import Evaluation, OxfordScore

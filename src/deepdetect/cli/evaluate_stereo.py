@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from .shared import PATH, json_option, print_json
+from ._options import PATH, json_option, print_json
 
 
 @click.command(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from .._shared.errors import OptionError
-from .shared import (
+from ._options import (
     PATH,
     chosen_label_settings,
     expand_images,

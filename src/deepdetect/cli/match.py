@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from ._generated import FieldOptions, generated_command, given_only
-from .shared import (
+from ._options import (
     PATH,
     SELECTION,
     detector_options,
@@ -57,6 +57,7 @@ GEOMETRY = FieldOptions(
 @click.pass_context
 def match(
     context: click.Context,
+    /,
     image0: Path,
     image1: Path,
     output: Path,
@@ -138,7 +139,7 @@ def match(
             ("density", f"{numbers['density0']:.3f} and {numbers['density1']:.3f}"),
             ("matches", f"{len(matches):,}"),
             (f"inliers ({matches.model})", f"{numbers['inliers']:,}"),
-            ("guided by", matches.guide.model if matches.guided else "nothing"),
+            ("guided by", matches.guide.model if matches.guide and matches.guided else "nothing"),
             *seconds_rows(matches.seconds),
             ("written", ", ".join(str(path) for path in (file, picture) if path)),
         ],

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ._generated import generated_command, given_only
-from .shared import (
+from ._options import (
     PATH,
     SELECTION,
     check_inputs_survive,

@@ -8,8 +8,16 @@ from typing import Any
 import click
 
 from ._generated import generated_command
-from .recipe import SHARDS, chosen_recipe, recipe_options
-from .shared import PATH, json_option, print_json, print_table, workers_option
+from ._options import (
+    PATH,
+    SHARDS,
+    chosen_recipe,
+    json_option,
+    print_json,
+    print_table,
+    recipe_options,
+    workers_option,
+)
 
 
 @generated_command(SHARDS, short_help="Pack images for training on sets too big for the memory.")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .._shared.errors import DeepDetectError, OptionError
-from .shared import (
+from ._options import (
     PATH,
     check_inputs_survive,
     detector_options,

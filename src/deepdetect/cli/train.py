@@ -15,8 +15,16 @@ import click
 
 from .._shared.errors import DeepDetectError
 from ._generated import FieldOptions, generated_command, given_only, with_flags
-from .recipe import RECIPE, chosen_recipe, recipe_options
-from .shared import PATH, json_option, print_json, print_table, workers_option
+from ._options import (
+    PATH,
+    RECIPE,
+    chosen_recipe,
+    json_option,
+    print_json,
+    print_table,
+    recipe_options,
+    workers_option,
+)
 
 if TYPE_CHECKING:
     from ..training import StageProfile, TrainingResult

@@ -134,7 +134,7 @@ def refine_matches(
         )
     pixels0 = pixels0.astype(np.int64)
     start = np.ascontiguousarray(points1, np.float64).reshape(-1, 2)
-    known: np.ndarray = np.isfinite(start).all(1)
+    known = np.asarray(np.isfinite(start).all(1))
     known[known] = ((start[known] >= 0) & (start[known] < gray1.shape[::-1])).all(1)
     if not known.all():
         found = refine_matches(gray0, gray1, pixels0[known], start[known], options)

@@ -150,7 +150,7 @@ class Engine:
         self._forward = self._set_up()
 
     def _set_up(self) -> nn.Module:
-        network = self.network
+        network: Any = self.network
         if self.compiled:
             # Not dynamic: there are only as many shapes as stages, and each gets its own code.
             network = torch.compile(network, dynamic=False)

@@ -174,7 +174,7 @@ class TrainingOptions:
             raise OptionError(f"`seed` must lie in [0, 2147483647], not {self.seed}")
         if not 0 <= self.final_learning_rate <= self.learning_rate:
             raise OptionError(
-                "`learning_rate` must be at least `final_learning_rate`, and that must not be negative"
+                "`learning_rate` must be at least `final_learning_rate`, and neither be negative"
             )
 
     def _check_sizes(self) -> None:
