@@ -1,0 +1,86 @@
+"""What the documentation names exists: links, files, commands with their flags, Python names."""
+
+from __future__ import annotations
+
+import pkgutil
+import re
+from pathlib import Path
+
+import click
+import pytest
+
+from deepdetect.cli import main
+
+ROOT = Path(__file__).parents[1]
+CARDS = ROOT / "src/deepdetect/detector/weights"
+PAGES = {
+    str(page.relative_to(ROOT)): page.read_text(encoding="utf-8")
+    for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *CARDS.glob("*CARD.md"))
+}
+PRESENT = {
+    name: text.partition("### Old and new names")[0] if name == "CHANGELOG.md" else text
+    for name, text in PAGES.items()
+    if name != "docs/history.md"  # its commands are as they were run
+}
+FOLDERS = "src|tests|benchmarks|docs|requirements"
+
+
+def code(text: str) -> list[str]:
+    """Return the lines of code blocks, continued ones joined, and what is in backticks."""
+    blocks = re.findall(r"^```\w*\n(.*?)^```", text, re.S | re.M)
+    lines = [line for block in blocks for line in re.sub(r"\\\n", " ", block).splitlines()]
+    inline = re.findall(r"`([^`]+)`", re.sub(r"^```.*?^```", "", text, flags=re.S | re.M))
+    return [*lines, *(" ".join(part.split()) for part in inline)]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page: str) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", PAGES[page]):
+        if not target.startswith(("http:", "https:", "mailto:")):
+            path, _, anchor = target.partition("#")
+            other = (ROOT / page).parent / path if path else ROOT / page
+            assert other.exists(), target
+            if anchor and other.suffix == ".md":
+                assert anchor in anchors(other.read_text(encoding="utf-8")), target
+
+
+def anchors(text: str) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PRESENT)
+def test_paths_exist(page: str) -> None:
+    for part in code(PRESENT[page]):
+        for path in re.findall(rf"(?<![\w/.-])(?:{FOLDERS})/[\w./-]+", part):
+            assert (ROOT / path).exists(), path
+
+
+@pytest.mark.parametrize("page", PRESENT)
+def test_commands_have_these_flags(page: str) -> None:
+    for part in code(PRESENT[page]):
+        for name, rest in re.findall(r"(?<!from )\bdeepdetect ([a-z][a-z-]+)\b([^#|]*)", part):
+            command = main.commands[name]
+            flags = {
+                flag
+                for option in command.get_params(click.Context(command))
+                for flag in (*option.opts, *option.secondary_opts)
+            }
+            assert set(re.findall(r"(?<!\S)--[\w-]+", rest)) <= flags | {"--help"}, (name, rest)
+
+
+@pytest.mark.parametrize("page", PRESENT)
+def test_python_names_exist(page: str) -> None:
+    for part in code(PRESENT[page]):
+        for name in re.findall(r"(?<![\w/.-])deepdetect(?:\.\w+)+", part):
+            if name != "deepdetect.onnx":
+                pkgutil.resolve_name(name)
+        if found := re.fullmatch(r"from (deepdetect[\w.]*) import ([\w, ]+)", part):
+            for name in found[2].split(", "):
+                pkgutil.resolve_name(f"{found[1]}:{name}")
+
+
+def test_the_index_lists_every_page() -> None:
+    pages = {Path(page).name for page in PAGES if page.startswith("docs/")} - {"index.md"}
+    assert pages <= set(re.findall(r"\((?:\.\./)?([\w.-]+)\)", PAGES["docs/index.md"]))
