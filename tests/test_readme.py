@@ -65,11 +65,6 @@ def test_it_starts_as_promised() -> None:
     assert commands[:2] == ["deepdetect detect left.png", "deepdetect match left.png right.png"]
 
 
-def test_links_lead_somewhere() -> None:
-    for target in re.findall(r"\]\(([^)]+)\)", README):
-        assert (ROOT / target).exists(), target
-
-
 def test_the_python_lines_run(folder: Path) -> None:
     for block in PYTHON:
         done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True)
