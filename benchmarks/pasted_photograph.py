@@ -4,9 +4,9 @@
 
 OXFORD holds refined homographies (`H1toKp.refined`), DATA the stereo scenes cones, teddy and art. A
 photograph that has nothing to do with the pair covers a quarter of the second image, its middle; of
-the keypoints that belong under it the share is printed that is matched nevertheless, the median and
-the largest over the seeds. The truth only tells which keypoints these are, and how many matches
-of the stereo pairs are right (within 1 px) without the photograph.
+the keypoints that belong under it the fraction is printed that is matched nevertheless, the median
+and the largest over the seeds. The ground truth says which keypoints these are, and how many
+matches of the stereo pairs are correct (within 1 px) without the photograph.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ def main() -> None:
             def moved(points: np.ndarray, homography: np.ndarray = pair.homography) -> np.ndarray:
                 return transform_points(points, homography)
 
-            told = under_photographs(first, second, moved, squashed, arguments.seeds)
-            print(f"{pair.name}: matched under {told}", flush=True)
+            texts = under_photographs(first, second, moved, squashed, arguments.seeds)
+            print(f"{pair.name}: matched under {texts}", flush=True)
     for name in SCENES if arguments.middlebury is not None else ():
         scene = load_middlebury(arguments.middlebury / name)
         whole = match_images(scene.left, scene.right, detector)
@@ -63,9 +63,9 @@ def main() -> None:
         def by_depth(points: np.ndarray, disparity: np.ndarray = scene.disparity) -> np.ndarray:
             return moved_by_disparity(points, disparity)
 
-        told = under_photographs(scene.left, scene.right, by_depth, detector, arguments.seeds)
+        texts = under_photographs(scene.left, scene.right, by_depth, detector, arguments.seeds)
         print(
-            f"{name}: {score.correct:,} right ({score.precision:.3f}), matched under {told}",
+            f"{name}: {score.correct:,} right ({score.precision:.3f}), matched under {texts}",
             flush=True,
         )
 
@@ -78,7 +78,7 @@ def under_photographs(
     seeds: int,
 ) -> str:
     """Return the shares under each photograph as text; `moved` is the truth."""
-    told = []
+    texts = []
     for name in PHOTOGRAPHS:
         pasted, box = paste(second, load_image(getattr(data, name)()))
         shares, guided = [], True
@@ -89,8 +89,8 @@ def under_photographs(
         text = f"{np.median(shares):.2%}"
         if seeds > 1:
             text += f" (at most {max(shares):.2%})"
-        told.append(f"{name} {text}{'' if guided else ' unguided'}")
-    return ", ".join(told)
+        texts.append(f"{name} {text}{'' if guided else ' unguided'}")
+    return ", ".join(texts)
 
 
 def moved_by_disparity(points: np.ndarray, disparity: np.ndarray) -> np.ndarray:
@@ -117,7 +117,7 @@ def share_under(
     moved: Callable[[np.ndarray], np.ndarray],
     box: tuple[int, int, int, int],
 ) -> float:
-    """Return which share of the first image's keypoints under the box is matched."""
+    """Return which fraction of the first image's keypoints under the box is matched."""
     left, top, width, height = box
 
     def under(points: np.ndarray) -> np.ndarray:

@@ -13,8 +13,8 @@ rows of each scene:
 - SGBM, framed: both views continued to the left by that range, so that OpenCV gives values
   also where the right view shows nothing.
 
-Shares are of the points whose true disparity is known; completeness is the share of the pixels
-with known truth, hidden ones too, that have a point within 1 px of it. The truth only judges.
+Fractions are of the points whose true disparity is known; completeness is the fraction of the
+pixels with known truth, occluded ones too, that have a point within 1 px of it.
 
 The true disparity of dolls is of another view than its photographs: two baselines aside. Its rows
 are given as the file says, and with the truth moved to the photographs' view.
@@ -59,7 +59,7 @@ def main() -> None:
                 found = compute()
                 seconds.append(time.perf_counter() - started)
             for note, truth in known.items():
-                print(f"{name + note:22s} {way:22s} {judged(found, truth)} {min(seconds):6.2f} s")
+                print(f"{name + note:22s} {way:22s} {scores(found, truth)} {min(seconds):6.2f} s")
 
 
 def ways(
@@ -119,7 +119,7 @@ def search_count(known: dict[str, np.ndarray | None]) -> int:
     return -(-(int(np.nanmax(truth)) + 2) // 16) * 16
 
 
-def judged(found: np.ndarray, truth: np.ndarray | None) -> str:
+def scores(found: np.ndarray, truth: np.ndarray | None) -> str:
     """Return points, shares within the tolerances and completeness as text."""
     points = int(np.isfinite(found).sum())
     if truth is None:

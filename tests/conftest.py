@@ -64,7 +64,7 @@ def photo() -> np.ndarray:
 class Facade:
     """Two views of a wall, 10 baselines away, and of a post before it at half that distance.
 
-    `near` (H, W) bool tells where the left view shows the post, `match` takes (N, 2) pixels of
+    `near` (H, W) bool is where the left view shows the post, `match` takes (N, 2) pixels of
     that view to their places in the right one.
     """
 

@@ -33,7 +33,7 @@ def test_every_error_is_a_deepdetect_error(kind: type[Exception]) -> None:
         ("SIFT", ("sift", "orb"), "sift"),
         ("shi_tomasi", ("shi-tomasi", "sift"), "shi-tomasi"),
         ("onnx", ("auto", "onnxruntime", "openvino", "torch"), "onnxruntime"),
-        # Names with capitals: the nearest one is judged without regard to case.
+        # Names with capitals: the nearest one is found without regard to case.
         ("CUDAExecutionProvidr", PROVIDERS, "CUDAExecutionProvider"),
         ("cudaexecutionprovider", PROVIDERS, "CUDAExecutionProvider"),
         ("CpuExecutionProvider", PROVIDERS, "CPUExecutionProvider"),

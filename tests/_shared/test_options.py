@@ -91,8 +91,8 @@ def test_a_whole_group_and_one_value_of_it() -> None:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_no_name_is_used_twice(preset: str) -> None:
-    # Keywords are told apart by name alone, so a name must have one home. Those of guided matching
-    # are given as a whole.
+    # Keywords go by name alone, so a name must have one home. Those of guided matching are given
+    # as a whole.
     options = PRESETS[preset]
     groups = [options, options.selection, options.geometry]
     groups += [options.heatmap] if options.heatmap is not None else []

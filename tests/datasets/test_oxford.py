@@ -11,7 +11,7 @@ from deepdetect.datasets.oxford import SCENES, find_scene, load_oxford
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The public layout, with homographies that can be told apart."""
+    """The public layout, with homographies that differ."""
     for index, scene in enumerate(SCENES):
         (tmp_path / scene).mkdir()
         for number in range(1, 7):

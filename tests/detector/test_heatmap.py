@@ -13,7 +13,7 @@ RGB = np.random.default_rng(11).integers(0, 256, (61, 90, 3), dtype=np.uint8)
 
 
 class Recorder:
-    """A network that keeps what it was shown; its answer tells the channels apart."""
+    """A network that keeps what it was shown; its answer differs between the channels."""
 
     def __init__(self) -> None:
         self.shown: list[np.ndarray] = []

@@ -22,7 +22,7 @@ from deepdetect.io.image import luma
 
 
 def make_gray(seed: int = 0, width: int = 90, height: int = 70) -> np.ndarray:
-    """A smooth random image: neighbouring pixels are alike, as in a photo."""
+    """A smooth random image: neighbouring pixels are similar, as in a photograph."""
     noise = np.random.default_rng(seed).integers(0, 256, (height, width)).astype(np.float32)
     smooth = cv2.GaussianBlur(noise, (0, 0), 2)
     return cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
@@ -234,8 +234,8 @@ def test_takes_none_and_one(count: int) -> None:
     assert correlation_distance(some, rows, some, rows, np.zeros(128, np.float32)).shape == (count,)
 
 
-def test_equal_descriptors_are_exactly_alike() -> None:
-    """What tells strangers that are all the same from strangers that are nearly so."""
+def test_equal_descriptors_have_no_distance() -> None:
+    """Null pairs that are all the same differ from ones that are nearly so."""
     generator = np.random.default_rng(0)
     first = generator.integers(0, 256, (20_000, 128)).astype(np.uint8)
     rows = np.arange(len(first))

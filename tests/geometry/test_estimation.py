@@ -71,7 +71,9 @@ def true_matrix(model: str) -> np.ndarray:
     return np.linalg.inv(CAMERA1).T @ essential @ np.linalg.inv(CAMERA0)
 
 
-def judged(points0: np.ndarray, points1: np.ndarray, kind: str, matrix: np.ndarray) -> np.ndarray:
+def errors_of(
+    points0: np.ndarray, points1: np.ndarray, kind: str, matrix: np.ndarray
+) -> np.ndarray:
     """Errors in pixels, computed by scikit-image."""
     if kind == "homography":
         return ProjectiveTransform(matrix).residuals(points0, points1)
@@ -102,7 +104,7 @@ def test_finds_the_model_among_outliers(model: str, estimator: str) -> None:
     assert geometry.inliers[~scene.true].mean() < (0.01 if model == "homography" else 0.05)
     # Judged on other matches, without noise: the model itself is right.
     fresh = make_scene(model, 100, outliers=0, noise=0)
-    assert np.median(judged(fresh.points0, fresh.points1, model, geometry.matrix)) < 0.3
+    assert np.median(errors_of(fresh.points0, fresh.points1, model, geometry.matrix)) < 0.3
 
 
 @every_way
@@ -205,7 +207,7 @@ def test_inliers_are_exactly_the_matches_under_the_threshold(
     geometry = estimate_geometry(scene.points0, scene.points1, options)
     assert_consistent(geometry, 60)
     if geometry.matrix is not None:
-        errors = judged(scene.points0, scene.points1, model, geometry.matrix)
+        errors = errors_of(scene.points0, scene.points1, model, geometry.matrix)
         clear = np.abs(errors - threshold) > 1e-6
         np.testing.assert_array_equal(geometry.inliers[clear], (errors < threshold)[clear])
 

@@ -34,7 +34,7 @@ def project(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
 
 
 def two_cameras(seed: int = 0, count: int = 50) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points seen by two unlike cameras, and the fundamental matrix from its definition."""
+    """Points seen by two different cameras, and the fundamental matrix from its definition."""
     rng = np.random.default_rng(seed)
     scene = rng.uniform([-2, -2, 4], [2, 2, 9], (count, 3))
     camera0 = np.array([[500, 0, 320], [0, 520, 240], [0, 0, 1]])

@@ -50,27 +50,27 @@ def saved(cloud: PointCloud, path: Path, notes: dict | None = None) -> Page:
 
 
 def stored_points(page: Page) -> tuple[np.ndarray, np.ndarray, dict]:
-    told = json.loads(page.scripts["cloud"])
+    cloud = json.loads(page.scripts["cloud"])
     levels = np.frombuffer(base64.b64decode(page.scripts["positions"]), "<u2").reshape(-1, 3)
     colors = np.frombuffer(base64.b64decode(page.scripts["colors"]), np.uint8).reshape(-1, 3)
-    return levels * np.array(told["step"]) + told["offset"], colors, told
+    return levels * np.array(cloud["step"]) + cloud["offset"], colors, cloud
 
 
 def test_the_page_holds_the_points_to_half_a_step(cones: PointCloud, tmp_path: Path) -> None:
     page = saved(cones, tmp_path / "cones.html")
-    points, colors, told = stored_points(page)
-    left_out = len(cones) - told["count"]
-    assert len(points) == len(colors) == told["count"]
+    points, colors, cloud = stored_points(page)
+    left_out = len(cones) - cloud["count"]
+    assert len(points) == len(colors) == cloud["count"]
     assert 0 < left_out < 0.001 * len(cones)
     # The points are in their order, without those that are far away.
     box = np.percentile(cones.points, [1, 99], axis=0)
     margin = box[1] - box[0]
     near = ((cones.points >= box[0] - margin) & (cones.points <= box[1] + margin)).all(1)
-    assert near.sum() == told["count"]
+    assert near.sum() == cloud["count"]
     error = np.abs(points - cones.points[near])
-    assert (error <= np.array(told["step"]) * 0.5001).all()
+    assert (error <= np.array(cloud["step"]) * 0.5001).all()
     np.testing.assert_array_equal(colors, cones.colors[near])
-    assert f"{told['count']:,}" in page.texts
+    assert f"{cloud['count']:,}" in page.texts
     assert f"{left_out:,}" in page.texts
     assert (tmp_path / "cones.html").stat().st_size < 12.1 * len(cones) + 20_000
 
@@ -187,10 +187,10 @@ def test_the_matrix_is_that_of_a_camera_around_the_target(
     page = saved(small, tmp_path / "page.html")
     view = "{ azimuth: 0.4, elevation: 0.7, distance: 500, target: [5, 6, 800] }"
     matrix = np.reshape(run_node(page, f"return [...clipMatrix(cloud, {view}, 1)];"), (4, 4))
-    told = json.loads(page.scripts["cloud"])
+    cloud = json.loads(page.scripts["cloud"])
     axes = orbit_camera(small, np.rad2deg(0.4), np.rad2deg(0.7)).axes
     seen = (np.array([30.0, -40.0, 900.0]) - [5, 6, 800]) @ axes.T + [0, 0, 500]
-    level = (np.array([30.0, -40.0, 900.0]) - told["offset"]) / told["step"]
+    level = (np.array([30.0, -40.0, 900.0]) - cloud["offset"]) / cloud["step"]
     clip = [*level, 1] @ matrix
     zoom = 1 / np.tan(0.35)
     np.testing.assert_allclose(clip[3], seen[2], rtol=1e-4)

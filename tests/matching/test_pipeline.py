@@ -166,7 +166,7 @@ def test_images_of_two_sizes(photo: np.ndarray, detector: Any) -> None:
     assert share_correct(matches, np.array([[1, 0, -30], [0, 1, -20], [0, 0, 1]]), 0.1) > 0.9
 
 
-# The road of the data, against a pipeline of OpenCV's own
+# The whole pipeline, compared with one of OpenCV's own
 
 
 def opencv_pipeline(

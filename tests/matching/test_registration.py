@@ -25,11 +25,11 @@ def second(photo: np.ndarray) -> np.ndarray:
 def test_the_second_image_comes_to_lie_on_the_first(photo: np.ndarray, second: np.ndarray) -> None:
     found = register(photo, second)
     assert corner_error(found.homography, WARP, (256, 256)) < 0.5
-    inside = cv2.erode(found.seen.astype(np.uint8), np.ones((9, 9)), borderValue=0) > 0
+    inside = cv2.erode(found.valid.astype(np.uint8), np.ones((9, 9)), borderValue=0) > 0
     assert 0.5 < inside.mean() < 1
     assert np.abs(found.warped.astype(int) - photo)[inside].mean() < 4
     assert found.difference()[inside].mean() < 4
-    assert not found.difference()[~found.seen].any()
+    assert not found.difference()[~found.valid].any()
     assert found.zncc > 0.95
     assert found.matches > 5000
 

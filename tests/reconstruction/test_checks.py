@@ -263,7 +263,7 @@ def _worse(pose: RelativePose) -> RelativePose:
 
 
 def test_what_stands_in_front_of_a_plane() -> None:
-    """100 matches on the plane, 10 off it of which the fundamental matrix explains so many."""
+    """100 matches on the plane, 10 off it, some explained by the fundamental matrix."""
     off_plane = np.append(np.ones(100), np.full(10, 20.0))
     for explained, expected in ((10, True), (8, True), (7, False), (0, False)):
         by_fundamental = np.ones(110, bool)

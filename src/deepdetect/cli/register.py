@@ -61,7 +61,7 @@ def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: 
         "image1": image1,
         "homography": found.homography.tolist(),
         "matches": found.matches,
-        "overlap": round(float(found.seen.mean()), 4),
+        "overlap": round(float(found.valid.mean()), 4),
         "correlation": round(found.zncc, 4),
         "files": files,
     }

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     type=float,
     default=1.0,
     show_default=True,
-    help="Pixels of the panorama for a pixel of the reference.",
+    help="Pixels of the panorama per pixel of the reference.",
 )
 @click.option(
     "--max-canvas-megapixels",

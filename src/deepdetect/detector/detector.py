@@ -112,7 +112,7 @@ class DeepDetect:
     def heatmap_and_logits(self, image: Any) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of its probabilities; argument as of `heatmap`.
 
-        Float32 rounds the highest probabilities to 1. The logits still tell these pixels apart, so
+        Float32 rounds the highest probabilities to 1. The logits still distinguish these pixels, so
         keypoints are ranked by them.
 
         Returns:

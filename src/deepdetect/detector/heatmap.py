@@ -73,7 +73,7 @@ def compute_heatmap_and_logits(
 
     Returns:
         The heat map, and the (H, W) float32 logits of its probabilities. Float32 rounds the
-        highest probabilities to 1; logits still tell them apart, so keypoints are ranked by them.
+        highest probabilities to 1; logits still distinguish them, so keypoints are ranked by them.
     """
     height, width = rgb.shape[:2]
     if (rgb == rgb[0, 0]).all():

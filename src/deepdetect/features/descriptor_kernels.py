@@ -108,7 +108,7 @@ def _normalise(histogram, out):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def square_root(first, last, descriptors):  # type: ignore[no-untyped-def]
-    """Convert SIFT to RootSIFT in place: 512 times the root of each number's share of the sum."""
+    """Convert SIFT to RootSIFT in place: 512 times the root of each number over the sum."""
     for k in range(first, last):
         total = 0
         for d in range(128):

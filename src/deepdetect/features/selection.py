@@ -20,7 +20,7 @@ class SelectionOptions:
 
     Attributes:
         threshold: pixels with a probability above it become keypoints (paper: tau = 0.5).
-        density: keypoints per pixel, in (0, 1]; replaces the threshold: this share of the pixels
+        density: keypoints per pixel, in (0, 1]; replaces the threshold: this fraction of the pixels
             is taken, the most probable ones.
         max_keypoints: at most this many are kept, the most probable ones.
         nms_radius: of non-maximum suppression in pixels: a pixel is kept when it ranks highest

@@ -15,13 +15,13 @@ class ModelSelectionOptions:
     of those that the homography does not explain.
 
     Attributes:
-        min_share_of_rest: of the matches that the homography leaves, the fundamental matrix must
-            explain at least this share.
-        min_share_of_all: these must be at least this share of all that it explains.
+        min_fraction_of_rest: of the matches that the homography leaves, the fundamental matrix must
+            explain at least this fraction.
+        min_fraction_of_all: these must be at least this fraction of all that it explains.
     """
 
-    min_share_of_rest: float = 0.5
-    min_share_of_all: float = 0.1
+    min_fraction_of_rest: float = 0.5
+    min_fraction_of_all: float = 0.1
 
 
 def select_model(
@@ -43,8 +43,8 @@ def select_model(
     """
     gained = np.count_nonzero(fundamental_inliers & ~homography_inliers)
     needed = max(
-        options.min_share_of_rest * np.count_nonzero(~homography_inliers),
-        options.min_share_of_all * np.count_nonzero(fundamental_inliers),
+        options.min_fraction_of_rest * np.count_nonzero(~homography_inliers),
+        options.min_fraction_of_all * np.count_nonzero(fundamental_inliers),
         1,
     )
     return "fundamental" if gained >= needed else "homography"

@@ -22,7 +22,7 @@ class PoseRefinementOptions:
         derivative_step: by which the pose is varied for its derivatives, in radians.
         min_change: a smaller change of the pose, in radians, ends the refinement.
         max_refits: how often the pose is fitted to its own inliers again ...
-        min_inlier_gain: ... while that gives this share of further inliers.
+        min_inlier_gain: ... while that gives this fraction of further inliers.
         max_matches: that are used, sampled evenly: more do not improve the pose.
     """
 
@@ -43,7 +43,7 @@ class RelativePose:
         translation: (3,) float64 of length 1: only its direction can be known.
         inliers: (M,) bool, the matches with an error below the threshold.
         errors: (M,) float64 Sampson distances in pixels.
-        cheirality_ratio: share of the inliers that lie in front of both cameras, in [0, 1].
+        cheirality_ratio: fraction of the inliers that lie in front of both cameras, in [0, 1].
     """
 
     rotation: np.ndarray

@@ -105,7 +105,7 @@ class MatchingOptions:
 PRESETS: dict[str, MatchingOptions] = {
     "default": MatchingOptions(),
     # What the authors' published code runs: BGR although the weights were trained on
-    # RGB, the angle unset, and every match judged by the true homography.
+    # RGB, the angle unset, and every match evaluated by the true homography.
     "published": MatchingOptions(
         heatmap=HeatmapOptions(resolution=480, channels="bgr"),
         selection=SelectionOptions(threshold=0.5),

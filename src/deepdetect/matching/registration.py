@@ -28,7 +28,7 @@ class Registration:
         homography: (3, 3) from the first image to the second.
         first: (H, W, 3) uint8 RGB, the first image.
         warped: (H, W, 3) uint8 RGB, the second in its frame, black where it has nothing.
-        seen: (H, W) bool, where it has something.
+        valid: (H, W) bool, where the second image was warped to.
         matches: number of dense matches that hold.
         zncc: median local ZNCC of the two over what both show, in [-1, 1].
     """
@@ -36,21 +36,21 @@ class Registration:
     homography: np.ndarray
     first: np.ndarray
     warped: np.ndarray
-    seen: np.ndarray
+    valid: np.ndarray
     matches: int
     zncc: float
 
     def checkerboard(self) -> np.ndarray:
         """Return both images in turn, in squares: edges go on where they fit; (H, W, 3) uint8."""
-        height, width = self.seen.shape
+        height, width = self.valid.shape
         side = max(1, min(height, width) // SQUARES)
         row, column = np.indices((height, width)) // side
-        second = self.seen & ((row + column) % 2 == 1)
+        second = self.valid & ((row + column) % 2 == 1)
         return np.where(second[..., None], self.warped, self.first)
 
     def difference(self) -> np.ndarray:
         """Return how far apart the colours are, 0 where only one has something; (H, W, 3) uint8."""
-        return np.where(self.seen[..., None], cv2.absdiff(self.first, self.warped), 0)
+        return np.where(self.valid[..., None], cv2.absdiff(self.first, self.warped), 0)
 
 
 @suggest_keywords
@@ -124,12 +124,12 @@ def register(
     warped = cv2.warpPerspective(second, found.matrix, size, flags=flags)
     whole = np.full(second.shape[:2], 255, np.uint8)
     nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    seen = cv2.warpPerspective(whole, found.matrix, size, flags=nearest) > 0
+    valid = cv2.warpPerspective(whole, found.matrix, size, flags=nearest) > 0
     return Registration(
         found.matrix,
         first,
         warped,
-        seen,
+        valid,
         len(found),
         median_local_zncc(luma(first), luma(second), found.matrix),
     )

@@ -171,7 +171,7 @@ def check_matches(
     Args:
         points0, points1: (M, 2) matched positions in pixels.
         size1: (width, height) of the second image.
-        calibration: tells a rotating camera from a plane, where it is known.
+        calibration: distinguishes a rotating camera from a plane, where it is known.
         seed: of the random samples.
         options: the thresholds.
 

@@ -38,7 +38,7 @@ class PointFilterOptions:
             rectified pairs neither.
         sor_window_px: side of the window of pixels that SOR compares with in rectified pairs.
         sor_std_ratio: standard deviations above the mean distance; fewer remove more.
-        sor_disparity_weight: distance that a pixel of disparity counts beside a pixel in the image.
+        sor_disparity_weight: distance of 1 px of disparity, in pixels of the image.
 
     Raises:
         OptionError: a value is out of its range.
@@ -172,7 +172,7 @@ def disparity_space(
         points: (N, 3) in its frame, z above 0.
         focal_px: its focal length.
         baseline: in the units of the points.
-        disparity_weight: of a pixel of disparity beside a pixel in the image.
+        disparity_weight: distance of 1 px of disparity, in pixels of the image.
 
     Returns:
         (N, 3) float64.

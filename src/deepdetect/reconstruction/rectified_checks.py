@@ -208,7 +208,7 @@ def check_pure_rotation(
     Args:
         pixels: (N, 2) positions in the left image.
         disparity: (N,) their disparities in pixels.
-        calibration: tells the rays.
+        calibration: gives the rays.
         options: the thresholds.
 
     Raises:
@@ -239,7 +239,7 @@ def check_depths(
 
     Args:
         disparity: (N,) in pixels.
-        calibration: tells the offset.
+        calibration: gives the offset.
         options: the thresholds.
 
     Raises:

@@ -107,7 +107,7 @@ def refine_matches(
     Args:
         gray0, gray1: (H, W) uint8 luma.
         points0: (N, 2) whole pixels of the first image.
-        points1: (N, 2) positions in the second, right to a pixel or two.
+        points1: (N, 2) positions in the second, accurate to a pixel or two.
         options: of the alignment.
 
     Returns:

@@ -54,7 +54,7 @@ needs_openvino_telemetry = pytest.mark.skipif(
 
 
 def run(code: str, home: Path, **variables: str) -> list[str]:
-    """Run Python in a fresh process that is not told to send nothing; return what it forbade."""
+    """Run Python without the settings against telemetry; return what it forbade."""
     kept = {
         name: value
         for name, value in os.environ.items()

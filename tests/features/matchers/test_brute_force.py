@@ -245,5 +245,5 @@ def test_it_is_registered_and_serves_the_ratio_test(photo: np.ndarray) -> None:
     mutual = (every.min(1) == every.min(0)[every.argmin(1)]) & kept
     assert len(found) > 50
     assert set(found.rows0) <= set(np.flatnonzero(kept))
-    # Ties among the columns' nearest alone may tell the two apart.
+    # Ties among the columns' nearest alone may distinguish the two.
     assert abs(len(found) - mutual.sum()) <= 0.02 * mutual.sum()

@@ -13,10 +13,10 @@ from deepdetect.features.matchers.approximate import flann_neighbours
 from deepdetect.features.matchers.brute_force import exact_neighbours
 
 
-def told(
+def fixed_matcher(
     rows: list[list[int]], distances: list[list[float]]
 ) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
-    """A matcher that answers what it was told."""
+    """A matcher with fixed answers."""
 
     def matcher(
         queries, base, count: int, seed: int, positions=None
@@ -55,7 +55,7 @@ def pairs(matches: DescriptorMatches) -> set[tuple[int, int]]:
 def test_the_ratio_is_strict(best: float, second: float, ratio: float, kept: bool) -> None:
     one = points((0, 0))
     two = points((0, 0), (1, 1))
-    matches = match_descriptors(one, two, told([[1, 0]], [[best, second]]), ratio=ratio)
+    matches = match_descriptors(one, two, fixed_matcher([[1, 0]], [[best, second]]), ratio=ratio)
     assert pairs(matches) == ({(0, 1)} if kept else set())
     if kept:
         np.testing.assert_allclose(matches.ratios, [best / second if second else 1], rtol=1e-6)

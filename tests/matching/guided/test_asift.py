@@ -20,7 +20,7 @@ def views(gray: np.ndarray, tilt: float, max_keypoints: int) -> Iterator[Keypoin
 
 
 def blob(x: float, y: float, across: float, down: float) -> np.ndarray:
-    """A bright spot of so many pixels (sigma) on dark ground."""
+    """A bright spot of a given sigma in pixels on dark ground."""
     row, column = np.indices((160, 220))
     away = ((column - x) / across) ** 2 + ((row - y) / down) ** 2
     return np.rint(40 + 180 * np.exp(-away / 2)).astype(np.uint8)

@@ -82,7 +82,7 @@ def resized(gray: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.n
 
 
 def from_the_side(gray: np.ndarray, tilt: int, turn: float) -> tuple[np.ndarray, np.ndarray]:
-    """An image turned and then made so many times narrower, each pixel the mean of its own."""
+    """An image rotated and then made narrower by a factor, each pixel the mean of its own."""
     height, width = gray.shape
     rotation = np.eye(3)
     rotation[:2] = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn, 1)

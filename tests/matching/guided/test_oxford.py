@@ -1,4 +1,4 @@
-"""Guided matching of real pairs, judged by the refined homographies of Oxford."""
+"""Guided matching of real pairs, evaluated by the refined homographies of Oxford."""
 
 from __future__ import annotations
 

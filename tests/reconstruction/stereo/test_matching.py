@@ -234,9 +234,9 @@ def test_a_part_of_cones_against_the_truth(shared: Path, every_pixel) -> None:
     xy = every_pixel(left.shape)
     for options, share, complete in ((DisparityOptions(), 0.97, 0.45), (DENSE, 0.88, 0.75)):
         errors = np.abs(as_map(match_rectified(left, right, xy, options), xy, left.shape) - truth)
-        judged = np.isfinite(errors)
-        assert np.mean(errors[judged] <= 1) > share
-        assert np.sum(errors[judged] <= 1) > complete * np.isfinite(truth).sum()
+        known = np.isfinite(errors)
+        assert np.mean(errors[known] <= 1) > share
+        assert np.sum(errors[known] <= 1) > complete * np.isfinite(truth).sum()
 
 
 def test_what_is_wrong_is_said(photo: np.ndarray, one_line) -> None:

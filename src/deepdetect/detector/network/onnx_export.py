@@ -15,7 +15,7 @@ OPSET = 17
 
 
 class ProbabilityAndLogits(nn.Module):
-    """The network followed by the sigmoid, and its logits, which tell the best pixels apart."""
+    """The network followed by the sigmoid, and its logits, which distinguish the best pixels."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()

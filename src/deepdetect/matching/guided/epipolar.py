@@ -27,7 +27,7 @@ def match_along_epipolar_lines(
     options: EpipolarMatchingOptions = EpipolarMatchingOptions(),
     seed: int = 0,
 ) -> DescriptorMatches:
-    """Match keypoints by a fundamental matrix, and keep those that are similar and move alike.
+    """Match by a fundamental matrix, and keep matches that are similar and move consistently.
 
     Args:
         pair: images and keypoints.
@@ -118,8 +118,8 @@ def densely_matched(
         options: the window and the least densities.
 
     Returns:
-        (N,) bool: at least a share `min_match_density` of the keypoints in the window is matched,
-        or `min_relative_density` of the median over all points where that is less.
+        (N,) bool: at least the fraction `min_match_density` of the keypoints in the window is
+        matched, or `min_relative_density` of the median over all points where that is less.
     """
     if not len(points):
         return np.empty(0, bool)
@@ -137,7 +137,7 @@ def densely_matched(
 def _null_distance(
     first: np.ndarray, second: np.ndarray, seed: int, options: EpipolarMatchingOptions
 ) -> float:
-    """Return the distance that a share `false_positive_rate` of random pairs stays under."""
+    """Return the distance below which the fraction `false_positive_rate` of random pairs is."""
     generator = np.random.default_rng(seed)
     sample = [
         part[generator.integers(0, len(part), options.null_pairs)].astype(np.float32)

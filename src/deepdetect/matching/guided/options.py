@@ -72,10 +72,10 @@ class VerificationOptions:
 
     Attributes:
         keypoint_sizes_px: diameters of the keypoints of the descriptors that are compared.
-        false_positive_rate: share of null pairs (unrelated patches of the two images) that pass.
+        false_positive_rate: fraction of null pairs (unrelated patches of the two images) that pass.
         smoothing_sigma_px: of the Gaussian mean over neighbouring points.
         window_px: side of the window around a point in which most points must pass, odd.
-        min_support: share of the points in the window that must pass.
+        min_support: fraction of the points in the window that must pass.
         null_shifts: shifts between the patches of a null pair, in shares of width and height.
         null_block_px: side of the blocks of the image that null pairs are taken from.
         max_null_blocks: at most this many blocks for each shift, chosen at random: all of them up
@@ -135,19 +135,19 @@ class EpipolarMatchingOptions:
         max_epipolar_distance_px: from the epipolar line to a partner.
         max_cycle_error_px: from a keypoint to the best partner of its best partner. Dense
             keypoints have equally good neighbours, so it need not be 0.
-        false_positive_rate: share of random pairs whose descriptors are similar enough to pass.
+        false_positive_rate: fraction of random pairs whose descriptors are similar enough to pass.
         null_pairs: number of random pairs that this is measured on.
-        motion_window_px: side of the window in which matches must move alike, odd.
+        motion_window_px: side of the window in which matches must move consistently, odd.
         max_motion_difference_px: by which the motions of neighbours may differ, in x and in y.
-        min_motion_support: share of the matches in the window that must move so.
+        min_motion_support: fraction of the matches in the window that must move so.
         density_window_px: side of the window around a match in which keypoints must be matched,
             odd.
-        min_match_density: share of the keypoints in the window that must be matched.
+        min_match_density: fraction of the keypoints in the window that must be matched.
         min_relative_density: of the median of these shares, where that is less: scattered
             keypoints are matched less often.
         max_refits: the fundamental matrix is estimated again from the dense matches at most this
             often,
-        min_refit_gain: as long as each new one gives this share of further matches.
+        min_refit_gain: as long as each new one gives this fraction of further matches.
         refit_threshold_px: inlier threshold of these estimates.
 
     Raises:
@@ -190,12 +190,12 @@ class PrewarpOptions:
     """When and how a second image is warped by an affinity before it is matched.
 
     Attributes:
-        min_deviation: an affinity matters when it moves a point by more than this share of its
+        min_deviation: an affinity matters when it moves a point by more than this fraction of its
             distance from another. The floor shears rectified pairs by less (0.13 on art), and so
             small a rotation costs fewer matches than the warp; 12 degrees cost most of them.
         max_anisotropy: an affinity that stretches one direction by more than this factor, relative
             to the other or in all, is not trusted.
-        frame_margin: share of the sides of the first image by which the warped image may extend
+        frame_margin: fraction of the sides of the first image by which the warped image may extend
             beyond it: parallax moves points there. It bounds the memory.
         max_distance_px: a pixel of the warped image stands for a keypoint nearer than this, in
             pixels of the second image.
@@ -223,8 +223,8 @@ class GuidedOptions:
         epipolar_matching: scenes with depth.
         prewarp: second images that are rotated, zoomed or sheared, of scenes with depth.
         verification: when two patches count as the same.
-        min_matched_fraction: with fewer matches than this share of the keypoints, the geometry is
-            not trusted after all.
+        min_matched_fraction: with a smaller fraction of the keypoints matched, the geometry is not
+            trusted after all.
 
     Raises:
         OptionError: a value is out of its range.

@@ -87,8 +87,8 @@ def dissimilarity(
         seed: of the null pairs.
 
     Returns:
-        (N,) float32: 1 - correlation, averaged over neighbours, relative to the bound that a share
-        `false_positive_rate` of null pairs stays under. Infinite where the second image has no
+        (N,) float32: 1 - correlation, averaged over neighbours, relative to the bound below which
+        the fraction `false_positive_rate` of null pairs is. Infinite where the second image has no
         content, where most points around are dissimilar, and everywhere when all null pairs look
         the same.
     """
@@ -142,8 +142,8 @@ def sample_null_pairs(
     size = np.array(warped.shape[::-1])
     result = []
     blocks = _sample_blocks(points, options, seed)
-    for rows, share in zip(blocks, options.null_shifts, strict=True):
-        shift = np.rint(np.array(share) * size).astype(np.int64)
+    for rows, fraction in zip(blocks, options.null_shifts, strict=True):
+        shift = np.rint(np.array(fraction) * size).astype(np.int64)
         places = (points[rows] - shift) % size
         known = valid[places[:, 1], places[:, 0]]
         rows, places = rows[known], places[known]

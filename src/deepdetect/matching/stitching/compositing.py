@@ -107,8 +107,8 @@ def plan_canvas(
         sizes: (width, height) of the images, by number.
         homographies: (3, 3) from each to a common frame.
         reference: number of the image that is not distorted.
-        scale: pixels of the canvas for a pixel of the reference.
-        max_canvas_megapixels: the canvas may have so many.
+        scale: pixels of the canvas per pixel of the reference.
+        max_canvas_megapixels: the largest canvas allowed.
 
     Raises:
         DeepDetectError: an image reaches the horizon of the reference.

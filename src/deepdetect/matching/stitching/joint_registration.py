@@ -31,7 +31,7 @@ KEYPOINTS = 30_000
 """Dense keypoints of an image, at the most, which must confirm a homography."""
 
 PARTNERS = 3
-"""Pairs that each image takes part in, where it has so many, beyond those that connect all."""
+"""Pairs that each image takes part in, where it has that many, beyond those that connect all."""
 
 SAMPLES = 400
 """Matches of a pair, spread out, that the joint fit is made to."""
@@ -196,7 +196,7 @@ def _matches_within(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> in
 
 
 def _composed(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
-    """Compose homographies to the image with most matches, along the tree of the surest pairs."""
+    """Compose homographies to the image with most matches, along the maximum spanning tree."""
     tree: list[RegisteredPair] = []
     matches = dict.fromkeys(group, 0)
     for pair in sorted(pairs, key=lambda pair: -len(pair.points)):

@@ -72,9 +72,9 @@ def stitch(
         detector: a `DeepDetect`, or anything with its `heatmap` method; default `DeepDetect()`.
         reference: number of the photograph in whose frame the panorama is; None for the one in
             the middle.
-        scale: pixels of the panorama for a pixel of the reference.
+        scale: pixels of the panorama per pixel of the reference.
         max_canvas_megapixels: a larger panorama is refused before it is drawn. It takes 22
-            to 47 bytes of memory a pixel.
+            to 47 bytes of memory per pixel.
         registration_side: longer side in pixels to which photographs are reduced for registration.
         seed: of all random choices.
 

@@ -8,7 +8,7 @@ disparity, so that slanted surfaces fit as well as those that face the camera, a
 other side of a disparity discontinuity do not count. Measured on the Motorcycle pair, on which the
 defaults were chosen: 83 % of the disparities within 0.25 px of the truth instead of the parabola's
 73 %, and fractions as often near whole pixels as between them (each tenth of a pixel has 0.97 to
-1.04 times its share; with the parabola 0.44 to 2.04 times).
+1.04 times the expected number; with the parabola 0.44 to 2.04 times).
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def refine_disparity(
 
     Args:
         left, right: (H, W) uint8 luma of a rectified pair.
-        disparity: (H, W) float32 in pixels, right to a pixel.
+        disparity: (H, W) float32 in pixels, accurate to a pixel.
         known: (H, W) bool, where it is to be refined.
         options: of the fit.
         max_difference_px: of disparities on one surface.

@@ -139,7 +139,7 @@ def semi_global_matching(
         options: the penalties.
 
     Returns:
-        The disparities, to sub-pixel by a parabola; these still crowd around whole pixels.
+        The disparities, to sub-pixel by a parabola; these still cluster around whole pixels.
 
     Example:
         >>> scene = np.random.default_rng(0).integers(0, 256, (40, 80), np.uint8)
