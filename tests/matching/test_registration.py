@@ -44,6 +44,7 @@ def test_the_checkerboard_has_both(photo: np.ndarray) -> None:
     assert brightness == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.slow
 def test_images_of_different_things_are_refused(photo: np.ndarray) -> None:
     noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
     with pytest.raises(DeepDetectError, match="no homography can be trusted"):

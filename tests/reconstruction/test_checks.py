@@ -115,6 +115,7 @@ def test_what_moves_in_a_small_part_makes_two_pictures(photo: np.ndarray) -> Non
     check_images(small_left, small_right)
 
 
+@pytest.mark.slow
 def test_one_view_stored_badly(level: Any, detector: DeepDetect, one_line) -> None:
     file = io.BytesIO()
     Image.fromarray(level.left).save(file, "JPEG", quality=30)
@@ -123,7 +124,7 @@ def test_one_view_stored_badly(level: Any, detector: DeepDetect, one_line) -> No
     assert "nothing moves between the images" in message
 
 
-@pytest.mark.parametrize("guide", ["auto", "fundamental"])
+@pytest.mark.parametrize("guide", ["auto", pytest.param("fundamental", marks=pytest.mark.slow)])
 def test_a_camera_that_only_rotated(
     level: Any, only_turned: np.ndarray, detector: DeepDetect, guide: str, one_line
 ) -> None:
@@ -145,7 +146,15 @@ def test_a_plane(photo: np.ndarray, one_line) -> None:
 
 
 @pytest.mark.parametrize("other", [2, 4])
-@pytest.mark.parametrize("name", ["bark", "bikes", "leuven", "wall"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "bark",
+        pytest.param("bikes", marks=pytest.mark.slow),
+        pytest.param("leuven", marks=pytest.mark.slow),
+        pytest.param("wall", marks=pytest.mark.slow),
+    ],
+)
 def test_planar_photographs(shared: Path, name: str, other: int, one_line) -> None:
     images = [
         load_image(shared / "data" / "oxford" / name / f"img{number}.png") for number in (1, other)
@@ -177,7 +186,18 @@ def test_no_overlap(level: Any, one_line) -> None:
     assert "lower `threshold`, or give `density`" in message
 
 
-@pytest.mark.parametrize("name", ["art", "cones", "dolls", "moebius", "rocks", "cloth", "teddy"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cones",
+        "teddy",
+        pytest.param("art", marks=pytest.mark.slow),
+        pytest.param("dolls", marks=pytest.mark.slow),
+        pytest.param("moebius", marks=pytest.mark.slow),
+        pytest.param("rocks", marks=pytest.mark.slow),
+        pytest.param("cloth", marks=pytest.mark.slow),
+    ],
+)
 def test_scenes_with_depth_pass(shared: Path, name: str) -> None:
     folder = shared / "data" / "middlebury" / name
     points = sparse(*(load_image(folder / f"{side}.png") for side in ("left", "right")))

@@ -163,6 +163,7 @@ def test_a_post_before_a_wall_is_not_left_out(
         assert (errors[part] < 2).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_a_post_before_a_wall_has_points_of_both_depths(facade: Any, detector: DeepDetect) -> None:
     pair = facade(0.07)
     camera = Camera((400, 300), 400.0)
@@ -178,6 +179,7 @@ def test_a_post_before_a_wall_has_points_of_both_depths(facade: Any, detector: D
         assert (off < 0.1).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_a_wall_alone_gives_no_depth(facade: Any, detector: DeepDetect, one_line: Any) -> None:
     pair = facade(0)
     with pytest.raises(ReconstructionError, match="one homography explains all") as error:
@@ -198,6 +200,7 @@ def test_the_right_camera_is_where_it_is_seen_from(posed: Any, turned: Any) -> N
     np.testing.assert_allclose(posed.triangulation_angles(), angle, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_baseline_gives_millimetres_and_the_same_points(turned: Any, level: Any) -> None:
     detector = DeepDetect("dense")
     for pair in (level, turned):
@@ -213,6 +216,7 @@ def test_a_baseline_gives_millimetres_and_the_same_points(turned: Any, level: An
         )
 
 
+@pytest.mark.slow
 def test_both_pipelines_agree_on_a_rectified_pair(level: Any, detector: DeepDetect) -> None:
     """Forced each way the depths are the same; found out it is the rectified one."""
     ways = [
@@ -250,6 +254,7 @@ def test_a_disparity_offset_is_taken_into_account(level: Any, detector: DeepDete
     assert (np.abs(ratio[np.isfinite(ratio)] - 1) < 0.02).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_is_the_same_on_repetition(found: Any, posed: Any, cones: Any, turned: Any) -> None:
     detector = DeepDetect("dense")
     again = reconstruct(cones.left, cones.right, detector, focal_px=500)
@@ -258,6 +263,7 @@ def test_is_the_same_on_repetition(found: Any, posed: Any, cones: Any, turned: A
     np.testing.assert_array_equal(again.points, posed.points)
 
 
+@pytest.mark.slow
 def test_is_the_same_for_any_number_of_threads(
     turned: Any, level: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -401,6 +407,7 @@ def test_pairs_only_said_to_be_rectified_give_no_cloud(
     assert "all disparities are -9 px" in refusal(one_line, *shifted, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rectified", [None, True, False])
 @pytest.mark.parametrize("quality", [80, 95])
 def test_a_copy_as_jpeg_gives_no_depth(

@@ -13,7 +13,13 @@ from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.io.image import load_image, luma
 from deepdetect.reconstruction.rectification import detect_rectification
 
-SCENES = ("art", "cloth", "cones", "dolls", "moebius", "rocks", "teddy")
+SCENES = [
+    *("art", "cones", "teddy"),
+    *(
+        pytest.param(name, marks=pytest.mark.slow)
+        for name in ("cloth", "dolls", "moebius", "rocks")
+    ),
+]
 OXFORD = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
 
 
@@ -82,7 +88,7 @@ def test_moved_and_turned_views_are_not_rectified(shared: Path, name: str, wrong
         assert "same row" in found.reason
 
 
-@pytest.mark.parametrize("other", [2, 6])
+@pytest.mark.parametrize("other", [6, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", OXFORD)
 def test_planar_scenes_are_not_rectified(shared: Path, name: str, other: int) -> None:
     folder = shared / "data" / "oxford" / name
@@ -91,6 +97,7 @@ def test_planar_scenes_are_not_rectified(shared: Path, name: str, other: int) ->
     assert found.reason
 
 
+@pytest.mark.slow
 def test_dense_matches_of_the_whole_pipeline(
     level: Any, turned: Any, level_matches: Any, turned_matches: Any
 ) -> None:

@@ -140,6 +140,7 @@ def test_what_is_wrong_is_said(turned: Any, turned_matches: Any, level: Any, one
             TwoViewOptions(**options)
 
 
+@pytest.mark.slow
 def test_a_camera_that_only_rotated_gives_no_cloud(level: Any, only_turned: np.ndarray) -> None:
     from deepdetect.io.image import luma
 

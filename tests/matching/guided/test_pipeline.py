@@ -98,6 +98,7 @@ def test_the_command_says_what_guided(
     assert "no geometry could be trusted: these matches are unguided" in bad.stderr
 
 
+@pytest.mark.slow
 def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> None:
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
     detector = DeepDetect("dense")
@@ -129,7 +130,9 @@ def test_a_plane_that_is_asked_for_guides(shared: Path, name: str) -> None:
     assert match_images(pair.left, pair.right, Everywhere()).guide.model == "fundamental"
 
 
-@pytest.mark.parametrize("model", ["fundamental", "essential"])
+@pytest.mark.parametrize(
+    "model", ["fundamental", pytest.param("essential", marks=pytest.mark.slow)]
+)
 def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
     """A homography explains nine tenths of the matches, and would drop what stands before."""
     pair = facade(0.07)
@@ -150,6 +153,7 @@ def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
         match_images(*images, model=model, camera0=camera, camera1=camera, guide="homography")
 
 
+@pytest.mark.slow
 def test_mutual_matches_are_one_to_one(photo: np.ndarray, second: np.ndarray) -> None:
     plain, mutual = (
         match_images(photo, second, Everywhere(), mutual=mutual) for mutual in (False, True)
@@ -196,6 +200,7 @@ def test_the_command_says_which_options_do_not_apply(
     assert said("c", "--ratio", "0.9") == []  # unguided after all
 
 
+@pytest.mark.slow
 def test_is_the_same_on_repetition(photo: np.ndarray, second: np.ndarray) -> None:
     one, other = (match_images(photo, second, Everywhere()) for _ in range(2))
     np.testing.assert_array_equal(one.points1, other.points1)

@@ -58,7 +58,7 @@ def upright(cones: StereoPair, match: Callable[[np.ndarray], Matches]) -> tuple[
 @pytest.mark.parametrize(
     ("degrees", "scale"),
     [
-        (30, 1.3),
+        pytest.param(30, 1.3, marks=pytest.mark.slow),
         pytest.param(20, 1, marks=pytest.mark.slow),
         pytest.param(90, 1, marks=pytest.mark.slow),
         pytest.param(0, 1.3, marks=pytest.mark.slow),

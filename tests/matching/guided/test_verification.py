@@ -69,7 +69,7 @@ def test_the_same_image_agrees_nearly_everywhere(photo: np.ndarray) -> None:
     ("name", "other"),
     [
         ("camera", "rocket"),
-        ("astronaut", "coffee"),
+        pytest.param("astronaut", "coffee", marks=pytest.mark.slow),
         pytest.param("camera", "astronaut", marks=pytest.mark.slow),
         pytest.param("astronaut", "chelsea", marks=pytest.mark.slow),
         pytest.param("camera", "brick", marks=pytest.mark.slow),
@@ -97,7 +97,7 @@ def test_under_another_photograph_next_to_nothing_agrees(
     assert np.concatenate(under_it).mean() < OPTIONS.false_positive_rate
 
 
-@pytest.mark.parametrize("name", ["astronaut", "coffee"])
+@pytest.mark.parametrize("name", ["astronaut", pytest.param("coffee", marks=pytest.mark.slow)])
 def test_few_null_pairs_pass(picture: Callable[..., np.ndarray], name: str) -> None:
     """Of an image shifted by other shares of its size than those of the null pairs."""
     gray = picture(name, 2 * HALF)
@@ -180,6 +180,7 @@ def test_the_seed_decides_and_hardly_matters(photo: np.ndarray) -> None:
     assert (found[0] == found[2]).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_up_to_a_megapixel_the_seed_does_not_matter(photo: np.ndarray) -> None:
     gray = cv2.resize(luma(photo), (1000, 700))  # the largest of Oxford
     pixels = every_pixel(gray)[::31]
@@ -239,7 +240,10 @@ def test_flat_images_tell_nothing(photo: np.ndarray) -> None:
         )
 
 
-@pytest.mark.parametrize("width", [120, 180, 260])
+@pytest.mark.parametrize(
+    "width",
+    [120, pytest.param(180, marks=pytest.mark.slow), pytest.param(260, marks=pytest.mark.slow)],
+)
 def test_images_that_are_flat_for_a_large_part_tell_nothing(width: int) -> None:
     """A hundredth of the null pairs are equal, flat ones: nothing can be more similar."""
     gray = np.full((300, 400), 235, np.uint8)
@@ -273,6 +277,7 @@ def test_points_far_apart_are_all_described(photo: np.ndarray, odd: int) -> None
     assert (scores[wrong] < 1).mean() < 0.05
 
 
+@pytest.mark.slow
 def test_it_changes_little_which_points_are_described(photo: np.ndarray) -> None:
     """Points on pixels of one colour of a chessboard agree like those of the other."""
     gray = luma(photo)
