@@ -25,11 +25,11 @@ def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo)
     parts = [pretrained_weights(name, ".safetensors") for name in ("default", "dense")]
     expected = average_weights([parts[0], parts[0], parts[1]])
     assert weights_digest(load_network(files["weights"])) == weights_digest(expected)
-    told = json.loads(read_notes(files["weights"])["parts"])
-    assert [part["sha256"] for part in told] == [
+    values = json.loads(read_notes(files["weights"])["parts"])
+    assert [part["sha256"] for part in values] == [
         weights_digest(load_network(parts[k])) for k in (0, 0, 1)
     ]
-    assert told[2]["command"] == read_notes(parts[1])["command"]
+    assert values[2]["command"] == read_notes(parts[1])["command"]
     maps = [
         DeepDetect(files[name], backend=backend).heatmap(photo)
         for name, backend in (("weights", "torch"), ("onnx", "onnxruntime"))

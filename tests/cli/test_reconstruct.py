@@ -86,23 +86,23 @@ def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
     )
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in Path("out").iterdir()) == FILES
-    told = json.loads(result.stdout)
-    assert told == json.loads(Path("out/m.json").read_text())
-    assert sorted(Path(file).name for file in told["files"]) == FILES
+    values = json.loads(result.stdout)
+    assert values == json.loads(Path("out/m.json").read_text())
+    assert sorted(Path(file).name for file in values["files"]) == FILES
 
-    assert told["rectified"] is True
-    assert "on the same row" in told["rectified_why"]
-    assert (told["unit"], told["scale"]) == ("mm", "lengths are in mm")
-    assert told["points"] + sum(told["dropped"].values()) == told["matches"]
-    assert told["density"] == pytest.approx(told["points"] / (400 * 300), abs=1e-6)
-    assert told["filled"] == 0
-    assert told["pose"] is None is told["median_reprojection_error_px"]
-    assert told["calibration"]["baseline_mm"] == BASELINE
-    assert told["calibration"]["source"].endswith("calib.json")
-    assert set(told["seconds"]) >= {"rectified or not", "keypoints", "matching", "files"}
+    assert values["rectified"] is True
+    assert "on the same row" in values["rectified_why"]
+    assert (values["unit"], values["scale"]) == ("mm", "lengths are in mm")
+    assert values["points"] + sum(values["dropped"].values()) == values["matches"]
+    assert values["density"] == pytest.approx(values["points"] / (400 * 300), abs=1e-6)
+    assert values["filled"] == 0
+    assert values["pose"] is None is values["median_reprojection_error_px"]
+    assert values["calibration"]["baseline_mm"] == BASELINE
+    assert values["calibration"]["source"].endswith("calib.json")
+    assert set(values["seconds"]) >= {"rectified or not", "keypoints", "matching", "files"}
 
     points, colors = ply_points(Path("out/m.ply"))
-    assert len(points) == told["points"] > 30_000
+    assert len(points) == values["points"] > 30_000
     with np.load("out/m_depth.npz", allow_pickle=False) as file:
         depth, disparity, matched = file["depth"], file["disparity"], file["matched"]
         assert str(file["unit"]) == "mm"
@@ -114,26 +114,29 @@ def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
         depth[known], FOCAL * BASELINE / (disparity[known] + OFFSET), rtol=1e-5
     )
     np.testing.assert_allclose(np.sort(points[:, 2]), np.sort(depth[known]), rtol=1e-5)
-    assert told["depth"]["50%"] == pytest.approx(np.median(depth[known]), rel=1e-4)
-    assert told["disparity"]["95%"] == pytest.approx(np.quantile(disparity[known], 0.95), rel=1e-4)
+    assert values["depth"]["50%"] == pytest.approx(np.median(depth[known]), rel=1e-4)
+    percentile = np.quantile(disparity[known], 0.95)
+    assert values["disparity"]["95%"] == pytest.approx(percentile, rel=1e-4)
+        np.quantile(disparity[known], 0.95), rel=1e-4
+    )
     # Each point lies where its pixel looks, and has that pixel's colour.
     picture = np.asarray(Image.open(folder / "left.png"))
     column, row = np.rint(points[:, :2] / points[:, 2:] * FOCAL + [61.193, 194.877]).astype(int).T
     np.testing.assert_array_equal(picture[row, column], colors)
     # Half the angle between the cameras has the tangent of half the baseline over the depth.
-    angle = np.degrees(2 * np.arctan(BASELINE / 2 / told["depth"]["50%"]))
-    assert told["median_triangulation_angle_degrees"] == pytest.approx(angle, rel=0.05)
+    angle = np.degrees(2 * np.arctan(BASELINE / 2 / values["depth"]["50%"]))
+    assert values["median_triangulation_angle_degrees"] == pytest.approx(angle, rel=0.05)
 
     stored = cv2.imread("out/m_depth.png", cv2.IMREAD_UNCHANGED)
     assert stored.dtype == np.uint16
-    step = told["depth_png"]["value_per_unit"]
-    assert told["depth_png"]["known_pixels"] == np.count_nonzero(stored) == told["points"]
+    step = values["depth_png"]["value_per_unit"]
+    assert values["depth_png"]["known_pixels"] == np.count_nonzero(stored) == values["points"]
     np.testing.assert_allclose(stored[known] / step, depth[known], atol=0.51 / step)
     read, unit = load_depth_png("out/m_depth.png")
     assert unit == "mm"
     np.testing.assert_array_equal(np.isfinite(read), known)
     page = Path("out/m.html").read_text()
-    assert f"{told['points']:,}" in page or "Left out" in page
+    assert f"{values['points']:,}" in page or "Left out" in page
     assert "left.png and right.png" in page
     assert Path("out/m.glb").read_bytes()[:4] == b"glTF"
 
@@ -147,12 +150,12 @@ def test_the_depth_is_true(run, folder: Path) -> None:
     arguments = folder / "left.png", folder / "right.png", "--calibration", folder / "calib.json"
     for more, least, share in ((["--density", 1], 0.85, 0.85), ([], 0.3, 0.96)):
         result = run("reconstruct", *arguments, "-o", "m.glb", "--json", *more)
-        told = json.loads(result.stdout)
+        values = json.loads(result.stdout)
         depth = np.load("m_depth.npz")["depth"]
         off = np.abs(depth / true - 1)[np.isfinite(depth) & np.isfinite(true)]
         assert (off < 0.01).mean() > share
-        assert told["density"] > least
-        assert (told["filled"] > 0) == bool(more)
+        assert values["density"] > least
+        assert (values["filled"] > 0) == bool(more)
 
 
 def test_a_turned_pair_has_no_scale_and_says_so(run, folder: Path) -> None:
@@ -164,31 +167,31 @@ def test_a_turned_pair_has_no_scale_and_says_so(run, folder: Path) -> None:
     assert sorted(path.name for path in Path().iterdir()) == FILES
     assert "the true scale is not known (give baseline_mm in a calib.json)" in result.stdout
     assert "baselines" in result.stdout
-    told = json.loads(Path("m.json").read_text())
-    assert told["rectified"] is False
-    assert "on the same row" in told["rectified_why"]
-    assert told["rectification"]["rectified"] is False
-    assert told["unit"] == "baseline"
-    assert told["calibration"]["source"] == "focal_px"
-    assert 0 < told["median_reprojection_error_px"] < 0.2
-    assert told["pose"]["angle_degrees"] == pytest.approx(5.9, abs=0.3)
+    values = json.loads(Path("m.json").read_text())
+    assert values["rectified"] is False
+    assert "on the same row" in values["rectified_why"]
+    assert values["rectification"]["rectified"] is False
+    assert values["unit"] == "baseline"
+    assert values["calibration"]["source"] == "focal_px"
+    assert 0 < values["median_reprojection_error_px"] < 0.2
+    assert values["pose"]["angle_degrees"] == pytest.approx(5.9, abs=0.3)
     with np.load("m_depth.npz", allow_pickle=False) as file:
         assert set(file.files) == {"depth", "unit", "matched"}
-        assert np.isfinite(file["depth"]).sum() == told["points"] > 10_000
+        assert np.isfinite(file["depth"]).sum() == values["points"] > 10_000
 
 
 def test_selection_options_and_weights_reach_the_detector(run, folder: Path) -> None:
     from deepdetect import DeepDetect
 
     pair = folder / "left.png", folder / "right.png", "--focal", FOCAL, "--rectified", "--json"
-    told = json.loads(run("reconstruct", *pair, "--max-keypoints", 3000).stdout)
-    assert told["keypoints"] == 3000
-    assert told["rectified_why"] == "as asked for"
+    values = json.loads(run("reconstruct", *pair, "--max-keypoints", 3000).stdout)
+    assert values["keypoints"] == 3000
+    assert values["rectified_why"] == "as asked for"
     assert Path("deepdetect-output/model.ply").is_file()
     for given, weights in (([], "dense"), (["--weights", "default"], "default")):
-        told = json.loads(run("reconstruct", *pair, "--threshold", 0.7, *given).stdout)
+        values = json.loads(run("reconstruct", *pair, "--threshold", 0.7, *given).stdout)
         expected = DeepDetect(weights).detect(folder / "left.png", threshold=0.7)
-        assert told["keypoints"] == len(expected)
+        assert values["keypoints"] == len(expected)
 
 
 CASES = {
@@ -319,14 +322,14 @@ def test_exif_gives_the_focal_length(run, folder: Path) -> None:
     exif.get_ifd(0x8769).update({0xA405: 90})
     for name in ("left", "right"):
         Image.open(folder / f"{name}.png").save(f"{name}.png", exif=exif)
-    told = json.loads(run("reconstruct", "left.png", "right.png", "-o", "m.ply", "--json").stdout)
-    assert told["calibration"]["source"] == "EXIF"
+    values = json.loads(run("reconstruct", "left.png", "right.png", "-o", "m.ply", "--json").stdout)
+    assert values["calibration"]["source"] == "EXIF"
     focal = 90 * np.hypot(400, 300) / np.hypot(36, 24)
-    assert told["calibration"]["left"]["focal_px"] == pytest.approx([focal, focal])
+    assert values["calibration"]["left"]["focal_px"] == pytest.approx([focal, focal])
 
 
 def test_the_progress_counts_every_stage(monkeypatch: pytest.MonkeyPatch, run, folder) -> None:
-    """On a terminal the bar ends full, whichever road was taken."""
+    """On a terminal the bar ends full, whichever pipeline ran."""
     import deepdetect._shared.progress
 
     bars = []

@@ -41,9 +41,9 @@ def test_what_cannot_be_connected_is_told(views: list[np.ndarray], tmp_path: Pat
     np.testing.assert_allclose(report["homographies"][1], moved, atol=1e-9)
     assert report["pairs"][0]["images"] == [files[0], files[2]]
     assert report["pairs"][0]["matches"] > 1000
-    told = CliRunner().invoke(main, words)
-    assert f"left out: {files[1]}, as it overlaps with no other image" in told.stderr
-    assert "2 of 3" in told.stdout
+    values = CliRunner().invoke(main, words)
+    assert f"left out: {files[1]}, as it overlaps with no other image" in values.stderr
+    assert "2 of 3" in values.stdout
 
 
 def test_the_command_writes_the_file(views: list[np.ndarray], tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_photographs_are_not_written_over(files: list[Path]) -> None:
     assert "panorama.jpg would be written over" in refused(*files, "panorama.jpg")
     assert Path("panorama.jpg").read_bytes() == before[files[0]]
     assert {path: path.read_bytes() for path in files} == before
-    # A panorama that is no input is made anew.
+    # A panorama that is no input is written again.
     assert CliRunner().invoke(main, ["stitch", *map(str, files)]).exit_code == 0
     assert Path("panorama.jpg").read_bytes() != before[files[0]]
 

@@ -40,9 +40,9 @@ def test_train_and_shards(run, images: Path, tmp_path: Path) -> None:
     assert json.loads(packed.output)["validation"] == 1
     trained = run("train", "packed", "-o", "run", *TINY, "--workers", "1", "--json")
     assert trained.exit_code == 0, trained.output
-    told = json.loads(trained.output)
-    assert Path(told["onnx"]).is_file()
-    assert told["validation_loss"] > 0
+    values = json.loads(trained.output)
+    assert Path(values["onnx"]).is_file()
+    assert values["validation_loss"] > 0
     again = run("train", "packed", "-o", "run", *TINY, "--workers", "1")
     assert "best after epoch" in again.output
     other = run("train", "packed", "-o", "run", *TINY, "--short-side", "96")

@@ -20,7 +20,7 @@ MOVES = {
     "graf": [[0.98, 0.03, 2], [-0.02, 1.01, 1], [2e-4, -1e-4, 1]],
     "wall": [[1, 0, 2], [0, 1, -4], [0, 0, 1]],
 }
-"""From each image to the next; the other scenes stand still."""
+"""From each image to the next; nothing moves in the other scenes."""
 
 
 class EdgeDetector(DeepDetect):

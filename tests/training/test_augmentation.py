@@ -302,7 +302,7 @@ def test_all_of_it_comes_from_inside() -> None:
         view = augmentation._rotated_crop(ramps, 100, RANGES, generator).astype(float)
         across = view[50, 75, :2] - view[50, 25, :2]
         down = view[75, 50, :2] - view[25, 50, :2]
-        # Turned and scaled alike along both axes, and not mirrored.
+        # Rotated, and scaled equally along both axes, and not mirrored.
         assert np.linalg.norm(across) == pytest.approx(np.linalg.norm(down), rel=0.06)
         assert across @ down == pytest.approx(0, abs=0.06 * (across @ across))
         assert across[0] * down[1] - across[1] * down[0] > 0

@@ -98,7 +98,7 @@ def test_the_context_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatc
     monkeypatch.delenv("TORCHELASTIC_RUN_ID", raising=False)
     monkeypatch.setenv("RANK", "3")
     assert DistributedContext.from_environment() == DistributedContext(), (
-        "a variable of another program is no cluster"
+        "a variable of another program starts no distributed run"
     )
     monkeypatch.setenv("TORCHELASTIC_RUN_ID", "run")
     monkeypatch.setenv("WORLD_SIZE", "8")

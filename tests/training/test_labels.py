@@ -62,7 +62,7 @@ def test_an_image_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path
 
 
 def test_photographs_of_one_name_have_their_own_labels(photographs: Path, tmp_path: Path) -> None:
-    """Training and validation folders often number their photographs alike."""
+    """Training and validation folders often number their photographs in the same way."""
     for part, source in (("train", "photo00.png"), ("val", "photo05.png")):
         (tmp_path / part).mkdir()
         (tmp_path / part / "0001.png").write_bytes((photographs / source).read_bytes())

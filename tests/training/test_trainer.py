@@ -88,7 +88,7 @@ def same_run(a: Path, b: Path) -> bool:
 
 
 def interrupted(monkeypatch: pytest.MonkeyPatch, method: str, count: int) -> Any:
-    """Let a method of the learner fail when it is called again after so many calls."""
+    """Let a method of the learner fail when it is called again after this many calls."""
     calls = iter(range(count))
     whole = getattr(Learner, method)
 

@@ -1,4 +1,4 @@
-"""The command `deepdetect`: its subcommands, and how errors are told."""
+"""The command `deepdetect`: its subcommands, and how errors are reported."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def main() -> None:
     \b
     deepdetect detect photo.jpg            keypoints of a photograph
     deepdetect match left.jpg right.jpg    matches between two photographs
-    deepdetect reconstruct left.jpg right.jpg --focal 1250    a model in space
+    deepdetect reconstruct left.jpg right.jpg --focal 1250    a 3D reconstruction
 
     Each command has its own --help.
     """

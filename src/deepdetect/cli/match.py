@@ -46,7 +46,7 @@ GEOMETRY = FieldOptions(
     help="Options to start from: default, or published (exactly the paper's code).",
 )
 @click.option(
-    "--homography", type=PATH, help="Text file of a known 3x3 homography to judge matches by."
+    "--homography", type=PATH, help="Text file of a known 3x3 homography to evaluate matches by."
 )
 @click.option("--camera0", type=PATH, help="Text file of the 3x3 camera matrix, for essential.")
 @click.option("--camera1", type=PATH, help="The same of the second image.  [default: camera0]")

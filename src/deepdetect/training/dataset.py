@@ -192,7 +192,7 @@ def prepare_data(
         validation: folder of other images; None holds out some of the first.
         labels: folder of the label cache; None: in `output`.
         workers: processes that make labels; default one per processor.
-        num_workers: processes that will load the data, for their share of the memory.
+        num_workers: processes that will load the data, to divide the memory between.
         quiet: show no progress bar.
 
     Raises:

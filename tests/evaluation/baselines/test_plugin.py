@@ -75,7 +75,7 @@ def test_points_without_descriptors_get_upright_rootsift_of_size_4(
 def test_own_descriptors_take_part_in_matching(
     write: Write, photo_path: Path, crop: np.ndarray, given: str
 ) -> None:
-    """Float32, float64 and lists alike, also when only the best keypoints count."""
+    """Float32, float64 and lists are equal, also when only the best keypoints count."""
     target = write(CORNERS % f", 'descriptors': {given}") + ":find"
     method = plugin_feature(target)
     np.testing.assert_array_equal(method.describe(crop, method.detect(crop)), np.eye(4, 8))

@@ -92,7 +92,7 @@ def test_the_counts_are_those_of_match_images(
 
 
 def test_a_wrong_truth_finds_nothing_right(section) -> None:
-    """The truth judges only: the matches are the same, and none of them is right."""
+    """The ground truth only evaluates: the matches are the same, and none of them is right."""
     true, wrong = rows(section, "key_true"), rows(section, "key_wrong")
     for name, row in wrong.items():
         assert row["guided: precision"] < 0.01

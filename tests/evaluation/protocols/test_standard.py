@@ -202,7 +202,7 @@ def test_baselines_are_worth_what_chance_is(report: Report) -> None:
     every = rows["baseline: all pixels (a grid, where there is a budget)"]
     assert every["all"] == 1
     assert every["all: chance"] == 1
-    assert every["all: chance-corrected"] is None, "nothing can be told from chance"
+    assert every["all: chance-corrected"] is None, "nothing can be distinguished from chance"
     assert every["keypoints of all"] == 80 * 64
     # Of smoky's two images the random points differ; dusty's are one image twice.
     own = rows["DeepDetect, native resolution, suppression 3x3, sub-pixel"]

@@ -116,13 +116,13 @@ def test_every_pipeline_tells_what_its_stages_took(section: Section) -> None:
         assert (row["matching, s"] or 0) > 0, name
 
 
-def test_without_a_truth_nothing_is_judged(section: Section) -> None:
-    judged, blank = (rows(section, f"middlebury_{s}") for s in ("cones", "nothing-known"))
+def test_without_a_truth_nothing_is_evaluated(section: Section) -> None:
+    known, blank = (rows(section, f"middlebury_{s}") for s in ("cones", "nothing-known"))
     for name, row in blank.items():
         assert row["1 - bad-1"] is None
         assert row["F-score"] is None
         if name.startswith(("ours", "all", "baseline: all", "OpenCV")):
-            assert row["points"] == judged[name]["points"]
+            assert row["points"] == known[name]["points"]
 
 
 def test_figure_8_is_a_picture_with_counts(section: Section) -> None:
