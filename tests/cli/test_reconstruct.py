@@ -117,8 +117,6 @@ def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
     assert values["depth"]["50%"] == pytest.approx(np.median(depth[known]), rel=1e-4)
     percentile = np.quantile(disparity[known], 0.95)
     assert values["disparity"]["95%"] == pytest.approx(percentile, rel=1e-4)
-        np.quantile(disparity[known], 0.95), rel=1e-4
-    )
     # Each point lies where its pixel looks, and has that pixel's colour.
     picture = np.asarray(Image.open(folder / "left.png"))
     column, row = np.rint(points[:, :2] / points[:, 2:] * FOCAL + [61.193, 194.877]).astype(int).T
