@@ -8,6 +8,7 @@ from ._shared.errors import (
 )
 from .detector.detector import DeepDetect as DeepDetect
 from .detector.heatmap import HeatmapOptions as HeatmapOptions
+from .evaluation.evaluate import Evaluation as Evaluation, evaluate as evaluate
 from .features.keypoints import Keypoints as Keypoints
 from .features.selection import (
     SelectionOptions as SelectionOptions,
@@ -44,5 +45,7 @@ from .reconstruction.stereo.matching import (
     DisparityOptions as DisparityOptions,
     disparity_map as disparity_map,
 )
+from .training.recipe import TrainingOptions as TrainingOptions
+from .training.run import train as train
 
 __version__: str

@@ -99,7 +99,11 @@ def _missing(tensors: dict[str, torch.Tensor], name: str) -> None:
     del tensors[name]
 
 
-@pytest.mark.parametrize("change", [_shorter, _doubled, _missing])
+def _not_finite(tensors: dict[str, torch.Tensor], name: str) -> None:
+    tensors[name] = torch.full_like(tensors[name], float("nan"))
+
+
+@pytest.mark.parametrize("change", [_shorter, _doubled, _missing, _not_finite])
 @pytest.mark.parametrize(
     ("optimizer", "name"),
     [

@@ -106,7 +106,7 @@ network.train()
 if sys.argv[2] == "frozen":
     freeze_batch_norm(network)
 loss = binary_cross_entropy_with_logits(engine.logits(engine.to_float(rgb[mine])), masks[mine])
-engine.backward(loss)
+engine.fabric.backward(loss)
 if engine.context.is_main:
     tensors = {f"gradient.{n}": p.grad.contiguous() for n, p in network.named_parameters()}
     tensors |= {n: b.float().contiguous() for n, b in network.named_buffers()}

@@ -24,7 +24,7 @@ def gradients(engine: Engine, images: torch.Tensor, truth: torch.Tensor) -> list
     engine.network.train()
     engine.network.zero_grad()
     loss = torch.nn.functional.binary_cross_entropy_with_logits(engine.logits(images), truth)
-    engine.backward(loss)
+    engine.fabric.backward(loss)
     return [parameter.grad.clone() for parameter in engine.network.parameters()]
 
 
@@ -120,7 +120,6 @@ def test_images_become_floats_and_values_come_back_alone() -> None:
     assert found.is_contiguous(memory_format=torch.channels_last)
     torch.testing.assert_close(found, rgb.permute(0, 3, 1, 2) / 255)
     assert engine.all_gather({"a": 1}) == [{"a": 1}]
-    assert engine.broadcast("word") == "word"
     assert engine.all_reduce_mean(torch.tensor(3.0)) == 3
     assert engine.describe() == "cpu, float32, eager"
     engine.context.barrier()

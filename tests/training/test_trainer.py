@@ -28,13 +28,13 @@ from deepdetect.detector.network.weights import (  # noqa: E402
     weights_digest,
 )
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
-from deepdetect.training import trainer  # noqa: E402
 from deepdetect.training.checkpoint import read_checkpoint  # noqa: E402
 from deepdetect.training.learner import Learner  # noqa: E402
 from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions  # noqa: E402
-from deepdetect.training.trainer import TrainingResult, train  # noqa: E402
+from deepdetect.training.run import train  # noqa: E402
+from deepdetect.training.trainer import TrainingResult  # noqa: E402
 
-PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
+PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1, checkpoint_interval_s=0)
 OPTIONS = TrainingOptions(
     stages=(Stage(64, 4, 3), Stage(96, 2, 1)),
     short_sides=(96, 64),
@@ -98,7 +98,6 @@ def interrupted(monkeypatch: pytest.MonkeyPatch, method: str, count: int) -> Any
         return whole(*arguments)
 
     monkeypatch.setattr(Learner, method, step)
-    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", -1.0)
     return pytest.raises(KeyboardInterrupt)
 
 

@@ -145,7 +145,7 @@ def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelSet
 
 RECIPE = FieldOptions(
     "training.recipe:TrainingOptions",
-    skip=("darkening", "detectors", "label_changes"),
+    skip=("darkening", "augmentation_ranges", "detectors", "label_changes"),
     flags={
         "stages": "--stage",
         "short_sides": "--short-side",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import sys
 import traceback
@@ -83,14 +82,9 @@ def train(
     deepdetect train photos/ -o run
     deepdetect detect photo.jpg --weights run/deepdetect.onnx
     """
-    from .._shared.errors import MissingExtraError
+    from ..training.run import require_packages
 
-    for package in ("torch", "lightning_fabric", "safetensors", "onnx"):
-        if importlib.util.find_spec(package) is None:
-            raise MissingExtraError(
-                f"training needs the package {package.replace('_', '-')}, which is not installed: "
-                "run pip install torch lightning-fabric safetensors onnx matplotlib"
-            )
+    require_packages()
     from ..training import DeviceOptions, profile
     from ..training import train as train_network
 

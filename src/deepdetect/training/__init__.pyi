@@ -1,5 +1,4 @@
 from .dataset import CropDataset as CropDataset, ValidationDataset as ValidationDataset
-from .profiling import StageProfile as StageProfile, profile as profile
 from .recipe import (
     PRESETS as PRESETS,
     DeviceOptions as DeviceOptions,
@@ -7,6 +6,7 @@ from .recipe import (
     TrainingOptions as TrainingOptions,
     training_preset as training_preset,
 )
+from .run import StageProfile as StageProfile, profile as profile, train as train
 from .sampler import CropSampler as CropSampler, Schedule as Schedule
 from .shards import write_shards as write_shards
-from .trainer import Trainer as Trainer, TrainingResult as TrainingResult, train as train
+from .trainer import Trainer as Trainer, TrainingResult as TrainingResult

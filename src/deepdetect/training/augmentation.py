@@ -16,9 +16,6 @@ RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
 AUGMENTATION_VERSION = 2
 """Part of the names of augmented views: when `augment` draws otherwise, old labels do not fit."""
 
-MAX_JITTER_SATURATION = 1.2
-"""`jitter_color` scales the saturation by a factor of up to this."""
-
 
 @dataclass(frozen=True)
 class Darkening:
@@ -81,6 +78,12 @@ class AugmentationRanges:
     jpeg_probability: float = 0.35
     jpeg_quality: tuple[int, int] = (20, 95)
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            low, high = value if isinstance(value, tuple) else (value, value)
+            if not 0 <= low <= high or (name.endswith("probability") and high > 1):
+                raise OptionError(f"`{name}` is {value}, which is no probability or range")
+
 
 def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
     """Reduce the brightness, then the contrast (paper, Section III-B).
@@ -107,11 +110,7 @@ def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
 
 
 def flip(image: np.ndarray, mask: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror a crop and its label left to right (axis 1) or upside down (axis 0).
-
-    Some detectors label a mirrored photograph differently: they have filters of even width, or
-    look for corners at even pixels of a smaller image (docs/training.md).
-    """
+    """Mirror a crop and its label left to right (axis 1) or upside down (axis 0)."""
     # Copies a hundred times faster than a negative stride.
     return cv2.flip(image, axis), cv2.flip(mask.view(np.uint8), axis).view(bool)
 
@@ -121,31 +120,26 @@ def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
 
 
-def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -> np.ndarray:
+def jitter_color(
+    rgb: np.ndarray, generator: np.random.Generator, exact: bool, max_saturation: float = 1.2
+) -> np.ndarray:
     """Remove the colours or rotate the hue, both with the same luma.
 
     Args:
         rgb: (H, W, 3) uint8 RGB.
-        generator: draws which, and the angle.
+        generator: draws which, the angle, and the factor of the saturation.
         exact: only remove colours: rotating them can change the luma by one level, which
             matters for the keypoints of dark images.
+        max_saturation: of that factor.
     """
     if exact or generator.random() < 0.5:
         return to_gray(rgb)
     angle = generator.uniform(0, 2 * np.pi)
-    return rotate_hue(rgb, angle, generator.uniform(0, MAX_JITTER_SATURATION))
+    return rotate_hue(rgb, angle, generator.uniform(0, max_saturation))
 
 
 def to_gray(rgb: np.ndarray) -> np.ndarray:
-    """Replace colours by the luma, the only thing that labels depend on.
-
-    Args:
-        rgb: (H, W, 3) uint8 RGB.
-
-    Example:
-        >>> to_gray(np.full((1, 1, 3), (200, 100, 50), np.uint8)).tolist()
-        [[[124, 124, 124]]]
-    """
+    """Replace the colours of (H, W, 3) uint8 RGB by the luma, on which labels depend."""
     return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
 
 
@@ -182,10 +176,8 @@ def augment(
 ) -> np.ndarray:
     """Make an augmented view: a part of a photograph, rotated, relit, blurred, noisy, compressed.
 
-    Detectors that look at single pixels label a rotated or blurred photograph quite differently,
-    so each augmented view shows the network something new. Its label is made from the view
-    itself. Noise, interpolation and compression are those of NumPy and OpenCV: other versions may
-    give slightly different views for the same seed.
+    Its label is made from the view itself. Other versions of NumPy and OpenCV may give slightly
+    different views for the same seed.
 
     Args:
         rgb: (H, W, 3) uint8 RGB.

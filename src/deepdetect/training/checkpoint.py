@@ -66,13 +66,7 @@ class TrainingState:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a checkpoint file holds.
-
-    Attributes:
-        path: the file.
-        metadata: what `save_checkpoint` was given.
-        tensors: those of the network and of the optimisers, by name.
-    """
+    """A checkpoint file: its path, its metadata, and the tensors of network and optimisers."""
 
     path: Path
     metadata: dict[str, Any]
@@ -80,19 +74,17 @@ class Checkpoint:
 
     def unfit(self, reason: object) -> WeightsError:
         """Return the error for a checkpoint that cannot be resumed from."""
-        return _unfit(self.path, reason)
+        text = str(reason).splitlines()[0] if str(reason) else type(reason).__name__
+        return WeightsError(
+            f"{self.path} is not a checkpoint of this network ({text}): "
+            "delete it, or train into another folder"
+        )
 
 
 def save_checkpoint(
     path: Path, network: nn.Module, optimizers: Sequence[Optimizer], metadata: Mapping[str, Any]
 ) -> None:
-    """Write the network, the state of the optimisers and that of the run.
-
-    Args:
-        path: the file.
-        network: its state dict is stored under "network.".
-        optimizers: of its parameters; their state is stored under "optimizer.MOMENT.PARAMETER".
-        metadata: anything JSON can hold.
+    """Write the network ("network.NAME"), its optimisers ("optimizer.MOMENT.PARAMETER") and JSON.
 
     Raises:
         DeepDetectError: the file cannot be written.
@@ -121,9 +113,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
             tensors = {name: file.get_tensor(name) for name in list(file.keys())}
             metadata = json.loads((file.metadata() or {})["state"])
     except (SafetensorError, OSError, KeyError, ValueError, RecursionError) as error:
-        raise _unfit(path, error) from None
+        raise Checkpoint(path, {}, {}).unfit(error) from None
     if not isinstance(metadata, dict):
-        raise _unfit(path, "its state is not an object")
+        raise Checkpoint(path, {}, {}).unfit("its state is not an object")
     return Checkpoint(path, metadata, tensors)
 
 
@@ -152,6 +144,8 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimizers: Sequence[Opt
         if wanted.get(name) != found.get(name):
             is_now, should = (each.get(name, "missing") for each in (found, wanted))
             raise checkpoint.unfit(f"{name} is {is_now}, it should be {should}")
+        if not tensors[name].isfinite().all():
+            raise checkpoint.unfit(f"{name} is not finite")
     network.load_state_dict({name: tensors[f"network.{name}"] for name in network.state_dict()})
     for optimizer, parameter, shapes in trained:
         optimizer.state[parameter] = {
@@ -161,10 +155,7 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimizers: Sequence[Opt
 
 
 def _like(value: Tensor, parameter: Tensor) -> Tensor:
-    """Bring a moment to its parameter's device.
-
-    In the parameter's memory layout: fused Adam walks both in parallel.
-    """
+    """Bring a moment to its parameter's device and memory layout, which fused Adam relies on."""
     if value.shape == parameter.shape:
         return torch.empty_like(parameter).copy_(value)
     return value.to(parameter.device, copy=True)
@@ -179,11 +170,3 @@ def _number(values: Mapping[str, Any], name: str, kind: type) -> Any:
     if kind is float and (whole or isinstance(value, float)) and math.isfinite(value):
         return float(value)
     raise ValueError(f"{name} is not a number that it can be")
-
-
-def _unfit(path: Path, reason: object) -> WeightsError:
-    text = str(reason).splitlines()[0] if str(reason) else type(reason).__name__
-    return WeightsError(
-        f"{path} is not a checkpoint of this network ({text}): "
-        "delete it, or train into another folder"
-    )

@@ -19,7 +19,7 @@ from .._shared.parallel import available_memory
 from .augmentation import flip, jitter_color, transpose
 from .engine import DistributedContext
 from .labels import LabelCache
-from .recipe import Stage, TrainingOptions
+from .recipe import DeviceOptions, Stage, TrainingOptions
 from .sampler import CropIndex
 from .shards import Shards, ShardSource, has_shards
 from .views import SourceImage, View, digest_images, list_images, render, train_val_split
@@ -40,12 +40,9 @@ class ImageSource(Protocol):
 
 
 class FolderSource:
-    """Images in files, with labels in a cache. Views are kept in memory up to a limit.
+    """Images in files, with labels in a cache.
 
-    Args:
-        images: the images.
-        labels: their labels.
-        memory_bytes: how much memory views may take; those beyond it are rendered each time.
+    Up to `memory_bytes` of views are kept in memory; those beyond are rendered each time.
     """
 
     def __init__(
@@ -85,10 +82,6 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
 
     Each crop is a pure function of its index and the seed: (crop, crop, 3) uint8 RGB, and
     (crop, crop) bool label.
-
-    Args:
-        source: the images.
-        options: the recipe.
     """
 
     def __init__(self, source: ImageSource, options: TrainingOptions) -> None:
@@ -112,7 +105,8 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
         if options.transpositions and generator.random() < 0.5:
             image, mask = transpose(image, mask)
         if generator.random() < options.color_jitter:
-            image = jitter_color(image, generator, exact=view.darkening is not None)
+            dark = view.darkening is not None
+            image = jitter_color(image, generator, dark, options.max_jitter_saturation)
         return torch.tensor(image), torch.tensor(mask)
 
     def _choose_view(
@@ -129,13 +123,9 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
 
 
 class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
-    """Whole images: (H, W, 3) uint8 RGB, and (H, W) bool label.
+    """This process's part of the whole images: (H, W, 3) uint8 RGB, and (H, W) bool label.
 
     Those in normal light come first, then the darkened ones.
-
-    Args:
-        source: the images.
-        context: this process; it gets its part of the images.
     """
 
     def __init__(
@@ -171,29 +161,19 @@ class TrainingData:
 
 
 def prepare_data(
-    images: Path,
+    images: str | Path,
     options: TrainingOptions,
-    output: Path,
+    output: str | Path,
     *,
-    validation: Path | None = None,
-    labels: Path | None = None,
+    validation: str | Path | None = None,
+    labels: str | Path | None = None,
     workers: int | None = None,
-    num_workers: int = 0,
+    device: DeviceOptions = DeviceOptions(),
     quiet: bool = True,
 ) -> TrainingData:
-    """List the images of a run and make the labels of all their views.
+    """List the images of a run and make the labels of all their views; arguments of `train`.
 
     The first process of each machine makes the labels, the others wait for it.
-
-    Args:
-        images: folder of images, or of shards (`write_shards`).
-        options: the recipe.
-        output: folder of the run, which is left out when it is below the images.
-        validation: folder of other images; None holds out some of the first.
-        labels: folder of the label cache; None: in `output`.
-        workers: processes that make labels; default one per processor.
-        num_workers: processes that will load the data, to divide the memory between.
-        quiet: show no progress bar.
 
     Raises:
         ImageError: a folder is missing or empty.
@@ -203,13 +183,15 @@ def prepare_data(
     context = DistributedContext.from_environment()
     for stage in options.stages:
         context.local_slice(stage.batch)  # an uneven one is reported before the labels are made
-    cache = LabelCache(output / "labels" if labels is None else labels, options.label_options)
-    exclude = (output, output / "labels" if labels is None else labels)
+    images, output = Path(images), Path(output)
+    label_folder = output / "labels" if labels is None else Path(labels)
+    cache = LabelCache(label_folder, options.label_options)
+    exclude = (output, label_folder)
     shards = Shards.open(images, options) if has_shards(images) else None
     listed = [] if shards else list_images(images, options, exclude, options.max_images)
     held_out: list[SourceImage] = []
     if validation is not None:
-        held_out = list_images(validation, options, exclude)
+        held_out = list_images(Path(validation), options, exclude)
     elif not shards:
         listed, held_out = train_val_split(listed, options.val_fraction)
     if context.local_rank == 0:
@@ -217,27 +199,26 @@ def prepare_data(
         wanted += [(image, image.validation_views) for image in held_out]
         cache.make(wanted, workers, quiet or not context.is_main)
     context.barrier()
-    # Half of the free memory, for all processes together.
-    memory = available_memory() // (2 * context.local_world_size * max(1, num_workers))
+    memory = device.view_memory_bytes
+    memory = available_memory() // 2 if memory is None else memory
+    local = context.local_world_size
+    memory //= local * max(1, device.worker_count(local))  # each process has its own
     held = FolderSource(held_out, cache, memory // 8)
     if not shards:
-        return TrainingData(
-            FolderSource(listed, cache, memory), held, digest_images(listed, held_out)
-        )
-    source, sizes = ShardSource(shards.training, options), tuple(n for _, n in shards.training)
+        source = FolderSource(listed, cache, memory)
+        return TrainingData(source, held, digest_images(listed, held_out))
+    packed, sizes = ShardSource(shards.training, options), tuple(n for _, n in shards.training)
     if validation is None:
         own = ShardSource(shards.validation, options)
-        return TrainingData(source, own, shards.digest, sizes)
-    return TrainingData(source, held, f"{shards.digest} {digest_images([], held_out)}", sizes)
+        return TrainingData(packed, own, shards.digest, sizes)
+    return TrainingData(packed, held, f"{shards.digest} {digest_images([], held_out)}", sizes)
 
 
 @contextlib.contextmanager
 def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
-    """Iterate over a loader; an error in one of its processes comes as it was raised there.
+    """Yield an iterator over a loader; an error in one of its processes comes as raised there.
 
-    Yields:
-        The iterator over its batches. OpenCV has one thread meanwhile: a forked process cannot
-        use the threads of its parent.
+    OpenCV has one thread meanwhile: a forked process cannot use the threads of its parent.
     """
     threads = cv2.getNumThreads()
     if loader.num_workers:

@@ -6,7 +6,6 @@ and sets the precision; `torchrun` starts the processes.
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import itertools
 import logging
@@ -32,14 +31,7 @@ _barriers = itertools.count()  # each has its own name in the store
 
 @dataclass(frozen=True)
 class DistributedContext:
-    """This process among those of a run.
-
-    Attributes:
-        rank: its number among all processes.
-        world_size: number of all processes.
-        local_rank: its number among those of this machine.
-        local_world_size: number of processes on this machine, the same on each.
-    """
+    """This process among those of a run: `torchrun`'s RANK, WORLD_SIZE and so on."""
 
     rank: int = 0
     world_size: int = 1
@@ -117,9 +109,7 @@ class DistributedContext:
 class Engine:
     """A network on its device, with processes, precision and compilation as chosen.
 
-    Args:
-        network: the network; it is moved, and stays the same object (with the same state).
-        options: the choices.
+    The network is moved, and stays the same object (with the same state).
     """
 
     def __init__(self, network: nn.Module, options: DeviceOptions) -> None:
@@ -140,12 +130,10 @@ class Engine:
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if self.context.world_size > 1:
             synchronize_batch_norm(self.network, self.device)
-        compiled = options.compile
-        if compiled is None:
-            has_compiler = kind == "cuda" or any(map(shutil.which, ("g++", "clang++")))
-            # Sums over processes, inside the batch normalisation, break the graph.
-            compiled = has_compiler and self.context.world_size == 1
-        self.compiled = compiled
+        has_compiler = kind == "cuda" or any(map(shutil.which, ("g++", "clang++")))
+        # Sums over processes, inside the batch normalisation, break the graph.
+        default = has_compiler and self.context.world_size == 1
+        self.compiled = default if options.compile is None else options.compile
         self._may_fall_back = options.compile is None
         self._forward = self._set_up()
 
@@ -164,19 +152,11 @@ class Engine:
         """Turn (B, H, W, 3) uint8 into (B, 3, H, W) float32 in [0, 1] on the device."""
         return self.to_device(images).permute(0, 3, 1, 2).float().div_(255)
 
-    def autocast(self) -> contextlib.AbstractContextManager[object]:
-        """Return the context that the forward pass of training runs in.
-
-        Not Fabric's own precision, which would round the images to bfloat16 as well.
-        """
-        if not self.bfloat16:
-            return contextlib.nullcontext()
-        return torch.autocast(self.device.type, dtype=torch.bfloat16)
-
     def logits(self, images: Tensor) -> Tensor:
         """Run the network for training; logits are float32."""
         try:
-            with self.autocast():
+            # Not Fabric's own precision, which would round the images to bfloat16 as well.
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
                 return self._forward(images).float()
         except torch._dynamo.exc.TorchDynamoException as error:
             # A compiler on the path may still lack headers, and CUDA its Triton.
@@ -189,17 +169,11 @@ class Engine:
             self._forward = self._set_up()
             return self.logits(images)
 
-    def backward(self, loss: Tensor) -> None:
-        """Compute the gradients, averaged over all processes."""
-        self.fabric.backward(loss)
-
     def all_reduce_mean(self, value: Tensor) -> Tensor:
         """Average a tensor over all processes."""
         if self.context.world_size == 1:
             return value
-        total = value.clone()
-        torch.distributed.all_reduce(total)
-        return total / self.context.world_size
+        return _all_reduce_sum(value) / self.context.world_size
 
     def all_gather(self, value: Value) -> list[Value]:
         """Return every process's value, in the order of the processes, to all of them."""
@@ -209,20 +183,13 @@ class Engine:
         torch.distributed.all_gather_object(gathered, value)
         return gathered
 
-    def broadcast(self, value: Value) -> Value:
-        """Return the main process's value to all."""
-        return self.fabric.broadcast(value)
-
     def broadcast_(self, tensor: Tensor) -> None:
         """Replace a tensor, in place, by that of the main process."""
         if self.context.world_size > 1:
             torch.distributed.broadcast(tensor, 0)
 
     def close(self) -> None:
-        """Leave the process group, at the end of a run that went well.
-
-        After an error no process can be waited for: this one ends, and torchrun ends the others.
-        """
+        """Leave the process group, at the end of a run that went well."""
         # Not gloo's: its threads need the interpreter to let go of the last sum, and destroying
         # joins them without letting them have it (pytorch#190489). They end with the process.
         if self.context.world_size > 1 and self.device.type == "cuda":
@@ -239,19 +206,16 @@ class Engine:
 
 
 class SynchronizedBatchNorm(nn.BatchNorm2d):
-    """Batch normalisation whose statistics are those of all processes' batches together.
+    """`SyncBatchNorm` for CPUs, where torch's own does not run.
 
-    For CPUs (gloo): torch's own `SyncBatchNorm` runs on CUDA only. Every process must
-    have the same number of pixels.
+    Every process must have the same number of pixels.
     """
 
     def forward(self, x: Tensor) -> Tensor:
         if not self.training:
             return super().forward(x)
-        assert self.running_mean is not None
-        assert self.running_var is not None
-        assert self.num_batches_tracked is not None
-        assert self.momentum is not None
+        running_mean, running_var = self.get_buffer("running_mean"), self.get_buffer("running_var")
+        momentum = self.momentum or 0.0
         values = x.float()  # sums in bfloat16 would lose too much
         world_size = torch.distributed.get_world_size()
         count = values.numel() // values.shape[1] * world_size
@@ -259,9 +223,9 @@ class SynchronizedBatchNorm(nn.BatchNorm2d):
         centred = values - mean[:, None, None]
         variance = _all_reduce_sum(centred.square().mean((0, 2, 3))) / world_size
         with torch.no_grad():
-            self.running_mean.lerp_(mean, self.momentum)
-            self.running_var.lerp_(variance * (count / (count - 1)), self.momentum)
-            self.num_batches_tracked.add_(1)
+            running_mean.lerp_(mean, momentum)
+            running_var.lerp_(variance * (count / (count - 1)), momentum)
+            self.get_buffer("num_batches_tracked").add_(1)
         scale = self.weight * torch.rsqrt(variance + self.eps)
         return (centred * scale[:, None, None] + self.bias[:, None, None]).to(x.dtype)
 
@@ -271,15 +235,13 @@ class _AllReduceSum(torch.autograd.Function):
 
     @staticmethod
     def forward(context: Any, x: Tensor) -> Tensor:
-        total = x.clone()
+        total = x.clone(memory_format=torch.contiguous_format)
         torch.distributed.all_reduce(total)
         return total
 
     @staticmethod
     def backward(context: Any, *gradients: Tensor) -> Tensor:
-        total = gradients[0].clone(memory_format=torch.contiguous_format)
-        torch.distributed.all_reduce(total)
-        return total
+        return _all_reduce_sum(gradients[0])
 
 
 def _all_reduce_sum(x: Tensor) -> Tensor:
@@ -287,10 +249,7 @@ def _all_reduce_sum(x: Tensor) -> Tensor:
 
 
 def synchronize_batch_norm(network: nn.Module, device: torch.device) -> None:
-    """Make all batch normalisations of a network compute the statistics of all processes.
-
-    The network is changed in place; names and values of its state stay.
-    """
+    """Change a network in place: batch normalisations use the statistics of all processes."""
     if device.type == "cuda":
         nn.SyncBatchNorm.convert_sync_batchnorm(network)
         return
@@ -300,11 +259,7 @@ def synchronize_batch_norm(network: nn.Module, device: torch.device) -> None:
 
 
 def freeze_batch_norm(network: nn.Module) -> None:
-    """Make the batch normalisations of a training network use the statistics they have.
-
-    To be called after every `network.train()`, which thaws them. Their scales and biases
-    are still trained.
-    """
+    """Make the batch normalisations use the statistics they have, until `network.train()`."""
     for module in network.modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             module.eval()

@@ -20,13 +20,7 @@ from .recipe import DeviceOptions, TrainingOptions
 
 
 class Learner:
-    """A network on its device, with what optimises it.
-
-    Args:
-        network: the network, with its initial weights.
-        device: how it is run.
-        options: the recipe: optimiser, weights of the loss, what is frozen.
-    """
+    """A network on its device, with what optimises it as a recipe says."""
 
     def __init__(self, network: nn.Module, device: DeviceOptions, options: TrainingOptions) -> None:
         self.options = options
@@ -39,16 +33,13 @@ class Learner:
     def training_step(
         self, images: Tensor, masks: Tensor, learning_rate: float, step: int
     ) -> float:
-        """Make one optimiser step.
+        """Make one optimiser step, and return the loss over the whole batch.
 
         Args:
             images: (B, crop, crop, 3) uint8 RGB, this process's part of the batch.
             masks: (B, crop, crop) bool, its labels.
-            learning_rate: the learning rate.
+            learning_rate: of this step.
             step: number of the step, for the error.
-
-        Returns:
-            The loss over the whole batch.
 
         Raises:
             OptionError: the loss or its gradients are not finite.
@@ -69,7 +60,7 @@ class Learner:
             probability = logits.detach().sigmoid()
             weight = 1 + (weight - 1) * 4 * probability * (1 - probability)
         loss = binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
-        self.engine.backward(loss)
+        self.engine.fabric.backward(loss)
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         value = self.engine.all_reduce_mean(loss.detach()).item()
         # A finite loss can have gradients that are not, in bfloat16.
@@ -92,11 +83,7 @@ class Learner:
         return self.engine.to_device(torch.tensor(found)[:, None, None, None])
 
     def score(self, pairs: Iterable[tuple[Tensor, Tensor]]) -> list[MaskScore]:
-        """Score the network on images with known labels, one at a time, in float32.
-
-        Args:
-            pairs: (H, W, 3) uint8 RGB images and (H, W) bool labels.
-        """
+        """Score the network on (H, W, 3) uint8 RGB images with (H, W) bool labels, in float32."""
         was_training = self.network.training
         self.network.eval()
         scores = [score_heatmap(self._heatmap(image), mask.numpy()) for image, mask in pairs]

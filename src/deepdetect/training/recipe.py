@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.parallel import processor_count
 from .._shared.registry import look_up
 from ..labels import DETECTOR_NAMES, LABEL_SETTINGS, LabelOptions, SettingChange
-from .augmentation import DarkeningRange
+from .augmentation import AugmentationRanges, DarkeningRange
 
 OPTIMIZERS = ("adam", "soap")
 DEVICES = ("auto", "cpu", "cuda")
 PRECISIONS = ("auto", "float32", "bfloat16")
+InitWeights = str | Path | Sequence[str | Path]
 
 
 @dataclass(frozen=True)
@@ -86,11 +89,14 @@ class TrainingOptions:
         augmentations: augmented views of each image at the first size, in normal and in dark
             light: rotated, relit, blurred, noisy or compressed. Each is used as often as the plain
             view of a size.
+        augmentation_ranges: probabilities and ranges of their changes.
         flips: mirror crops left to right and upside down. The label of a mirrored image
             is different, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
         transpositions: mirror crops along their diagonal, which changes labels of BRISK only.
         color_jitter: fraction of the crops whose colours are removed, or rotated with the same
             luma, the only thing that labels depend on.
+        max_jitter_saturation: largest factor of the saturation of rotated colours.
+        shuffle_buffer_shards: this many shards are read at a time; their images are shuffled.
         optimizer: "adam", or "soap", which learns more per image (docs/history.md has the
             measurements).
         learning_rate: at the start of the cosine annealing.
@@ -130,9 +136,12 @@ class TrainingOptions:
     dark_variants: int = 1
     darkening: DarkeningRange = field(default_factory=DarkeningRange)
     augmentations: int = 0
+    augmentation_ranges: AugmentationRanges = field(default_factory=AugmentationRanges)
     flips: bool = False
     transpositions: bool = True
     color_jitter: float = 0.5
+    max_jitter_saturation: float = 1.2
+    shuffle_buffer_shards: int = 4
     optimizer: str = "adam"
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-6
@@ -152,26 +161,30 @@ class TrainingOptions:
         if self.optimizer not in OPTIMIZERS:
             raise unknown_name("optimizer", self.optimizer, OPTIMIZERS)
         self._check_sizes()
-        if self.max_images is not None and self.max_images < 2:
-            raise OptionError(f"`max_images` must be at least 2, not {self.max_images}")
+        _check_least(
+            self,
+            max_images=2,
+            augmentations=0,
+            warm_up=0,
+            dark_variants=1,
+            val_count=1,
+            shuffle_buffer_shards=1,
+            max_jitter_saturation=0,
+        )
         if not 0 < self.val_fraction < 1:
             raise OptionError(f"`val_fraction` must lie in (0, 1), not {self.val_fraction}")
-        for name in ("dark_fraction", "color_jitter"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise OptionError(f"`{name}` must lie in [0, 1], not {getattr(self, name)}")
-        for name, least in (("augmentations", 0), ("warm_up", 0), ("dark_variants", 1)):
-            if getattr(self, name) < least:
-                raise OptionError(f"`{name}` must be at least {least}, not {getattr(self, name)}")
-        if self.val_count < 1:
-            raise OptionError(f"`val_count` must be at least 1, not {self.val_count}")
-        for name in ("pos_weight", "low_light_pos_weight"):
-            weight = getattr(self, name)
-            if weight is not None and not 0.1 <= weight <= 10:
-                raise OptionError(f"`{name}` must lie in [0.1, 10], not {weight}")
+        for name, low, high in (
+            ("dark_fraction", 0, 1),
+            ("color_jitter", 0, 1),
+            ("pos_weight", 0.1, 10),
+            ("low_light_pos_weight", 0.1, 10),
+            ("seed", 0, 2**31 - 1),
+        ):
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise OptionError(f"`{name}` must lie in [{low}, {high}], not {value}")
         if self.pos_weight_uncertain and {self.pos_weight, self.low_light_pos_weight or 1} == {1}:
             raise OptionError("`pos_weight_uncertain` needs a `pos_weight` other than 1")
-        if not 0 <= self.seed < 2**31:
-            raise OptionError(f"`seed` must lie in [0, 2147483647], not {self.seed}")
         if not 0 <= self.final_learning_rate <= self.learning_rate:
             raise OptionError(
                 "`learning_rate` must be at least `final_learning_rate`, and neither be negative"
@@ -205,6 +218,14 @@ class TrainingOptions:
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
 
 
+def _check_least(options: object, **least: float) -> None:
+    """Raise an OptionError for a field below its smallest value; None is no value."""
+    for name, smallest in least.items():
+        value = getattr(options, name)
+        if value is not None and value < smallest:
+            raise OptionError(f"`{name}` must be at least {smallest}, not {value}")
+
+
 @dataclass(frozen=True)
 class DeviceOptions:
     """How the network is run, which does not change the recipe.
@@ -218,6 +239,10 @@ class DeviceOptions:
         num_workers: processes that load and augment crops (of a torch DataLoader), 0 for none
             but the one that trains; by default 0 when training on a CPU, which has no time to
             spare, and one per processor but one when training on a GPU.
+        checkpoint_interval_s: seconds from one checkpoint to the next: a killed run loses at
+            most this much time.
+        view_memory_bytes: memory that rendered views may take, in bytes, on a machine; by default
+            half of what is free.
     """
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -225,6 +250,8 @@ class DeviceOptions:
     compile: bool | None = None
     threads: int | None = None
     num_workers: int | None = None
+    checkpoint_interval_s: float = 60.0
+    view_memory_bytes: int | None = None
 
     def __post_init__(self) -> None:
         for name, known in (("device", DEVICES), ("precision", PRECISIONS)):
@@ -235,10 +262,7 @@ class DeviceOptions:
 
             if not is_available():
                 raise OptionError("there is no CUDA device: use `device=cpu`")
-        for name, least in (("threads", 1), ("num_workers", 0)):
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise OptionError(f"`{name}` must be at least {least}, not {value}")
+        _check_least(self, threads=1, num_workers=0, checkpoint_interval_s=0, view_memory_bytes=0)
 
     @property
     def accelerator(self) -> str:

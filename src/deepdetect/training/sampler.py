@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +16,6 @@ from torch.utils.data import Sampler
 
 from .engine import DistributedContext
 from .recipe import Stage, TrainingOptions
-
-SHUFFLE_BUFFER_SHARDS = 4
-"""This many shards are read at a time; their images are shuffled."""
 
 
 class CropIndex(NamedTuple):
@@ -37,15 +33,8 @@ class CropIndex(NamedTuple):
     stage: Stage
 
 
-@dataclass(frozen=True)
-class Position:
-    """Where a step lies.
-
-    Attributes:
-        stage: its stage.
-        sample: number of its first crop in the stage.
-        first_epoch: the epochs of the stages before.
-    """
+class Position(NamedTuple):
+    """Where a step lies: its stage, its first crop in the stage, and the stage's first epoch."""
 
     stage: Stage
     sample: int
@@ -53,12 +42,7 @@ class Position:
 
 
 class Schedule:
-    """The steps of a run over a number of images.
-
-    Args:
-        options: the recipe.
-        images: number of images.
-    """
+    """The steps of a run by a recipe over a number of images."""
 
     def __init__(self, options: TrainingOptions, images: int) -> None:
         self.options = options
@@ -116,7 +100,7 @@ class CropSampler(Sampler[list[CropIndex]]):
     Example:
         >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
         >>> [[index.image for index in batch] for batch in CropSampler(schedule)]
-        [[0, 2], [3, 1]]
+        [[3, 0], [2, 1]]
     """
 
     def __init__(
@@ -147,29 +131,31 @@ class CropSampler(Sampler[list[CropIndex]]):
         for sample in range(stage.batch)[self.context.local_slice(stage.batch)]:
             epoch, place = divmod(position.sample + sample, count)
             epoch += position.first_epoch
-            order = epoch_order(self.schedule.options.seed, epoch, count, self.shard_sizes)
+            options = self.schedule.options
+            shards = self.shard_sizes, options.shuffle_buffer_shards
+            order = epoch_order(options.seed, epoch, count, *shards)
             batch.append(CropIndex(int(order[place]), epoch, place, stage))
         return batch
 
 
 @functools.lru_cache(maxsize=16)  # interleaved stages are in epochs of their own
 def epoch_order(
-    seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
+    seed: int,
+    epoch: int,
+    count: int,
+    shard_sizes: tuple[int, ...] | None = None,
+    shuffle_buffer_shards: int = 4,
 ) -> np.ndarray:
     """Return the numbers of the images in the order of an epoch, each once.
 
-    Args:
-        seed: of the order.
-        epoch: number of the epoch.
-        count: number of images.
-        shard_sizes: as of `CropSampler`: images of one shard stay close to each other.
+    With shards, the images of `shuffle_buffer_shards` of them are shuffled at a time.
     """
     if shard_sizes is None:
         return np.random.default_rng([seed, 1, epoch]).permutation(count)
     shards = np.split(np.arange(count), np.cumsum(shard_sizes)[:-1])
     order = np.random.default_rng([seed, 3, epoch]).permutation(len(shards))
     groups = []
-    for k, first in enumerate(range(0, len(order), SHUFFLE_BUFFER_SHARDS)):
-        group = np.concatenate([shards[s] for s in order[first : first + SHUFFLE_BUFFER_SHARDS]])
+    for k, first in enumerate(range(0, len(order), shuffle_buffer_shards)):
+        group = np.concatenate([shards[s] for s in order[first : first + shuffle_buffer_shards]])
         groups.append(np.random.default_rng([seed, 4, epoch, k]).permutation(group))
     return np.concatenate(groups)

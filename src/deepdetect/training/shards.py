@@ -331,7 +331,8 @@ def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
     """Return what of a recipe is fixed once the labels are made, as JSON would give it back."""
     names = ("short_sides", "square", "max_images", "val_fraction", "dark_variants")
     fixed = {name: getattr(options, name) for name in (*names, "augmentations")}
-    fixed["darkening"] = dataclasses.asdict(options.darkening)
+    for name in ("darkening", "augmentation_ranges"):
+        fixed[name] = dataclasses.asdict(getattr(options, name))
     fixed["labels"] = settings_digest(options.label_options)
     return dict(json.loads(json.dumps(fixed)))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ import torch
 from torch.utils.data import DataLoader
 
 from .._shared.errors import OptionError, WeightsError
-from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from .._shared.provenance import provenance
 from ..detector.network.espnet import ESPNet
@@ -30,20 +29,16 @@ from ..detector.pretrained import resolve_weights
 from ..evaluation.metrics.masks import MaskScore, mean_score
 from .checkpoint import Checkpoint, TrainingState, read_checkpoint, restore, save_checkpoint
 from .dataset import CropDataset, TrainingData, ValidationDataset, loading, prepare_data
-from .engine import DistributedContext
 from .learner import Learner
 from .model_card import CurvePoint, save_curves, write_model_card
-from .recipe import DeviceOptions, TrainingOptions
+from .recipe import DeviceOptions, InitWeights, TrainingOptions
 from .sampler import CropSampler, Schedule
 
 CHECKPOINT = "checkpoint.safetensors"
 BEST = "best.safetensors"
 ONNX = "deepdetect.onnx"
 CARD = "MODEL_CARD.md"
-CHECKPOINT_SECONDS = 60.0
-"""A killed run loses at most this much time."""
-
-InitWeights = str | Path | Sequence[str | Path]
+FULL_IMAGE_PIXELS = 480 * 480
 
 
 @dataclass(frozen=True)
@@ -65,103 +60,35 @@ class TrainingResult:
     images_per_second: float
 
 
-@suggest_keywords
-def train(
-    images: str | Path,
-    output: str | Path,
-    options: TrainingOptions = TrainingOptions(),
-    *,
-    validation: str | Path | None = None,
-    labels: str | Path | None = None,
-    init_weights: InitWeights | None = None,
-    device: DeviceOptions = DeviceOptions(),
-    workers: int | None = None,
-    log: Callable[[str], None] | None = None,
-) -> TrainingResult:
-    """Train the network on a folder of images.
-
-    A run that was interrupted resumes from its last checkpoint when it is started again
-    with the same options, with the same result as an uninterrupted one. Labels are made in
-    other processes, so a script must call this under `if __name__ == "__main__":`.
-
-    Args:
-        images: folder of images, or of shards (`write_shards`).
-        output: folder for checkpoint.safetensors, best.safetensors, deepdetect.onnx,
-            MODEL_CARD.md and the loss curves.
-        options: the recipe.
-        validation: folder of other images; default: some are held out.
-        labels: folder of the label cache; default: in `output`.
-        init_weights: weights (.safetensors) to start from, or "default" or "dense" for those
-            inside the package; of several, their mean; default: random ones, by the seed.
-        device: how the network is run.
-        workers: processes that make labels; default one per processor.
-        log: takes lines of text for the user; without it there is no progress bar either.
-
-    Returns:
-        The weights' files and the loss curves.
-
-    Raises:
-        ImageError: a folder is missing or empty.
-        OptionError: the folder holds a run with other options, or the batch statistics or the
-            encoder of random weights are to be frozen.
-        WeightsError: the initial weights are missing or do not fit.
-        DeepDetectError: an image cannot be read.
-
-    Example:
-        >>> train("images", "run")  # doctest: +SKIP
-    """
-    trainer = make_trainer(
-        images, output, options, validation, labels, init_weights, device, workers, log
-    )
-    result = trainer.fit()
-    trainer.engine.close()
-    return result
-
-
 def make_trainer(
     images: str | Path,
     output: str | Path,
-    options: TrainingOptions = TrainingOptions(),
-    validation: str | Path | None = None,
-    labels: str | Path | None = None,
-    init_weights: InitWeights | None = None,
-    device: DeviceOptions = DeviceOptions(),
-    workers: int | None = None,
-    log: Callable[[str], None] | None = None,
+    options: TrainingOptions,
+    validation: str | Path | None,
+    labels: str | Path | None,
+    init_weights: InitWeights | None,
+    device: DeviceOptions,
+    workers: int | None,
+    log: Callable[[str], None] | None,
     resume: bool = True,
 ) -> Trainer:
-    """Make the labels, and a trainer where its last checkpoint left off; arguments as of `train`.
-
-    Args:
-        images, output, options, validation, labels, init_weights, device, workers, log: of `train`.
-        resume: resume from the folder's checkpoint.
-    """
+    """Make the labels, and a trainer where its last checkpoint left off; arguments of `train`."""
     options, network = _initial_network(options, init_weights)  # before the labels, for its errors
-    context = DistributedContext.from_environment()
     data = prepare_data(
-        Path(images),
+        images,
         options,
-        Path(output),
-        validation=None if validation is None else Path(validation),
-        labels=None if labels is None else Path(labels),
+        output,
+        validation=validation,
+        labels=labels,
         workers=workers,
-        num_workers=device.worker_count(context.local_world_size),
+        device=device,
         quiet=log is None,
     )
     return Trainer(data, Path(output), options, device, network, log, resume)
 
 
 class Trainer:
-    """One training run: its data, network, files and state.
-
-    Args:
-        data: what is trained on and validated with.
-        folder: where the files go.
-        options: the recipe.
-        device: how the network is run.
-        network: the network with its initial weights.
-        log: as of `train`.
-        resume: resume from the folder's checkpoint.
+    """One training run: its data, network, files and state; arguments as of `train`.
 
     Raises:
         OptionError: the folder holds a run with other options.
@@ -184,7 +111,7 @@ class Trainer:
         self.learner = Learner(network, device, options)
         self.engine, self.network = self.learner.engine, self.learner.network
         self.context = self.engine.context
-        self.num_workers = device.worker_count(self.context.local_world_size)
+        self.device = device
         self.log = log if self.context.is_main else None
         self.run = {
             "options": options.to_json(),
@@ -211,7 +138,7 @@ class Trainer:
     def _loader(self, dataset: Any, **batches: Any) -> DataLoader[Any]:
         return DataLoader(
             dataset,
-            num_workers=self.num_workers,
+            num_workers=self.device.worker_count(self.context.local_world_size),
             pin_memory=self.engine.device.type == "cuda",
             generator=torch.Generator(),  # not torch's own, whose state is the user's
             **batches,
@@ -237,20 +164,21 @@ class Trainer:
                 state.images += batch
                 pixels += batch * masks[0].numel()
                 bar.update(1)
-                speed = pixels / (480 * 480) / (time.monotonic() - started)
+                speed = pixels / FULL_IMAGE_PIXELS / (time.monotonic() - started)
                 loss = state.loss_sum / state.loss_count
                 bar.set_postfix_str(f"loss {loss:.4f}, {speed:.1f} images/s", False)
                 if state.step in milestones:
                     self._save()  # the validation takes its time, too
                     self._validate()
-                if state.step in milestones or time.monotonic() - saved > CHECKPOINT_SECONDS:
+                interval = self.device.checkpoint_interval_s
+                if state.step in milestones or time.monotonic() - saved >= interval:
                     self._save()
                     saved = time.monotonic()
-        speed = pixels / (480 * 480) / max(time.monotonic() - started, 1e-9)
+        speed = pixels / FULL_IMAGE_PIXELS / max(time.monotonic() - started, 1e-9)
         return self._result(speed)
 
     def _result(self, images_per_second: float) -> TrainingResult:
-        best = self.engine.broadcast(self.best)
+        best = self.engine.fabric.broadcast(self.best)
         if best is None:
             raise WeightsError(
                 f"{self.folder / BEST} is missing or damaged: train into another folder"
@@ -322,7 +250,7 @@ class Trainer:
                 found = read_checkpoint(self.folder / CHECKPOINT)
             except WeightsError as error:
                 found = error
-        found = self.engine.broadcast(found)
+        found = self.engine.fabric.broadcast(found)
         if isinstance(found, WeightsError):
             raise found  # by all processes, so that none waits for another
         if found is None:

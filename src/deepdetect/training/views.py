@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ import numpy as np
 
 from .._shared.errors import ImageError
 from ..io.image import find_images, load_image, scale_short_side
-from .augmentation import AUGMENTATION_VERSION, Darkening, augment, darken
+from .augmentation import AUGMENTATION_VERSION, AugmentationRanges, Darkening, augment, darken
 from .recipe import TrainingOptions
 
 DIGEST_BYTES = 65536
@@ -29,12 +30,14 @@ class View:
         darkening: the darkening, or None for normal light.
         square: squashed to a square instead of scaled evenly.
         augmentation: seed of an augmented square (`augment`), or None for the whole image.
+        ranges: what the augmentation is drawn from.
     """
 
     short_side: int
     darkening: Darkening | None = None
     square: bool = False
     augmentation: int | None = None
+    ranges: AugmentationRanges = field(default_factory=AugmentationRanges)
 
     @property
     def name(self) -> str:
@@ -45,6 +48,8 @@ class View:
         shape = "x" * self.square
         if self.augmentation is not None:
             shape = f"v{AUGMENTATION_VERSION}-{self.augmentation:08x}"
+            if self.ranges != AugmentationRanges():
+                shape += f"-{zlib.crc32(repr(self.ranges).encode()):08x}"
         return f"{self.short_side}{shape}_{light}"
 
 
@@ -90,8 +95,9 @@ def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tup
     side = options.short_sides[0]
     for _ in range(options.augmentations):
         seed = int(generator.integers(2**32))
-        normal += (View(side, None, False, seed),)
-        dark += (View(side, options.darkening.draw(generator), False, seed),)
+        view = View(side, None, False, seed, options.augmentation_ranges)
+        normal += (view,)
+        dark += (dataclasses.replace(view, darkening=options.darkening.draw(generator)),)
     return normal, dark
 
 
@@ -107,7 +113,7 @@ def render(image: object, view: View) -> np.ndarray:
     """
     rgb = load_image(image)
     if view.augmentation is not None:
-        rgb = augment(rgb, view.short_side, view.augmentation)
+        rgb = augment(rgb, view.short_side, view.augmentation, view.ranges)
     elif not view.square:
         rgb = scale_short_side(rgb, view.short_side)
     elif rgb.shape[:2] != (view.short_side, view.short_side):

@@ -6,8 +6,10 @@ import pytest
 
 pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-from deepdetect.training.profiling import profile
-from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions
+import importlib.util
+
+from deepdetect import MissingExtraError, TrainingOptions, train
+from deepdetect.training import DeviceOptions, Stage, profile
 
 
 def test_a_profile_times_each_stage_and_writes_no_weights(
@@ -37,3 +39,14 @@ def test_a_profile_times_each_stage_and_writes_no_weights(
         assert 50e6 < stage.memory_bytes < 20e9
         assert stage.device_memory_bytes is None
     assert {path.name for path in tmp_path.iterdir()} == {"labels"}
+
+
+def test_a_missing_package_is_named_before_any_work(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_line
+) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    for function in (train, profile):
+        with pytest.raises(MissingExtraError, match="needs the package torch") as caught:
+            function(photographs, tmp_path / "run")
+        one_line(caught.value)
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,219 @@
+"""`train` and `profile`: a training run, and how fast it would be.
+
+Their module imports no torch, so that the package can offer them where it is missing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .._shared.errors import MissingExtraError
+from .._shared.options import suggest_keywords
+from .._shared.progress import progress
+from .recipe import DeviceOptions, InitWeights, Stage, TrainingOptions
+
+if TYPE_CHECKING:
+    from .trainer import Trainer, TrainingResult
+
+
+@suggest_keywords
+def train(
+    images: str | Path,
+    output: str | Path,
+    options: TrainingOptions = TrainingOptions(),
+    *,
+    validation: str | Path | None = None,
+    labels: str | Path | None = None,
+    init_weights: InitWeights | None = None,
+    device: DeviceOptions = DeviceOptions(),
+    workers: int | None = None,
+    log: Callable[[str], None] | None = None,
+) -> TrainingResult:
+    """Train the network on a folder of images.
+
+    A run that was interrupted resumes from its last checkpoint when it is started again
+    with the same options, with the same result as an uninterrupted one. Labels are made in
+    other processes, so a script must call this under `if __name__ == "__main__":`.
+
+    Args:
+        images: folder of images, or of shards (`write_shards`).
+        output: folder for checkpoint.safetensors, best.safetensors, deepdetect.onnx,
+            MODEL_CARD.md and the loss curves.
+        options: the recipe.
+        validation: folder of other images. None: some of the images are held out.
+        labels: folder of the label cache. None: in `output`.
+        init_weights: weights (.safetensors) to start from, or "default" or "dense" for those
+            inside the package; of several, their mean. None: random ones, by the seed.
+        device: how the network is run.
+        workers: processes that make labels. None: one per processor.
+        log: takes lines of text for the user; without it there is no progress bar either.
+
+    Returns:
+        The weights' files and the loss curves.
+
+    Raises:
+        MissingExtraError: torch, Lightning Fabric, safetensors or onnx is not installed.
+        ImageError: a folder is missing or empty.
+        OptionError: the folder holds a run with other options, or the batch statistics or the
+            encoder of random weights are to be frozen.
+        WeightsError: the initial weights are missing or do not fit.
+        DeepDetectError: an image cannot be read.
+
+    Example:
+        >>> from deepdetect.training import Stage
+        >>> options = TrainingOptions(stages=(Stage(crop=240, batch=16, epochs=44),), seed=1)
+        >>> result = train("photos", "run", options, init_weights="default")  # doctest: +SKIP
+        >>> detector = DeepDetect(result.onnx)  # doctest: +SKIP
+    """
+    require_packages()
+    from .trainer import make_trainer
+
+    trainer = make_trainer(
+        images, output, options, validation, labels, init_weights, device, workers, log
+    )
+    result = trainer.fit()
+    trainer.engine.close()
+    return result
+
+
+@dataclass(frozen=True)
+class StageProfile:
+    """The speed of one stage, over all processes.
+
+    Attributes:
+        stage: the stage.
+        steps: steps that were timed.
+        images_per_second: crops per second.
+        full_images_per_second: the same in 480x480 images' worth of pixels.
+        waiting_fraction: fraction of the time in which the main process waited for data.
+        memory_bytes: peak resident memory of the main process so far, or None where the system
+            does not report it.
+        device_memory_bytes: peak memory of torch on the main process's GPU, or None.
+    """
+
+    stage: Stage
+    steps: int
+    images_per_second: float
+    full_images_per_second: float
+    waiting_fraction: float
+    memory_bytes: int | None
+    device_memory_bytes: int | None
+
+
+@suggest_keywords
+def profile(
+    images: str | Path,
+    output: str | Path,
+    options: TrainingOptions = TrainingOptions(),
+    *,
+    steps: int = 30,
+    warm_up_steps: int = 5,
+    validation: str | Path | None = None,
+    labels: str | Path | None = None,
+    init_weights: InitWeights | None = None,
+    device: DeviceOptions = DeviceOptions(),
+    workers: int | None = None,
+    log: Callable[[str], None] | None = None,
+) -> list[StageProfile]:
+    """Time some steps of each stage of a run; nothing but the label cache is written.
+
+    Args:
+        steps: steps to time in each stage.
+        warm_up_steps: steps before them that are not timed: they compile, allocate memory and
+            render the first views.
+        images, output, options, validation, labels, init_weights, device, workers, log: as of
+            `train`.
+
+    Returns:
+        One profile per stage.
+
+    Raises:
+        The errors of `train`.
+
+    Example:
+        >>> profile("photos", "run")[0].images_per_second  # doctest: +SKIP
+    """
+    require_packages()
+    from .trainer import make_trainer
+
+    options = dataclasses.replace(options, interleave=False)  # each stage by itself
+    trainer = make_trainer(
+        images, output, options, validation, labels, init_weights, device, workers, log, False
+    )
+    steps_of_stage = trainer.schedule.steps_of_stage
+    lengths = [min(n, steps + warm_up_steps) for n in steps_of_stage]
+    if trainer.log is not None:
+        trainer.log(f"timing {trainer.engine.describe()}")
+    profiles, first = [], 0
+    with progress(sum(lengths), "timing", "step", trainer.log is None) as bar:
+        for length, whole in zip(lengths, steps_of_stage, strict=True):
+            warm_up = min(warm_up_steps, length - 1)
+            profiles.append(_time_steps(trainer, first, first + length, warm_up, bar.update))
+            first += whole
+    trainer.engine.close()
+    return profiles
+
+
+def _time_steps(
+    trainer: Trainer, first: int, last: int, warm_up: int, done: Callable[[int], object]
+) -> StageProfile:
+    import torch
+
+    from .dataset import loading
+    from .trainer import FULL_IMAGE_PIXELS
+
+    stage = trainer.schedule.position(first).stage
+    on_gpu = trainer.engine.device.type == "cuda"
+    if on_gpu:
+        torch.cuda.reset_peak_memory_stats()
+    waited = 0.0
+    started = time.perf_counter()
+    with loading(trainer.loader(first, last)) as batches:
+        for step in range(first, last):
+            asked = time.perf_counter()
+            if step == first + warm_up:
+                waited, started = 0.0, asked
+            images, masks = next(batches)
+            waited += time.perf_counter() - asked
+            trainer.learner.training_step(images, masks, trainer.schedule.learning_rate(step), step)
+            done(1)
+    # Reading the loss has waited for the GPU at each step.
+    seconds = time.perf_counter() - started
+    steps = last - first - warm_up
+    rate = steps * stage.batch / seconds
+    return StageProfile(
+        stage=stage,
+        steps=steps,
+        images_per_second=rate,
+        full_images_per_second=rate * stage.crop**2 / FULL_IMAGE_PIXELS,
+        waiting_fraction=waited / seconds,
+        memory_bytes=_peak_memory_bytes(),
+        device_memory_bytes=torch.cuda.max_memory_allocated() if on_gpu else None,
+    )
+
+
+def _peak_memory_bytes() -> int | None:
+    """Return this process's peak resident memory."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def require_packages() -> None:
+    """Raise a MissingExtraError that says what to install where training cannot run."""
+    for package in ("torch", "lightning_fabric", "safetensors", "onnx"):
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtraError(
+                f"training needs the package {package.replace('_', '-')}, which is not installed: "
+                "run pip install torch lightning-fabric safetensors onnx matplotlib"
+            )
