@@ -6,7 +6,7 @@ To add a benchmark, write the function that plans its sections, and add its line
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
@@ -16,9 +16,8 @@ from ..datasets.hpatches import in_d2net_subset, is_illumination, load_hpatches
 from ..datasets.low_visibility import load_low_visibility
 from ..datasets.oxford import find_scene, load_oxford
 from ..datasets.types import PlanarPair, PlanarScene
-from ..detector.pretrained import pretrained_weights
 from .baselines.method import LocalFeature
-from .baselines.opencv import CLASSICAL
+from .baselines.opencv import CLASSICAL, with_kd_trees
 from .charts import bar_chart
 from .context import BenchmarkContext
 from .options import BenchmarkOptions
@@ -28,30 +27,28 @@ from .protocols.paper import (
     OXFORD_PAIRS,
     density_part,
     keypoint_figure,
-    loss_figure,
     mask_figure,
     match_figure,
     matches_part,
     repeatability_part,
 )
 from .protocols.paper_numbers import (
+    DEEPDETECT,
     DENSITY,
     FIGURE_2,
     FIGURE_6,
     HPATCHES_REPEATABILITY,
     MATCHES,
-    MATCHES_CAUSES,
     MAX_MATCHES,
     NOTEBOOK_MATCHES,
     OXFORD_REPEATABILITY,
-    with_paper_column,
     with_paper_rows,
 )
 from .protocols.speed import PAIR, speed_part
 from .protocols.standard import standard_part
 from .protocols.stereo import STEREO_TEXT, stereo_parts
 from .report import Cell, Column, Figure, Table
-from .tasks import Part, SectionPlan, figure_part
+from .tasks import Part, SectionPlan, Shown, figure_part
 
 KEYPOINT_SCENES = ("graf", "bikes", "leuven")
 """Of Figure 2."""
@@ -78,6 +75,13 @@ OXFORD_TRUTHS: dict[Truth, str] = {
 
 NOTHING_MOVES = "Nothing moves between the two images of a scene."
 
+FIGURE_2_TEXT = (
+    "Figure 2 of the paper prints the keypoints of SIFT, SIFT with low settings and DeepDetect in "
+    "two scenes that it does not name and that are not among these: "
+    + "; ".join(f"{scene} scene {a:,}, {b:,}, {c:,}" for scene, (a, b, c) in FIGURE_2.items())
+    + "."
+)
+
 Plans = list[SectionPlan]
 
 
@@ -97,7 +101,7 @@ class Benchmark:
 
 
 def plan_oxford(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
-    """Tables I and II, the Oxford half of III, Figures 1, 2, 4, 5 and 6; the other protocols."""
+    """Tables I and II, the Oxford half of III, Figures 1, 2, 4 and 6; the other protocols."""
     folder = context.folder("oxford")
     scenes = load_oxford(folder)
     unrefined = [
@@ -113,15 +117,10 @@ def plan_oxford(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
         plans.append(_oxford_paper(context, options, scenes))
     if "standard" in options.protocols:
         for truth in truths:
+            title, by_truth = f"Oxford, {truth} homographies", load_oxford(folder, truth)
+            text = OXFORD_TRUTHS[truth]
             plans.append(
-                _standard_section(
-                    context,
-                    options,
-                    load_oxford(folder, truth),
-                    f"oxford_{truth}",
-                    f"Oxford, {truth} homographies",
-                    OXFORD_TRUTHS[truth],
-                )
+                _standard_section(context, options, by_truth, f"oxford_{truth}", title, text)
             )
         if "refined" not in truths:
             context.skipped.append(
@@ -149,107 +148,63 @@ def _oxford_paper(
     pairs = select_pairs(scenes, OXFORD_PAIRS)
     figure_6 = select_pairs(scenes, (*OXFORD_PAIRS, ("graf", 3)))
 
-    def with_figure_1(table: Table) -> Sequence[Table | Figure]:
+    def with_figure_1(table: Table) -> Shown:
         return [with_paper_rows(table, OXFORD_REPEATABILITY), _repeatability_figure(table)]
 
     parts = [
-        density_part(
-            context,
-            features,
-            scenes,
-            "oxford_density",
-            lambda table: [with_paper_column(table, "mean", DENSITY)],
-        ),
+        density_part(context, features, scenes, "oxford_density", DENSITY),
         repeatability_part(context, features, scenes, "oxford_repeatability", with_figure_1),
         matches_part(
             context,
-            options.matching_features(),
+            with_kd_trees(options.matching_features()),
             pairs,
             "oxford_matches",
-            finish=lambda table: [
-                _with_notebooks(with_paper_rows(table, MATCHES, MATCHES_CAUSES), pairs)
-            ],
+            paper=MATCHES,
+            notebooks=NOTEBOOK_MATCHES,
         ),
-        matches_part(
-            context,
-            _figure_features(options),
-            figure_6,
-            "oxford_figure6",
-            "Figure 6: correct matches",
-            lambda table: [with_paper_rows(table, FIGURE_6, MATCHES_CAUSES)],
-        ),
-        *_keypoint_figures(
-            context, options, [scene for scene in scenes if scene.name in KEYPOINT_SCENES]
-        ),
+        *_figures(context, options, figure_6, "oxford", KEYPOINT_SCENES, scenes),
         figure_part("Figure 4, the masks", partial(mask_figure, scenes[0])),
-        *_loss_figure(context, options),
-        *_match_figures(context, options.deepdetect_480(), pairs, "Figure 6"),
     ]
     text = (
-        "Tables I, II and the Oxford half of III, Figures 1, 2, 4, 5 and 6. DeepDetect sees images "
+        "Tables I, II and the Oxford half of III, Figures 1, 2, 4 and 6. DeepDetect sees images "
         f"squashed to 480x480 as {options.channels.upper()}; the classical detectors see them as "
         "they are. The paper's numbers are beside ours, and so are those that its authors' public "
-        f"notebooks print. {_figure_2_text()}"
+        f"notebooks print. {FIGURE_2_TEXT}"
     )
     return SectionPlan("Oxford, the paper's protocol", (text,), parts)
-
-
-def _figure_features(options: BenchmarkOptions) -> tuple[LocalFeature, ...]:
-    """Return the methods of Figures 2 and 6."""
-    return CLASSICAL["sift"], CLASSICAL["sift-low"], options.deepdetect_480()
-
-
-def _figure_2_text() -> str:
-    counts = "; ".join(
-        f"{scene} scene {', '.join(f'{count:,}' for count in counts)}"
-        for scene, counts in FIGURE_2.items()
-    )
-    return (
-        "Figure 2 of the paper prints the keypoints of SIFT, SIFT with low settings and DeepDetect "
-        f"in two scenes that it does not name: {counts}."
-    )
 
 
 def _repeatability_figure(table: Table) -> Figure:
     values = {str(row[0]): float(row[1]) for row in table.rows if isinstance(row[1], float)}
     ours = [name for name in values if name.startswith("DeepDetect")]
     png = bar_chart(values, "repeatability as in the paper, mean of the scenes", ours)
-    title = (
-        "Figure 1: average repeatability, with baselines; in the paper DeepDetect has "
-        f"{OXFORD_REPEATABILITY['DeepDetect, threshold 0.5']['mean']}"
-    )
+    mean = OXFORD_REPEATABILITY[DEEPDETECT]["mean"]
+    title = f"Figure 1: average repeatability, with baselines; in the paper DeepDetect has {mean}"
     return Figure("oxford_repeatability", title, png)
 
 
-def _with_notebooks(table: Table, pairs: Sequence[PlanarPair]) -> Table:
-    rows = []
-    for title, known in NOTEBOOK_MATCHES.items():
-        cells: list[Cell] = []
-        for pair in pairs:
-            found = known.get(pair.name)
-            cells += [None, None] if found is None else [found[0], found[0] / found[1]]
-        rows.append((f"{title}, in the authors' notebook", *cells))
-    return replace(table, rows=(*table.rows, *rows))
-
-
-def _keypoint_figures(
-    context: BenchmarkContext, options: BenchmarkOptions, scenes: Sequence[PlanarScene]
+def _figures(
+    context: BenchmarkContext,
+    options: BenchmarkOptions,
+    pairs: Sequence[PlanarPair],
+    key: str,
+    drawn: Sequence[str],
+    scenes: Sequence[PlanarScene],
 ) -> list[Part]:
-    features = _figure_features(options)
-    return [
+    """Make Figure 6 with its table, and Figure 2 of the scenes with these names."""
+    features = CLASSICAL["sift"], CLASSICAL["sift-low"], options.deepdetect_480()
+    table = matches_part(
+        context, features, pairs, f"{key}_figure6", "Figure 6: correct matches", FIGURE_6
+    )
+    keypoints = [
         figure_part(
             f"Figure 2, keypoints of {scene.name}",
             partial(keypoint_figure, context, features, scene),
         )
         for scene in scenes
+        if scene.name in drawn
     ]
-
-
-def _loss_figure(context: BenchmarkContext, options: BenchmarkOptions) -> list[Part]:
-    if options.detector.weights == pretrained_weights("default"):
-        return [figure_part("Figure 5, the losses", loss_figure)]
-    context.skipped.append("Figure 5, the losses: the package has those of its own weights only")
-    return []
+    return [table, *keypoints, *_match_figures(context, features[-1], pairs, "Figure 6")]
 
 
 def _match_figures(
@@ -272,17 +227,10 @@ def plan_hpatches(context: BenchmarkContext, options: BenchmarkOptions) -> Plans
     if "paper" in options.protocols:
         plans.append(_hpatches_paper(context, options, scenes, last))
     if "standard" in options.protocols:
+        text = "Evaluated by its own files."
         for name, subset in hpatches_subsets(scenes):
-            plans.append(
-                _standard_section(
-                    context,
-                    options,
-                    subset,
-                    f"hpatches_{len(subset)}",
-                    f"HPatches, {name}",
-                    "Evaluated by its own files.",
-                )
-            )
+            key, title = f"hpatches_{len(subset)}", f"HPatches, {name}"
+            plans.append(_standard_section(context, options, subset, key, title, text))
     if "guided" in options.protocols:
         truths = {"published": last}
         plans.append(guided_section(context, options, truths, "hpatches_guided", "HPatches"))
@@ -305,19 +253,22 @@ def _hpatches_paper(
     last: Sequence[PlanarPair],
 ) -> SectionPlan:
     features = options.density_features()
-
-    def with_table_3(by_scene: Table) -> Sequence[Table | Figure]:
-        return [_table_3(by_scene, scenes), by_scene]
-
+    light = [is_illumination(scene) for scene in scenes]
     drawn = [
         pair
         for kind in (True, False)
-        for pair in [p for p, s in zip(last, scenes, strict=True) if is_illumination(s) is kind][
+        for pair in [pair for pair, one in zip(last, light, strict=True) if one is kind][
             : FIGURE_7_SCENES // 2
         ]
     ]
     parts = [
-        repeatability_part(context, features, scenes, "hpatches_repeatability", with_table_3),
+        repeatability_part(
+            context,
+            features,
+            scenes,
+            "hpatches_repeatability",
+            lambda by_scene: [_table_3(by_scene, light), by_scene],
+        ),
         density_part(context, features, scenes, "hpatches_density"),
         matches_part(context, options.matching_features(), last, "hpatches_matches"),
         *_match_figures(context, options.deepdetect_480(), drawn, "Figure 7"),
@@ -329,21 +280,18 @@ def _hpatches_paper(
     return SectionPlan("HPatches, the paper's protocol", (text,), parts)
 
 
-def _table_3(by_scene: Table, scenes: Sequence[PlanarScene]) -> Table:
-    """Average the repeatability by kind of scene."""
-    groups = {
-        kind: [scene.name for scene in scenes if is_illumination(scene) is light]
-        for kind, light in (("illumination", True), ("viewpoint", False))
-    }
+def _table_3(by_scene: Table, light: Sequence[bool]) -> Table:
+    """Average the repeatability by kind of scene; `light` says which change in illumination."""
+    kinds = {"illumination": True, "viewpoint": False}
+    titles = {kind: f"{kind}, {light.count(wanted)} scenes" for kind, wanted in kinds.items()}
     rows: list[tuple[Cell, ...]] = []
     for row in by_scene.rows:
-        values = dict(zip([scene.name for scene in scenes], row[2:], strict=True))
         cells: list[Cell] = [row[0]]
-        for names in groups.values():
-            known = [v for name in names if isinstance(v := values[name], float)]
+        for wanted in kinds.values():
+            values = [v for v, one in zip(row[2:], light, strict=True) if one is wanted]
+            known = [value for value in values if isinstance(value, float)]
             cells.append(sum(known) / len(known) if known else None)
         rows.append(tuple(cells))
-    titles = {kind: f"{kind}, {len(names)} scenes" for kind, names in groups.items()}
     table = Table(
         "hpatches_table3",
         "Table III: repeatability as in the paper, by kind of scene",
@@ -355,7 +303,7 @@ def _table_3(by_scene: Table, scenes: Sequence[PlanarScene]) -> Table:
         title: {titles[kind]: value for kind, value in numbers.items()}
         for title, numbers in HPATCHES_REPEATABILITY.items()
     }
-    counts = " and ".join(str(len(names)) for names in groups.values())
+    counts = " and ".join(str(light.count(wanted)) for wanted in kinds.values())
     cause = f"the paper's are of 57 and 59 scenes, ours of {counts}"
     return with_paper_rows(table, paper, {"": cause})
 
@@ -364,34 +312,23 @@ def plan_low_visibility(context: BenchmarkContext, options: BenchmarkOptions) ->
     """Run all protocols on the dusty and the smoky pair (Figure 6)."""
     scenes = load_low_visibility(context.folder("low-visibility"))
     pairs = [pair for scene in scenes for pair in scene.pairs()]
-    key = "low_visibility"
+    key, title = "low_visibility", "Low visibility"
     plans = []
     if "paper" in options.protocols:
         features = options.density_features()
+        names = [scene.name for scene in scenes]
         parts = [
             density_part(context, features, scenes, f"{key}_density"),
             repeatability_part(context, features, scenes, f"{key}_repeatability"),
             matches_part(context, options.matching_features(), pairs, f"{key}_matches"),
-            matches_part(
-                context,
-                _figure_features(options),
-                pairs,
-                f"{key}_figure6",
-                "Figure 6: correct matches",
-                lambda table: [with_paper_rows(table, FIGURE_6, MATCHES_CAUSES)],
-            ),
-            *_keypoint_figures(context, options, scenes),
-            *_match_figures(context, options.deepdetect_480(), pairs, "Figure 6"),
+            *_figures(context, options, pairs, key, names, scenes),
         ]
-        title = "Low visibility, the paper's protocol"
-        plans.append(SectionPlan(title, (NOTHING_MOVES, _figure_2_text()), parts))
+        text = (NOTHING_MOVES, FIGURE_2_TEXT)
+        plans.append(SectionPlan(f"{title}, the paper's protocol", text, parts))
     if "standard" in options.protocols:
-        plans.append(
-            _standard_section(context, options, scenes, key, "Low visibility", NOTHING_MOVES)
-        )
+        plans.append(_standard_section(context, options, scenes, key, title, NOTHING_MOVES))
     if "guided" in options.protocols:
-        truths = {"published": pairs}
-        plans.append(guided_section(context, options, truths, f"{key}_guided", "Low visibility"))
+        plans.append(guided_section(context, options, {"published": pairs}, f"{key}_guided", title))
     return plans
 
 

@@ -72,6 +72,10 @@ class Table:
                     f"{len(self.columns)} columns"
                 )
 
+    def titles(self) -> list[Cell]:
+        """Return the first cell of each row."""
+        return [row[0] for row in self.rows]
+
     def shown(self) -> list[list[str]]:
         """Return all cells as text."""
         return [

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Any, Protocol, TypeVar
 
+from .baselines.method import LocalFeature
 from .context import BenchmarkContext
 from .report import Figure, Section, Table
+
+Item = TypeVar("Item")
+Shown = Sequence[Table | Figure]
 
 
 class ProgressBar(Protocol):
@@ -20,12 +25,7 @@ class ProgressBar(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """A piece of work.
-
-    Attributes:
-        name: as the progress bar and the list of what was skipped give it.
-        run: does it.
-    """
+    """A piece of work; the progress bar and the list of what was skipped give its name."""
 
     name: str
     run: Callable[[], Any]
@@ -42,7 +42,7 @@ class Part:
     """
 
     tasks: Mapping[Any, Task]
-    summarize: Callable[[Mapping[Any, Any]], Sequence[Table | Figure]]
+    summarize: Callable[[Mapping[Any, Any]], Shown]
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,24 @@ class SectionPlan:
             tuple(item for item in items if isinstance(item, Table)),
             tuple(item for item in items if isinstance(item, Figure)),
         )
+
+
+def feature_part(
+    features: Sequence[LocalFeature],
+    items: Mapping[str, Item],
+    what: str,
+    measure: Callable[[LocalFeature, Item], Any],
+    summarize: Callable[[Mapping[tuple[str, str], Any]], Shown],
+) -> Part:
+    """Make the part that measures each feature on each item, by the names of both."""
+    tasks = {
+        (feature.name, name): Task(
+            f"{what}{feature.title} on {name}", partial(measure, feature, item)
+        )
+        for feature in features
+        for name, item in items.items()
+    }
+    return Part(tasks, summarize)
 
 
 def figure_part(name: str, draw: Callable[[], Figure]) -> Part:

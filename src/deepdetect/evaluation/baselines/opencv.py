@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -15,6 +15,8 @@ from ...io.image import luma
 from .method import BaselineError, LocalFeature
 
 MAX_CORNERS = 1_000_000
+
+KD_TREES = "bytes by kd-trees"
 
 AGAST_7_12D = 1
 """AgastFeatureDetector::AGAST_7_12d, the type of the paper's low settings."""
@@ -219,3 +221,15 @@ STANDARD: dict[str, LocalFeature] = {
 }
 """By the names of the default settings, what replaces them where detectors are compared by their
 best N keypoints: settings that give enough of them, ranked by score."""
+
+
+def with_kd_trees(features: Iterable[LocalFeature]) -> list[LocalFeature]:
+    """Add after each binary one with low settings one that the paper's kd-trees match, as bytes."""
+    found: list[LocalFeature] = []
+    for feature in features:
+        found.append(feature)
+        if feature.binary and feature.name.endswith("-low"):
+            title = f"{feature.title}, {KD_TREES}"
+            name = f"{feature.name}-kd-trees"
+            found.append(replace(feature, name=name, title=title, binary=False))
+    return found

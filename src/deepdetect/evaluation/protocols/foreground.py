@@ -15,11 +15,9 @@ from ..context import BenchmarkContext
 from ..metrics.coverage import foreground_fraction
 from ..report import Cell, Column, Figure, Table
 from ..tasks import Part, Task
-from .paper_numbers import FOREGROUND, with_paper_column
+from .paper_numbers import FOREGROUND, FOREGROUND_CAUSES, with_paper_column
 
 FRACTION = "fraction on the foreground"
-
-CAUSE = {"": "measured on 18 photographs of the authors' own, which are not published"}
 
 
 def foreground_part(
@@ -66,7 +64,7 @@ def foreground_part(
             "which is what random points reach."
         )
         table = Table("foreground", "Keypoints on the foreground", columns, tuple(rows), note)
-        return [with_paper_column(table, FRACTION, FOREGROUND, CAUSE)]
+        return [with_paper_column(table, FRACTION, FOREGROUND, FOREGROUND_CAUSES)]
 
     return Part(tasks, summarize)
 

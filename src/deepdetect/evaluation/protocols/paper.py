@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,11 +17,18 @@ from ...labels import draw_label, fuse
 from ...viz.draw import add_caption, draw_keypoints, draw_matches, hstack
 from ..baselines.method import LocalFeature
 from ..cache import matrix_digest
-from ..charts import line_chart, picture
+from ..charts import picture
 from ..context import BenchmarkContext, MatchSettings
 from ..metrics.repeatability import repeatability_paper
 from ..report import Cell, Column, Figure, Table
-from ..tasks import Part, Task
+from ..tasks import Part, Shown, feature_part
+from .paper_numbers import (
+    MATCHES_CAUSES,
+    NOT_IN_DENSITY,
+    Paper,
+    with_paper_column,
+    with_paper_rows,
+)
 
 OXFORD_PAIRS = (
     *(("graf", 6), ("wall", 6), ("bikes", 6), ("leuven", 6), ("trees", 6), ("ubc", 6)),
@@ -34,6 +39,8 @@ OXFORD_PAIRS = (
 CORRECT_PX = 1.0
 """A match is correct strictly under this distance."""
 
+PAPER_MEAN = f"mean without {NOT_IN_DENSITY}"
+
 PAPER_MATCHING = MatchSettings(matcher="flann", ratio=0.99)
 
 SEEDS = 3
@@ -43,11 +50,7 @@ FEW_MATCHES = 1000
 MANY_SEEDS = 64
 """Few correct matches (graf's are a hundred) vary by a tenth from seed to seed."""
 
-Finish = Callable[[Table], Sequence[Table | Figure]]
-
-
-def _as_it_is(table: Table) -> Sequence[Table | Figure]:
-    return [table]
+Finish = Callable[[Table], Shown]
 
 
 def density_part(
@@ -55,33 +58,38 @@ def density_part(
     features: Sequence[LocalFeature],
     scenes: Sequence[PlanarScene],
     key: str,
-    finish: Finish = _as_it_is,
+    paper: Mapping[str, float] = {},
 ) -> Part:
-    """Tabulate keypoints per pixel, mean over the images of each scene and over all images."""
-    tasks = {
-        (feature.name, image): Task(
-            f"density of {feature.title} on {image.parent.name}/{image.name}",
-            partial(_density, context, feature, image),
-        )
-        for feature in features
-        for scene in scenes
-        for image in scene.images
-    }
+    """Tabulate keypoints per pixel, mean over all images and those of each scene.
 
-    def summarize(found: Mapping[Any, float]) -> Sequence[Table | Figure]:
-        rows: list[tuple[Cell, ...]] = []
-        for feature in features:
-            by_scene = [
-                [found[feature.name, i] for i in scene.images if (feature.name, i) in found]
-                for scene in scenes
+    The paper's numbers are beside the mean that they are of, without one of the scenes.
+    """
+    images = {f"{scene.name}/{path.name}": path for scene in scenes for path in scene.images}
+
+    def summarize(found: Mapping[tuple[str, str], float]) -> Shown:
+        def mean(feature: LocalFeature, chosen: Sequence[PlanarScene]) -> float | None:
+            keys = [
+                (feature.name, f"{one.name}/{path.name}") for one in chosen for path in one.images
             ]
-            every = [value for values in by_scene for value in values]
-            rows.append((feature.title, _mean(every), *map(_mean, by_scene)))
-        columns = (Column("method"), Column("mean", ".4f"), *_scene_columns(scenes))
-        note = "The mean is over all images. Several keypoints on one pixel all count."
-        return finish(Table(key, "Keypoints per pixel", columns, tuple(rows), note))
+            return _mean([found[each] for each in keys if each in found])
 
-    return Part(tasks, summarize)
+        columns = {"mean": scenes, **{scene.name: [scene] for scene in scenes}}
+        note = "The mean is over all images. Several keypoints on one pixel all count."
+        if paper:
+            others = [scene for scene in scenes if scene.name != NOT_IN_DENSITY]
+            columns = {"mean": scenes, PAPER_MEAN: others, **columns}
+            note += (
+                f" The paper's means are those without {NOT_IN_DENSITY}: of the classical "
+                "detectors they are the same to all its digits, at both settings."
+            )
+        rows = [(f.title, *(mean(f, chosen) for chosen in columns.values())) for f in features]
+        table = Table(key, "Keypoints per pixel", _columns(columns), tuple(rows), note)
+        return [with_paper_column(table, PAPER_MEAN, paper) if paper else table]
+
+    def measure(feature: LocalFeature, image: Path) -> float:
+        return context.keypoints(feature, image).features.density
+
+    return feature_part(features, images, "density of ", measure, summarize)
 
 
 def repeatability_part(
@@ -89,36 +97,27 @@ def repeatability_part(
     features: Sequence[LocalFeature],
     scenes: Sequence[PlanarScene],
     key: str,
-    finish: Finish = _as_it_is,
+    finish: Finish = lambda table: [table],
 ) -> Part:
     """Tabulate the paper's repeatability at 1 px: clipped, mean over the pairs of each scene."""
-    tasks = {
-        (feature.name, pair.name): Task(
-            f"repeatability of {feature.title} on {pair.name}",
-            partial(pair_repeatability, context, feature, pair),
-        )
-        for feature in features
-        for scene in scenes
-        for pair in scene.pairs()
-    }
+    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs()}
 
-    def summarize(found: Mapping[Any, float]) -> Sequence[Table | Figure]:
+    def summarize(found: Mapping[tuple[str, str], float]) -> Shown:
         rows: list[tuple[Cell, ...]] = []
         for feature in features:
             names = [[(feature.name, pair.name) for pair in scene.pairs()] for scene in scenes]
             values = [_mean([found[n] for n in of_scene if n in found]) for of_scene in names]
             rows.append((feature.title, _mean([v for v in values if v is not None]), *values))
-        columns = (Column("method"), Column("mean", ".4f"), *_scene_columns(scenes))
+        columns = _columns(["mean", *(scene.name for scene in scenes)])
         note = (
             "Points of the first image that land under 1 px from some point of the second, over "
             "the smaller of the two counts, clipped at 1. It grows with the density: the baselines "
             "say what it is worth."
         )
-        return finish(
-            Table(key, "Repeatability as in the paper", columns, tuple(rows), note),
-        )
+        return finish(Table(key, "Repeatability as in the paper", columns, tuple(rows), note))
 
-    return Part(tasks, summarize)
+    measure = partial(pair_repeatability, context)
+    return feature_part(features, pairs, "repeatability of ", measure, summarize)
 
 
 def matches_part(
@@ -127,42 +126,41 @@ def matches_part(
     pairs: Sequence[PlanarPair],
     key: str,
     title: str = "Correct matches",
-    finish: Finish = _as_it_is,
+    paper: Mapping[str, Paper] = {},
+    notebooks: Mapping[str, Mapping[str, tuple[int, int]]] = {},
 ) -> Part:
-    """Tabulate the correct matches of each pair: FLANN, ratio 0.99, strictly under 1 px."""
-    tasks = {
-        (feature.name, pair.name): Task(
-            f"matches of {feature.title} on {pair.name}",
-            partial(correct_matches, context, feature, pair),
-        )
-        for feature in features
-        for pair in pairs
-    }
+    """Tabulate correct matches under 1 px, and their fraction of all matches."""
+    columns = [Column("method")]
+    for pair in pairs:
+        columns += [Column(pair.name, ",d"), Column(f"{pair.name}, precision", ".2%")]
+    note = (
+        "FLANN (5 trees, 50 checks), ratio 0.99; correct: strictly under 1 px by the "
+        "homography in the file. Binary descriptors (ORB, BRISK) are matched exactly by "
+        "Hamming's distance. The number grows with the number of points, whatever they are: "
+        "see the baselines."
+    )
 
-    def summarize(found: Mapping[Any, tuple[int, int]]) -> Sequence[Table | Figure]:
-        rows: list[tuple[Cell, ...]] = []
-        for feature in features:
-            cells: list[Cell] = []
-            for pair in pairs:
-                correct, matches = found.get((feature.name, pair.name), (None, None))
-                cells += [correct, correct / matches if correct is not None and matches else None]
-            rows.append((feature.title, *cells))
-        columns = [Column("method")]
+    def row(title: str, counts: Mapping[str, tuple[int, int]]) -> tuple[Cell, ...]:
+        cells: list[Cell] = [title]
         for pair in pairs:
-            columns += [Column(pair.name, ",d"), Column(f"{pair.name}, precision", ".2%")]
-        note = (
-            "FLANN (5 trees, 50 checks), ratio 0.99; correct: strictly under 1 px by the "
-            "homography in the file. Binary descriptors (ORB, BRISK) are matched exactly by "
-            "Hamming's distance. The number grows with the number of points, whatever they are: "
-            "see the baselines."
+            correct, matches = counts.get(pair.name, (None, None))
+            cells += [correct, correct / matches if correct is not None and matches else None]
+        return tuple(cells)
+
+    def summarize(found: Mapping[tuple[str, str], tuple[int, int]]) -> Shown:
+        ours = tuple(
+            row(each.title, {name: counts for (f, name), counts in found.items() if f == each.name})
+            for each in features
         )
-        return finish(Table(key, title, tuple(columns), tuple(rows), note))
+        table = with_paper_rows(
+            Table(key, title, tuple(columns), ours, note), paper, MATCHES_CAUSES
+        )
+        printed = (row(f"{name}, in the authors' notebook", n) for name, n in notebooks.items())
+        return [replace(table, rows=(*table.rows, *printed))]
 
-    return Part(tasks, summarize)
-
-
-def _density(context: BenchmarkContext, feature: LocalFeature, image: Path) -> float:
-    return context.keypoints(feature, image).features.density
+    measure = partial(correct_matches, context)
+    named = {pair.name: pair for pair in pairs}
+    return feature_part(features, named, "matches of ", measure, summarize)
 
 
 def pair_repeatability(context: BenchmarkContext, feature: LocalFeature, pair: PlanarPair) -> float:
@@ -224,22 +222,6 @@ def mask_figure(scene: PlanarScene) -> Figure:
     return Figure("masks", title, picture(draw_label(rgb, fuse(luma(rgb)))))
 
 
-def loss_figure() -> Figure:
-    """Draw Figure 5: the losses of the pretrained weights' last training run."""
-    text = resources.files("deepdetect").joinpath("detector/weights/curves.csv").read_text("utf-8")
-    rows = list(csv.DictReader(text.splitlines()))
-    epochs = [float(row["epoch"]) for row in rows]
-    lines = {
-        name.replace("_", " "): (epochs, [float(row[name]) for row in rows])
-        for name in ("training_loss", "validation_loss")
-    }
-    title = (
-        f"Figure 5: losses of the pretrained weights' last run, {len(rows)} validations; "
-        f"the last {rows[-1]['validation_loss']}"
-    )
-    return Figure("losses", title, line_chart(lines, "epoch", "binary cross-entropy per pixel"))
-
-
 def match_figure(
     context: BenchmarkContext, feature: LocalFeature, pair: PlanarPair, number: str
 ) -> Figure:
@@ -257,8 +239,8 @@ def match_figure(
     return Figure(f"matches_{pair.name.replace(' ', '_')}", title, picture(drawn))
 
 
-def _scene_columns(scenes: Sequence[PlanarScene]) -> tuple[Column, ...]:
-    return tuple(Column(scene.name, ".4f") for scene in scenes)
+def _columns(titles: Iterable[str]) -> tuple[Column, ...]:
+    return (Column("method"), *(Column(title, ".4f") for title in titles))
 
 
 def _mean(values: Sequence[float]) -> float | None:

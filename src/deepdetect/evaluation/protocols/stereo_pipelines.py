@@ -76,7 +76,7 @@ class Pipeline:
     version: str = ""
     rounds: int = ROUNDS
     drawn: str = ""
-    paper: Mapping[str, int] = field(default_factory=dict)
+    paper: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def _reconstruct(
     return StereoPoints(found.pixels, found.disparity, filled, profiler.stages, profiler.memory)
 
 
-def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, int] = {}) -> Pipeline:
+def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = {}) -> Pipeline:
     """Make the paper's pipeline with the keypoints and descriptors of a local feature."""
 
     def run(scene: CalibratedStereoPair) -> StereoPoints:
