@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from deepdetect.cli import main
-from deepdetect.cli.main import with_flags
+from deepdetect.cli.main import OLD_FLAGS, with_flags
 
 
 def commands(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -62,3 +62,31 @@ def test_every_option_says_what_it_is(words: tuple[str, ...]) -> None:
 )
 def test_errors_name_flags_instead_of_parameters(message: str, expected: str | None) -> None:
     assert with_flags(message, main.commands["reconstruct"]) == (expected or message)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "right"),
+    [
+        ("benchmark oxford --only sift", "--baselines"),
+        ("benchmark oxford --baselnes sift", "--baselines"),
+        ("evaluate samples --against other.onnx", "--compare"),
+        ("evaluate samples --comparee other.onnx", "--compare"),
+        ("reconstruct a.png b.png --calib c.json", "--calibration"),
+        ("train photographs --loaders 2", "--num-workers"),
+    ],
+)
+def test_an_old_or_misspelt_flag_names_the_right_one(arguments: str, right: str) -> None:
+    result = CliRunner().invoke(main, arguments.split())
+    assert result.exit_code == 2
+    assert f"'{right}'" in result.stderr or f"{right}?" in result.stderr, result.stderr
+
+
+def test_every_old_flag_has_a_new_one() -> None:
+    flags = {
+        o
+        for c in main.commands.values()
+        for p in c.get_params(click.Context(c))
+        for o in (*p.opts, *p.secondary_opts)
+    }
+    assert set(OLD_FLAGS.values()) <= flags
+    assert not set(OLD_FLAGS) & flags

@@ -25,6 +25,25 @@ from .shards import shards
 from .stitch import stitch
 from .train import train
 
+OLD_FLAGS = {
+    "--against": "--compare",
+    "--calib": "--calibration",
+    "--color-changes": "--color-jitter",
+    "--dark-marked-weight": "--low-light-pos-weight",
+    "--doubtful-only": "--pos-weight-uncertain",
+    "--explain": "--visualize",
+    "--in-turn": "--no-interleave",
+    "--layers": "--freeze-encoder",
+    "--loaders": "--num-workers",
+    "--marked-weight": "--pos-weight",
+    "--only": "--baselines",
+    "--photos-a-shard": "--shard-size",
+    "--start": "--init",
+    "--validations": "--val-count",
+    "--variations": "--augmentations",
+}
+"""What flags of older versions are called today."""
+
 
 class Commands(click.Group):
     """A group that names the nearest right command, and ends with exit code 2 on user errors."""
@@ -40,6 +59,11 @@ class Commands(click.Group):
     def invoke(self, context: click.Context) -> Any:
         try:
             return super().invoke(context)
+        except click.NoSuchOption as error:
+            new = OLD_FLAGS.get(error.option_name)
+            if error.ctx is None or not any(new in each.opts for each in error.ctx.command.params):
+                raise
+            raise click.UsageError(f"{error.message} Did you mean '{new}'?", error.ctx) from None
         except DeepDetectError as error:
             command = self.get_command(context, context.invoked_subcommand or "")
             click.echo(f"deepdetect: {with_flags(str(error), command)}", err=True)
