@@ -233,13 +233,6 @@ def track_corners(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Track corners from the first image to the warped second one and back.
 
-    Args:
-        gray0: (H, W) uint8.
-        warped: (H, W) uint8, the second image in the frame of the first.
-        valid_mask: (H, W) bool, where that has content.
-        window_px: side of the tracked windows in pixels.
-        options: number of corners, levels of the pyramid and round trip.
-
     Returns:
         (N, 2) float32 positions in both; None with fewer than `min_tracks`.
     """
@@ -271,11 +264,6 @@ def refine_homography_irls(
 ) -> np.ndarray:
     """Return a homography that aligns clearly more pixels, or the initial one.
 
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        homography: (3, 3) from the first image to the second, right within some pixels.
-        options: how.
-
     Returns:
         (3, 3), its last element 1.
     """
@@ -297,10 +285,6 @@ def fit_homography_irls(
     points0: np.ndarray, points1: np.ndarray, options: IrlsOptions = IrlsOptions()
 ) -> np.ndarray | None:
     """Fit a homography by iteratively reweighted least squares with Cauchy weights.
-
-    Args:
-        points0, points1: (N, 2), most of them at most some pixels from where they were.
-        options: scale of the weights, and iterations.
 
     Returns:
         (3, 3), its last element 1; None when the points do not determine it.
@@ -353,11 +337,6 @@ def aligned_fraction(
 
     The error of a pixel is the length of one Lucas-Kanade step over the window around it, after
     both images are equalised.
-
-    Args:
-        gray0, warped: (H, W) uint8.
-        valid_mask: (H, W) bool, where the second has content.
-        options: the largest error of an aligned pixel, and the window.
     """
     if not valid_mask.any():
         return 0.0

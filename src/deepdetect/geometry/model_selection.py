@@ -31,11 +31,6 @@ def select_model(
 ) -> str:
     """Return the model of a scene: "homography" (no depth) or "fundamental".
 
-    Args:
-        homography_inliers, fundamental_inliers: (M,) bool, which of the same matches each model
-            explains.
-        options: when a scene has depth.
-
     Example:
         >>> plane = np.arange(100) < 60
         >>> select_model(plane, plane), select_model(plane, np.arange(100) < 95)

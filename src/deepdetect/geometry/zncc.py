@@ -19,21 +19,16 @@ MIN_VARIANCE = 1.0
 
 
 def warp_to_reference(
-    gray1: np.ndarray, homography: np.ndarray, size: tuple[int, int]
+    image1: np.ndarray, homography: np.ndarray, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Warp the second image into the frame of the first.
-
-    Args:
-        gray1: (H1, W1) uint8, the second image.
-        homography: (3, 3) from the first image to the second.
-        size: (width, height) of the first image.
+    """Warp the second image by the homography from the first to it, into the frame of the first.
 
     Returns:
-        (H, W) uint8 warped image, and its (H, W) bool mask of valid pixels.
+        (H, W) or (H, W, 3) uint8 warped image, and its (H, W) bool mask of valid pixels.
     """
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(gray1, homography, size, flags=flags)
-    whole = np.full(gray1.shape, 255, np.uint8)
+    warped = cv2.warpPerspective(image1, homography, size, flags=flags)
+    whole = np.full(image1.shape[:2], 255, np.uint8)
     nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
     return warped, cv2.warpPerspective(whole, homography, size, flags=nearest) > 0
 
@@ -112,10 +107,6 @@ def normalise_local_contrast(gray: np.ndarray, window_px: int = WINDOW_PX) -> np
     """Subtract the mean of the window around each pixel and divide by its standard deviation.
 
     The correlation of two images normalised like this is that of all their windows at once.
-
-    Args:
-        gray: (H, W), any dtype.
-        window_px: side of the square windows in pixels, odd.
 
     Returns:
         (H, W) float32; near 0 where a window is flat.

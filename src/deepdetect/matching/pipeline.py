@@ -190,12 +190,6 @@ def unguided_matches(
 ) -> DescriptorMatches:
     """Match all descriptors with all others.
 
-    Args:
-        grays: (H, W) uint8 luma of both images.
-        points: (N, 2) float32 keypoints of both.
-        options: whether they ask for guided matching does not matter.
-        timer: measures the stages.
-
     Raises:
         OptionError: there are too many keypoints for the memory.
     """
@@ -252,9 +246,6 @@ def _configured(
 
 def check_memory(keypoints: Sequence[int]) -> None:
     """Stop before the descriptors and their search trees fill the memory.
-
-    Args:
-        keypoints: how many there are in each image.
 
     Raises:
         OptionError: there are too many.

@@ -11,7 +11,7 @@ import numpy as np
 from .._shared.errors import DeepDetectError
 from .._shared.options import suggest_keywords
 from ..detector.detector import HeatmapDetector
-from ..geometry.zncc import median_local_zncc
+from ..geometry.zncc import median_local_zncc, warp_to_reference
 from ..io.image import load_image, luma
 from .guided import GuidedOptions
 from .pipeline import match_images
@@ -120,11 +120,7 @@ def register(
             "plane or be taken from one place"
         )
     size = (first.shape[1], first.shape[0])
-    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    warped = cv2.warpPerspective(second, found.matrix, size, flags=flags)
-    whole = np.full(second.shape[:2], 255, np.uint8)
-    nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    valid = cv2.warpPerspective(whole, found.matrix, size, flags=nearest) > 0
+    warped, valid = warp_to_reference(second, found.matrix, size)
     return Registration(
         found.matrix,
         first,

@@ -138,10 +138,6 @@ def check_images(
 
     Copies that lost more show the same view: `check_matches` and `check_disparities` refuse them.
 
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        options: how little they differ.
-
     Raises:
         ReconstructionError: they are the same.
 
@@ -235,15 +231,6 @@ def check_pose(
 ) -> RelativePose:
     """Refuse a pose that explains far less than is possible: the calibration is wrong.
 
-    Args:
-        pose: of the same matches as the evidence; None when none could be estimated.
-        evidence: of `check_matches`.
-        calibration: that gave the pose.
-        options: the thresholds.
-
-    Returns:
-        The pose.
-
     Raises:
         ReconstructionError: too few matches agree with the pose, or too many points lie behind.
     """
@@ -282,12 +269,6 @@ def check_focal(
     noticed: it gives a scene that is stretched in depth. One that is too long is noticed less than
     one that is too short.
 
-    Args:
-        points0, points1: (M, 2) the matches that the pose and the evidence come from.
-        pose, evidence, calibration: as of `check_pose`.
-        seed: of the random samples.
-        options: the thresholds.
-
     Raises:
         ReconstructionError: another focal length halves the median error; it is named.
     """
@@ -324,12 +305,7 @@ def is_planar(
     by_fundamental: np.ndarray,
     min_ratio: float = CheckOptions.min_planar_ratio,
 ) -> bool:
-    """Return whether a homography explains all that can be explained, though many may be wrong.
-
-    Args:
-        by_homography, by_fundamental: (M,) bool, the matches that each explains.
-        min_ratio: matches of the homography per match of the fundamental matrix.
-    """
+    """Return whether a homography explains all that can be explained, though many may be wrong."""
     explained = np.count_nonzero(by_homography) >= min_ratio * np.count_nonzero(by_fundamental)
     return bool(explained and select_model(by_homography, by_fundamental) == "homography")
 
@@ -339,13 +315,7 @@ def has_foreground(
     by_fundamental: np.ndarray,
     options: ForegroundOptions = ForegroundOptions(),
 ) -> bool:
-    """Return whether something stands in front of the plane, small as it may be.
-
-    Args:
-        off_plane_px: (N,) errors of the plane's homography.
-        by_fundamental: (N,) bool, the matches that the fundamental matrix explains.
-        options: the thresholds.
-    """
+    """Return whether something stands in front of the plane, small as it may be."""
     clear = off_plane_px > options.min_distance_px
     foreground = np.count_nonzero(clear & by_fundamental)
     needed = max(
@@ -433,13 +403,7 @@ def _no_depth(
 def is_pure_rotation(
     points0: np.ndarray, points1: np.ndarray, calibration: Calibration, max_error_px: float
 ) -> bool:
-    """Return whether one rotation maps the rays of matches onto each other (Kabsch's method).
-
-    Args:
-        points0, points1: (M, 2) matched positions.
-        calibration: of both cameras.
-        max_error_px: median error in the second image.
-    """
+    """Return whether one rotation maps the rays of matches onto each other (Kabsch's method)."""
     rays0, rays1 = (
         rays / np.linalg.norm(rays, axis=1, keepdims=True)
         for rays in (calibration.camera0.rays(points0), calibration.camera1.rays(points1))

@@ -82,10 +82,6 @@ DEFAULTS = RectifiedCheckOptions()
 def check_cameras(calibration: Calibration, options: RectifiedCheckOptions = DEFAULTS) -> None:
     """Refuse a calibration that no rectified pair has.
 
-    Args:
-        calibration: of a pair treated as rectified.
-        options: the thresholds.
-
     Raises:
         ReconstructionError: focal lengths or cy of both views differ.
 
@@ -116,10 +112,6 @@ are 500 and 600 px, those of a rectified pair are one: fix the calibration (give
 
 def check_keypoints(keypoints: int, selection: SelectionOptions) -> None:
     """Refuse an image without keypoints.
-
-    Args:
-        keypoints: their number.
-        selection: how they were chosen.
 
     Raises:
         ReconstructionError: there are none.
@@ -162,10 +154,6 @@ def check_matched(
 def check_disparities(disparity: np.ndarray, options: RectifiedCheckOptions = DEFAULTS) -> None:
     """Refuse disparities of a rectified pair that are all one value.
 
-    Args:
-        disparity: (N,) in pixels; those that are not finite do not count.
-        options: the thresholds.
-
     Raises:
         ReconstructionError: there are none, or they do not differ.
 
@@ -205,12 +193,6 @@ def check_pure_rotation(
     far off, with a tilt besides that takes matches off their rows, or when it bends by less than
     the noise, a rotation is not noticed.
 
-    Args:
-        pixels: (N, 2) positions in the left image.
-        disparity: (N,) their disparities in pixels.
-        calibration: gives the rays.
-        options: the thresholds.
-
     Raises:
         ReconstructionError: one rotation explains most disparities, and far better than a plane.
     """
@@ -236,11 +218,6 @@ def check_depths(
     disparity: np.ndarray, calibration: Calibration, options: RectifiedCheckOptions = DEFAULTS
 ) -> None:
     """Refuse disparities of a rectified pair of which many would lie behind the cameras.
-
-    Args:
-        disparity: (N,) in pixels.
-        calibration: gives the offset.
-        options: the thresholds.
 
     Raises:
         ReconstructionError: left and right are exchanged, or the offset is wrong.

@@ -10,9 +10,9 @@ from deepdetect.matching.stitching import compositing
 from deepdetect.matching.stitching.compositing import (
     Canvas,
     composite,
-    drawn_in_box,
-    least_stretched,
+    least_distorted,
     plan_canvas,
+    warp_to_box,
 )
 
 CAMERA = np.array([[400.0, 0, 199.5], [0, 400, 149.5], [0, 0, 1]])
@@ -88,12 +88,12 @@ def test_the_one_in_the_middle_is_least_stretched() -> None:
     angles = {4: -35, 1: 20, 7: 2, 2: 38}
     for frame in (0, 25):
         homographies = {number: turned(-frame) @ turned(a) for number, a in angles.items()}
-        assert least_stretched(dict.fromkeys(angles, SIZE), homographies) == 7
-    assert least_stretched({2: SIZE, 1: SIZE}, {2: moved(0), 1: moved(50)}) == 2
+        assert least_distorted(dict.fromkeys(angles, SIZE), homographies) == 7
+    assert least_distorted({2: SIZE, 1: SIZE}, {2: moved(0), 1: moved(50)}) == 2
 
 
 def test_an_image_is_drawn_where_it_belongs(scene: np.ndarray) -> None:
-    drawn, mask = drawn_in_box(scene, moved(40, 10), (30, 0, 700, 405))
+    drawn, mask = warp_to_box(scene, moved(40, 10), (30, 0, 700, 405))
     assert drawn.shape == (405, 670, 3)
     np.testing.assert_array_equal(drawn[10:, 10:610], scene[:395])
     assert (mask[10:, 10:610] == 255).all()
@@ -101,7 +101,7 @@ def test_an_image_is_drawn_where_it_belongs(scene: np.ndarray) -> None:
     # Stripes of one pixel are grey when made smaller, not what sampling hits.
     stripes = np.zeros((200, 200, 3), np.uint8)
     stripes[:, ::2] = 255
-    small, _ = drawn_in_box(stripes, np.diag([0.25, 0.25, 1]), (0, 0, 50, 50))
+    small, _ = warp_to_box(stripes, np.diag([0.25, 0.25, 1]), (0, 0, 50, 50))
     assert np.abs(small[5:-5, 5:-5].astype(int) - 127.5).max() < 30
 
 

@@ -24,13 +24,7 @@ GRAY_OUTSIDE = 128
 def simulated_views(
     gray: np.ndarray, tilt: float, rotation_step_deg: float, sift: SiftOptions
 ) -> Iterator[Keypoints]:
-    """Detect the keypoints of an image as seen from the side, from directions all around.
-
-    Args:
-        gray: (H, W) uint8 luma.
-        tilt: how many times shorter one direction is seen.
-        rotation_step_deg: between the directions for a tilt of 1.
-        sift: the keypoints of each view.
+    """Detect keypoints of an image seen from the side; the rotation step is that of a tilt of 1.
 
     Yields:
         The described keypoints of each view, at their positions in the image itself.
@@ -55,11 +49,6 @@ def simulate_view(
     gray: np.ndarray, tilt: float, rotation_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotate an image and shorten it along x, blurred before as by a camera.
-
-    Args:
-        gray: (H, W) uint8 luma.
-        tilt: how many times it is shortened.
-        rotation_deg: before that.
 
     Returns:
         The view, gray outside the image, and the (2, 3) affine map from the image to it.

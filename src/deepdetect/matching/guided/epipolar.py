@@ -29,12 +29,6 @@ def match_along_epipolar_lines(
 ) -> DescriptorMatches:
     """Match by a fundamental matrix, and keep matches that are similar and move consistently.
 
-    Args:
-        pair: images and keypoints.
-        fundamental: (3, 3) with x1^T F x0 = 0.
-        options: what keeps a match.
-        seed: of the search, and of the null pairs.
-
     Returns:
         The matches, their ratios the distance of their descriptors relative to null pairs, under 1.
     """
@@ -71,13 +65,7 @@ def motion_consistent(
     shape: tuple[int, ...],
     options: EpipolarMatchingOptions = EpipolarMatchingOptions(),
 ) -> np.ndarray:
-    """Find the matches that move as those around them do (as in GMS).
-
-    Args:
-        points0: (N, 2) whole pixels of the first image, each once.
-        points1: (N, 2) their partners.
-        shape: (H, W) of the first image.
-        options: the window, the largest difference, and the least support.
+    """Find the matches that move as those around them do (as in GMS); whole pixels, each once.
 
     Returns:
         (N,) bool: at least `min_motion_support` of the other matches in the window move so, and
@@ -109,13 +97,7 @@ def densely_matched(
     shape: tuple[int, ...],
     options: EpipolarMatchingOptions = EpipolarMatchingOptions(),
 ) -> np.ndarray:
-    """Find the matched points around which many keypoints are matched.
-
-    Args:
-        points: (N, 2) whole pixels of the first image that are matched, each once.
-        keypoints: (M, 2) all its keypoints.
-        shape: (H, W) of the first image.
-        options: the window and the least densities.
+    """Find the matched points around which many keypoints are matched; whole pixels, each once.
 
     Returns:
         (N,) bool: at least the fraction `min_match_density` of the keypoints in the window is

@@ -39,13 +39,6 @@ def match_by_homography(
 ) -> DescriptorMatches:
     """Match keypoints by a homography, and keep those whose patches are the same.
 
-    Args:
-        pair: images and keypoints.
-        homography: (3, 3) from the first image to the second.
-        options: how near a partner must be.
-        verification: when patches count as the same.
-        seed: of the null pairs.
-
     Returns:
         The matches, their ratios the `dissimilarity` of their patches, under 1. Each keypoint of
         the first image is matched once at most, those of the second image perhaps more often.

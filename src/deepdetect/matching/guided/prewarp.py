@@ -96,14 +96,7 @@ def estimate_affinity(
 def prewarp(
     pair: ImagePair, affinity: np.ndarray, options: PrewarpOptions = PrewarpOptions()
 ) -> PrewarpedPair:
-    """Warp the second image, and its keypoints, into the frame of the first.
-
-    Args:
-        pair: images and keypoints.
-        affinity: (3, 3) from the first image to the second.
-        options: how large the frame is, and which pixels stand for a keypoint; a keypoint may have
-            several.
-    """
+    """Warp the second image to the first; several pixels may stand for a keypoint."""
     gray0, gray1 = pair.gray0, pair.gray1
     left, top, width, height = _frame(gray0.shape, gray1.shape, affinity, options.frame_margin)
     to_second = affinity @ np.array([[1.0, 0, left], [0, 1, top], [0, 0, 1]])

@@ -1,7 +1,7 @@
-"""Photographs with known homographies put onto one flat canvas.
+"""Composites photographs with known homographies on one flat canvas.
 
 The canvas and its memory are known before anything is drawn. Exposure and seams are found on small
-pictures; the photographs themselves are drawn one after the other, blended in bands of frequency
+copies; the photographs themselves are warped one after the other, blended in frequency bands
 (Burt and Adelson, "A multiresolution spline with application to image mosaics", 1983; OpenCV's).
 """
 
@@ -19,33 +19,33 @@ from ..._shared.parallel import available_memory
 from ...geometry.rescaling import downscale, scaled_homography
 from ...geometry.residuals import transform_points
 
-STEEPEST = 5.0
+MAX_DEPTH_RATIO = 5.0
 """How many times farther from the camera one corner of an image may lie on the canvas than
 another: near the horizon an image is stretched without bound."""
 
 SEAM_MEGAPIXELS = 0.5
 """Size of the canvas, at the most, on which exposure and seams are found."""
 
-LEAST_OVERLAP = 100
-"""Pixels there that two images must share for their brightness to be compared."""
+MIN_OVERLAP_PX = 100
+"""Pixels there by which two images must overlap for their brightness to be compared."""
 
-GAIN_ERROR = 0.05
-GAIN_SPREAD = 0.5
+GAIN_ERROR_STD = 0.05
+GAIN_PRIOR_STD = 0.5
 """Standard deviations of the logarithm of brightness: of what an overlap says about two images
 (vignetting and reflections say something else), and of what cameras choose."""
 
-BANDS = 5
-"""Bands of frequency; the coarsest blends over some 2^5 pixels."""
+NUM_BANDS = 5
+"""Frequency bands; the coarsest blends over about 2^5 pixels."""
 
-FINENESS = 32
+BLEND_FACTOR = 32
 """Brightness is multiplied by this for blending, whose bands are rounded down to whole numbers."""
 
-MINIFIED = 0.67
-"""An image that the canvas shows smaller than this is shrunk before, so that it does not alias."""
+MIN_WARP_SCALE = 0.67
+"""An image that the canvas shows smaller than this is downscaled first, against aliasing."""
 
-BYTES_A_CANVAS_PIXEL = 22
-BYTES_A_DRAWN_PIXEL = 25
-"""Memory that blending takes: for each pixel of the canvas, and of the box of one image on it."""
+BYTES_PER_CANVAS_PIXEL = 22
+BYTES_PER_IMAGE_PIXEL = 25
+"""Memory that blending takes per pixel of the canvas, and of the box of one image on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,25 +64,17 @@ class Canvas:
 
     @property
     def memory_bytes(self) -> int:
-        """What compositing takes at the most, about."""
+        """About the most memory that compositing takes."""
         drawn = max(
             (right - left) * (bottom - top) for left, top, right, bottom in self.boxes.values()
         )
-        return self.size[0] * self.size[1] * BYTES_A_CANVAS_PIXEL + drawn * BYTES_A_DRAWN_PIXEL
+        return self.size[0] * self.size[1] * BYTES_PER_CANVAS_PIXEL + drawn * BYTES_PER_IMAGE_PIXEL
 
 
-def least_stretched(
+def least_distorted(
     sizes: Mapping[int, tuple[int, int]], homographies: Mapping[int, np.ndarray]
 ) -> int:
-    """Find the image in whose frame all images are least distorted: the one in the middle.
-
-    Args:
-        sizes: (width, height) of the images, by number.
-        homographies: (3, 3) from each to a common frame.
-
-    Returns:
-        Its number; of several that are as good, the first.
-    """
+    """Return the number of the image in whose frame all images are least distorted."""
 
     def stretch(frame: int) -> float:
         back = np.linalg.inv(homographies[frame])
@@ -118,7 +110,7 @@ def plan_canvas(
     placed = {number: back @ matrix for number, matrix in homographies.items()}
     for number, matrix in placed.items():
         depths = _depths(sizes[number], matrix)
-        if depths.min() * STEEPEST <= depths.max():
+        if depths.min() * MAX_DEPTH_RATIO <= depths.max():
             raise DeepDetectError(
                 f"images[{number}] is seen too much from the side of images[{reference}] for a "
                 "flat panorama: leave it out, or choose a reference between them"
@@ -182,33 +174,28 @@ def composite(
         (H, W, 3) uint8 RGB, black where there is nothing; (H, W) bool where there is something;
         and the factor that the brightness of each image is multiplied by.
     """
-    scale, low = _small_canvas(small, canvas)
+    scale, low = _downscaled_canvas(small, canvas)
     gains = _gains(low)
     seams = _seams(low, gains)
     width, height = canvas.size
-    blender = cv2.detail_MultiBandBlender(0, BANDS)
+    blender = cv2.detail_MultiBandBlender(0, NUM_BANDS)
     blender.prepare((0, 0, width, height))
     for number, box in canvas.boxes.items():
-        drawn, mask = drawn_in_box(load(number), canvas.homographies[number], box)
-        mask &= _enlarged(seams[number], low[number].corner, scale, box)
-        bright = cv2.multiply(drawn, (FINENESS * gains[number],) * 4, dtype=cv2.CV_16S)
+        drawn, mask = warp_to_box(load(number), canvas.homographies[number], box)
+        mask &= _upscale_mask(seams[number], low[number].corner, scale, box)
+        bright = cv2.multiply(drawn, (BLEND_FACTOR * gains[number],) * 4, dtype=cv2.CV_16S)
         blender.feed(bright, mask, box[:2])
     del drawn, mask, bright
     blended, valid = blender.blend(None, None)
-    panorama = cv2.convertScaleAbs(np.maximum(blended, 0, out=blended), alpha=1 / FINENESS)
+    panorama = cv2.convertScaleAbs(np.maximum(blended, 0, out=blended), alpha=1 / BLEND_FACTOR)
     panorama[valid == 0] = 0
     return panorama, valid > 0, gains
 
 
-def drawn_in_box(
+def warp_to_box(
     rgb: np.ndarray, homography: np.ndarray, box: tuple[int, int, int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw an image on its part of the canvas.
-
-    Args:
-        rgb: (H, W, 3) uint8.
-        homography: (3, 3) to the canvas.
-        box: left, top, right and bottom.
 
     Returns:
         (h, w, 3) uint8, mirrored beyond its borders, and (h, w) uint8 mask, 255 inside.
@@ -217,7 +204,7 @@ def drawn_in_box(
     middle = np.array([(rgb.shape[1] - 1) / 2, (rgb.shape[0] - 1) / 2])
     around = transform_points(middle + [[0, 0], [1, 0], [0, 1]], homography)
     shown = float(np.sqrt(abs(np.linalg.det(around[1:] - around[0]))))
-    if shown < MINIFIED:
+    if shown < MIN_WARP_SCALE:
         rgb, scale = downscale(rgb, max(16, int(np.ceil(shown * max(rgb.shape[:2])))))
         homography = scaled_homography(homography, scale, 1)
     shift = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
@@ -230,7 +217,7 @@ def drawn_in_box(
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
+class _WarpedImage:
     picture: np.ndarray
     mask: np.ndarray
     corner: tuple[int, int]
@@ -241,9 +228,9 @@ class _Drawn:
         return self.picture[part], self.mask[part]
 
 
-def _small_canvas(
+def _downscaled_canvas(
     small: Mapping[int, tuple[np.ndarray, float]], canvas: Canvas
-) -> tuple[float, dict[int, _Drawn]]:
+) -> tuple[float, dict[int, _WarpedImage]]:
     """Draw the small images on a small canvas; return its scale, too."""
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
@@ -257,31 +244,31 @@ def _small_canvas(
             int(np.ceil(bottom * scale)),
         )
         homography = scaled_homography(canvas.homographies[number], shrinking, scale)
-        drawn, mask = drawn_in_box(picture, homography, box)
-        low[number] = _Drawn(drawn, mask, box[:2])
+        drawn, mask = warp_to_box(picture, homography, box)
+        low[number] = _WarpedImage(drawn, mask, box[:2])
     return scale, low
 
 
-def _gains(low: Mapping[int, _Drawn]) -> dict[int, float]:
+def _gains(low: Mapping[int, _WarpedImage]) -> dict[int, float]:
     """Find factors that make images equally bright where they overlap, on the whole near 1.
 
     Least squares of logarithms, else as Brown and Lowe, "Automatic panoramic image stitching using
     invariant features", 2007.
     """
     numbers = list(low)
-    rows, right = [*np.eye(len(low)) / GAIN_SPREAD], [0.0] * len(low)
+    rows, right = [*np.eye(len(low)) / GAIN_PRIOR_STD], [0.0] * len(low)
     for i, j in combinations(range(len(low)), 2):
         means = _overlap_means(low[numbers[i]], low[numbers[j]])
         if means is not None:
             row = np.zeros(len(low))
-            row[i], row[j] = 1 / GAIN_ERROR, -1 / GAIN_ERROR
+            row[i], row[j] = 1 / GAIN_ERROR_STD, -1 / GAIN_ERROR_STD
             rows.append(row)
-            right.append(np.log(means[1] / means[0]) / GAIN_ERROR)
+            right.append(np.log(means[1] / means[0]) / GAIN_ERROR_STD)
     gains = np.exp(np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0])
     return dict(zip(numbers, gains.tolist(), strict=True))
 
 
-def _overlap_means(first: _Drawn, second: _Drawn) -> tuple[float, float] | None:
+def _overlap_means(first: _WarpedImage, second: _WarpedImage) -> tuple[float, float] | None:
     """Return the mean brightness of both images where they overlap; None for too small a part."""
     (x0, y0), (x1, y1) = first.corner, second.corner
     left, top = max(x0, x1), max(y0, y1)
@@ -291,13 +278,13 @@ def _overlap_means(first: _Drawn, second: _Drawn) -> tuple[float, float] | None:
         return None
     parts = [one.cut(left, top, right, bottom) for one in (first, second)]
     both = (parts[0][1] > 0) & (parts[1][1] > 0)
-    if np.count_nonzero(both) < LEAST_OVERLAP:
+    if np.count_nonzero(both) < MIN_OVERLAP_PX:
         return None
     means = [float(picture[both].mean()) + 1 for picture, _ in parts]  # black is not 0 times white
     return means[0], means[1]
 
 
-def _seams(low: Mapping[int, _Drawn], gains: Mapping[int, float]) -> dict[int, np.ndarray]:
+def _seams(low: Mapping[int, _WarpedImage], gains: Mapping[int, float]) -> dict[int, np.ndarray]:
     """Divide the overlaps where the images differ least; (h, w) uint8 masks on the small canvas."""
     pictures = [one.picture.astype(np.float32) * gains[number] for number, one in low.items()]
     # Graph cuts take minutes where large overlaps are equal.
@@ -311,7 +298,7 @@ def _seams(low: Mapping[int, _Drawn], gains: Mapping[int, float]) -> dict[int, n
     }
 
 
-def _enlarged(
+def _upscale_mask(
     seam: np.ndarray, corner: tuple[int, int], scale: float, box: tuple[int, int, int, int]
 ) -> np.ndarray:
     """Return a mask of the small canvas in a box of the canvas, with a margin: no gaps."""

@@ -9,12 +9,12 @@ import numpy as np
 
 from ...geometry.residuals import transform_points
 
-ROUNDS = 20
-SMALL_STEP = 1e-7
-"""Steps at the most, and the change of the homographies that ends it."""
+MAX_ITERATIONS = 20
+MIN_STEP = 1e-7
+"""The fit ends after this many iterations, or with a smaller change of the homographies."""
 
-LARGE_RESIDUAL_PX = 2.0
-"""Residuals above this have less weight."""
+HUBER_THRESHOLD_PX = 2.0
+"""Larger residuals have less weight."""
 
 UNIT_PX = 500.0
 """Unit of length of the fit, so that all entries of a homography are of one order."""
@@ -75,14 +75,14 @@ def fit_jointly(
         )
         for pair in pairs
     ]
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ITERATIONS):
         normal, right = np.zeros((8 * len(moving),) * 2), np.zeros(8 * len(moving))
         for pair, (points, targets) in zip(pairs, samples, strict=True):
             residuals, *jacobians = _linearised(
                 current[pair.first], current[pair.second], points, targets
             )
             distances = UNIT_PX * np.linalg.norm(residuals, axis=1)
-            weights = np.minimum(1, LARGE_RESIDUAL_PX / np.maximum(distances, 1e-12))
+            weights = np.minimum(1, HUBER_THRESHOLD_PX / np.maximum(distances, 1e-12))
             blocks = [
                 (column[number], jacobian)
                 for number, jacobian in zip((pair.first, pair.second), jacobians, strict=True)
@@ -99,7 +99,7 @@ def fit_jointly(
         for number in moving:  # H (I + E), with the last element of E 0
             change = np.append(step[column[number] : column[number] + 8], 0).reshape(3, 3)
             current[number] = _unit_determinant(current[number] @ (np.eye(3) + change))
-        if np.abs(step).max(initial=0) < SMALL_STEP:
+        if np.abs(step).max(initial=0) < MIN_STEP:
             break
     left = [
         _linearised(current[pair.first], current[pair.second], *sample)[0]

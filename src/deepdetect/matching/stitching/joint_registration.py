@@ -27,19 +27,19 @@ from .joint_fit import Correspondences, fit_jointly
 SIFT = SiftOptions(max_keypoints=2000)
 """Sparse keypoints by which overlaps are found."""
 
-KEYPOINTS = 30_000
-"""Dense keypoints of an image, at the most, which must confirm a homography."""
+MAX_KEYPOINTS = 30_000
+"""Dense keypoints per image that must confirm a homography."""
 
-PARTNERS = 3
+MIN_PARTNERS = 3
 """Pairs that each image takes part in, where it has that many, beyond those that connect all."""
 
-SAMPLES = 400
-"""Matches of a pair, spread out, that the joint fit is made to."""
+MAX_CORRESPONDENCES = 400
+"""Evenly spread matches per pair that the joint fit uses."""
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredPair:
-    """Two images that a homography lays onto each other, confirmed by dense keypoints.
+    """Two images related by a homography that dense keypoints confirm.
 
     Attributes:
         first, second: numbers of the images.
@@ -73,7 +73,7 @@ class JointRegistration:
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
+class _Image:
     gray: np.ndarray
     features: Keypoints
     keypoints: np.ndarray
@@ -101,9 +101,9 @@ def register_jointly(
     Raises:
         DeepDetectError: no two images overlap, or the reference with none.
     """
-    views = [_view(image, detector) for image in images]
+    views = [_prepare(image, detector) for image in images]
     pairs = _registered_pairs(views, seed)
-    groups = sorted({tuple(sorted(_reached(k, pairs))) for k in range(len(images))})
+    groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
         group = next(group for group in groups if reference in group)
     else:
@@ -126,7 +126,7 @@ def register_jointly(
     }
     pairs = [pair for pair in pairs if pair.first in group]
     homographies, residual_px = fit_jointly(
-        _composed(group, pairs),
+        _compose(group, pairs),
         [_correspondences(pair, views) for pair in pairs],
         {number: views[number].size for number in group},
     )
@@ -134,15 +134,15 @@ def register_jointly(
     return JointRegistration(homographies, matches, residual_px, left_out)
 
 
-def _view(image: np.ndarray, detector: HeatmapDetector) -> _View:
+def _prepare(image: np.ndarray, detector: HeatmapDetector) -> _Image:
     gray = luma(image)
     # Without suppression: neighbouring pixels are what the verification compares.
-    options = SelectionOptions(max_keypoints=KEYPOINTS, nms_radius=0, subpixel=False)
+    options = SelectionOptions(max_keypoints=MAX_KEYPOINTS, nms_radius=0, subpixel=False)
     keypoints = find_keypoints(detector, image, options)
-    return _View(gray, detect_sift(gray, SIFT), keypoints.xy)
+    return _Image(gray, detect_sift(gray, SIFT), keypoints.xy)
 
 
-def _registered_pairs(views: Sequence[_View], seed: int) -> list[RegisteredPair]:
+def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair]:
     """Register the pairs that overlap most, until all are connected and have enough partners."""
     overlaps: list[tuple[int, int, int, InitialMatches]] = []
     for first, second in combinations(range(len(views)), 2):
@@ -155,8 +155,8 @@ def _registered_pairs(views: Sequence[_View], seed: int) -> list[RegisteredPair]
     pairs: list[RegisteredPair] = []
     partners = [0] * len(views)
     for _, first, second, initial in overlaps:
-        enough = min(partners[first], partners[second]) >= PARTNERS
-        if enough and second in _reached(first, pairs):
+        enough = min(partners[first], partners[second]) >= MIN_PARTNERS
+        if enough and second in _connected(first, pairs):
             continue
         a, b = views[first], views[second]
         guide, matches = guided_matches(
@@ -170,17 +170,17 @@ def _registered_pairs(views: Sequence[_View], seed: int) -> list[RegisteredPair]
     return pairs
 
 
-def _correspondences(pair: RegisteredPair, views: Sequence[_View]) -> Correspondences:
+def _correspondences(pair: RegisteredPair, views: Sequence[_Image]) -> Correspondences:
     """Choose matches of a pair, spread out."""
     order = np.argsort(bayer_order(pair.points, views[pair.first].size), kind="stable")
-    points = pair.points[order[:SAMPLES]]
+    points = pair.points[order[:MAX_CORRESPONDENCES]]
     # The homography is sharper than keypoints on whole pixels.
     return Correspondences(
         pair.first, pair.second, points, transform_points(points, pair.homography)
     )
 
 
-def _reached(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
+def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
     """Return the images that pairs connect with one of them, itself included."""
     reached = {number}
     while True:
@@ -195,12 +195,12 @@ def _matches_within(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> in
     return sum(len(pair.points) for pair in pairs if pair.first in group)
 
 
-def _composed(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
+def _compose(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
     """Compose homographies to the image with most matches, along the maximum spanning tree."""
     tree: list[RegisteredPair] = []
     matches = dict.fromkeys(group, 0)
     for pair in sorted(pairs, key=lambda pair: -len(pair.points)):
-        if pair.second not in _reached(pair.first, tree):
+        if pair.second not in _connected(pair.first, tree):
             tree.append(pair)
         matches[pair.first] += len(pair.points)
         matches[pair.second] += len(pair.points)

@@ -16,7 +16,7 @@ from ...detector.detector import DeepDetect, HeatmapDetector
 from ...geometry.rescaling import downscale, scaled_homography
 from ...io.image import load_image
 from ..guided import GuidedOptions
-from .compositing import composite, least_stretched, plan_canvas
+from .compositing import composite, least_distorted, plan_canvas
 from .joint_registration import register_jointly
 
 
@@ -118,7 +118,7 @@ def stitch(
         number: scaled_homography(matrix, 1 / small[number][1], 1)
         for number, matrix in registration.homographies.items()
     }
-    frame = least_stretched(sizes, homographies) if reference is None else reference
+    frame = least_distorted(sizes, homographies) if reference is None else reference
     canvas = plan_canvas(
         sizes, homographies, frame, scale=scale, max_canvas_megapixels=max_canvas_megapixels
     )

@@ -197,10 +197,6 @@ def match_rectified(
 ) -> RectifiedMatches:
     """Find the disparities of keypoints of the left view: `disparity_map`, sampled at them.
 
-    Args:
-        left, right, options: as of `disparity_map`.
-        keypoints: of the left view, on whole pixels; or their (N, 2) positions.
-
     Raises:
         ImageError, OptionError: as of `disparity_map` and `DisparityMap.at`.
     """
@@ -249,10 +245,6 @@ def find_disparity_range(
 
     A small copy of the pair is matched over all of them. What both views agree on, in patches of
     some size, gives the range.
-
-    Args:
-        left, right: (H, W) uint8 luma.
-        options: its `range_search` and `sgm`.
 
     Returns:
         The range, or None where the views agree on nothing.
