@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import deepdetect
@@ -63,6 +64,25 @@ def test_options_are_frozen_dataclasses(name: str) -> None:
     kind = getattr(deepdetect, name)
     assert dataclasses.is_dataclass(kind)
     assert kind.__dataclass_params__.frozen
+
+
+def test_results_say_what_they_hold() -> None:
+    rgb, mask = np.zeros((20, 30, 3), np.uint8), np.ones((20, 30), bool)
+    matrix, cloud = np.eye(3), np.zeros((4, 3))
+    results = [
+        deepdetect.Label(mask, ~mask, "low"),
+        deepdetect.PointCloud(cloud, cloud.astype(np.uint8), "mm"),
+        deepdetect.DisparityMap(np.full((20, 30), np.nan, np.float32), ~mask, None),
+        deepdetect.Registration(matrix, rgb, rgb, mask, 1234, 0.5),
+        deepdetect.Panorama(rgb, mask, {0: matrix, 1: matrix}, 0, {}, {(0, 1): 9}, 0.25, {}, {}),
+    ]
+    assert [repr(result) for result in results] == [
+        "Label(30x20, density 1.000, low visibility)",
+        "PointCloud(4 points, unit='mm')",
+        "DisparityMap(30x20, 0.0% known, 0.0% matched)",
+        "Registration(30x20, overlap 100%, 1,234 matches, zncc=0.500)",
+        "Panorama(30x20, 2 images, left_out={}, residual_px=0.250)",
+    ]
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

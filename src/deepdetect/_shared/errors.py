@@ -51,8 +51,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
     names = list(known)
     spelled = {known_name.lower(): known_name for known_name in names}
     nearest = difflib.get_close_matches(str(name).lower(), spelled, n=1, cutoff=0.5)
-    hint = f"did you mean {spelled[nearest[0]]!r}? " if nearest else ""
-    return OptionError(f"unknown {kind} {name!r}: {hint}(known: {', '.join(names)})")
+    hint = f": did you mean {spelled[nearest[0]]!r}?" if nearest else ""
+    return OptionError(f"unknown {kind} {name!r}{hint} (known: {', '.join(names)})")
 
 
 for _error in (

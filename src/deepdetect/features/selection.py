@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
 from .keypoints import Keypoints, bayer_order
 
 MAX_OFFSET_PX = 0.499
@@ -69,6 +70,7 @@ class SelectionOptions:
         return self.max_keypoints is not None if self.subpixel is None else self.subpixel
 
 
+@suggest_keywords
 def select_keypoints(
     heatmap: np.ndarray,
     options: SelectionOptions = SelectionOptions(),

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import suggest_keywords
 from .model_selection import select_model
 from .residuals import epipolar_errors, transfer_errors
 
@@ -116,6 +117,7 @@ class _Model:
     errors: Callable[[np.ndarray, np.ndarray, np.ndarray, GeometryOptions], np.ndarray]
 
 
+@suggest_keywords
 def estimate_geometry(
     points0: np.ndarray, points1: np.ndarray, options: GeometryOptions = GeometryOptions()
 ) -> Geometry:

@@ -19,7 +19,7 @@ MAX_ANGULAR_SPACING = 0.02
 """In radians: no point is drawn wider than this (1 degree)."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PointCloud:
     """Coloured points in the frame of the left camera: x right, y down, z forward.
 
@@ -68,6 +68,9 @@ class PointCloud:
             raise OptionError("every coordinate of a point cloud must be finite: remove the others")
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "colors", colors)
+
+    def __repr__(self) -> str:
+        return f"PointCloud({len(self):,} points, unit={self.unit!r})"
 
     def __len__(self) -> int:
         return len(self.points)

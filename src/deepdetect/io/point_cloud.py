@@ -7,6 +7,7 @@ from numbers import Real
 from pathlib import Path
 
 from .._shared.atomic import atomic_path
+from .._shared.options import suggest_keywords
 from .._shared.registry import look_up
 from ..geometry.point_cloud import PointCloud, require_points
 from .glb import write_glb
@@ -24,6 +25,7 @@ POINT_CLOUD_WRITERS: dict[str, PointCloudWriter] = {
 """By suffix. A new format is a function `(cloud, path, metadata) -> None` and a line here."""
 
 
+@suggest_keywords
 def save_point_cloud(cloud: PointCloud, path: str | Path, metadata: Metadata | None = None) -> None:
     """Write a point cloud, whole or not at all.
 

@@ -48,6 +48,13 @@ def load_keypoints(path: str | Path) -> Keypoints:
 
     Raises:
         DeepDetectError: the file is missing or is no such file.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "keypoints.npz"
+        >>> save_keypoints(Keypoints([[3, 4]], [0.9], (20, 10)), path)
+        >>> load_keypoints(path)
+        Keypoints(1 keypoints in 20x10 pixels, scores 0.9 to 0.9)
     """
     with _reading(path, "keypoints") as arrays:
         return Keypoints(

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .._shared.options import suggest_keywords
 from ..viz.draw import draw_masks
 from .detectors import DETECTOR_NAMES, select_detectors
 from .settings import SettingChange, settings_for
@@ -36,7 +37,7 @@ class LabelOptions:
         check_visibility(self.visibility)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Label:
     """A fusion label.
 
@@ -44,6 +45,7 @@ class Label:
         keypoints: (H, W) bool, pixels marked by a keypoint detector.
         edges: (H, W) bool, pixels marked by an edge detector.
         visibility: the settings that were used, "normal" or "low".
+        mask: (H, W) bool, the pixelwise OR of both.
     """
 
     keypoints: np.ndarray
@@ -54,12 +56,17 @@ class Label:
     def __post_init__(self) -> None:
         object.__setattr__(self, "mask", self.keypoints | self.edges)
 
+    def __repr__(self) -> str:
+        height, width = self.mask.shape
+        return f"Label({width}x{height}, density {self.density:.3f}, {self.visibility} visibility)"
+
     @property
     def density(self) -> float:
         """Fraction of the pixels that are marked."""
         return float(self.mask.mean())
 
 
+@suggest_keywords
 def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
     """Run the chosen detectors on a grey image and fuse what they mark.
 

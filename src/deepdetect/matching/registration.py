@@ -20,7 +20,7 @@ SQUARES = 8
 """Squares of the checkerboard along the shorter side."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Registration:
     """A second image in the frame of a first.
 
@@ -39,6 +39,14 @@ class Registration:
     valid: np.ndarray
     matches: int
     zncc: float
+
+    def __repr__(self) -> str:
+        height, width = self.valid.shape
+        overlap = self.valid.mean()
+        return (
+            f"Registration({width}x{height}, overlap {overlap:.0%}, {self.matches:,} matches, "
+            f"zncc={self.zncc:.3f})"
+        )
 
     def checkerboard(self) -> np.ndarray:
         """Return both images in turn, in squares: edges go on where they fit; (H, W, 3) uint8."""

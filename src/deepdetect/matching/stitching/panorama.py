@@ -20,7 +20,7 @@ from .compositing import composite, least_distorted, plan_canvas
 from .joint_registration import register_jointly
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Panorama:
     """Photographs put together.
 
@@ -47,6 +47,13 @@ class Panorama:
     residual_px: float
     gains: dict[int, float]
     seconds: dict[str, float]
+
+    def __repr__(self) -> str:
+        height, width = self.valid.shape
+        return (
+            f"Panorama({width}x{height}, {len(self.homographies)} images, "
+            f"left_out={self.left_out}, residual_px={self.residual_px:.3f})"
+        )
 
 
 @suggest_keywords

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from ..._shared.errors import ImageError, OptionError
+from ..._shared.options import suggest_keywords
 from ...features.keypoints import Keypoints
 from ...io.image import load_image, luma
 from .consistency import (
@@ -123,7 +124,7 @@ class RectifiedMatches:
         return len(self.indices)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DisparityMap:
     """The disparity of each pixel of the left view of a rectified pair.
 
@@ -138,6 +139,11 @@ class DisparityMap:
     disparity: np.ndarray
     matched: np.ndarray
     disparity_range: DisparityRange | None
+
+    def __repr__(self) -> str:
+        height, width = self.disparity.shape
+        known, matched = np.isfinite(self.disparity).mean(), self.matched.mean()
+        return f"DisparityMap({width}x{height}, {known:.1%} known, {matched:.1%} matched)"
 
     def at(self, keypoints: Keypoints | np.ndarray) -> RectifiedMatches:
         """Return the disparities of keypoints: the map is only sampled, nothing is matched again.
@@ -155,6 +161,7 @@ class DisparityMap:
         return RectifiedMatches(indices, disparity[indices], matched)
 
 
+@suggest_keywords
 def disparity_map(
     left: Any, right: Any, options: DisparityOptions = DisparityOptions()
 ) -> DisparityMap:
