@@ -1,11 +1,19 @@
 from __future__ import annotations
 
+import dataclasses
+import importlib
+import math
+import pkgutil
+import re
 from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
 import pytest
 
+import deepdetect
 from deepdetect._shared.errors import OptionError
-from deepdetect._shared.options import option_names, replace_options, suggest_keywords
+from deepdetect._shared.options import check_ranges, option_names, replace_options, suggest_keywords
 from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry import GeometryOptions
 from deepdetect.matching.options import PRESETS, MatchingOptions
@@ -114,3 +122,64 @@ def test_a_decorated_function_suggests_the_right_keyword() -> None:
         detect("a.png", maxkeypoints=5)
     with pytest.raises(TypeError):
         detect()
+
+
+@dataclass(frozen=True)
+class Ranges:
+    size_px: float = 1
+    offsets_px: tuple[float, ...] = (1, 2)
+    count: int = 0
+    shares: tuple[tuple[float, float], ...] = ((0, 0.5), (1, 0.2))
+    window_px: int = 3
+    ratio: float = 1.5
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("size_px", "offsets_px"),
+            not_negative=("count",),
+            fractions=("shares",),
+            odd=("window_px",),
+            between={"ratio": (1, math.inf), "count": (0, 9)},
+        )
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"size_px": 0}, "`size_px` must be above 0, not 0"),
+        ({"size_px": math.nan}, "`size_px` must be above 0, not nan"),
+        ({"offsets_px": (3, -1)}, "`offsets_px` must be above 0, not (3, -1)"),
+        ({"offsets_px": ()}, "`offsets_px` must be above 0, not ()"),
+        ({"count": -1}, "`count` must be 0 or more, not -1"),
+        ({"count": "3"}, "`count` must be 0 or more, not 3"),
+        ({"count": 10}, "`count` must lie in [0, 9], not 10"),
+        ({"shares": ((0, 1.1),)}, "`shares` must lie in [0, 1], not ((0, 1.1),)"),
+        ({"window_px": 4}, "`window_px` must be odd and at least 1, not 4"),
+        ({"ratio": 0.99}, "`ratio` must be at least 1, not 0.99"),
+    ],
+)
+def test_numbers_out_of_their_ranges_are_refused(values: dict[str, Any], message: str) -> None:
+    Ranges(size_px=np.float32(0.5), count=np.int64(9))
+    with pytest.raises(OptionError, match=re.escape(message)):
+        Ranges(**values)
+
+
+OPTIONS = sorted(
+    {
+        kind
+        for module in pkgutil.walk_packages(deepdetect.__path__, "deepdetect.")
+        if not module.name.startswith(("deepdetect.cli", "deepdetect.__main__"))
+        for name, kind in vars(importlib.import_module(module.name)).items()
+        if name.endswith("Options") and dataclasses.is_dataclass(kind)
+    },
+    key=lambda kind: kind.__name__,
+)
+
+
+@pytest.mark.parametrize("kind", OPTIONS, ids=lambda kind: kind.__name__)
+def test_every_number_among_the_options_is_checked(kind: type) -> None:
+    numbers = [one.name for one in dataclasses.fields(kind) if type(one.default) in (int, float)]
+    for name in numbers:
+        with pytest.raises(OptionError, match=name):
+            kind(**{name: math.nan})

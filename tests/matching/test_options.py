@@ -184,7 +184,7 @@ def test_an_unknown_option_brings_the_nearest(name: str, meant: str) -> None:
     [
         ({"descriptor": "siift"}, "unknown descriptor 'siift': did you mean 'sift'?"),
         ({"matcher": "flan"}, "unknown matcher 'flan': did you mean 'flann'?"),
-        ({"keypoint_size": 0}, "keypoint size must be above 0 and at most 100 pixels, not 0"),
+        ({"keypoint_size": 0}, "`keypoint_size` must be above 0 and at most 100 pixels, not 0"),
         ({"keypoint_size": 101}, "not 101"),
         ({"keypoint_size": float("nan")}, "not nan"),
         ({"angle": 360}, "angle must lie in [0, 360) or be -1, not 360"),
@@ -235,12 +235,15 @@ def test_presets_cannot_be_changed_in_place(name: str) -> None:
             lambda: MatchingOptions(guide="fundamental", geometry=GeometryOptions("homography")),
             "the guide fundamental contradicts the model homography",
         ),
-        (lambda: InitialGeometryOptions(ratio=1.2), "ratio must lie in [0, 1], not 1.2"),
-        (lambda: VerificationOptions(keypoint_sizes_px=()), "keypoint_sizes_px must be above 0"),
-        (lambda: VerificationOptions(false_positive_rate=-0.1), "false_positive_rate must lie"),
-        (lambda: EpipolarMatchingOptions(max_cycle_error_px=0), "max_cycle_error_px must be above"),
-        (lambda: PrewarpOptions(max_anisotropy=float("nan")), "max_anisotropy must be above 0"),
-        (lambda: GuidedOptions(min_matched_fraction=2), "min_matched_fraction must lie"),
+        (lambda: InitialGeometryOptions(ratio=1.2), "`ratio` must lie in [0, 1], not 1.2"),
+        (lambda: VerificationOptions(keypoint_sizes_px=()), "`keypoint_sizes_px` must be above 0"),
+        (lambda: VerificationOptions(false_positive_rate=-0.1), "`false_positive_rate` must lie"),
+        (
+            lambda: EpipolarMatchingOptions(max_cycle_error_px=0),
+            "`max_cycle_error_px` must be above",
+        ),
+        (lambda: PrewarpOptions(max_anisotropy=float("nan")), "`max_anisotropy` must be above 0"),
+        (lambda: GuidedOptions(min_matched_fraction=2), "`min_matched_fraction` must lie"),
     ],
 )
 def test_wrong_options_of_guided_matching(make: Any, message: str) -> None:

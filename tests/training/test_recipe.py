@@ -104,7 +104,7 @@ def test_an_unknown_preset_is_refused() -> None:
     [
         ({"device": "cpuu"}, "cpu"),
         ({"precision": "float16"}, "bfloat16"),
-        ({"threads": 0}, "1"),
+        ({"threads": 0}, "above 0"),
         ({"num_workers": -1}, "0"),
     ],
 )

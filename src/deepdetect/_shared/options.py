@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Real
 from typing import Any, ParamSpec, TypeVar
 
-from .errors import unknown_name
+from .errors import OptionError, unknown_name
 
 Options = TypeVar("Options")
 Parameters = ParamSpec("Parameters")
@@ -43,6 +45,51 @@ def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Paramet
         return function(*args, **kwargs)
 
     return call
+
+
+def check_ranges(
+    options: object,
+    *,
+    positive: Sequence[str] = (),
+    not_negative: Sequence[str] = (),
+    fractions: Sequence[str] = (),
+    odd: Sequence[str] = (),
+    between: Mapping[str, tuple[float, float]] = {},
+) -> None:
+    """Check the numbers in the fields of options: in tuples each of them, None always passes.
+
+    Args:
+        options: of any class.
+        positive, not_negative, fractions, odd: names of fields above 0, from 0, in [0, 1], and odd
+            from 1.
+        between: smallest and largest allowed value by the name of a field.
+
+    Raises:
+        OptionError: a value is not a number, or out of its range.
+    """
+    bounds = [(name, math.ulp(0), math.inf, "be above 0") for name in positive]
+    bounds += [(name, 0, math.inf, "be 0 or more") for name in not_negative]
+    bounds += [(name, 0, 1, "lie in [0, 1]") for name in fractions]
+    bounds += [(name, 1, math.inf, "be odd and at least 1") for name in odd]
+    for name, (smallest, largest) in between.items():
+        limits = f"lie in [{smallest:.12g}, {largest:.12g}]"
+        expected = f"be at least {smallest:.12g}" if largest == math.inf else limits
+        bounds.append((name, smallest, largest, expected))
+    for name, smallest, largest, expected in bounds:
+        value = getattr(options, name)
+        if value is None:
+            continue
+        values = _numbers(value)
+        fits = bool(values) and all(smallest <= one <= largest for one in values)
+        if not fits or (name in odd and value % 2 != 1):
+            raise OptionError(f"`{name}` must {expected}, not {value}")
+
+
+def _numbers(value: object) -> list[float]:
+    """Return a number, or those of nested tuples; NaN for anything else."""
+    if isinstance(value, tuple):
+        return [number for one in value for number in _numbers(one)]
+    return [float(value) if isinstance(value, Real) else math.nan]
 
 
 def replace_options(options: Options, **changes: Any) -> Options:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from .._shared.errors import OptionError
+from .._shared.options import check_ranges
 from .keypoints import Keypoints
 from .sift import to_root_sift
 
@@ -33,10 +33,11 @@ class SiftOptions:
     grid_cells: int = 24
 
     def __post_init__(self) -> None:
-        if not self.contrast_thresholds or min(self.contrast_thresholds) <= 0:
-            raise OptionError("contrast_thresholds needs one or more values above 0")
-        if self.grid_cells < 1:
-            raise OptionError(f"grid_cells must be at least 1, not {self.grid_cells}")
+        check_ranges(
+            self,
+            positive=("contrast_thresholds", "grid_cells"),
+            not_negative=("max_keypoints", "min_keypoints"),
+        )
 
 
 def detect_sift(gray: np.ndarray, options: SiftOptions = SiftOptions()) -> Keypoints:

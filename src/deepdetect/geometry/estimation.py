@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
-from .._shared.options import suggest_keywords
+from .._shared.options import check_ranges, suggest_keywords
 from .model_selection import select_model
 from .residuals import epipolar_errors, transfer_errors
 
@@ -55,16 +55,13 @@ class GeometryOptions:
             raise unknown_name("model", self.model, MODEL_NAMES)
         if self.estimator not in ESTIMATORS:
             raise unknown_name("estimator", self.estimator, ESTIMATORS)
-        if not self.inlier_threshold > 0:
-            raise OptionError(
-                f"the inlier threshold must be above 0 pixels, not {self.inlier_threshold}"
-            )
         if not 0 < self.confidence < 1:
             raise OptionError(f"the confidence must lie between 0 and 1, not {self.confidence}")
-        if not 0 <= self.seed < 2**31:
-            raise OptionError(f"the seed must lie in [0, 2147483647], not {self.seed}")
-        if self.iterations < 1:
-            raise OptionError(f"iterations must be at least 1, not {self.iterations}")
+        check_ranges(
+            self,
+            positive=("inlier_threshold", "iterations"),
+            between={"seed": (0, 2**31 - 1)},
+        )
         for name in ("homography", "camera0", "camera1"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _matrix(name, getattr(self, name)))

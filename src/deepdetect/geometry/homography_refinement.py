@@ -16,6 +16,7 @@ two is measured by the fraction of aligned pixels.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 
@@ -23,6 +24,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.options import check_ranges
 from .residuals import transform_points
 from .zncc import (
     WINDOW_PX,
@@ -70,23 +72,22 @@ class RefinementOptions:
     min_pixel_gain: float = 0.0001
 
     def __post_init__(self) -> None:
-        if self.max_rounds < 1:
-            raise OptionError(f"max_rounds must be at least 1, not {self.max_rounds}")
-        if self.min_tracks < 4 or self.max_corners < self.min_tracks:
-            raise OptionError(
-                f"min_tracks must be at least 4, and max_corners at least min_tracks, not "
-                f"{self.min_tracks} and {self.max_corners}"
-            )
-        if self.pyramid_levels < 0:
-            raise OptionError(f"pyramid_levels must be 0 or more, not {self.pyramid_levels}")
-        if not self.windows_px or min(self.windows_px) < 5:
-            raise OptionError(f"windows_px must be 5 pixels or more, not {self.windows_px}")
-        if self.blur_sigmas_px and min(self.blur_sigmas_px) <= 0:
-            raise OptionError(f"blur_sigmas_px must be above 0 pixels, not {self.blur_sigmas_px}")
-        if not (self.max_round_trip_px > 0 and self.inlier_threshold > 0):
-            raise OptionError("max_round_trip_px and inlier_threshold must be above 0 pixels")
-        if not 0 <= self.ignored_fraction < 1:
-            raise OptionError(f"ignored_fraction must lie in [0, 1), not {self.ignored_fraction}")
+        if not self.windows_px or self.max_corners < self.min_tracks:
+            raise OptionError("windows_px must not be empty, nor max_corners below min_tracks")
+        check_ranges(
+            self,
+            positive=("max_round_trip_px", "inlier_threshold"),
+            not_negative=("pyramid_levels", "min_track_gain", "min_pixel_gain"),
+            between={
+                "max_rounds": (1, math.inf),
+                "min_tracks": (4, math.inf),
+                "max_corners": (4, math.inf),
+                "windows_px": (5, math.inf),
+                "ignored_fraction": (0, 0.99),
+            },
+        )
+        if self.blur_sigmas_px:
+            check_ranges(self, positive=("blur_sigmas_px",))
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,9 @@ class IrlsOptions:
         max_alignment_error_px: up to which a pixel counts as aligned.
         alignment_window_px: side of the window around a pixel by which its error is measured.
         min_gain: the fit is taken when it aligns this many times as many pixels.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     window_px: int = 31
@@ -108,6 +112,15 @@ class IrlsOptions:
     max_alignment_error_px: float = 0.5
     alignment_window_px: int = 41
     min_gain: float = 1.1
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("cauchy_scale_px", "max_alignment_error_px"),
+            not_negative=("max_iterations", "min_gain"),
+            odd=("alignment_window_px",),
+            between={"window_px": (5, math.inf)},
+        )
 
 
 @dataclass(frozen=True, eq=False)

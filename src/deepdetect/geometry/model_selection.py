@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .._shared.options import check_ranges
+
 
 @dataclass(frozen=True)
 class ModelSelectionOptions:
@@ -18,10 +20,16 @@ class ModelSelectionOptions:
         min_fraction_of_rest: of the matches that the homography leaves, the fundamental matrix must
             explain at least this fraction.
         min_fraction_of_all: these must be at least this fraction of all that it explains.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     min_fraction_of_rest: float = 0.5
     min_fraction_of_all: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_ranges(self, fractions=("min_fraction_of_rest", "min_fraction_of_all"))
 
 
 def select_model(

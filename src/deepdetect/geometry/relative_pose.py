@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from .._shared.options import check_ranges
 from .camera import Calibration
 from .estimation import GeometryOptions, estimate_geometry
 from .residuals import epipolar_errors
@@ -24,6 +25,9 @@ class PoseRefinementOptions:
         max_refits: how often the pose is fitted to its own inliers again ...
         min_inlier_gain: ... while that gives this fraction of further inliers.
         max_matches: that are used, sampled evenly: more do not improve the pose.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     max_iterations: int = 10
@@ -32,6 +36,13 @@ class PoseRefinementOptions:
     max_refits: int = 4
     min_inlier_gain: float = 0.01
     max_matches: int = 50_000
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("derivative_step", "max_matches"),
+            not_negative=("max_iterations", "min_change", "max_refits", "min_inlier_gain"),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,8 +86,7 @@ class MatchingOptions:
             )
         if not 0 < self.keypoint_size <= 100:
             raise OptionError(
-                f"the keypoint size must be above 0 and at most 100 pixels, "
-                f"not {self.keypoint_size}"
+                f"`keypoint_size` must be above 0 and at most 100 pixels, not {self.keypoint_size}"
             )
         if self.angle != -1 and not 0 <= self.angle < 360:
             raise OptionError(f"the angle must lie in [0, 360) or be -1, not {self.angle}")

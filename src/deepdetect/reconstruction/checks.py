@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import ReconstructionError
+from .._shared.options import check_ranges
 from ..features.selection import grid_subsample
 from ..geometry import GeometryOptions, epipolar_errors, estimate_geometry, transfer_errors
 from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
@@ -31,12 +32,21 @@ class CopyOptions:
         max_difference_to_gradient: the same, as a multiple of what the picture differs from itself
             shifted by a pixel: dark views differ by few levels.
         quantile: the fraction of the pixels that is nearly everywhere.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     max_mean_difference_levels: float = 0.5
     max_difference_levels: float = 8.0
     max_difference_to_gradient: float = 0.5
     quantile: float = 0.999
+
+    def __post_init__(self) -> None:
+        levels = "max_mean_difference_levels", "max_difference_levels"
+        check_ranges(
+            self, not_negative=(*levels, "max_difference_to_gradient"), fractions=("quantile",)
+        )
 
 
 @dataclass(frozen=True)
@@ -47,11 +57,18 @@ class StaticOptions:
         max_median_motion_px: the median match moves less.
         max_motion_px: nearly all matches move less.
         quantile: the fraction of the matches that is nearly all.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     max_median_motion_px: float = 0.5
     max_motion_px: float = 3.0
     quantile: float = 0.9
+
+    def __post_init__(self) -> None:
+        limits = "max_median_motion_px", "max_motion_px"
+        check_ranges(self, not_negative=limits, fractions=("quantile",))
 
 
 @dataclass(frozen=True)
@@ -66,11 +83,18 @@ class ForegroundOptions:
         min_fraction: of the matches that the fundamental matrix explains, clearly off the plane.
         min_epipolar_fraction: of the matches clearly off the plane, explained by the fundamental
             matrix.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     min_distance_px: float = 6.0
     min_fraction: float = 0.05
     min_epipolar_fraction: float = 0.8
+
+    def __post_init__(self) -> None:
+        shares = "min_fraction", "min_epipolar_fraction"
+        check_ranges(self, not_negative=("min_distance_px",), fractions=shares)
 
 
 @dataclass(frozen=True)
@@ -95,6 +119,9 @@ class CheckOptions:
         max_focal_error_ratio: of the median error of another focal length to that of the given one,
             which is refused below it: a focal length that is off by a fifth passes.
         good_error_px: median error at which no other focal length is tried.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     copy: CopyOptions = field(default_factory=CopyOptions)
@@ -110,6 +137,23 @@ class CheckOptions:
     focal_factors: tuple[float, ...] = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
     max_focal_error_ratio: float = 0.5
     good_error_px: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=(
+                *("grid_size_px", "max_epipolar_distance_px", "max_transfer_error_px"),
+                "focal_factors",
+            ),
+            not_negative=(
+                "min_matches",
+                "min_planar_ratio",
+                "min_pose_ratio",
+                "max_focal_error_ratio",
+                "good_error_px",
+            ),
+            fractions=("min_in_front_fraction",),
+        )
 
 
 @dataclass(frozen=True, eq=False)

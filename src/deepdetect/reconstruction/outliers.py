@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.options import check_ranges
 from ..geometry.windows import window_sums
 
 FLANN_INDEX_KDTREE_SINGLE = 4
@@ -51,11 +52,8 @@ class PointFilterOptions:
     sor_disparity_weight: float = 2.0
 
     def __post_init__(self) -> None:
-        for name in ("min_parallax_px", "sor_neighbors", "sor_std_ratio", "sor_disparity_weight"):
-            if not getattr(self, name) >= 0:
-                raise OptionError(f"{name} must not be negative, but is {getattr(self, name)}")
-        if self.sor_window_px < 1 or self.sor_window_px % 2 == 0:
-            raise OptionError(f"sor_window_px must be odd and positive, not {self.sor_window_px}")
+        limits = "min_parallax_px", "sor_std_ratio", "sor_disparity_weight"
+        check_ranges(self, not_negative=("sor_neighbors", *limits), odd=("sor_window_px",))
 
 
 DEFAULTS = PointFilterOptions()

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from .._shared.options import check_ranges
 from ..features.selection import grid_subsample
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
@@ -33,6 +34,9 @@ class RectificationOptions:
         grid_size_px: cells of the left image of this size give one match each.
         iterations: samples of three matches, for the rows that are shifted, tilted and scaled.
         static: when nothing moves.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     max_row_distance_px: float = 1.0
@@ -44,6 +48,16 @@ class RectificationOptions:
     grid_size_px: int = 8
     iterations: int = 500
     static: StaticOptions = field(default_factory=StaticOptions)
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("max_row_distance_px", "max_transfer_error_px", "grid_size_px", "iterations"),
+            not_negative=(
+                *("min_inlier_ratio", "min_planar_ratio"),
+                *("min_disparity_spread_px", "min_planar_spread_px"),
+            ),
+        )
 
 
 @dataclass(frozen=True)

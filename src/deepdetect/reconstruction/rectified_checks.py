@@ -5,12 +5,14 @@ As `checks`, for disparities; in the order of this module.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
 from .._shared.errors import ReconstructionError
+from .._shared.options import check_ranges
 from ..features.selection import SelectionOptions, grid_subsample
 from ..geometry.camera import Calibration
 from .checks import StaticOptions, is_static
@@ -35,6 +37,9 @@ class RotationOptions:
         grid_size_px: cells of this size give one match each.
         min_matches: one per cell, below which nothing is tried.
         max_samples: matches that are used at the most.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     max_error_px: float = 0.3
@@ -45,6 +50,14 @@ class RotationOptions:
     grid_size_px: int = 16
     min_matches: int = 30
     max_samples: int = 50_000
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("max_error_px", "grid_size_px", "max_samples"),
+            not_negative=("max_ratio_to_plane", "max_off_row_px", "iterations", "min_matches"),
+            fractions=("min_explained_fraction",),
+        )
 
 
 @dataclass(frozen=True)
@@ -63,6 +76,9 @@ class RectifiedCheckOptions:
         max_behind_fraction: of the points, behind the cameras.
         static: when both images show the same view.
         rotation: when the camera only rotated.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     max_focal_difference_fraction: float = 0.01
@@ -74,6 +90,17 @@ class RectifiedCheckOptions:
     max_behind_fraction: float = 0.25
     static: StaticOptions = field(default_factory=StaticOptions)
     rotation: RotationOptions = field(default_factory=RotationOptions)
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            not_negative=("max_cy_difference_px", "min_disparity_spread_px"),
+            fractions=(
+                *("max_focal_difference_fraction", "min_unique_fraction"),
+                *("min_matched_fraction", "max_behind_fraction"),
+            ),
+            between={"min_disparity_px": (-math.inf, math.inf)},
+        )
 
 
 DEFAULTS = RectifiedCheckOptions()

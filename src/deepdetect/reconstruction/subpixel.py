@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.options import check_ranges
 from .._shared.parallel import parallel_for
 from ..geometry.windows import window_sums
 
@@ -56,24 +57,15 @@ class SubpixelOptions:
     max_similarity_samples: int = 5000
 
     def __post_init__(self) -> None:
-        if not 1 <= self.patch_radius_px <= 31:
-            raise OptionError(
-                f"patch_radius_px must lie in [1, 31] pixels, not {self.patch_radius_px}"
-            )
-        for name in (
-            "sigma_px",
-            "max_iterations",
-            "max_shift_px",
-            "convergence_px",
-            "coarse_convergence_px",
-            "affinity_window_px",
-            "affinity_regularization",
-            "max_similarity_samples",
-        ):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} must be above 0, not {getattr(self, name)}")
-        if not -1 <= self.min_correlation <= 1:
-            raise OptionError(f"min_correlation must lie in [-1, 1], not {self.min_correlation}")
+        check_ranges(
+            self,
+            positive=(
+                *("sigma_px", "max_iterations", "max_shift_px", "convergence_px"),
+                *("coarse_convergence_px", "affinity_window_px", "affinity_regularization"),
+                "max_similarity_samples",
+            ),
+            between={"patch_radius_px": (1, 31), "min_correlation": (-1, 1)},
+        )
 
 
 DEFAULTS = SubpixelOptions()

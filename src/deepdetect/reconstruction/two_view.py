@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .._shared.errors import OptionError, ReconstructionError
+from .._shared.errors import ReconstructionError
+from .._shared.options import check_ranges
 from .._shared.timing import StageTimer
 from ..geometry.camera import Calibration
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
@@ -39,9 +40,7 @@ class TwoViewOptions:
     checks: CheckOptions = field(default_factory=CheckOptions)
 
     def __post_init__(self) -> None:
-        for name in ("max_epipolar_distance_px", "max_reprojection_error_px"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} must be above 0 pixels, not {getattr(self, name)}")
+        check_ranges(self, positive=("max_epipolar_distance_px", "max_reprojection_error_px"))
 
 
 @dataclass(frozen=True, eq=False)

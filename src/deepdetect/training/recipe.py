@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import check_ranges
 from .._shared.parallel import processor_count
 from .._shared.registry import look_up
 from ..labels import DETECTOR_NAMES, LABEL_SETTINGS, LabelOptions, SettingChange
@@ -161,28 +163,20 @@ class TrainingOptions:
         if self.optimizer not in OPTIMIZERS:
             raise unknown_name("optimizer", self.optimizer, OPTIMIZERS)
         self._check_sizes()
-        _check_least(
+        check_ranges(
             self,
-            max_images=2,
-            augmentations=0,
-            warm_up=0,
-            dark_variants=1,
-            val_count=1,
-            shuffle_buffer_shards=1,
-            max_jitter_saturation=0,
+            positive=("dark_variants", "val_count", "shuffle_buffer_shards"),
+            not_negative=("augmentations", "warm_up", "max_jitter_saturation"),
+            fractions=("dark_fraction", "color_jitter"),
+            between={
+                "max_images": (2, math.inf),
+                "pos_weight": (0.1, 10),
+                "low_light_pos_weight": (0.1, 10),
+                "seed": (0, 2**31 - 1),
+            },
         )
         if not 0 < self.val_fraction < 1:
             raise OptionError(f"`val_fraction` must lie in (0, 1), not {self.val_fraction}")
-        for name, low, high in (
-            ("dark_fraction", 0, 1),
-            ("color_jitter", 0, 1),
-            ("pos_weight", 0.1, 10),
-            ("low_light_pos_weight", 0.1, 10),
-            ("seed", 0, 2**31 - 1),
-        ):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise OptionError(f"`{name}` must lie in [{low}, {high}], not {value}")
         if self.pos_weight_uncertain and {self.pos_weight, self.low_light_pos_weight or 1} == {1}:
             raise OptionError("`pos_weight_uncertain` needs a `pos_weight` other than 1")
         if not 0 <= self.final_learning_rate <= self.learning_rate:
@@ -216,14 +210,6 @@ class TrainingOptions:
     def to_json(self) -> str:
         """Return the options as JSON text, which is stored with the weights."""
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
-
-
-def _check_least(options: object, **least: float) -> None:
-    """Raise an OptionError for a field below its smallest value; None is no value."""
-    for name, smallest in least.items():
-        value = getattr(options, name)
-        if value is not None and value < smallest:
-            raise OptionError(f"`{name}` must be at least {smallest}, not {value}")
 
 
 @dataclass(frozen=True)
@@ -262,7 +248,8 @@ class DeviceOptions:
 
             if not is_available():
                 raise OptionError("there is no CUDA device: use `device=cpu`")
-        _check_least(self, threads=1, num_workers=0, checkpoint_interval_s=0, view_memory_bytes=0)
+        counts = "num_workers", "checkpoint_interval_s", "view_memory_bytes"
+        check_ranges(self, positive=("threads",), not_negative=counts)
 
     @property
     def accelerator(self) -> str:

@@ -8,11 +8,13 @@ one spreads to those around it. It does not suit few or scattered keypoints.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..._shared.options import check_ranges
 from ..._shared.parallel import parallel_for
 from ..keypoints import on_pixels
 
@@ -29,6 +31,9 @@ class PatchMatchOptions:
         line_tries: random places on its epipolar line that a query starts with.
         search_shrink: random tries begin in the whole image around the best neighbour; each next
             one is this many times nearer.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     sweeps: int = 4
@@ -36,6 +41,14 @@ class PatchMatchOptions:
     band_height_px: int = 96
     line_tries: int = 16
     search_shrink: int = 3
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("offsets_px", "band_height_px"),
+            not_negative=("sweeps", "line_tries"),
+            between={"search_shrink": (2, math.inf)},
+        )
 
 
 def patchmatch_neighbours(

@@ -7,11 +7,10 @@ and art, as they are and rotated (docs/matching.md).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
-import numpy as np
-
-from ..._shared.errors import OptionError
+from ..._shared.options import check_ranges
 from ...features.sift_detector import SiftOptions
 from ...geometry.acontrario import MAX_LOG10_NFA
 from ...geometry.homography_refinement import RefinementOptions
@@ -49,15 +48,14 @@ class InitialGeometryOptions:
     rotation_step_deg: float = 72.0
 
     def __post_init__(self) -> None:
-        _check_fractions(self, "ratio")
-        _check_positive(
+        check_ranges(
             self,
-            "max_side_px",
-            "min_separation_px",
-            "homography_threshold_px",
-            "fundamental_threshold_px",
-            "tilts",
-            "rotation_step_deg",
+            positive=(
+                *("max_side_px", "min_separation_px", "tilts", "rotation_step_deg"),
+                *("homography_threshold_px", "fundamental_threshold_px"),
+            ),
+            fractions=("ratio",),
+            between={"max_log10_nfa": (-math.inf, 0)},
         )
 
     def threshold_px(self, model: str) -> float:
@@ -95,9 +93,14 @@ class VerificationOptions:
     max_null_blocks: int = 256
 
     def __post_init__(self) -> None:
-        _check_fractions(self, "false_positive_rate", "min_support", "null_shifts")
-        _check_positive(self, "keypoint_sizes_px", "smoothing_sigma_px", "window_px")
-        _check_positive(self, "null_block_px", "max_null_blocks")
+        check_ranges(
+            self,
+            positive=(
+                *("keypoint_sizes_px", "smoothing_sigma_px", "window_px"),
+                *("null_block_px", "max_null_blocks"),
+            ),
+            fractions=("false_positive_rate", "min_support", "null_shifts"),
+        )
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,7 @@ class HomographyMatchingOptions:
     max_distance_px: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_positive(self, "max_side_px", "max_distance_px")
+        check_ranges(self, positive=("max_side_px", "max_distance_px"))
 
 
 @dataclass(frozen=True)
@@ -170,18 +173,18 @@ class EpipolarMatchingOptions:
     refit_threshold_px: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_fractions(self, "false_positive_rate", "min_motion_support")
-        _check_fractions(self, "min_match_density", "min_relative_density", "min_refit_gain")
-        _check_positive(
+        check_ranges(
             self,
-            "keypoint_size_px",
-            "max_epipolar_distance_px",
-            "max_cycle_error_px",
-            "null_pairs",
-            "motion_window_px",
-            "max_motion_difference_px",
-            "density_window_px",
-            "refit_threshold_px",
+            positive=(
+                *("keypoint_size_px", "max_epipolar_distance_px", "max_cycle_error_px"),
+                *("null_pairs", "motion_window_px", "max_motion_difference_px"),
+                *("density_window_px", "refit_threshold_px"),
+            ),
+            not_negative=("max_refits",),
+            fractions=(
+                *("false_positive_rate", "min_motion_support", "min_match_density"),
+                *("min_relative_density", "min_refit_gain"),
+            ),
         )
 
 
@@ -210,7 +213,8 @@ class PrewarpOptions:
     max_distance_px: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_positive(self, "min_deviation", "max_anisotropy", "frame_margin", "max_distance_px")
+        names = "min_deviation", "max_anisotropy", "frame_margin", "max_distance_px"
+        check_ranges(self, positive=names)
 
 
 @dataclass(frozen=True)
@@ -240,18 +244,4 @@ class GuidedOptions:
     min_matched_fraction: float = 0.02
 
     def __post_init__(self) -> None:
-        _check_fractions(self, "min_matched_fraction")
-
-
-def _check_positive(options: object, *names: str) -> None:
-    for name in names:
-        values = np.ravel(getattr(options, name))
-        if not (len(values) and (values > 0).all()):
-            raise OptionError(f"{name} must be above 0, not {getattr(options, name)}")
-
-
-def _check_fractions(options: object, *names: str) -> None:
-    for name in names:
-        values = np.ravel(getattr(options, name))
-        if not ((values >= 0) & (values <= 1)).all():
-            raise OptionError(f"{name} must lie in [0, 1], not {getattr(options, name)}")
+        check_ranges(self, fractions=("min_matched_fraction",))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -9,7 +10,7 @@ import cv2
 import numpy as np
 
 from ..._shared.errors import ImageError, OptionError
-from ..._shared.options import suggest_keywords
+from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
 from ...io.image import load_image, luma
 from .consistency import (
@@ -37,6 +38,9 @@ class RangeSearchOptions:
         tail_fraction: of the disparities at each end, which may be wrong.
         margin_px: of the small copy, added at both ends of the range.
         margin_fraction: of the range, added at both ends, too, for what is too small to be seen.
+
+    Raises:
+        OptionError: a value is out of its range.
     """
 
     width_px: int = 160
@@ -45,6 +49,14 @@ class RangeSearchOptions:
     tail_fraction: float = 0.01
     margin_px: float = 1.5
     margin_fraction: float = 0.2
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("width_px",),
+            not_negative=("max_speckle_area_px", "margin_px", "margin_fraction"),
+            between={"uniqueness_ratio": (1, math.inf), "tail_fraction": (0, 0.5)},
+        )
 
 
 @dataclass(frozen=True)
@@ -89,16 +101,11 @@ class DisparityOptions:
             if len(self.disparity_range) != 2 or any(int(d) != d for d in self.disparity_range):
                 raise OptionError("disparity_range takes two whole disparities, as (0, 63)")
             DisparityRange(*self.disparity_range)
-        if not self.uniqueness_ratio >= 1:
-            raise OptionError(f"uniqueness_ratio must be at least 1, not {self.uniqueness_ratio}")
-        if not 0 <= self.discontinuity_margin_px <= 100:
-            raise OptionError(
-                "discontinuity_margin_px must be between 0 and 100 pixels, not "
-                f"{self.discontinuity_margin_px}"
-            )
-        for name in ("max_speckle_area_px", "max_difference_px", "occlusion_slack_px"):
-            if not getattr(self, name) >= 0:
-                raise OptionError(f"{name} must not be negative, but is {getattr(self, name)}")
+        check_ranges(
+            self,
+            not_negative=("max_speckle_area_px", "max_difference_px", "occlusion_slack_px"),
+            between={"uniqueness_ratio": (1, math.inf), "discontinuity_margin_px": (0, 100)},
+        )
 
 
 DENSE = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..._shared.errors import OptionError
+from ..._shared.options import check_ranges
 from ..._shared.parallel import parallel_for
 from .consistency import MAX_DIFFERENCE_PX
 
@@ -50,14 +50,13 @@ class DisparityRefinementOptions:
     min_gain: float = 0.2
 
     def __post_init__(self) -> None:
-        for name in ("window_radius_px", "smoothing_radius_px", "final_smoothing_radius_px"):
-            if not 1 <= getattr(self, name) <= 31:
-                raise OptionError(f"{name} must lie in [1, 31] pixels, not {getattr(self, name)}")
-        if self.iterations < 0:
-            raise OptionError(f"iterations must not be negative, but is {self.iterations}")
-        for name in ("noise_levels", "min_gain"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} must be above 0, not {getattr(self, name)}")
+        radii = "window_radius_px", "smoothing_radius_px", "final_smoothing_radius_px"
+        check_ranges(
+            self,
+            positive=("noise_levels", "min_gain"),
+            not_negative=("iterations",),
+            between=dict.fromkeys(radii, (1, 31)),
+        )
 
 
 def refine_disparity(

@@ -9,12 +9,14 @@ disparity that changes by one pixel, P2 for a larger change, less where the grey
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..._shared.options import check_ranges
 from ..._shared.parallel import parallel_for
 
 CENSUS_RADIUS_X = 4
@@ -64,13 +66,11 @@ class SGMOptions:
     def __post_init__(self) -> None:
         if not 0 <= self.p1 <= self.p2:
             raise OptionError(f"p1 must lie between 0 and p2, {self.p2:g}, not {self.p1:g}")
-        if not self.p2_half_gradient_levels > 0:
-            raise OptionError(
-                "p2_half_gradient_levels must be above 0 grey levels, not "
-                f"{self.p2_half_gradient_levels}"
-            )
-        if not self.min_p2_to_p1 >= 1:
-            raise OptionError(f"min_p2_to_p1 must be at least 1, not {self.min_p2_to_p1}")
+        check_ranges(
+            self,
+            positive=("p2_half_gradient_levels",),
+            between={"min_p2_to_p1": (1, math.inf)},
+        )
         if max(self.p2, self.min_p2_to_p1 * self.p1) > MAX_PENALTY:
             raise OptionError(
                 f"p2 and min_p2_to_p1 * p1 must be at most {MAX_PENALTY}: costs are kept in 16 bits"
