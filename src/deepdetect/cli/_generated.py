@@ -1,7 +1,7 @@
-"""Options of commands, generated from the dataclasses that the library takes.
+"""Options of commands, generated from the dataclasses and functions of the library.
 
-Name, type, default and help of an option are those of the field and its docstring, so that the
-command line says what the library does. A class is imported when its command is run or its help is
+Name, type, default and help of an option are those of the parameter and its docstring, so that the
+command line says what the library does. They are imported when the command is run or its help is
 shown: `deepdetect --help` stays fast.
 """
 
@@ -11,6 +11,7 @@ import dataclasses
 import importlib
 import inspect
 import re
+import sys
 import textwrap
 import types
 import typing
@@ -25,18 +26,18 @@ Function = Callable[..., Any]
 
 @dataclasses.dataclass(frozen=True)
 class FieldOptions:
-    """The fields of a dataclass that are options of a command.
+    """The fields of a dataclass, or parameters of a function, that are options of a command.
 
     Attributes:
-        path: module and class, as "features.selection:SelectionOptions", within the package.
-        names: the fields, in the order of the help; empty for all that are initialised.
-        skip: fields that are left out.
-        flags: flags of fields whose flag is not their name, as {"short_sides": "--short-side"}, or
+        path: module and name, as "features.selection:SelectionOptions", within the package.
+        names: the parameters, in the order of the help; empty for all.
+        skip: parameters that are left out.
+        flags: flags that are not the name, as {"short_sides": "--short-side"}, or
             {"guided": "--guided/--unguided"}.
         metavars: what stands for the value in the help, where it is not the type.
-        types: click's types of fields whose annotation does not say it.
-        defaults: what is used unless the option is given, where it is not the field's default; for
-            the help.
+        types: click's types of parameters whose annotation does not say it.
+        defaults: what is used unless the option is given, where it is not the parameter's default;
+            for the help.
     """
 
     path: str
@@ -48,25 +49,28 @@ class FieldOptions:
     defaults: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def make(self) -> list[click.Option]:
-        """Import the class and make the options."""
+        """Import the class or function and make the options."""
         module, name = self.path.split(":")
-        kind = getattr(importlib.import_module(f"..{module}", __package__), name)
-        fields = {field.name: field for field in dataclasses.fields(kind) if field.init}
-        hints, helps = typing.get_type_hints(kind), attribute_helps(inspect.getdoc(kind) or "")
-        chosen = self.names or [name for name in fields if name not in self.skip]
-        return [self._option(fields[name], hints[name], helps[name]) for name in chosen]
+        target = getattr(importlib.import_module(f"..{module}", __package__), name)
+        parameters = inspect.signature(target).parameters
+        helps = attribute_helps(inspect.getdoc(target) or "")
+        scope = vars(sys.modules[target.__module__])
+        chosen = self.names or [name for name in parameters if name not in self.skip]
+        # Only what is chosen is evaluated: other annotations may be there for type checkers only.
+        hints = {name: eval(parameters[name].annotation, scope) for name in chosen}
+        return [self._option(parameters[name], hints[name], helps[name]) for name in chosen]
 
-    def _option(self, field: dataclasses.Field[Any], hint: Any, text: str) -> click.Option:
-        flag = self.flags.get(field.name, "--" + field.name.replace("_", "-"))
-        settings = _type_settings(hint, flag) | {"help": text}
-        settings["metavar"] = self.metavars.get(field.name)
-        if field.name in self.types:
-            settings["type"] = self.types[field.name]
+    def _option(self, parameter: inspect.Parameter, hint: Any, text: str) -> click.Option:
+        name = parameter.name
+        flag = self.flags.get(name, "--" + name.replace("_", "-"))
+        settings = _type_settings(hint) | {"help": text, "metavar": self.metavars.get(name)}
+        if name in self.types:
+            settings["type"] = self.types[name]
         if settings.pop("switch", False) and "/" not in flag:
             flag = f"{flag}/--no-{flag.removeprefix('--')}"
-        if shown := self.defaults.get(field.name, _default_text(field)):
+        if shown := self.defaults.get(name, _default_text(parameter.default)):
             settings["help"] += f"  [default: {shown}]"
-        return click.Option([flag, field.name], **settings)
+        return click.Option([flag, name], **settings)
 
 
 class GeneratedCommand(click.Command):
@@ -87,7 +91,7 @@ class GeneratedCommand(click.Command):
 def generated_command(
     *fields: FieldOptions, **settings: Any
 ) -> Callable[[Function], GeneratedCommand]:
-    """Make a command with options generated from dataclasses.
+    """Make a command with generated options.
 
     An option that is not given is None (or, where it may be repeated, an empty tuple): `given_only`
     leaves these out.
@@ -139,7 +143,7 @@ def with_flags(message: str, command: click.Command | None) -> str:
 
 
 def attribute_helps(doc: str) -> dict[str, str]:
-    """Return the first sentence on each attribute of a Google style docstring.
+    """Return the first sentence on each attribute or argument of a Google style docstring.
 
     Example:
         >>> helps = attribute_helps('''Options.
@@ -151,7 +155,7 @@ def attribute_helps(doc: str) -> dict[str, str]:
         >>> helps["mutual"]
         "Of the ratio test, which is Lowe's."
     """
-    match = re.search(r"^Attributes:\n((?:[ \t]+.*\n?|\n)*)", doc, flags=re.MULTILINE)
+    match = re.search(r"^(?:Attributes|Args):\n((?:[ \t]+.*\n?|\n)*)", doc, flags=re.MULTILINE)
     section = textwrap.dedent(match.group(1)) if match else ""
     helps: dict[str, str] = {}
     for entry in re.split(r"\n(?=\S)", section.strip()):
@@ -161,15 +165,16 @@ def attribute_helps(doc: str) -> dict[str, str]:
     return helps
 
 
-def _type_settings(hint: Any, flag: str) -> dict[str, Any]:
+def _type_settings(hint: Any) -> dict[str, Any]:
     """Return click's settings for an annotation."""
     parts = [part for part in typing.get_args(hint) if part is not type(None)]
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return _type_settings(parts[0], flag) if len(parts) == 1 else {"type": str}
+        repeated = any(typing.get_origin(part) is Sequence for part in parts)
+        return _type_settings(parts[0]) if len(parts) == 1 else {"type": str, "multiple": repeated}
     if typing.get_origin(hint) is Literal:
         return {"type": click.Choice([str(value) for value in typing.get_args(hint)])}
     if typing.get_origin(hint) is tuple and len(parts) == 2 and parts[1] is Ellipsis:
-        return _type_settings(parts[0], flag) | {"multiple": True}
+        return _type_settings(parts[0]) | {"multiple": True}
     if hint is bool:
         return {"switch": True, "default": None}
     if hint is Path:
@@ -177,13 +182,12 @@ def _type_settings(hint: Any, flag: str) -> dict[str, Any]:
     return {"type": hint if hint in (int, float, str) else str}
 
 
-def _default_text(field: dataclasses.Field[Any]) -> str:
+def _default_text(value: Any) -> str:
     """Return a default for the help; none where it is None, which the text explains."""
-    value = field.default
-    if value is dataclasses.MISSING or value is None or value == ():
-        return ""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, tuple):
         return " ".join(map(str, value))
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:g}"
+    return str(value) if isinstance(value, (int, str)) else ""

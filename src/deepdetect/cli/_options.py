@@ -21,10 +21,8 @@ if TYPE_CHECKING:
 
 PATH = click.Path(path_type=Path)
 
-Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
-
-class Resolution(click.ParamType[str | int]):
+class Resolution(click.ParamType):  # type: ignore[type-arg]  # generic in new versions only
     """The word "native", or a number of pixels."""
 
     name = "native|PIXELS"
@@ -38,53 +36,14 @@ class Resolution(click.ParamType[str | int]):
             self.fail(f"{value!r} is neither 'native' nor a number of pixels", param, context)
 
 
-def combined(*options: Decorator) -> Decorator:
-    """Make one decorator of several, which appear in this order in the help."""
-
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        for option in reversed(options):
-            function = option(function)
-        return function
-
-    return decorate
-
-
-def detector_options_with(weights: str) -> Decorator:
-    """Make the options that choose a detector, with the weights that are taken by default."""
-    return combined(
-        click.option(
-            "--weights",
-            default=weights,
-            show_default=True,
-            help="default or dense, the bundled weights; or an ONNX or safetensors file.",
-        ),
-        click.option(
-            "--resolution",
-            type=Resolution(),
-            default="native",
-            show_default=True,
-            help="Show the network the image as it is, or squashed to a square (paper: 480).",
-        ),
-        click.option(
-            "--backend",
-            default="auto",
-            show_default=True,
-            help="onnxruntime, openvino, torch, or auto: OpenVINO when it is installed.",
-        ),
-        click.option(
-            "--provider",
-            "providers",
-            multiple=True,
-            metavar="NAME",
-            help="Execution provider of ONNX Runtime, as CUDAExecutionProvider; may be repeated.",
-        ),
-        click.option(
-            "--threads", type=int, help="Number of threads.  [default: the backend's choice]"
-        ),
-    )
-
-
-detector_options = detector_options_with("default")
+DETECTOR = FieldOptions(
+    "detector.detector:DeepDetect",
+    names=("weights", "resolution", "backend", "providers", "threads"),
+    flags={"providers": "--provider"},
+    types={"resolution": Resolution()},
+    metavars={"weights": "NAME|FILE", "providers": "NAME"},
+    defaults={"threads": "the backend's choice"},
+)
 
 SELECTION = FieldOptions(
     "features.selection:SelectionOptions",
@@ -128,12 +87,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print the re
 
 
 def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelSettings:
-    """Find the settings; detectors named on the command line take the place of theirs.
-
-    Args:
-        detectors: names with commas between, or None.
-        chosen: name, TOML file, or None.
-    """
+    """Find settings by name or TOML file; detectors (with commas between) replace theirs."""
     from ..labels import LabelSettings, find_label_settings
 
     settings = LabelSettings() if chosen is None else find_label_settings(chosen)
@@ -168,31 +122,26 @@ SHARDS = FieldOptions(
 )
 """What of a recipe is fixed once the labels are made."""
 
-recipe_options = combined(
-    click.option(
+
+def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that choose a recipe, before others change it."""
+    function = label_settings_option(function)
+    function = click.option(
+        "--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]"
+    )(function)
+    return click.option(
         "--preset",
         default="default",
         show_default=True,
         help="Recipe that the other options change: default (its values are shown here), paper "
         "(the paper's own), or dense (normal light only, denser labels).",
-    ),
-    click.option(
-        "--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]"
-    ),
-    label_settings_option,
-)
+    )(function)
 
 
 def chosen_recipe(
     preset: str, detectors: str | None, label_settings: str | None, values: dict[str, Any]
 ) -> TrainingOptions:
-    """Return a preset's training options with the values that are given changed.
-
-    Args:
-        preset: its name.
-        detectors, label_settings: as of `chosen_label_settings`.
-        values: the others, by name; None and () stand for what is not given.
-    """
+    """Return a preset's training options with the given values changed."""
     from ..training import Stage, training_preset
 
     given = given_only(values)
@@ -210,24 +159,18 @@ def chosen_recipe(
     return dataclasses.replace(recipe, **given)
 
 
-def make_detector(values: dict[str, Any]) -> DeepDetect:
-    """Make the detector that `detector_options` describe, taking them out of the values."""
+def make_detector(values: dict[str, Any], weights: str = "default") -> DeepDetect:
+    """Make the detector that `DETECTOR`'s options describe, taking them out of the values."""
     from ..detector.detector import DeepDetect
 
-    names = ("weights", "resolution", "backend", "providers", "threads")
-    return DeepDetect(**{name: values.pop(name) for name in names})
+    given = given_only({name: values.pop(name) for name in DETECTOR.names})
+    return DeepDetect(**{"weights": weights, **given})
 
 
 def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
     """Replace folders by the images below them, and check that results will not collide.
 
-    Args:
-        paths: files and folders.
-        output: folder of the results, which is left out when it lies in one of the folders.
-
-    Raises:
-        ImageError: a folder is empty.
-        OptionError: two images have the same name without its ending.
+    The folder of the results is left out when it lies in one of the folders.
     """
     from ..io.image import find_images
 
@@ -248,13 +191,7 @@ def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
 def check_inputs_survive(outputs: Iterable[Path], inputs: Sequence[Path], advice: str) -> None:
     """Check that no file to be written is one of those that are read, under whatever name.
 
-    Args:
-        outputs: the files to be written.
-        inputs: the files that are read; they need not be there.
-        advice: what to do, as "give the model another name by -o".
-
-    Raises:
-        OptionError: an input would be written over.
+    The advice says what to do, as "give the model another name by -o".
     """
     there = [path for path in inputs if os.path.exists(path)]
     for output in outputs:
@@ -264,11 +201,7 @@ def check_inputs_survive(outputs: Iterable[Path], inputs: Sequence[Path], advice
 
 
 def report_failures(failures: Sequence[str], total: int) -> None:
-    """Raise when some of several images failed, naming the first.
-
-    Raises:
-        DeepDetectError: there are failures.
-    """
+    """Raise a DeepDetectError when some of several images failed, naming the first."""
     if failures and total == 1:
         raise DeepDetectError(failures[0])
     if failures:
@@ -283,10 +216,21 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2, default=str))
 
 
-def print_table(rows: Sequence[tuple[str, str]], title: str = "") -> None:
+def print_result(
+    as_json: bool, values: Any, rows: Iterable[tuple[str, str]], title: str = ""
+) -> None:
+    """Print the result of a command: as JSON, or as a table of names and values."""
+    if as_json:
+        print_json(values)
+    else:
+        print_table(rows, title)
+
+
+def print_table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
     """Print names and values in two columns."""
     if title:
         click.echo(title)
+    rows = list(rows)
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         click.echo(f"  {name:<{width}}  {value}")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from ._options import PATH, json_option, print_json, print_table
+from ._options import PATH, json_option, print_result
 
 
 @click.command(short_help="The mean of several weights.")
@@ -52,7 +52,5 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
     files = {"weights": output / "best.safetensors", "onnx": output / "deepdetect.onnx"}
     save_weights(network, files["weights"], {"parts": json.dumps(parts), **provenance()})
     export_onnx(network, files["onnx"])
-    if as_json:
-        print_json(files)
-        return
-    print_table([("mean of", f"{len(paths)} weights"), *((k, str(v)) for k, v in files.items())])
+    rows = [("mean of", f"{len(paths)} weights"), *((k, str(v)) for k, v in files.items())]
+    print_result(as_json, files, rows)

@@ -7,12 +7,13 @@ from typing import Any
 
 import click
 
-from ._options import PATH, detector_options, json_option, make_detector, print_json
+from ._generated import generated_command
+from ._options import DETECTOR, PATH, json_option, make_detector, print_json
 
 NAMES = ("oxford", "hpatches", "middlebury", "foreground", "low-visibility", "speed", "all")
 
 
-@click.command(short_help="The tables and figures of the paper, with baselines.")
+@generated_command(DETECTOR, short_help="The tables and figures of the paper, with baselines.")
 @click.argument("name", metavar="|".join(NAMES))
 @click.option("--data", type=PATH, required=True, help="Folder of the data sets.")
 @click.option(
@@ -57,7 +58,6 @@ NAMES = ("oxford", "hpatches", "middlebury", "foreground", "low-visibility", "sp
     default=("dense",),
     help="Weights for stereo pairs, as --weights; may be repeated.  [default: dense]",
 )
-@detector_options
 @json_option
 def benchmark(
     name: str,
@@ -90,7 +90,7 @@ def benchmark(
     from ..evaluation.runner import run_benchmarks
     from ..matching.options import get_preset
 
-    if values["resolution"] != "native":
+    if values["resolution"] not in (None, "native"):
         raise OptionError(
             "the protocols fix the resolution (480x480 and native): leave out --resolution"
         )

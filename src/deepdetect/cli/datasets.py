@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ._options import PATH, json_option, print_json, print_table
+from ._options import PATH, json_option, print_json, print_result, print_table
 
 
 @click.group(short_help="Download data sets.")
@@ -65,7 +65,8 @@ def get(name: str, output: Path | None, as_json: bool) -> None:
     dataset = find_remote_dataset(name)
     folder = get_dataset(dataset, output or Path("data") / dataset.name, quiet=as_json)
     images = len(find_images(folder))
-    if as_json:
-        print_json({"name": dataset.name, "folder": folder, "images": images})
-        return
-    print_table([("images", f"{images:,}"), ("written", str(folder)), ("licence", dataset.licence)])
+    print_result(
+        as_json,
+        {"name": dataset.name, "folder": folder, "images": images},
+        [("images", f"{images:,}"), ("written", str(folder)), ("licence", dataset.licence)],
+    )

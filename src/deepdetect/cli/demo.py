@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ._generated import generated_command
 from ._options import (
+    DETECTOR,
     PATH,
-    detector_options,
     json_option,
     make_detector,
     print_json,
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from ..features.matches import Matches
 
 
-@click.command(short_help="Detect and match a real stereo pair, and evaluate the matches.")
+@generated_command(DETECTOR, short_help="Match a real stereo pair, and evaluate the matches.")
 @click.option(
     "-o",
     "--output",
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     show_default=True,
     help="Folder for the pictures.",
 )
-@detector_options
 @json_option
 def demo(output: Path, as_json: bool, **values: Any) -> None:
     """Detect and match the Motorcycle stereo pair; evaluate the matches by its true disparity.

@@ -10,9 +10,9 @@ import click
 
 from ._generated import generated_command, given_only
 from ._options import (
+    DETECTOR,
     PATH,
     SELECTION,
-    detector_options,
     expand_images,
     format_option,
     json_option,
@@ -24,7 +24,7 @@ from ._options import (
 )
 
 
-@generated_command(SELECTION, short_help="Keypoints of photographs.")
+@generated_command(SELECTION, DETECTOR, short_help="Keypoints of photographs.")
 @click.argument("images", type=PATH, nargs=-1, required=True)
 @output_option
 @click.option(
@@ -32,7 +32,6 @@ from ._options import (
     type=PATH,
     help="Mask image of the same size: no keypoints where it is bright.",
 )
-@detector_options
 @format_option
 @pictures_option
 @json_option

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ._options import PATH, detector_options, json_option, make_detector, print_json
+from ._generated import generated_command
+from ._options import DETECTOR, PATH, json_option, make_detector, print_json
 
 if TYPE_CHECKING:
     from ..evaluation.evaluate import Evaluation, OxfordScore
@@ -17,9 +18,8 @@ if TYPE_CHECKING:
 WIDTH = 12
 
 
-@click.command(short_help="How good weights are.")
+@generated_command(DETECTOR, short_help="How good weights are.")
 @click.argument("samples", type=PATH)
-@detector_options
 @click.option(
     "--compare",
     multiple=True,
@@ -79,7 +79,7 @@ def evaluate(
     if labels and oxford is None:
         raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")
     scenes = load_oxford(oxford) if oxford is not None else []  # before hours of work
-    weights = [values["weights"], *compare]
+    weights = [values["weights"] or "default", *compare]
     detectors = [make_detector({**values, "weights": path}) for path in weights]
     found = [
         run(detector, samples=samples, scales=scales, oxford=oxford, quiet=as_json)

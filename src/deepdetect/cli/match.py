@@ -10,16 +10,15 @@ import click
 
 from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
+    DETECTOR,
     PATH,
     SELECTION,
-    detector_options,
     format_option,
     json_option,
     make_detector,
     output_option,
     pictures_option,
-    print_json,
-    print_table,
+    print_result,
     seconds_rows,
 )
 
@@ -35,7 +34,9 @@ GEOMETRY = FieldOptions(
 )
 
 
-@generated_command(SELECTION, MATCHING, GEOMETRY, short_help="Matches between two photographs.")
+@generated_command(
+    SELECTION, MATCHING, GEOMETRY, DETECTOR, short_help="Matches between two photographs."
+)
 @click.argument("image0", type=PATH)
 @click.argument("image1", type=PATH)
 @output_option
@@ -50,14 +51,10 @@ GEOMETRY = FieldOptions(
 )
 @click.option("--camera0", type=PATH, help="Text file of the 3x3 camera matrix, for essential.")
 @click.option("--camera1", type=PATH, help="The same of the second image.  [default: camera0]")
-@detector_options
 @format_option
 @pictures_option
 @json_option
-@click.pass_context
 def match(
-    context: click.Context,
-    /,
     image0: Path,
     image1: Path,
     output: Path,
@@ -89,6 +86,7 @@ def match(
     from ..matching.pipeline import match_images
 
     rgb0, rgb1 = load_image(image0), load_image(image1)
+    resolution_given = values["resolution"] is not None
     detector = make_detector(values)
     given = given_only(values)
     for name, path in (
@@ -98,7 +96,7 @@ def match(
     ):
         if path is not None:
             given[name] = _read_matrix(path)
-    if get_preset(preset).heatmap is not None and _was_given(context, "resolution"):
+    if get_preset(preset).heatmap is not None and resolution_given:
         given["resolution"] = detector.heatmap_options.resolution
     matches = match_images(rgb0, rgb1, detector, preset=preset, **given)
     stem = f"{image0.stem}_{image1.stem}_matches"
@@ -130,10 +128,9 @@ def match(
         words = " and ".join("--" + name.replace("_", "-") for name in unused)
         verb = "applies" if len(unused) == 1 else "apply"
         click.echo(f"{words} {verb} only to unguided matching: add --unguided", err=True)
-    if as_json:
-        print_json(numbers)
-        return
-    print_table(
+    print_result(
+        as_json,
+        numbers,
         [
             ("keypoints", f"{numbers['keypoints0']:,} and {numbers['keypoints1']:,}"),
             ("density", f"{numbers['density0']:.3f} and {numbers['density1']:.3f}"),
@@ -145,6 +142,8 @@ def match(
         ],
         f"{image0} and {image1}",
     )
+    if as_json:
+        return
     if matches.guide is not None and not matches.guided:
         click.echo("no geometry could be trusted: these matches are unguided", err=True)
     if matches.matrix is None and matches.model != "none":
@@ -173,10 +172,6 @@ def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
         f"({matches.model}); a random sample is drawn: green inliers, red others"
     )
     save_picture(add_caption(picture, caption), path)
-
-
-def _was_given(context: click.Context, name: str) -> bool:
-    return context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
 
 
 def _read_matrix(path: Path) -> Any:

@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ._generated import generated_command, given_only
+from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
+    DETECTOR,
     PATH,
     SELECTION,
     check_inputs_survive,
-    detector_options_with,
     json_option,
     make_detector,
-    print_json,
-    print_table,
+    print_result,
     seconds_rows,
 )
 
@@ -27,32 +26,29 @@ if TYPE_CHECKING:
     from ..io.depth import DepthPng
     from ..reconstruction.result import Reconstruction
 
+CAMERAS = FieldOptions(
+    "reconstruction.pipeline:reconstruct",
+    names=("calibration", "focal_px", "rectified"),
+    flags={"focal_px": "--focal", "rectified": "--rectified/--not-rectified"},
+    metavars={"focal_px": "PX"},
+    defaults={"focal_px": "from EXIF", "rectified": "detected"},
+    types={"calibration": PATH},
+)
 WHOLE_PIXEL_SELECTION = dataclasses.replace(SELECTION, skip=(*SELECTION.skip, "subpixel"))
+DENSE_DETECTOR = dataclasses.replace(DETECTOR, defaults={**DETECTOR.defaults, "weights": "dense"})
 
 STAGES = 8
 """Of a reconstruction at most; the files are one more."""
 
 
-@generated_command(WHOLE_PIXEL_SELECTION, short_help="Two photographs to a 3D reconstruction.")
+@generated_command(
+    CAMERAS,
+    WHOLE_PIXEL_SELECTION,
+    DENSE_DETECTOR,
+    short_help="A 3D reconstruction of two photographs.",
+)
 @click.argument("left", type=PATH)
 @click.argument("right", type=PATH)
-@click.option(
-    "--calibration",
-    type=PATH,
-    help="JSON file of the cameras, as in docs/reconstruction.md.",
-)
-@click.option(
-    "--focal",
-    "focal_px",
-    type=float,
-    metavar="PX",
-    help="Focal length in pixels of these images.  [default: from EXIF]",
-)
-@click.option(
-    "--rectified/--not-rectified",
-    default=None,
-    help="Whether matches lie on the same row of both images.  [default: detected]",
-)
 @click.option(
     "-o",
     "--output",
@@ -61,14 +57,11 @@ STAGES = 8
     show_default=True,
     help="The model, .ply, .glb or .html; the other files get its name and stand beside it.",
 )
-@detector_options_with("dense")
 @json_option
 def reconstruct(
     left: Path,
     right: Path,
     calibration: Path | None,
-    focal_px: float | None,
-    rectified: bool | None,
     output: Path,
     as_json: bool,
     **values: Any,
@@ -93,7 +86,7 @@ def reconstruct(
 
     find_writer(output)
     files = _files(output, [path for path in (left, right, calibration) if path is not None])
-    detector = make_detector(values)
+    detector = make_detector(values, weights="dense")
     chosen = given_only(values)
     # On a terminal only: what is logged stays readable.
     with progress(STAGES + 1, "reconstructing", "stage", not sys.stderr.isatty()) as bar:
@@ -107,18 +100,13 @@ def reconstruct(
             right,
             detector,
             calibration=calibration,
-            focal_px=focal_px,
-            rectified=rectified,
             progress=done,
             **chosen,
         )
         bar.update(STAGES - bar.n)
         numbers = _write(found, files, {"left": left, "right": right})
         done("files")
-    if as_json:
-        print_json(numbers)
-        return
-    print_table(_rows(found, numbers), f"{left} and {right}")
+    print_result(as_json, numbers, _rows(found, numbers), f"{left} and {right}")
 
 
 def _files(model: Path, inputs: list[Path]) -> dict[str, Path]:

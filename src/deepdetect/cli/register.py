@@ -9,22 +9,20 @@ import click
 
 from ._generated import generated_command, given_only
 from ._options import (
+    DETECTOR,
     PATH,
     SELECTION,
-    detector_options,
     json_option,
     make_detector,
     output_option,
-    print_json,
-    print_table,
+    print_result,
 )
 
 
-@generated_command(SELECTION, short_help="One photograph registered to another.")
+@generated_command(SELECTION, DETECTOR, short_help="One photograph registered to another.")
 @click.argument("image0", type=PATH)
 @click.argument("image1", type=PATH)
 @output_option
-@detector_options
 @json_option
 def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: Any) -> None:
     """Register IMAGE1 to IMAGE0: for planes, and for photographs from one place.
@@ -65,10 +63,9 @@ def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: 
         "correlation": round(found.zncc, 4),
         "files": files,
     }
-    if as_json:
-        print_json(numbers)
-        return
-    print_table(
+    print_result(
+        as_json,
+        numbers,
         [
             ("matches", f"{found.matches:,}"),
             ("overlap", f"{numbers['overlap']:.1%} of the first image"),

@@ -7,30 +7,24 @@ from typing import Any
 
 import click
 
-from ._generated import generated_command
+from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
     PATH,
     SHARDS,
     chosen_recipe,
     json_option,
-    print_json,
-    print_table,
+    print_result,
     recipe_options,
     workers_option,
 )
 
+WRITING = FieldOptions("training.shards:write_shards", names=("shard_size",))
 
-@generated_command(SHARDS, short_help="Pack images for training on sets too big for the memory.")
+
+@generated_command(SHARDS, WRITING, short_help="Pack images for training on large sets.")
 @click.argument("images", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="Folder for the shards.")
 @recipe_options
-@click.option(
-    "--shard-size",
-    type=click.IntRange(min=1),
-    default=256,
-    show_default=True,
-    help="About this many images go into a shard.",
-)
 @workers_option
 @json_option
 def shards(
@@ -39,7 +33,6 @@ def shards(
     preset: str,
     detectors: str | None,
     label_settings: str | None,
-    shard_size: int,
     workers: int | None,
     as_json: bool,
     **values: Any,
@@ -58,27 +51,20 @@ def shards(
 
     # Shards are for any stages: one that fits every size stands for them.
     values["stages"] = (Stage(16, 1, 1),)
+    chosen = given_only({name: values.pop(name) for name in WRITING.names})
     options = chosen_recipe(preset, detectors, label_settings, values)
-    made = write_shards(
-        images,
-        output,
-        options,
-        shard_size=shard_size,
-        workers=workers,
-        quiet=as_json,
-    )
+    made = write_shards(images, output, options, workers=workers, quiet=as_json, **chosen)
     counts = {
         kind: sum(count for _, count in files)
         for kind, files in (("training", made.training), ("validation", made.validation))
     }
     size = sum(path.stat().st_size for path, _ in made.training + made.validation)
-    if as_json:
-        print_json({"folder": output, **counts, "bytes": size})
-        return
-    print_table(
+    print_result(
+        as_json,
+        {"folder": output, **counts, "bytes": size},
         [
             ("to train on", f"{counts['training']:,} images in {len(made.training)} shards"),
             ("to validate with", f"{counts['validation']:,} images"),
             ("written", f"{output}, {size / 1e6:,.1f} MB"),
-        ]
+        ],
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,22 +9,27 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .._shared.errors import DeepDetectError, OptionError
+from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
+    DETECTOR,
     PATH,
     check_inputs_survive,
-    detector_options,
     json_option,
     make_detector,
-    print_json,
-    print_table,
+    print_result,
     seconds_rows,
 )
 
 if TYPE_CHECKING:
     from ..matching.stitching import Panorama
 
+PANORAMA = FieldOptions(
+    "matching.stitching.panorama:stitch",
+    names=("scale", "max_canvas_megapixels", "registration_side", "seed"),
+)
 
-@click.command(short_help="A panorama of overlapping photographs.")
+
+@generated_command(PANORAMA, DETECTOR, short_help="A panorama of overlapping photographs.")
 @click.argument("images", type=PATH, nargs=-1, required=True)
 @click.option(
     "-o",
@@ -40,38 +44,11 @@ if TYPE_CHECKING:
     type=PATH,
     help="The one of IMAGES that is not distorted.  [default: the one in the middle]",
 )
-@click.option(
-    "--scale",
-    type=float,
-    default=1.0,
-    show_default=True,
-    help="Pixels of the panorama per pixel of the reference.",
-)
-@click.option(
-    "--max-canvas-megapixels",
-    type=float,
-    default=50.0,
-    show_default=True,
-    help="Refuse a larger panorama, before it takes any memory.",
-)
-@click.option(
-    "--registration-side",
-    type=int,
-    default=640,
-    show_default=True,
-    help="Longer side to which photographs are reduced to be registered, pixels.",
-)
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the random choices.")
-@detector_options
 @json_option
 def stitch(
     images: tuple[Path, ...],
     output: Path,
     reference: Path | None,
-    scale: float,
-    max_canvas_megapixels: float,
-    registration_side: int,
-    seed: int,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -97,30 +74,22 @@ def stitch(
             images,
             detector=detector,
             reference=None if reference is None else images.index(reference),
-            scale=scale,
-            max_canvas_megapixels=max_canvas_megapixels,
-            registration_side=registration_side,
-            seed=seed,
+            **given_only(values),
         )
     except DeepDetectError as error:
         if type(error) not in (DeepDetectError, OptionError):  # an image, named as it was given
             raise
-        raise type(error)(_worded(str(error), images)) from error
+        text = str(error)
+        for number, path in enumerate(images):
+            text = text.replace(f"images[{number}]", str(path))
+        raise type(error)(text) from error
     save_picture(panorama.image, output)
     numbers = _numbers(panorama, images, output)
+    print_result(as_json, numbers, _rows(panorama, images, output), "panorama")
     if as_json:
-        print_json(numbers)
         return
-    print_table(_rows(panorama, images, output), "panorama")
     for left_out in numbers["left_out"]:
         click.echo(f"left out: {left_out['image']}, as {left_out['reason']}", err=True)
-
-
-def _worded(message: str, images: Sequence[Path]) -> str:
-    """Speak of files and flags where the library speaks of numbers and parameters."""
-    for name in ("max_canvas_megapixels", "registration_side", "scale", "reference between"):
-        message = message.replace(name, f"--{name.replace('_', '-')}")
-    return re.sub(r"images\[(\d+)\]", lambda found: str(images[int(found[1])]), message)
 
 
 def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[str, Any]:

@@ -28,27 +28,26 @@ from ._options import (
 if TYPE_CHECKING:
     from ..training import StageProfile, TrainingResult
 
-DEVICE = FieldOptions("training.recipe:DeviceOptions")
+RUN = FieldOptions(
+    "training.run:train",
+    names=("validation", "labels", "init_weights"),
+    flags={"init_weights": "--init"},
+    defaults={
+        "validation": "one image in twenty is held out",
+        "labels": "in the run's folder",
+        "init_weights": "random ones, by the seed",
+    },
+    metavars={"validation": "FOLDER", "labels": "FOLDER", "init_weights": "NAME|FILE"},
+)
+DEVICE = FieldOptions(
+    "training.recipe:DeviceOptions", flags={"checkpoint_interval_s": "--checkpoint-interval"}
+)
 
 
-@generated_command(RECIPE, DEVICE, short_help="Train the network on images.")
+@generated_command(RUN, RECIPE, DEVICE, short_help="Train the network on images.")
 @click.argument("images", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="Folder of the run.")
 @recipe_options
-@click.option(
-    "--validation",
-    type=PATH,
-    help="Folder of other images.  [default: one image in twenty is held out]",
-)
-@click.option("--labels", type=PATH, help="Folder of the label cache.  [default: in the run's]")
-@click.option(
-    "--init",
-    "init_weights",
-    multiple=True,
-    metavar="NAME|FILE",
-    help="Weights to start from: default or dense, the bundled ones, or a .safetensors "
-    "file; repeated, the mean of all.  [default: random ones]",
-)
 @click.option(
     "--profile",
     "profiling",
@@ -63,9 +62,6 @@ def train(
     preset: str,
     detectors: str | None,
     label_settings: str | None,
-    validation: Path | None,
-    labels: Path | None,
-    init_weights: tuple[str, ...],
     profiling: bool,
     workers: int | None,
     as_json: bool,
@@ -88,17 +84,11 @@ def train(
     from ..training import DeviceOptions, profile
     from ..training import train as train_network
 
+    arguments = given_only({name: values.pop(name) for name in RUN.names})
     chosen = {name: values.pop(name) for name in DeviceOptions.__dataclass_fields__}
-    device = DeviceOptions(**given_only(chosen))
+    arguments["device"] = DeviceOptions(**given_only(chosen))
+    arguments |= {"workers": workers, "log": None if as_json else click.echo}
     options = chosen_recipe(preset, detectors, label_settings, values)
-    arguments: dict[str, Any] = {
-        "validation": validation,
-        "labels": labels,
-        "init_weights": init_weights or None,
-        "device": device,
-        "workers": workers,
-        "log": None if as_json else click.echo,
-    }
     with _ending_all_processes(click.get_current_context()):
         if profiling:
             _print_profiles(profile(images, output, options, **arguments), as_json)

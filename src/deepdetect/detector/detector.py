@@ -36,9 +36,9 @@ class DeepDetect:
             image is squashed to a square of that side, as the paper does with 480.
         backend: "auto" (OpenVINO when it is installed, else ONNX Runtime; torch for
             safetensors), "onnxruntime", "openvino" or "torch".
-        providers: ONNX Runtime's execution providers by name, as
-            ("CUDAExecutionProvider", "CPUExecutionProvider").
-        threads: number of threads; None leaves the backend's choice.
+        providers: ONNX Runtime's execution providers by name, as "CUDAExecutionProvider", the
+            preferred one first.
+        threads: number of threads. None: the backend's choice.
         channels: "rgb", or "bgr" as the paper's published code feeds them.
 
     Attributes:

@@ -113,10 +113,10 @@ def reconstruct(
             the first one, whose frame the points are in.
         detector: a `DeepDetect`, or anything with its `heatmap` method; default
             `DeepDetect("dense")`.
-        calibration: a `Calibration` or the path of a calib.json (docs/reconstruction.md describes
-            its format); without one the focal length is taken from `focal_px`, or from EXIF.
+        calibration: JSON file of the cameras (docs/reconstruction.md describes its format), or a
+            `Calibration`. Without one the focal length is taken from `focal_px`, or from EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
-        rectified: whether matches lie on the same row of both images; None: detected.
+        rectified: whether matches lie on the same row of both images. None: detected.
         threshold, density, max_keypoints, nms_radius, ignore: which pixels become keypoints
             (`SelectionOptions`). A density of 1 takes every pixel, and `DENSE` disparities. Without
             `nms_radius`, pairs that are not rectified are matched without suppression.

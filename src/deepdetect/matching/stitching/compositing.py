@@ -113,7 +113,7 @@ def plan_canvas(
         if depths.min() * MAX_DEPTH_RATIO <= depths.max():
             raise DeepDetectError(
                 f"images[{number}] is seen too much from the side of images[{reference}] for a "
-                "flat panorama: leave it out, or choose a reference between them"
+                "flat panorama: leave it out, or choose a `reference` between them"
             )
     placed = {number: scaled_homography(matrix, 1, scale) for number, matrix in placed.items()}
     # A pixel belongs to an image when its centre does.
@@ -131,12 +131,12 @@ def plan_canvas(
         raise OptionError(
             f"the panorama would be {width}x{height} pixels, {width * height / 1e6:.0f} megapixels "
             f"and more than max_canvas_megapixels ({max_canvas_megapixels:g}): raise it, or make "
-            "scale smaller"
+            "`scale` smaller"
         )
     if canvas.memory_bytes > available_memory():
         raise OptionError(
             f"the panorama would be {width}x{height} pixels and need about "
-            f"{canvas.memory_bytes / 1e9:.1f} GB of memory, more than is free: make scale smaller"
+            f"{canvas.memory_bytes / 1e9:.1f} GB of memory, more than is free: make `scale` smaller"
         )
     return canvas
 

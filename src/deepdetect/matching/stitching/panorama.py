@@ -155,11 +155,11 @@ def _check(
         raise OptionError("a panorama needs two photographs or more: give more images")
     if reference is not None and not 0 <= reference < len(images):
         raise OptionError(
-            f"the reference must be the number of an image, from 0 to {len(images) - 1}, "
+            f"`reference` must be the number of an image, from 0 to {len(images) - 1}, "
             f"not {reference}"
         )
     if not (scale > 0 and math.isfinite(scale)):
-        raise OptionError(f"the scale must be above 0, not {scale}")
+        raise OptionError(f"`scale` must be above 0, not {scale}")
     if not max_canvas_megapixels > 0:
         raise OptionError(f"max_canvas_megapixels must be above 0, not {max_canvas_megapixels}")
     largest = GuidedOptions().initial_geometry.max_side_px
