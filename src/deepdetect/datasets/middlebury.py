@@ -57,13 +57,7 @@ def load_middlebury(folder: str | Path) -> StereoPair:
 
 
 def load_calibrated_pair(folder: str | Path) -> CalibratedStereoPair:
-    """Load a scene with the calibration of its calib.json, without its ground truth.
-
-    Args:
-        folder: the scene.
-
-    Returns:
-        The pair; its disparity is NaN.
+    """Load a scene with its calib.json, without its ground truth: the disparity is NaN.
 
     Raises:
         ImageError: an image is missing or damaged, or the two differ in size.

@@ -208,11 +208,6 @@ def find_keypoints(
 ) -> Keypoints:
     """Choose the keypoints of a loaded image, ranked by logits where the detector gives them.
 
-    Args:
-        detector: a `DeepDetect`, or anything with a method `heatmap`.
-        rgb: (H, W, 3) uint8 RGB, as `load_image` returns it.
-        options: what to choose.
-
     Raises:
         OptionError: the detector's map has another size than the image, or is not finite.
     """

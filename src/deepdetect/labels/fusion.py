@@ -95,10 +95,6 @@ def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
 def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
     """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
 
-    Args:
-        rgb: (H, W, 3) uint8 RGB.
-        label: its label.
-
     Returns:
         Four panels in a row, each mask captioned with its density.
     """

@@ -164,17 +164,7 @@ def disparity_space(
     baseline: float = 1.0,
     disparity_weight: float = DEFAULTS.sor_disparity_weight,
 ) -> np.ndarray:
-    """Return points as (x, y, weight * disparity) in pixels of the first camera.
-
-    Args:
-        points: (N, 3) in its frame, z above 0.
-        focal_px: its focal length.
-        baseline: in the units of the points.
-        disparity_weight: distance of 1 px of disparity, in pixels of the image.
-
-    Returns:
-        (N, 3) float64.
-    """
+    """Return (N, 3) points as (x, y, weight * disparity) in pixels of the first camera."""
     points = np.asarray(points, np.float64).reshape(-1, 3)
     with np.errstate(divide="ignore", invalid="ignore"):
         across = points[:, :2] / points[:, 2:] * focal_px

@@ -83,15 +83,7 @@ def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
 
 
 def draw_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw keypoints over a dimmed image: as circles when they are few, else as pixels.
-
-    Args:
-        rgb: (H, W, 3) uint8 RGB.
-        keypoints: its keypoints.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
-    """
+    """Draw keypoints over a dimmed RGB image: as circles when they are few, else as pixels."""
     canvas = rgb // 2
     pixels = np.rint(keypoints.xy).astype(int)
     if len(keypoints) <= MAX_CIRCLES:

@@ -26,19 +26,11 @@ def flann_neighbours(
     trees: int = 5,
     checks: int = 50,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find approximate nearest neighbours in kd-trees.
+    """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`.
 
     Args:
-        queries: (N, D) descriptors, uint8 or float32.
-        base: (M, D) descriptors, M >= count.
-        count: neighbours of each query.
-        seed: of the random trees; the result is the same for the same seed.
-        positions: not used; all matchers take the same arguments.
         trees: number of trees.
         checks: leaves that are visited for each query.
-
-    Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, nearest first.
     """
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
 
@@ -64,23 +56,16 @@ def faiss_neighbours(
     training_per_list: int = 40,
     min_indexed: int = 4096,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find approximate nearest neighbours in an inverted file.
+    """Find approximate nearest neighbours in an inverted file; otherwise as `Matcher`.
+
+    About one neighbour in fifty is missed.
 
     Args:
-        queries: (N, D) descriptors, uint8 or float32.
-        base: (M, D) descriptors, M >= count.
-        count: neighbours of each query.
-        seed: of the choice of descriptors that the index is trained on.
-        positions: not used; all matchers take the same arguments.
         lists_per_root: lists of the inverted file, in units of the square root of M.
         probes: lists that are searched for each query.
         training_per_list: descriptors that the centre of each list is trained on.
         min_indexed: with fewer descriptors than this all are compared: an inverted file would
             save nothing.
-
-    Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, nearest first.
-        About one neighbour in fifty is missed.
 
     Raises:
         MissingExtraError: faiss is not installed.

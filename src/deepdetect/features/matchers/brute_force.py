@@ -20,19 +20,9 @@ HAMMING_BASE = 200_000
 def exact_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the true nearest neighbours by matrix products.
+    """Find the true nearest neighbours by matrix products, as a `Matcher`; of equals the lower row.
 
     The time grows with the product of the numbers: meant for tens of thousands.
-
-    Args:
-        queries: (N, D) descriptors, uint8 or float32.
-        base: (M, D) descriptors, M >= count.
-        count: neighbours of each query.
-        seed, positions: not used; all matchers take the same arguments.
-
-    Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, nearest first;
-        among equals the lower row first.
     """
     rows = np.empty((len(queries), count), np.int32)
     distances = np.empty((len(queries), count), np.float32)
@@ -64,16 +54,7 @@ def exact_neighbours(
 def hamming_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest neighbours of binary descriptors, such as ORB's and BRISK's.
-
-    Args:
-        queries: (N, D) uint8 descriptors.
-        base: (M, D) uint8 descriptors, M >= count.
-        count: neighbours of each query.
-        seed, positions: not used; all matchers take the same arguments.
-
-    Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 Hamming distances, nearest first.
+    """Find nearest neighbours of binary descriptors (ORB, BRISK) by Hamming, as a `Matcher`.
 
     Raises:
         OptionError: the descriptors are not binary.

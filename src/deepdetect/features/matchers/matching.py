@@ -27,7 +27,17 @@ class Matcher(Protocol):
         seed: int,
         positions: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return (N, count) int32 rows of `base` and (N, count) float32 distances."""
+        """Find neighbours; a matcher may leave out what it does not need.
+
+        Args:
+            queries, base: (N, D) and (M, D) descriptors, M >= count, uint8 or float32.
+            count: neighbours of each query.
+            seed: of random choices: the same seed gives the same result.
+            positions: (N, 2) and (M, 2) keypoints in pixels.
+
+        Returns:
+            (N, count) int32 rows of `base` and (N, count) float32 distances, nearest first.
+        """
         ...
 
 

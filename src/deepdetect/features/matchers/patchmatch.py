@@ -61,17 +61,7 @@ def patchmatch_neighbours(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find two approximate nearest neighbours of each query by spreading good ones.
 
-    Args:
-        queries: (N, D) uint8 descriptors.
-        base: (M, D) uint8 descriptors, M >= 2.
-        count: neighbours of each query, 1 or 2.
-        seed: of the random tries; the result is the same for the same seed, for any number of
-            threads.
-        positions: (N, 2) and (M, 2) pixels of the keypoints.
-        options: of the search.
-
-    Returns:
-        (N, count) int32 rows of `base` and (N, count) float32 Euclidean distances, nearest first.
+    A `Matcher` of bytes on whole pixels; the result is the same for any number of threads.
 
     Raises:
         OptionError: the descriptors are not bytes, or the keypoints are not on whole pixels.
