@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -13,8 +12,8 @@ from ...datasets.foreground import MaskedPhotograph
 from ..baselines.method import LocalFeature
 from ..context import BenchmarkContext
 from ..metrics.coverage import foreground_fraction
-from ..report import Cell, Column, Figure, Table
-from ..tasks import Part, Task
+from ..report import Cell, Column, Table
+from ..tasks import Part, Shown, feature_part
 from .paper_numbers import FOREGROUND, FOREGROUND_CAUSES, with_paper_column
 
 FRACTION = "fraction on the foreground"
@@ -26,17 +25,10 @@ def foreground_part(
     photographs: Sequence[MaskedPhotograph],
 ) -> Part:
     """Tabulate the fraction on the foreground, mean over the photographs, and the density."""
-    tasks = {
-        (feature.name, photograph.image): Task(
-            f"foreground of {feature.title} on {photograph.image.name}",
-            partial(_measure, context, feature, photograph),
-        )
-        for feature in features
-        for photograph in photographs
-    }
+    named = {photograph.image.name: photograph for photograph in photographs}
 
-    def summarize(found: Mapping[Any, tuple[float, float]]) -> Sequence[Table | Figure]:
-        covered = {each.image: float(each.foreground().mean()) for each in photographs}
+    def summarize(found: Mapping[tuple[str, str], tuple[float, float]]) -> Shown:
+        covered = {name: float(each.foreground().mean()) for name, each in named.items()}
         rows: list[tuple[Cell, ...]] = []
         for feature in features:
             images = [image for image in covered if (feature.name, image) in found]
@@ -66,7 +58,7 @@ def foreground_part(
         table = Table("foreground", "Keypoints on the foreground", columns, tuple(rows), note)
         return [with_paper_column(table, FRACTION, FOREGROUND, FOREGROUND_CAUSES)]
 
-    return Part(tasks, summarize)
+    return feature_part(features, named, "foreground of ", partial(_measure, context), summarize)
 
 
 def _measure(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from ..metrics.matching import MatchAccuracy, match_accuracy, mean_matching_accu
 from ..metrics.repeatability import Repeatability, mutual_nn_repeatability
 from ..profiling import Profile
 from ..report import Cell, Column, Figure, Table
-from ..tasks import Part, Task
+from ..tasks import Part, Shown, feature_part
 
 BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
 RADII_PX = (1.0, 2.0, 3.0)
@@ -78,6 +78,13 @@ class FeatureResult:
     feature: LocalFeature
     pairs: list[PairResult]
 
+    def mean(self, value: Callable[[PairResult], float]) -> float | None:
+        """Average a value over the pairs where it is not NaN."""
+        return _mean(value(pair) for pair in self.pairs)
+
+
+Columns = Sequence[tuple[Column, Callable[[FeatureResult], Cell]]]
+
 
 def standard_part(
     context: BenchmarkContext,
@@ -97,19 +104,13 @@ def standard_part(
         what: the data, for the tables' titles.
         budgets: numbers of keypoints; None: all.
     """
-    tasks = {
-        (feature.name, pair.name): Task(
-            f"{feature.title} on {pair.name}",
-            partial(measure_pair, context, feature, pair, budgets),
-        )
-        for feature in features
-        for pair in pairs
-    }
 
-    def summarize(found: Mapping[Any, PairResult]) -> Sequence[Table | Figure]:
-        names = [pair.name for pair in pairs]
+    def measure(feature: LocalFeature, pair: PlanarPair) -> PairResult:
+        return measure_pair(context, feature, pair, budgets)
+
+    def summarize(found: Mapping[tuple[str, str], PairResult]) -> Shown:
         results = [
-            FeatureResult(f, [found[f.name, n] for n in names if (f.name, n) in found])
+            FeatureResult(f, [found[f.name, p.name] for p in pairs if (f.name, p.name) in found])
             for f in features
         ]
         return [
@@ -121,7 +122,7 @@ def standard_part(
             accuracy_figure(results, key, what),
         ]
 
-    return Part(tasks, summarize)
+    return feature_part(features, {pair.name: pair for pair in pairs}, "", measure, summarize)
 
 
 def measure_pair(
@@ -248,6 +249,16 @@ def _best(features: Keypoints, budget: int | None) -> np.ndarray:
     return (features if budget is None else features.best(budget)).xy
 
 
+def _tabulate(
+    results: Sequence[FeatureResult], key: str, title: str, columns: Columns, note: str
+) -> Table:
+    heads = (Column("method"), Column("pairs", ",d"), *(column for column, _ in columns))
+    rows = (
+        (one.feature.title, len(one.pairs), *(cell(one) for _, cell in columns)) for one in results
+    )
+    return Table(key, title, heads, tuple(rows), note)
+
+
 def repeatability_table(
     results: Sequence[FeatureResult],
     k: int,
@@ -256,28 +267,23 @@ def repeatability_table(
     budgets: Sequence[int | None] = BUDGETS,
 ) -> Table:
     """Tabulate the mutual-NN repeatability at the radius `RADII_PX[k]`."""
-    radius = RADII_PX[k]
-    columns = [Column("method"), Column("pairs", ",d")]
+    columns: list[tuple[Column, Callable[[FeatureResult], Cell]]] = []
     for budget in budgets:
-        name = _name(budget)
-        columns += [
-            Column(name, ".3f"),
-            Column(f"{name}: chance", ".3f"),
-            Column(f"{name}: chance-corrected", ".3f"),
-        ]
+        for place, title in enumerate(("", ": chance", ": chance-corrected")):
+            cell = partial(_value_and_chance, budget=budget, k=k, place=place)
+            columns.append((Column(f"{_name(budget)}{title}", ".3f"), cell))
+
+    def localization(pair: PairResult) -> float:
+        entry = pair.repeatability[MATCHING_BUDGET][k]
+        return entry.localization_px if entry.repeated else math.nan
+
     columns += [
-        Column("keypoints of all", ",.0f"),
-        Column(f"localization at {MATCHING_BUDGET:,}, px", ".2f"),
+        (Column("keypoints of all", ",.0f"), lambda one: one.mean(lambda p: p.counts[None])),
+        (
+            Column(f"localization at {MATCHING_BUDGET:,}, px", ".2f"),
+            lambda one: one.mean(localization),
+        ),
     ]
-    rows: list[tuple[Cell, ...]] = []
-    for result in results:
-        cells: list[Cell] = [result.feature.title, len(result.pairs)]
-        for budget in budgets:
-            cells += _value_and_chance(result, budget, k)
-        cells.append(_mean(pair.counts[None] for pair in result.pairs))
-        middle = [pair.repeatability[MATCHING_BUDGET][k] for pair in result.pairs]
-        cells.append(_mean(entry.localization_px for entry in middle if entry.repeated))
-        rows.append(tuple(cells))
     note = (
         "Keypoints that are mutual nearest neighbours, at most the radius apart, over the fewer of "
         "the keypoints that both images show, each position once; by number of keypoints in each "
@@ -286,46 +292,44 @@ def repeatability_table(
         f"method does not fill to {MIN_FILLED:.0%} is a dash. Localization: mean distance of the "
         "pairs of keypoints, where there are any."
     )
-    title = f"Mutual-NN repeatability within {radius:g} px, {what}"
-    return Table(f"{key}_repeatability_{radius:g}px", title, tuple(columns), tuple(rows), note)
+    title = f"Mutual-NN repeatability within {RADII_PX[k]:g} px, {what}"
+    return _tabulate(results, f"{key}_repeatability_{RADII_PX[k]:g}px", title, columns, note)
 
 
-def _value_and_chance(result: FeatureResult, budget: int | None, k: int) -> list[Cell]:
-    filled = _mean(pair.counts[budget] for pair in result.pairs)
+def _value_and_chance(
+    result: FeatureResult, budget: int | None, k: int, place: int
+) -> float | None:
+    """Return the repeatability, its chance, or the chance-corrected value; None if not filled."""
+    filled = result.mean(lambda pair: pair.counts[budget])
     if filled is None or (budget is not None and filled < MIN_FILLED * budget):
-        return [None, None, None]
+        return None
     entries = [pair.repeatability[budget][k] for pair in result.pairs]
     value = float(np.mean([entry.value for entry in entries]))
     chance = float(np.mean([entry.chance for entry in entries]))
-    return [value, chance, None if chance > MAX_CHANCE else (value - chance) / (1 - chance)]
+    corrected = None if chance > MAX_CHANCE else (value - chance) / (1 - chance)
+    return (value, chance, corrected)[place]
 
 
 def matching_table(results: Sequence[FeatureResult], key: str, what: str) -> Table:
     """Tabulate the matches."""
-    columns = (
-        Column("method"),
-        Column("pairs", ",d"),
-        Column("keypoints", ",.0f"),
-        Column("matches", ",.0f"),
-        *(Column(f"correct at {t} px", ",.0f") for t in (1, 3)),
-        *(Column(f"precision at {t} px", ".3f") for t in (1, 3)),
-        *(Column(f"matching score at {t} px", ".3f") for t in (1, 3)),
-    )
-    rows: list[tuple[Cell, ...]] = []
-    for result in results:
-        matches = [pair.matches for pair in result.pairs]
-        rows.append(
-            (
-                result.feature.title,
-                len(matches),
-                _mean(pair.counts[MATCHING_BUDGET] for pair in result.pairs),
-                _mean(one.matches for one in matches),
-                *(_mean(one.correct[t - 1] for one in matches) for t in (1, 3)),
-                *(_mean(one.precision(t) for one in matches) for t in (1, 3)),
-                *(_mean(one.matching_score(t) for one in matches) for t in (1, 3)),
+
+    def mean(value: Callable[[MatchAccuracy, int], float], t: int = 0) -> Callable[..., Cell]:
+        return lambda one: one.mean(lambda pair: value(pair.matches, t))
+
+    columns: Columns = [
+        (Column("keypoints", ",.0f"), lambda one: one.mean(lambda p: p.counts[MATCHING_BUDGET])),
+        (Column("matches", ",.0f"), mean(lambda found, _: found.matches)),
+        *(
+            (Column(f"{name} at {t} px", style), mean(value, t))
+            for name, style, value in (
+                ("correct", ",.0f", lambda found, t: found.correct[t - 1]),
+                ("precision", ".3f", MatchAccuracy.precision),
+                ("matching score", ".3f", MatchAccuracy.matching_score),
             )
-        )
-    return Table(f"{key}_matching", f"Matches, {what}", columns, tuple(rows), MATCHING_NOTE)
+            for t in (1, 3)
+        ),
+    ]
+    return _tabulate(results, f"{key}_matching", f"Matches, {what}", columns, MATCHING_NOTE)
 
 
 MATCHING_NOTE = (
@@ -338,28 +342,25 @@ MATCHING_NOTE = (
 
 def homography_table(results: Sequence[FeatureResult], key: str, what: str) -> Table:
     """Tabulate the homographies that the matches give, with their spread over the seeds."""
-    metrics: tuple[tuple[str, Callable[[Sequence[float], float], float]], ...] = (
-        ("accuracy", accuracy_at),
-        ("AUC", area_under_curve),
-    )
-    columns = [Column("method"), Column("pairs", ",d")]
-    for name, _ in metrics:
-        for threshold in CORNER_THRESHOLDS_PX:
-            columns += [
-                Column(f"{name} at {threshold:g} px", ".3f"),
-                Column(f"± of {name} {threshold:g}", ".3f"),
-            ]
-    rows: list[tuple[Cell, ...]] = []
-    for result in results:
-        seeds = list(zip(*(pair.corner_errors_px for pair in result.pairs), strict=True))
-        cells: list[Cell] = [result.feature.title, len(result.pairs)]
-        for _, metric in metrics:
-            for threshold in CORNER_THRESHOLDS_PX:
-                values = [metric(errors, threshold) for errors in seeds]
-                known = bool(values)
-                cells.append(float(np.mean(values)) if known else None)
-                cells.append(float(np.std(values, ddof=1)) if known else None)
-        rows.append(tuple(cells))
+
+    def over_seeds(
+        metric: Callable[[Sequence[float], float], float], threshold: float, spread: bool
+    ) -> Callable[[FeatureResult], Cell]:
+        def cell(one: FeatureResult) -> Cell:
+            seeds = zip(*(pair.corner_errors_px for pair in one.pairs), strict=True)
+            values = [metric(errors, threshold) for errors in seeds]
+            if not values:
+                return None
+            return float(np.std(values, ddof=1) if spread else np.mean(values))
+
+        return cell
+
+    columns = [
+        (Column(title.format(name, threshold), ".3f"), over_seeds(metric, threshold, spread))
+        for name, metric in (("accuracy", accuracy_at), ("AUC", area_under_curve))
+        for threshold in CORNER_THRESHOLDS_PX
+        for title, spread in (("{} at {:g} px", False), ("± of {} {:g}", True))
+    ]
     note = (
         f"{MATCHING_NOTE} MAGSAC at {INLIER_THRESHOLD_PX:g} px. Error: mean distance of the first "
         "image's corners from where the true homography takes them, at the images' own size; a "
@@ -367,32 +368,25 @@ def homography_table(results: Sequence[FeatureResult], key: str, what: str) -> T
         "threshold; AUC: exact area under it, up to the threshold. Mean and standard deviation (±) "
         f"over {SEEDS} seeds of MAGSAC."
     )
-    title = f"Homographies, {what}"
-    return Table(f"{key}_homography", title, tuple(columns), tuple(rows), note)
+    return _tabulate(results, f"{key}_homography", f"Homographies, {what}", columns, note)
 
 
 def accuracy_table(results: Sequence[FeatureResult], key: str, what: str) -> Table:
     """Tabulate the mean matching accuracy at 1 to 10 px."""
-    columns = (
-        Column("method"),
-        Column("pairs", ",d"),
-        Column("matches", ",.0f"),
-        *(Column(f"{t} px", ".3f") for t in range(1, 11)),
-    )
-    rows = tuple(
-        (
-            result.feature.title,
-            len(result.pairs),
-            _mean(pair.all_matches.matches for pair in result.pairs),
-            *(_accuracy(result) if result.pairs else (None,) * 10),
-        )
-        for result in results
-    )
+
+    def accuracy(one: FeatureResult, t: int) -> Cell:
+        return _accuracy(one)[t - 1] if one.pairs else None
+
+    columns: Columns = [
+        (Column("matches", ",.0f"), lambda one: one.mean(lambda p: p.all_matches.matches)),
+        *((Column(f"{t} px", ".3f"), partial(accuracy, t=t)) for t in range(1, 11)),
+    ]
     note = (
         f"Mutual nearest neighbours of the best {MATCHING_BUDGET:,} keypoints, no ratio test for "
         "any method: fraction of the matches within each distance, mean over the pairs."
     )
-    return Table(f"{key}_accuracy", f"Mean matching accuracy, {what}", columns, rows, note)
+    title = f"Mean matching accuracy, {what}"
+    return _tabulate(results, f"{key}_accuracy", title, columns, note)
 
 
 def accuracy_figure(results: Sequence[FeatureResult], key: str, what: str) -> Figure:
@@ -414,24 +408,23 @@ def cost_table(
     results: Sequence[FeatureResult], key: str, budgets: Sequence[int | None] = BUDGETS
 ) -> Table:
     """Tabulate coverage, seconds and memory."""
-    columns = (
-        Column("method"),
-        Column("pairs", ",d"),
-        *(Column(f"coverage, {_name(budget)}", ".3f") for budget in budgets),
-        *(Column(f"{stage}, s", ".3f") for stage in PROFILED_STAGES),
-        *(Column(f"{stage}, MB", ",.0f") for stage in PROFILED_STAGES),
-    )
-    rows: list[tuple[Cell, ...]] = []
-    for result in results:
-        times: list[Cell] = []
-        memory: list[Cell] = []
-        for stage in PROFILED_STAGES:
-            profiles = [pair.profiles[stage] for pair in result.pairs]
-            known = profiles and not (result.feature.chance and stage == "detect")
-            times.append(float(np.median([p.seconds for p in profiles])) if known else None)
-            memory.append(max(p.memory for p in profiles) / 1e6 if profiles else None)
-        covered = [_mean(pair.coverage[b] for pair in result.pairs) for b in budgets]
-        rows.append((result.feature.title, len(result.pairs), *covered, *times, *memory))
+
+    def covered(one: FeatureResult, budget: int | None) -> Cell:
+        return one.mean(lambda pair: pair.coverage[budget])
+
+    def seconds(one: FeatureResult, stage: str) -> Cell:
+        known = one.pairs and not (one.feature.chance and stage == "detect")
+        values = [pair.profiles[stage].seconds for pair in one.pairs]
+        return float(np.median(values)) if known else None
+
+    def megabytes(one: FeatureResult, stage: str) -> Cell:
+        return max((pair.profiles[stage].memory / 1e6 for pair in one.pairs), default=None)
+
+    columns: Columns = [
+        *((Column(f"coverage, {_name(b)}", ".3f"), partial(covered, budget=b)) for b in budgets),
+        *((Column(f"{s}, s", ".3f"), partial(seconds, stage=s)) for s in PROFILED_STAGES),
+        *((Column(f"{s}, MB", ",.0f"), partial(megabytes, stage=s)) for s in PROFILED_STAGES),
+    ]
     note = (
         "Coverage: fraction of the cells of 32x32 px that hold a keypoint of the first image. "
         "Seconds: the median when the results were made, on whatever else the machine did then; "
@@ -439,7 +432,7 @@ def cost_table(
         f"{MATCHING_BUDGET:,} keypoints (`deepdetect benchmark speed` compares on equal terms). "
         "Memory: the largest growth of the process."
     )
-    return Table(f"{key}_cost", "Coverage, time and memory", columns, tuple(rows), note)
+    return _tabulate(results, f"{key}_cost", "Coverage, time and memory", columns, note)
 
 
 def _name(budget: int | None) -> str:
