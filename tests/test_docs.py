@@ -12,7 +12,8 @@ import pytest
 from deepdetect.cli import main
 
 ROOT = Path(__file__).parents[1]
-CARDS = ROOT / "src/deepdetect/detector/weights"
+PACKAGE = ROOT / "src/deepdetect"
+CARDS = PACKAGE / "detector/weights"
 PAGES = {
     str(page.relative_to(ROOT)): page.read_text(encoding="utf-8")
     for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *CARDS.glob("*CARD.md"))
@@ -84,3 +85,17 @@ def test_python_names_exist(page: str) -> None:
 def test_the_index_lists_every_page() -> None:
     pages = {Path(page).name for page in PAGES if page.startswith("docs/")} - {"index.md"}
     assert pages <= set(re.findall(r"\((?:\.\./)?([\w.-]+)\)", PAGES["docs/index.md"]))
+
+
+@pytest.mark.parametrize("page", PRESENT)
+def test_make_targets_exist(page: str) -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([a-z0-9-]+):", makefile, re.M))
+    for part in code(PRESENT[page]):
+        for target in re.findall(r"^make (?:[A-Z]+=\S+ )?([a-z][a-z0-9-]*)", part):
+            assert target in targets
+
+
+def test_the_map_of_the_house_is_complete() -> None:
+    rows = re.findall(r"^\| `(\w+)` \|", PAGES["CONTRIBUTING.md"], re.M)
+    assert sorted(rows) == sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))
