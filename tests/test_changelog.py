@@ -15,7 +15,6 @@ import pytest
 import deepdetect
 from deepdetect.cli import main
 from deepdetect.geometry.relative_pose import RelativePose
-from deepdetect.matching.registration import Registration
 
 CHANGELOG = (Path(__file__).parents[1] / "CHANGELOG.md").read_text(encoding="utf-8")
 ROWS = [
@@ -29,9 +28,9 @@ NEW = sorted({name for row in ROWS for name in re.findall(r"`([^`]+)`", row[-1])
 def option_classes() -> dict[str, type]:
     """Return the dataclasses of the public API, and those of their fields, by name."""
     roots = [getattr(deepdetect, name) for name in deepdetect.__all__]
-    recipe = importlib.import_module("deepdetect.training.recipe").TrainingOptions
+    device = importlib.import_module("deepdetect.training").DeviceOptions
     classes: dict[str, type] = {}
-    waiting = [*filter(dataclasses.is_dataclass, roots), RelativePose, Registration, recipe]
+    waiting = [*filter(dataclasses.is_dataclass, roots), RelativePose, device]
     while waiting:
         kind = waiting.pop()
         if dataclasses.is_dataclass(kind) and kind.__name__ not in classes:
