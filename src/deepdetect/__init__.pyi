@@ -34,7 +34,11 @@ from .labels import Label as Label, LabelOptions as LabelOptions, fuse as fuse
 from .matching.options import MatchingOptions as MatchingOptions
 from .matching.pipeline import match_images as match_images
 from .matching.registration import Registration as Registration, register as register
-from .matching.stitching import Panorama as Panorama, stitch as stitch
+from .matching.stitching import (
+    Panorama as Panorama,
+    StitchingOptions as StitchingOptions,
+    stitch as stitch,
+)
 from .reconstruction.pipeline import (
     ReconstructionOptions as ReconstructionOptions,
     reconstruct as reconstruct,

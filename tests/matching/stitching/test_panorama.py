@@ -12,7 +12,7 @@ from PIL import Image
 from deepdetect import DeepDetectError, ImageError, OptionError
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
-from deepdetect.matching.stitching import Panorama, stitch
+from deepdetect.matching.stitching import Panorama, StitchingOptions, stitch
 
 
 @pytest.fixture(scope="module")
@@ -105,13 +105,13 @@ def test_what_makes_no_panorama_is_refused(views, one_line) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"reference": 2}, "reference must be the number of an image, from 0 to 1, not 2"),
-        ({"reference": -1}, "reference must be"),
-        ({"scale": 0}, "scale must be above 0"),
-        ({"scale": float("nan")}, "scale must be above 0"),
-        ({"max_canvas_megapixels": 0}, "max_canvas_megapixels must be above 0"),
-        ({"registration_side": 5000}, r"registration_side must lie in \[100, 1200\]"),
-        ({"seed": -1}, "seed must lie in"),
+        ({"reference": 2}, "`reference` must be the number of an image, from 0 to 1, not 2"),
+        ({"reference": -1}, "`reference` must be"),
+        ({"scale": 0}, "`scale` must be above 0"),
+        ({"scale": float("nan")}, "`scale` must be above 0"),
+        ({"max_canvas_megapixels": 0}, "`max_canvas_megapixels` must be above 0"),
+        ({"registration_side": 5000}, r"`registration_side` must lie in \[100, 1200\]"),
+        ({"seed": -1}, "`seed` must lie in"),
     ],
 )
 def test_options_out_of_range_are_refused(views, options: dict, message: str, one_line) -> None:
@@ -150,3 +150,13 @@ def test_the_oxford_boat_takes_little_memory(shared: Path) -> None:
     between = np.array(matrix.split(), float).reshape(3, 3)
     assert corner_error(between, np.loadtxt(folder / "H1to2p"), (850, 680)) < 2
     assert int(peak_bytes) < 2.5e9
+
+
+def test_options_reach_their_stages(panorama: Panorama, views) -> None:
+    images = [views.images[2], views.images[0], views.images[1]]
+    few = StitchingOptions(max_keypoints=2000, num_bands=1, huber_threshold_px=0.1)
+    changed = stitch(images, options=few)
+    assert sum(changed.matches.values()) < sum(panorama.matches.values())
+    assert changed.residual_px != panorama.residual_px
+    with pytest.raises(DeepDetectError, match="seen too much from the side"):
+        stitch(images, options=StitchingOptions(max_depth_ratio=1.0))

@@ -18,30 +18,10 @@ from ..._shared.errors import DeepDetectError, OptionError
 from ..._shared.parallel import available_memory
 from ...geometry.rescaling import downscale, scaled_homography
 from ...geometry.residuals import transform_points
-
-MAX_DEPTH_RATIO = 5.0
-"""How many times farther from the camera one corner of an image may lie on the canvas than
-another: near the horizon an image is stretched without bound."""
-
-SEAM_MEGAPIXELS = 0.5
-"""Size of the canvas, at the most, on which exposure and seams are found."""
-
-MIN_OVERLAP_PX = 100
-"""Pixels there by which two images must overlap for their brightness to be compared."""
-
-GAIN_ERROR_STD = 0.05
-GAIN_PRIOR_STD = 0.5
-"""Standard deviations of the logarithm of brightness: of what an overlap says about two images
-(vignetting and reflections say something else), and of what cameras choose."""
-
-NUM_BANDS = 5
-"""Frequency bands; the coarsest blends over about 2^5 pixels."""
+from .options import DEFAULTS, StitchingOptions
 
 BLEND_FACTOR = 32
 """Brightness is multiplied by this for blending, whose bands are rounded down to whole numbers."""
-
-MIN_WARP_SCALE = 0.67
-"""An image that the canvas shows smaller than this is downscaled first, against aliasing."""
 
 BYTES_PER_CANVAS_PIXEL = 22
 BYTES_PER_IMAGE_PIXEL = 25
@@ -92,6 +72,7 @@ def plan_canvas(
     *,
     scale: float,
     max_canvas_megapixels: float,
+    max_depth_ratio: float = DEFAULTS.max_depth_ratio,
 ) -> Canvas:
     """Find the smallest canvas that shows all of some images.
 
@@ -101,6 +82,8 @@ def plan_canvas(
         reference: number of the image that is not distorted.
         scale: pixels of the canvas per pixel of the reference.
         max_canvas_megapixels: the largest canvas allowed.
+        max_depth_ratio: see `StitchingOptions`; near the horizon an image is stretched without
+            bound.
 
     Raises:
         DeepDetectError: an image reaches the horizon of the reference.
@@ -110,7 +93,7 @@ def plan_canvas(
     placed = {number: back @ matrix for number, matrix in homographies.items()}
     for number, matrix in placed.items():
         depths = _depths(sizes[number], matrix)
-        if depths.min() * MAX_DEPTH_RATIO <= depths.max():
+        if depths.min() * max_depth_ratio <= depths.max():
             raise DeepDetectError(
                 f"images[{number}] is seen too much from the side of images[{reference}] for a "
                 "flat panorama: leave it out, or choose a `reference` between them"
@@ -162,6 +145,7 @@ def composite(
     load: Callable[[int], np.ndarray],
     small: Mapping[int, tuple[np.ndarray, float]],
     canvas: Canvas,
+    options: StitchingOptions = DEFAULTS,
 ) -> tuple[np.ndarray, np.ndarray, dict[int, float]]:
     """Put images onto a canvas.
 
@@ -169,19 +153,21 @@ def composite(
         load: returns an image, (H, W, 3) uint8 RGB, by its number; it is called once for each.
         small: the same images made smaller, and their scales (`downscale`).
         canvas: where they lie.
+        options: of panoramas.
 
     Returns:
         (H, W, 3) uint8 RGB, black where there is nothing; (H, W) bool where there is something;
         and the factor that the brightness of each image is multiplied by.
     """
-    scale, low = _downscaled_canvas(small, canvas)
-    gains = _gains(low)
+    scale, low = _downscaled_canvas(small, canvas, options)
+    gains = _gains(low, options)
     seams = _seams(low, gains)
     width, height = canvas.size
-    blender = cv2.detail_MultiBandBlender(0, NUM_BANDS)
+    blender = cv2.detail_MultiBandBlender(0, options.num_bands)
     blender.prepare((0, 0, width, height))
     for number, box in canvas.boxes.items():
-        drawn, mask = warp_to_box(load(number), canvas.homographies[number], box)
+        homography = canvas.homographies[number]
+        drawn, mask = warp_to_box(load(number), homography, box, options.min_warp_scale)
         mask &= _upscale_mask(seams[number], low[number].corner, scale, box)
         bright = cv2.multiply(drawn, (BLEND_FACTOR * gains[number],) * 4, dtype=cv2.CV_16S)
         blender.feed(bright, mask, box[:2])
@@ -193,7 +179,10 @@ def composite(
 
 
 def warp_to_box(
-    rgb: np.ndarray, homography: np.ndarray, box: tuple[int, int, int, int]
+    rgb: np.ndarray,
+    homography: np.ndarray,
+    box: tuple[int, int, int, int],
+    min_scale: float = DEFAULTS.min_warp_scale,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw an image on its part of the canvas.
 
@@ -204,7 +193,7 @@ def warp_to_box(
     middle = np.array([(rgb.shape[1] - 1) / 2, (rgb.shape[0] - 1) / 2])
     around = transform_points(middle + [[0, 0], [1, 0], [0, 1]], homography)
     shown = float(np.sqrt(abs(np.linalg.det(around[1:] - around[0]))))
-    if shown < MIN_WARP_SCALE:
+    if shown < min_scale:
         rgb, scale = downscale(rgb, max(16, int(np.ceil(shown * max(rgb.shape[:2])))))
         homography = scaled_homography(homography, scale, 1)
     shift = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
@@ -229,11 +218,11 @@ class _WarpedImage:
 
 
 def _downscaled_canvas(
-    small: Mapping[int, tuple[np.ndarray, float]], canvas: Canvas
+    small: Mapping[int, tuple[np.ndarray, float]], canvas: Canvas, options: StitchingOptions
 ) -> tuple[float, dict[int, _WarpedImage]]:
     """Draw the small images on a small canvas; return its scale, too."""
     width, height = canvas.size
-    scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
+    scale = min(1.0, float(np.sqrt(options.seam_megapixels * 1e6 / (width * height))))
     low = {}
     for number, (left, top, right, bottom) in canvas.boxes.items():
         picture, shrinking = small[number]
@@ -244,31 +233,33 @@ def _downscaled_canvas(
             int(np.ceil(bottom * scale)),
         )
         homography = scaled_homography(canvas.homographies[number], shrinking, scale)
-        drawn, mask = warp_to_box(picture, homography, box)
+        drawn, mask = warp_to_box(picture, homography, box, options.min_warp_scale)
         low[number] = _WarpedImage(drawn, mask, box[:2])
     return scale, low
 
 
-def _gains(low: Mapping[int, _WarpedImage]) -> dict[int, float]:
+def _gains(low: Mapping[int, _WarpedImage], options: StitchingOptions) -> dict[int, float]:
     """Find factors that make images equally bright where they overlap, on the whole near 1.
 
     Least squares of logarithms, else as Brown and Lowe, "Automatic panoramic image stitching using
     invariant features", 2007.
     """
     numbers = list(low)
-    rows, right = [*np.eye(len(low)) / GAIN_PRIOR_STD], [0.0] * len(low)
+    rows, right = [*np.eye(len(low)) / options.gain_prior_std], [0.0] * len(low)
     for i, j in combinations(range(len(low)), 2):
-        means = _overlap_means(low[numbers[i]], low[numbers[j]])
+        means = _overlap_means(low[numbers[i]], low[numbers[j]], options.min_overlap_px)
         if means is not None:
             row = np.zeros(len(low))
-            row[i], row[j] = 1 / GAIN_ERROR_STD, -1 / GAIN_ERROR_STD
+            row[i], row[j] = 1 / options.gain_error_std, -1 / options.gain_error_std
             rows.append(row)
-            right.append(np.log(means[1] / means[0]) / GAIN_ERROR_STD)
+            right.append(np.log(means[1] / means[0]) / options.gain_error_std)
     gains = np.exp(np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0])
     return dict(zip(numbers, gains.tolist(), strict=True))
 
 
-def _overlap_means(first: _WarpedImage, second: _WarpedImage) -> tuple[float, float] | None:
+def _overlap_means(
+    first: _WarpedImage, second: _WarpedImage, min_overlap_px: int
+) -> tuple[float, float] | None:
     """Return the mean brightness of both images where they overlap; None for too small a part."""
     (x0, y0), (x1, y1) = first.corner, second.corner
     left, top = max(x0, x1), max(y0, y1)
@@ -278,7 +269,7 @@ def _overlap_means(first: _WarpedImage, second: _WarpedImage) -> tuple[float, fl
         return None
     parts = [one.cut(left, top, right, bottom) for one in (first, second)]
     both = (parts[0][1] > 0) & (parts[1][1] > 0)
-    if np.count_nonzero(both) < MIN_OVERLAP_PX:
+    if np.count_nonzero(both) < min_overlap_px:
         return None
     means = [float(picture[both].mean()) + 1 for picture, _ in parts]  # black is not 0 times white
     return means[0], means[1]

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...geometry.residuals import transform_points
+from .options import DEFAULTS
 
 MAX_ITERATIONS = 20
 MIN_STEP = 1e-7
 """The fit ends after this many iterations, or with a smaller change of the homographies."""
-
-HUBER_THRESHOLD_PX = 2.0
-"""Larger residuals have less weight."""
 
 UNIT_PX = 500.0
 """Unit of length of the fit, so that all entries of a homography are of one order."""
@@ -39,6 +37,8 @@ def fit_jointly(
     homographies: Mapping[int, np.ndarray],
     pairs: Sequence[Correspondences],
     sizes: Mapping[int, tuple[int, int]],
+    *,
+    huber_threshold_px: float = DEFAULTS.huber_threshold_px,
 ) -> tuple[dict[int, np.ndarray], float]:
     """Fit all homographies but the first, which stays, to all pairs at once.
 
@@ -49,6 +49,7 @@ def fit_jointly(
         homographies: (3, 3) from each image to the frame of the first one, by number, near enough.
         pairs: what belongs together.
         sizes: (width, height) of the images.
+        huber_threshold_px: larger residuals have less weight.
 
     Returns:
         The homographies, and the root mean square of the residuals in pixels.
@@ -82,7 +83,7 @@ def fit_jointly(
                 current[pair.first], current[pair.second], points, targets
             )
             distances = UNIT_PX * np.linalg.norm(residuals, axis=1)
-            weights = np.minimum(1, HUBER_THRESHOLD_PX / np.maximum(distances, 1e-12))
+            weights = np.minimum(1, huber_threshold_px / np.maximum(distances, 1e-12))
             blocks = [
                 (column[number], jacobian)
                 for number, jacobian in zip((pair.first, pair.second), jacobians, strict=True)

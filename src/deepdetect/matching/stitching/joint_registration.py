@@ -17,24 +17,13 @@ from ..._shared.errors import DeepDetectError
 from ...detector.detector import HeatmapDetector, find_keypoints
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
-from ...features.sift_detector import SiftOptions, detect_sift
+from ...features.sift_detector import detect_sift
 from ...geometry.residuals import transform_points
 from ...io.image import luma
 from ..guided import InitialMatches, guided_matches, initial_matches
 from ..guided.initial_geometry import estimate_initial_geometry
 from .joint_fit import Correspondences, fit_jointly
-
-SIFT = SiftOptions(max_keypoints=2000)
-"""Sparse keypoints by which overlaps are found."""
-
-MAX_KEYPOINTS = 30_000
-"""Dense keypoints per image that must confirm a homography."""
-
-MIN_PARTNERS = 3
-"""Pairs that each image takes part in, where it has that many, beyond those that connect all."""
-
-MAX_CORRESPONDENCES = 400
-"""Evenly spread matches per pair that the joint fit uses."""
+from .options import DEFAULTS, StitchingOptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +77,7 @@ def register_jointly(
     detector: HeatmapDetector,
     *,
     reference: int | None = None,
+    options: StitchingOptions = DEFAULTS,
     seed: int = 0,
 ) -> JointRegistration:
     """Find the homographies of overlapping images to a common frame.
@@ -96,13 +86,14 @@ def register_jointly(
         images: two or more, (H, W, 3) uint8 RGB each, their longer sides at most 1200 pixels.
         detector: gives the heat maps.
         reference: number of an image that must be among them; None for the most images.
+        options: of panoramas.
         seed: of all random choices.
 
     Raises:
         DeepDetectError: no two images overlap, or the reference with none.
     """
-    views = [_prepare(image, detector) for image in images]
-    pairs = _registered_pairs(views, seed)
+    views = [_prepare(image, detector, options) for image in images]
+    pairs = _registered_pairs(views, options.min_partners, seed)
     groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
         group = next(group for group in groups if reference in group)
@@ -127,22 +118,25 @@ def register_jointly(
     pairs = [pair for pair in pairs if pair.first in group]
     homographies, residual_px = fit_jointly(
         _compose(group, pairs),
-        [_correspondences(pair, views) for pair in pairs],
+        [_correspondences(pair, views, options.max_correspondences) for pair in pairs],
         {number: views[number].size for number in group},
+        huber_threshold_px=options.huber_threshold_px,
     )
     matches = {(pair.first, pair.second): len(pair.points) for pair in pairs}
     return JointRegistration(homographies, matches, residual_px, left_out)
 
 
-def _prepare(image: np.ndarray, detector: HeatmapDetector) -> _Image:
+def _prepare(image: np.ndarray, detector: HeatmapDetector, options: StitchingOptions) -> _Image:
     gray = luma(image)
     # Without suppression: neighbouring pixels are what the verification compares.
-    options = SelectionOptions(max_keypoints=MAX_KEYPOINTS, nms_radius=0, subpixel=False)
-    keypoints = find_keypoints(detector, image, options)
-    return _Image(gray, detect_sift(gray, SIFT), keypoints.xy)
+    selection = SelectionOptions(max_keypoints=options.max_keypoints, nms_radius=0, subpixel=False)
+    keypoints = find_keypoints(detector, image, selection)
+    return _Image(gray, detect_sift(gray, options.sift), keypoints.xy)
 
 
-def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair]:
+def _registered_pairs(
+    views: Sequence[_Image], min_partners: int, seed: int
+) -> list[RegisteredPair]:
     """Register the pairs that overlap most, until all are connected and have enough partners."""
     overlaps: list[tuple[int, int, int, InitialMatches]] = []
     for first, second in combinations(range(len(views)), 2):
@@ -155,7 +149,7 @@ def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair
     pairs: list[RegisteredPair] = []
     partners = [0] * len(views)
     for _, first, second, initial in overlaps:
-        enough = min(partners[first], partners[second]) >= MIN_PARTNERS
+        enough = min(partners[first], partners[second]) >= min_partners
         if enough and second in _connected(first, pairs):
             continue
         a, b = views[first], views[second]
@@ -170,10 +164,10 @@ def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair
     return pairs
 
 
-def _correspondences(pair: RegisteredPair, views: Sequence[_Image]) -> Correspondences:
+def _correspondences(pair: RegisteredPair, views: Sequence[_Image], count: int) -> Correspondences:
     """Choose matches of a pair, spread out."""
     order = np.argsort(bayer_order(pair.points, views[pair.first].size), kind="stable")
-    points = pair.points[order[:MAX_CORRESPONDENCES]]
+    points = pair.points[order[:count]]
     # The homography is sharper than keypoints on whole pixels.
     return Correspondences(
         pair.first, pair.second, points, transform_points(points, pair.homography)

@@ -18,6 +18,7 @@ from ...io.image import load_image
 from ..guided import GuidedOptions
 from .compositing import composite, least_distorted, plan_canvas
 from .joint_registration import register_jointly
+from .options import DEFAULTS, StitchingOptions
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,6 +66,7 @@ def stitch(
     scale: float = 1.0,
     max_canvas_megapixels: float = 50.0,
     registration_side: int = 640,
+    options: StitchingOptions = DEFAULTS,
     seed: int = 0,
 ) -> Panorama:
     """Make a flat panorama of photographs from one place, or of a plane.
@@ -83,6 +85,7 @@ def stitch(
         max_canvas_megapixels: a larger panorama is refused before it is drawn. It takes 22
             to 47 bytes of memory per pixel.
         registration_side: longer side in pixels to which photographs are reduced for registration.
+        options: what counts as an overlap, the joint fit, exposure, seams and blending.
         seed: of all random choices.
 
     Returns:
@@ -119,6 +122,7 @@ def stitch(
             [rgb for rgb, _ in small.values()],
             DeepDetect() if detector is None else detector,
             reference=reference,
+            options=options,
             seed=seed,
         )
     homographies = {
@@ -127,10 +131,17 @@ def stitch(
     }
     frame = least_distorted(sizes, homographies) if reference is None else reference
     canvas = plan_canvas(
-        sizes, homographies, frame, scale=scale, max_canvas_megapixels=max_canvas_megapixels
+        sizes,
+        homographies,
+        frame,
+        scale=scale,
+        max_canvas_megapixels=max_canvas_megapixels,
+        max_depth_ratio=options.max_depth_ratio,
     )
     with timer.stage("compositing"):
-        panorama, valid, gains = composite(lambda number: load_image(images[number]), small, canvas)
+        panorama, valid, gains = composite(
+            lambda number: load_image(images[number]), small, canvas, options
+        )
     return Panorama(
         panorama,
         valid,
@@ -161,9 +172,9 @@ def _check(
     if not (scale > 0 and math.isfinite(scale)):
         raise OptionError(f"`scale` must be above 0, not {scale}")
     if not max_canvas_megapixels > 0:
-        raise OptionError(f"max_canvas_megapixels must be above 0, not {max_canvas_megapixels}")
+        raise OptionError(f"`max_canvas_megapixels` must be above 0, not {max_canvas_megapixels}")
     largest = GuidedOptions().initial_geometry.max_side_px
     if not 100 <= registration_side <= largest:
         raise OptionError(
-            f"registration_side must lie in [100, {largest}] pixels, not {registration_side}"
+            f"`registration_side` must lie in [100, {largest}] pixels, not {registration_side}"
         )
