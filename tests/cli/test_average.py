@@ -37,6 +37,7 @@ def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo)
     np.testing.assert_allclose(*maps, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_mean_of_equals_is_the_same(run, tmp_path: Path) -> None:
     assert run("average", "default", "default", "-o", tmp_path).exit_code == 0
     own = load_network(pretrained_weights("default", ".safetensors"))

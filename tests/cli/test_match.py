@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, match_images
@@ -100,6 +101,7 @@ def test_an_essential_matrix_from_camera_files(run, photos: Path) -> None:
     assert report["inliers"] > 0.3 * report["matches"]
 
 
+@pytest.mark.slow
 def test_resolution_changes_the_preset(run, photos: Path) -> None:
     counts = []
     for more in ([], ["--resolution", "240"]):

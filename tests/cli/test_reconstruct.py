@@ -156,6 +156,7 @@ def test_the_depth_is_true(run, folder: Path) -> None:
         assert (values["filled"] > 0) == bool(more)
 
 
+@pytest.mark.slow
 def test_a_turned_pair_has_no_scale_and_says_so(run, folder: Path) -> None:
     result = run(
         *("reconstruct", folder / "turned0.png", folder / "turned1.png", "--focal", FOCAL),
@@ -262,7 +263,21 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(("arguments", "message"), CASES.values(), ids=CASES.keys())
+SLOW = {
+    "two unrelated photographs",
+    "pure rotation",
+    "a focal length far too short",
+    "no overlap",
+}  # the checks themselves have quick tests, in tests/reconstruction
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        pytest.param(*case, id=name, marks=[pytest.mark.slow] if name in SLOW else [])
+        for name, case in CASES.items()
+    ],
+)
 def test_one_sentence_and_no_file(run, folder: Path, arguments: str, message: str) -> None:
     first, second, *more = arguments.format(folder).split()
     output = [] if "-o" in more else ["-o", "out/m.ply"]
@@ -326,6 +341,7 @@ def test_exif_gives_the_focal_length(run, folder: Path) -> None:
     assert values["calibration"]["left"]["focal_px"] == pytest.approx([focal, focal])
 
 
+@pytest.mark.slow
 def test_the_progress_counts_every_stage(monkeypatch: pytest.MonkeyPatch, run, folder) -> None:
     """On a terminal the bar ends full, whichever pipeline ran."""
     import deepdetect._shared.progress

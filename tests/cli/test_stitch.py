@@ -23,6 +23,7 @@ def views(whole: np.ndarray) -> list[np.ndarray]:
     return [np.ascontiguousarray(whole[:, left : left + 300]) for left in (0, 150, 300)]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_connected_is_told(views: list[np.ndarray], tmp_path: Path) -> None:
     data = pytest.importorskip("skimage.data")
     strange = np.ascontiguousarray(data.rocket()[:300, :300])

@@ -60,8 +60,8 @@ def test_train_and_shards(run, images: Path, tmp_path: Path) -> None:
     [
         (["--freeze-encoder"], "give trained ones as --init"),
         (["--frozen-batch-norm"], "--frozen-batch-norm would keep"),
-        (["--val-count", "0"], "--val-count must be at least 1"),
-        (["--num-workers", "-1"], "--num-workers must be at least 0"),
+        (["--val-count", "0"], "--val-count must be above 0"),
+        (["--num-workers", "-1"], "--num-workers must be 0 or more"),
         (["--pos-weight-uncertain"], "--pos-weight-uncertain needs a --pos-weight"),
         (["--stage", "480x8x1@720"], "not among --short-side"),
         (["--learning-rate", "-1"], "--learning-rate must be at least --final-learning-rate"),

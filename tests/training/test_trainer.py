@@ -138,6 +138,7 @@ def test_where_weights_come_from_is_written_into_them(run: Path) -> None:
     assert "short_sides | [96, 64]" in card
 
 
+@pytest.mark.slow
 def test_one_seed_gives_one_result(run: Path, tmp_path: Path, fit) -> None:
     lines: list[str] = []
     result = fit(tmp_path, log=lines.append)
@@ -147,7 +148,9 @@ def test_one_seed_gives_one_result(run: Path, tmp_path: Path, fit) -> None:
     assert result.images_per_second > 0
 
 
-@pytest.mark.parametrize(("method", "count"), [("training_step", 6), ("score", 1)])
+@pytest.mark.parametrize(
+    ("method", "count"), [("training_step", 6), pytest.param("score", 1, marks=pytest.mark.slow)]
+)
 def test_an_interrupted_run_ends_with_the_same_weights(
     method: str, count: int, run: Path, tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -209,6 +212,7 @@ def test_an_altered_checkpoint_is_refused(
     one_line(caught.value)
 
 
+@pytest.mark.slow
 def test_damaged_best_weights_do_not_stop_a_run(
     run: Path, tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,6 +228,7 @@ def test_damaged_best_weights_do_not_stop_a_run(
         fit(tmp_path)
 
 
+@pytest.mark.slow
 def test_trained_weights_keep_their_batch_statistics_and_learn(
     tmp_path: Path, fit, labels: Path
 ) -> None:
@@ -245,6 +250,7 @@ def test_trained_weights_keep_their_batch_statistics_and_learn(
     assert not any(torch.equal(before[name], after[name]) for name in statistics)
 
 
+@pytest.mark.slow
 def test_a_run_can_start_from_the_mean_of_several_weights(run: Path, tmp_path: Path, fit) -> None:
     first, other = run / "best.safetensors", tmp_path / "other.safetensors"
     changed = load_network(first)
@@ -297,6 +303,7 @@ def test_unknown_keywords_name_the_right_one(tmp_path: Path) -> None:
         train(tmp_path, tmp_path, init_weight="default")
 
 
+@pytest.mark.slow
 def test_shards_train_like_a_folder(photographs: Path, tmp_path: Path, fit, labels: Path) -> None:
     from deepdetect.training.shards import write_shards
 
