@@ -88,12 +88,7 @@ class AugmentationRanges:
 def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
     """Reduce the brightness, then the contrast (paper, Section III-B).
 
-    Args:
-        rgb: (H, W, 3) uint8.
-        darkening: the two factors.
-
-    Returns:
-        (H, W, 3) uint8, equal to what Pillow's `ImageEnhance` gives.
+    Both images are (H, W, 3) uint8; the result is what Pillow's `ImageEnhance` gives.
 
     Example:
         >>> int(darken(np.full((16, 16, 3), 200, np.uint8), Darkening(0.3, 0.4))[0, 0, 0])

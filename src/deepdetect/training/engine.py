@@ -90,10 +90,10 @@ class DistributedContext:
         return slice(self.rank * part, (self.rank + 1) * part)
 
     def barrier(self) -> None:
-        """Wait until every process has come here, for hours if need be.
+        """Wait, for hours if need be, until every process has come here equally often.
 
-        Through torchrun's own store, so that the time limits of the training itself, within
-        which a dead process is noticed, stay short. All processes must call it equally often.
+        Through torchrun's own store: the time limits of the training itself stay short, so that a
+        dead process is noticed.
         """
         if self.world_size == 1:
             return

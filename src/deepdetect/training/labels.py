@@ -25,14 +25,10 @@ VISIBILITIES: tuple[Visibility, ...] = ("normal", "low")
 
 
 class LabelCache:
-    """The labels of the views of images, in one folder.
+    """The labels of the views of images, in a subfolder for each set of label settings.
 
-    A label is named by the content of its image, so images of the same name do not get each
-    other's labels, and a replaced image gets a new label.
-
-    Args:
-        folder: where the labels are; each set of label settings has its own subfolder.
-        options: the label options, except for the visibility, which depends on the view.
+    A label is named by the content of its image: a replaced image gets a new label. The
+    visibility among the options is that of the view.
     """
 
     def __init__(self, folder: Path, options: LabelOptions) -> None:
@@ -53,15 +49,7 @@ class LabelCache:
         workers: int | None = None,
         quiet: bool = True,
     ) -> int:
-        """Make the labels that do not exist yet, in parallel over processes.
-
-        Args:
-            wanted: images, each with the views whose labels are needed.
-            workers: number of processes; default one per processor.
-            quiet: show no progress bar.
-
-        Returns:
-            How many were made.
+        """Make the labels that do not exist yet, in parallel; return how many were made.
 
         Raises:
             DeepDetectError: an image cannot be read; the other labels are made all the same.

@@ -72,14 +72,7 @@ def save_curves(points: Sequence[CurvePoint], folder: Path) -> None:
 def write_model_card(
     path: Path, weights: Path, metadata: Mapping[str, str], points: Sequence[CurvePoint]
 ) -> None:
-    """Write a model card as Markdown: where the weights come from and how good they are.
-
-    Args:
-        path: the card.
-        weights: the safetensors file that it describes.
-        metadata: of that file's header: command, commit, versions, options, data.
-        points: the loss curves.
-    """
+    """Write a model card as Markdown from the weights' file, its metadata and the loss curves."""
     best = CurvePoint(**json.loads(metadata["point"]))
     options = json.loads(metadata["options"])
     lines = [

@@ -22,10 +22,8 @@ def make_optimizers(
 ) -> list[Optimizer]:
     """Make the optimisers that together train a network's parameters, except frozen ones.
 
-    Args:
-        name: "adam", or "soap": SOAP for the kernels, Adam for biases and the like.
-        network: the network.
-        broadcast_: replaces a tensor, in place, by that of the main process.
+    They are "adam", or "soap": SOAP for the kernels, Adam for biases and the like.
+    `broadcast_` replaces a tensor, in place, by that of the main process.
 
     Raises:
         OptionError: the name is unknown (the nearest right one is named).

@@ -39,13 +39,7 @@ Files = tuple[tuple[Path, int], ...]
 
 @dataclass(frozen=True)
 class Shards:
-    """A folder of shards.
-
-    Attributes:
-        folder: the folder.
-        training, validation: files, each with the number of its images. Their names
-            hold a digest of what is in them.
-    """
+    """A folder of shards: files with the number of their images; names hold a content digest."""
 
     folder: Path
     training: Files
@@ -53,11 +47,7 @@ class Shards:
 
     @classmethod
     def open(cls, folder: Path, options: TrainingOptions) -> Shards:
-        """Read the index of a folder of shards.
-
-        Args:
-            folder: the folder.
-            options: the recipe that they are for.
+        """Read the index of a folder of shards for a recipe.
 
         Raises:
             OptionError: the shards were made with other options.
@@ -85,12 +75,7 @@ class Shards:
 
 
 class ShardSource:
-    """Images in shards.
-
-    Args:
-        files: the shards, each with the number of its images.
-        options: the recipe, which decides the views.
-    """
+    """Images in shards, whose views the recipe decides."""
 
     def __init__(self, files: Files, options: TrainingOptions) -> None:
         self.files, self.options = files, options
@@ -134,11 +119,7 @@ class ShardSource:
 
 
 def has_shards(folder: Path) -> bool:
-    """Return whether a folder holds shards.
-
-    Raises:
-        ImageError: it holds some, but not all of them are written.
-    """
+    """Return whether a folder holds shards; an ImageError where not all of them are written."""
     if (folder / INDEX).is_file():
         return True
     if any(folder.glob("training-*-*.tar")):
@@ -147,8 +128,8 @@ def has_shards(folder: Path) -> bool:
 
 
 def write_shards(
-    images: Path,
-    output: Path,
+    images: str | Path,
+    output: str | Path,
     options: TrainingOptions,
     *,
     shard_size: int = 256,
@@ -174,10 +155,11 @@ def write_shards(
         DeepDetectError: images cannot be read; the other shards are kept.
 
     Example:
-        >>> write_shards(Path("images"), Path("shards"), TrainingOptions())  # doctest: +SKIP
+        >>> write_shards("images", "shards", TrainingOptions())  # doctest: +SKIP
     """
     if shard_size < 1:
         raise OptionError(f"`shard_size` must be at least 1, not {shard_size}")
+    images, output = Path(images), Path(output)
     if images.resolve() == output.resolve():
         raise OptionError(f"{output} holds the images: choose another `output`")
     if (output / INDEX).exists():
@@ -242,11 +224,7 @@ class _ShardTask:
 
 
 def _deal(images: Sequence[SourceImage], root: Path, shard_size: int) -> list[list[SourceImage]]:
-    """Deal images to shards by the checksums of their names.
-
-    So no shard holds one kind of image only, and most shards stay as they are when an image is
-    added or removed.
-    """
+    """Deal images by the checksums of their names: most shards stay when an image is added."""
     shards: list[list[SourceImage]] = [[] for _ in range(-(-len(images) // shard_size))]
     for image in images:
         name = image.path.relative_to(root).as_posix()
@@ -290,11 +268,7 @@ def _files_of(image: SourceImage, task: _ShardTask) -> dict[str, bytes]:
 
 @functools.lru_cache(maxsize=64)
 def _read_members(path: Path) -> list[tuple[str, dict[str, tuple[int, int]]]]:
-    """List the images of a shard: the key of each, and where its files begin and how long they are.
-
-    Raises:
-        ImageError: it is damaged.
-    """
+    """List the images of a shard: the key of each, and the offset and size of its files."""
     samples: dict[str, dict[str, tuple[int, int]]] = {}
     try:
         with tarfile.open(path, "r:") as tar:

@@ -75,14 +75,9 @@ class SourceImage:
 
 
 def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """List the normal and the dark views of an image, the same on every call.
+    """List the normal and the dark views of an image: each size in turn, the augmented ones last.
 
-    Args:
-        name: the image's relative path, the seed of its dark and augmented views.
-        options: sizes, darkening and augmentation.
-
-    Returns:
-        The normal views and the dark ones, of each size in turn, the augmented ones last.
+    The image's relative path is the seed of its dark and augmented views.
     """
     generator = np.random.default_rng(zlib.crc32(name.encode()))
     normal = tuple(View(side, None, options.square) for side in options.short_sides)
@@ -102,15 +97,7 @@ def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tup
 
 
 def render(image: object, view: View) -> np.ndarray:
-    """Make a view of an image.
-
-    Args:
-        image: anything `load_image` takes.
-        view: the view.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
-    """
+    """Make a view, (H, W, 3) uint8 RGB, of anything `load_image` takes."""
     rgb = load_image(image)
     if view.augmentation is not None:
         rgb = augment(rgb, view.short_side, view.augmentation, view.ranges)
@@ -130,11 +117,7 @@ def list_images(
 ) -> list[SourceImage]:
     """List the images below a folder with their views.
 
-    Args:
-        root: the folder.
-        options: sizes, darkening and augmentation of the views.
-        exclude: folders below it that are left out.
-        limit: take at most this many, chosen by the checksums of their names.
+    Above the limit they are chosen by the checksums of their names.
 
     Raises:
         ImageError: the folder is missing or empty.
@@ -152,16 +135,9 @@ def list_images(
 def train_val_split(
     images: Sequence[SourceImage], val_fraction: float = 0.05
 ) -> tuple[list[SourceImage], list[SourceImage]]:
-    """Split images into those to train on and those for validation.
+    """Split images into those to train on and about a fraction for validation.
 
     By the checksums of their names, so that an image stays on its side when others are added.
-
-    Args:
-        images: the images.
-        val_fraction: about this fraction of them is for validation.
-
-    Returns:
-        The images to train on, and those for validation.
 
     Raises:
         ImageError: there are too few images to split.
