@@ -11,9 +11,10 @@ from deepdetect import DeepDetect
 from deepdetect.datasets.hpatches import in_d2net_subset
 from deepdetect.datasets.types import PlanarScene
 from deepdetect.evaluation import benchmarks
-from deepdetect.evaluation.benchmarks import hpatches_subsets, plan_hpatches
+from deepdetect.evaluation.benchmarks import _table_3, hpatches_subsets, plan_hpatches
 from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.options import BenchmarkOptions
+from deepdetect.evaluation.report import Column, Table
 
 LARGE = (
     *("i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding"),
@@ -60,3 +61,20 @@ def test_both_sets_are_labelled_sections(
 def test_few_scenes_are_said_to_be_few() -> None:
     sets = dict(hpatches_subsets([scene("v_dogman"), scene("i_pool")]))
     assert list(sets) == ["all 2 scenes"]
+
+
+def test_table_3_averages_by_kind_of_scene_and_says_how_many() -> None:
+    title = "DeepDetect, threshold 0.5"
+    columns = tuple(Column(name, ".4f") for name in ("method", "mean", "i_a", "v_a", "i_b"))
+    rows = ((title, 0.5, 0.25, 0.9, 0.75), ("SIFT", 0, 0.5, None, 0.5))
+    found = _table_3(Table("key", "", columns, rows), [True, False, True])
+    assert [column.title for column in found.columns[1:]] == [
+        "illumination, 2 scenes",
+        "viewpoint, 1 scenes",
+    ]
+    assert found.rows[:3] == (
+        (title, 0.5, 0.9),
+        (f"{title}, in the paper", 0.896, 0.901),
+        ("SIFT", 0.5, None),
+    )
+    assert "illumination, 2 scenes 0.5000 (0.8960); the paper's are of 57 and 59" in found.note

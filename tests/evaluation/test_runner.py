@@ -358,7 +358,9 @@ def write_few(tmp_path: Path, write_scene) -> Callable[[str], Path]:
     return write
 
 
-@pytest.mark.parametrize("name", ["hpatches", "middlebury", "foreground"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("hpatches", marks=pytest.mark.slow), "middlebury", "foreground"]
+)
 def test_every_benchmark_does_all_its_tasks(
     name: str,
     write_few: Callable[[str], Path],

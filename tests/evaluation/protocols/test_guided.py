@@ -115,6 +115,7 @@ def test_a_second_run_reads_what_the_first_has_kept(
     assert cache.made == made + 1
 
 
+@pytest.mark.slow
 def test_unrelated_images_are_said_to_be_unguided(
     options: BenchmarkOptions, tmp_path: Path, write_scene, no_bar
 ) -> None:

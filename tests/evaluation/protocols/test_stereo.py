@@ -88,6 +88,7 @@ def rows(section: Section, key: str) -> dict[str, dict[str, object]]:
     return {str(row[0]): dict(zip(titles, row, strict=True)) for row in table.rows}
 
 
+@pytest.mark.slow
 def test_ours_is_exact_and_the_baselines_are_there(section: Section) -> None:
     found = rows(section, "middlebury_cones")
     ours = found["ours, weights dense"]
@@ -107,6 +108,7 @@ def test_ours_is_exact_and_the_baselines_are_there(section: Section) -> None:
     assert published["points, in the paper"] == 49_979
 
 
+@pytest.mark.slow
 def test_every_pipeline_tells_what_its_stages_took(section: Section) -> None:
     for name, row in rows(section, "middlebury_cones").items():
         seconds = [row[f"{stage}, s"] for stage in STAGES]
@@ -116,6 +118,7 @@ def test_every_pipeline_tells_what_its_stages_took(section: Section) -> None:
         assert (row["matching, s"] or 0) > 0, name
 
 
+@pytest.mark.slow
 def test_without_a_truth_nothing_is_evaluated(section: Section) -> None:
     known, blank = (rows(section, f"middlebury_{s}") for s in ("cones", "nothing-known"))
     for name, row in blank.items():
@@ -125,6 +128,7 @@ def test_without_a_truth_nothing_is_evaluated(section: Section) -> None:
             assert row["points"] == known[name]["points"]
 
 
+@pytest.mark.slow
 def test_figure_8_is_a_picture_with_counts(section: Section) -> None:
     figures = {figure.key: figure for figure in section.figures}
     assert list(figures) == ["figure8_cones", "figure8_nothing-known"]
@@ -212,6 +216,7 @@ def test_a_truth_of_another_view_is_found(cones: StereoPair, offset: int) -> Non
     assert photometric_error(cones, back) < 1.2 * photometric_error(cones, cones.disparity)
 
 
+@pytest.mark.slow
 def test_the_truth_of_dolls_is_two_view_offset(shared: Path) -> None:
     found = ground_truths(shared / "data" / "middlebury" / "dolls")
     assert list(found) == [AS_IT_IS, SHIFTED]
@@ -232,6 +237,7 @@ def shifted_pair(photo: np.ndarray) -> StereoPair:
     return StereoPair("moved", left, right, np.full(left.shape[:2], 6.0, np.float32))
 
 
+@pytest.mark.slow
 def test_each_source_is_beside_its_chance_level(shifted_pair: StereoPair) -> None:
     pair = shifted_pair
     rows = score_stereo_matches({"labels": LabelDetector()}, [pair, pair])
