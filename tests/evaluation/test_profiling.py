@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import mmap
 import sys
 import time
 
@@ -20,19 +21,26 @@ def test_the_time_is_that_of_the_block() -> None:
     assert profile.seconds == before
 
 
+def written(size_bytes: int) -> mmap.mmap:
+    """Take memory from the system: an array may get some that was freed before."""
+    block = mmap.mmap(-1, size_bytes)
+    np.frombuffer(block, np.uint8)[:] = 1
+    return block
+
+
 def test_memory_that_is_freed_within_the_block_counts() -> None:
     with profiled() as profile:
-        block = np.ones(16_000_000)
+        block = written(128_000_000)
         time.sleep(0.1)
-        del block
+        block.close()
     assert 120e6 < profile.memory < 300e6
 
 
 def test_what_an_earlier_stage_holds_counts_in_the_whole() -> None:
     with StageProfiler() as profiler:
-        held = [np.ones(8_000_000)]
+        held = [written(64_000_000)]
         profiler.record("first")
-        held.append(np.ones(8_000_000))
+        held.append(written(64_000_000))
         profiler.record("second")
     assert all(50e6 < profile.memory < 100e6 for profile in profiler.stages.values())
     assert 110e6 < profiler.memory < 180e6

@@ -326,9 +326,12 @@ def test_a_method_that_fails_is_skipped_and_the_others_stay(
     assert len(set(both.skipped)) == len(both.skipped)
 
 
-def test_a_bug_of_ours_ends_the_run(low_visibility_folder: Path, options: BenchmarkOptions) -> None:
-    buggy = dataclasses.replace(options, others=(broken_feature(ZeroDivisionError("a bug")),))
-    with pytest.raises(ZeroDivisionError, match="a bug"):
+@pytest.mark.parametrize("error", [ZeroDivisionError("a bug"), OptionError("a bug")])
+def test_a_bug_of_ours_ends_the_run(
+    low_visibility_folder: Path, options: BenchmarkOptions, error: Exception
+) -> None:
+    buggy = dataclasses.replace(options, others=(broken_feature(error),))
+    with pytest.raises(type(error), match="a bug"):
         run_benchmarks(["low-visibility"], low_visibility_folder, buggy)
 
 

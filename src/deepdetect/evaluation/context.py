@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError
+from .._shared.errors import DeepDetectError, OptionError
 from ..features.keypoints import Keypoints
 from ..features.matchers import get_matcher, match_descriptors
 from ..io.image import load_image
@@ -102,15 +102,15 @@ class BenchmarkContext:
     def try_run(self, name: str, work: Callable[[], Any]) -> Any:
         """Do a piece of work; when it cannot be done, note that it is skipped and why.
 
-        Only errors of data, options and detectors from outside are noted: any other is a bug, and
-        passes.
+        Only errors of data and of detectors from outside are noted. Any other is a bug and passes,
+        an error of options too: those of the user were checked before the run.
 
         Returns:
             Its result, or None.
         """
         try:
             return work()
-        except CacheError:
+        except (CacheError, OptionError):
             raise
         except DeepDetectError as error:
             self.skipped.append(f"{name}: {error}")

@@ -67,6 +67,7 @@ def test_an_image_must_not_vanish(photo: np.ndarray, scale: float) -> None:
         score_at_scale(Labels(), [photo], scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("darkening", [None, Darkening(0.3, 0.4)])
 def test_the_bundled_weights_hold_from_half_to_twice_the_size(
     shared: Path, darkening: Darkening | None
@@ -114,7 +115,14 @@ def bundled_scores(shared: Path, backend: str) -> dict[str, MaskScore]:
     return score_samples(detector.heatmap, sample_images(shared / "data" / "label-samples" / "val"))
 
 
-@pytest.mark.parametrize("backend", ["onnxruntime", "openvino", "torch"])
+@pytest.mark.parametrize(
+    "backend",
+    [
+        "onnxruntime",
+        pytest.param("openvino", marks=pytest.mark.slow),
+        pytest.param("torch", marks=pytest.mark.slow),
+    ],
+)
 def test_bundled_weights_score_as_their_model_card_says(shared: Path, backend: str) -> None:
     """The card's first two rows, so that it cannot fall behind the weights."""
     card = pretrained_weights().with_name("MODEL_CARD.md").read_text()

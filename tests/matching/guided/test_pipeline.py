@@ -172,6 +172,7 @@ def test_mutual_matches_are_one_to_one(photo: np.ndarray, second: np.ndarray) ->
     assert {(*a, *b) for a, b in found} <= pairs
 
 
+@pytest.mark.slow
 def test_the_command_says_which_options_do_not_apply(
     photo: np.ndarray, second: np.ndarray, tmp_path: Path
 ) -> None:
