@@ -15,7 +15,7 @@ import pytest
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 # The same examples on every run, no files left behind, no limit on time.
-for _name, _examples in (("quick", 15), ("thorough", 60)):
+for _name, _examples in (("quick", 10), ("thorough", 60)):
     hypothesis.settings.register_profile(
         _name, deadline=None, derandomize=True, database=None, max_examples=_examples
     )

@@ -79,7 +79,16 @@ def test_the_command_lines_run(folder: Path, line: str) -> None:
     assert list((folder / "deepdetect-output").glob("*.png"))
 
 
-SLOW = ("train", "shards", "evaluate", "benchmark", "demo", "average", "reconstruct")
+SLOW = (
+    "train",
+    "shards",
+    "evaluate",
+    "evaluate-stereo",
+    "benchmark",
+    "demo",
+    "average",
+    "reconstruct",
+)
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,7 @@ def test_matching_where_nothing_can_be_written_beside_the_package(sealed: Path) 
 
 
 @needs_users
+@pytest.mark.slow
 def test_the_cache_in_the_temporary_directory(sealed: Path) -> None:
     folder = temporary_folder(sealed)
     for hits in "01":
@@ -125,6 +126,7 @@ def test_a_folder_that_another_user_may_have_made_is_not_taken(kind: str, sealed
 
 
 @needs_users
+@pytest.mark.slow
 def test_a_folder_of_another_user_is_not_taken(sealed: Path) -> None:
     if os.getuid() != 0:
         pytest.skip("only the superuser can give a folder to another user")
@@ -143,6 +145,7 @@ def test_where_numba_is_told_to_look_nowhere_else(sealed: Path) -> None:
     assert run(ADD, sealed, NUMBA_CACHE_LOCATOR_CLASSES="InTreeCacheLocator") == "None 0"
 
 
+@pytest.mark.slow
 def test_the_folder_that_the_user_names(sealed: Path, tmp_path: Path) -> None:
     path, _ = run(ADD, sealed, NUMBA_CACHE_DIR=tmp_path / "named").split()
     assert Path(path).parent == tmp_path / "named"

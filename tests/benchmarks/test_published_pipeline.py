@@ -23,6 +23,7 @@ def script(load_script: Callable[[str], ModuleType]) -> ModuleType:
     return load_script("published_pipeline")
 
 
+@pytest.mark.slow
 def test_counts_as_the_preset_does(script: ModuleType, photo_path: Path) -> None:
     image = load_image(photo_path)[:240, :320]
     shift = 7

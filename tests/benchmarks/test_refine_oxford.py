@@ -83,6 +83,7 @@ def test_the_table_tells_what_moved(script: ModuleType, refined: tuple[list, Pat
     assert rows["bark 1-2"][3] == pytest.approx(0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_file_that_is_there_already_is_compared(
     script: ModuleType, folder: Path, refined: tuple[list, Path], tmp_path: Path
 ) -> None:
@@ -99,6 +100,7 @@ def test_a_file_that_is_there_already_is_compared(
     assert rows["graf 1-3"][5:7] == (None, None)
 
 
+@pytest.mark.slow
 def test_the_script_writes_the_files_and_a_report(
     script: ModuleType,
     folder: Path,

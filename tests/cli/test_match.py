@@ -47,6 +47,7 @@ def test_options_reach_the_matcher(run, photos: Path) -> None:
     assert report["matrix"] is None
 
 
+@pytest.mark.slow
 def test_the_preset_is_changed_by_given_options_only(run, photos: Path) -> None:
     result = run(
         *("match", photos / "left.png", photos / "right.png", "--preset", "published", "--json"),

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.distance import cdist
 
-from deepdetect import DeepDetectError, OptionError
+from deepdetect import DeepDetectError
 from deepdetect.evaluation import context as context_module
 from deepdetect.evaluation.baselines.method import BaselineError, LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
@@ -343,7 +343,7 @@ def raises(error: Exception) -> Callable[[], None]:
 
 
 @pytest.mark.parametrize(
-    "error", [OptionError("reason"), DeepDetectError("reason"), BaselineError("reason")]
+    "error", [ImageError("reason"), DeepDetectError("reason"), BaselineError("reason")]
 )
 def test_what_cannot_be_done_is_skipped_with_its_reason(tmp_path: Path, error: Exception) -> None:
     context = BenchmarkContext(tmp_path)

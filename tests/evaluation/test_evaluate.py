@@ -84,6 +84,7 @@ def test_the_pretrained_weights_are_as_dense_as_the_paper_s(shared: Path) -> Non
     np.testing.assert_allclose(ours, theirs, atol=0.04)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_protocol")
 def test_the_command_prints_weights_side_by_side(run_evaluate, folder: Path) -> None:
     weights = "src/deepdetect/detector/weights/default.onnx"

@@ -85,7 +85,7 @@ def network() -> DeepDetect:
     return DeepDetect()
 
 
-@pytest.fixture(params=["stand-in", "network"])
+@pytest.fixture(params=["stand-in", pytest.param("network", marks=pytest.mark.slow)])
 def detector(request: pytest.FixtureRequest) -> Any:
     return Corners() if request.param == "stand-in" else request.getfixturevalue("network")
 

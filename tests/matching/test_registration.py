@@ -81,6 +81,7 @@ def test_the_command_writes_pictures_and_the_homography(
     assert corner_error(homography, WARP, (256, 256)) < 0.5
 
 
+@pytest.mark.slow
 def test_the_command_refuses_in_one_sentence(photo: np.ndarray, tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
     for name, image in (("a", photo), ("b", noise)):

@@ -62,6 +62,7 @@ def rows(section, key: str) -> dict[str, dict[str, object]]:
     return {str(row[1]): dict(zip(titles, row, strict=True)) for row in table.rows}
 
 
+@pytest.mark.slow
 def test_both_ways_and_both_baselines_have_counts_and_precision(section) -> None:
     found = rows(section, "key_true")
     assert len(found) == 3
@@ -77,6 +78,7 @@ def test_both_ways_and_both_baselines_have_counts_and_precision(section) -> None
         assert row["guided: corner error, px"] < 0.5
 
 
+@pytest.mark.slow
 def test_the_counts_are_those_of_match_images(
     section, options: BenchmarkOptions, pair: PlanarPair
 ) -> None:
@@ -91,6 +93,7 @@ def test_the_counts_are_those_of_match_images(
     assert row["lowest"] == min(counts) / row["matchable"]
 
 
+@pytest.mark.slow
 def test_a_wrong_truth_finds_nothing_right(section) -> None:
     """The ground truth only evaluates: the matches are the same, and none of them is right."""
     true, wrong = rows(section, "key_true"), rows(section, "key_wrong")
@@ -170,6 +173,7 @@ def test_seeds_that_fall_back_count(
     assert cells[3:6] == (middle / 10, middle / 20, least / 20)
 
 
+@pytest.mark.slow
 def test_the_low_visibility_report_has_the_table(
     low_visibility_folder: Path, options: BenchmarkOptions
 ) -> None:

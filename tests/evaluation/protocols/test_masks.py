@@ -133,6 +133,7 @@ def test_bundled_weights_score_as_their_model_card_says(shared: Path, backend: s
         assert scores[name].iou == pytest.approx(float(row[2]), abs=0.002)
 
 
+@pytest.mark.slow
 def test_bundled_weights_reach_the_bar(shared: Path) -> None:
     """What was asked of weights from two CPU cores alone: BCE and IoU of the published samples."""
     scores = bundled_scores(shared, "onnxruntime")

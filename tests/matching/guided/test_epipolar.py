@@ -48,6 +48,7 @@ def test_each_depth_finds_its_shift(pair: tuple[np.ndarray, np.ndarray]) -> None
     assert (found.ratios < 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "photograph"),
     [

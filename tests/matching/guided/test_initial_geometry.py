@@ -160,7 +160,9 @@ def test_points_are_the_matches_and_lie_in_the_images(photo: np.ndarray) -> None
     assert np.median(errors) < 0.5
 
 
-@pytest.mark.parametrize(("turn", "swapped"), [(0.0, False), (35.0, True)])
+@pytest.mark.parametrize(
+    ("turn", "swapped"), [pytest.param(0.0, False, marks=pytest.mark.slow), (35.0, True)]
+)
 def test_a_strong_tilt_needs_simulated_views(
     picture: Callable[..., np.ndarray], turn: float, swapped: bool
 ) -> None:
@@ -192,6 +194,7 @@ def test_matches_that_are_there_already_are_not_made_again(
     np.testing.assert_array_equal(found.matrix, expected.matrix)
 
 
+@pytest.mark.slow
 def test_initial_matches_of_a_large_pair_are_at_its_own_size(photo: np.ndarray) -> None:
     gray = cv2.resize(luma(photo), (2400, 2400), interpolation=cv2.INTER_CUBIC)
     shift = np.array([[1.0, 0, 40], [0, 1, -20], [0, 0, 1]])
@@ -217,7 +220,7 @@ def test_a_pair_that_needs_none_has_no_simulated_views(
     ("first", "second"),
     [
         ("camera", "rocket"),
-        ("rocket", "coins"),
+        pytest.param("rocket", "coins", marks=pytest.mark.slow),
     ],
 )
 def test_two_images_of_different_things_have_no_geometry(
@@ -280,6 +283,7 @@ def test_a_large_image_is_shrunk_and_its_matrix_comes_back_at_its_own_size(
     assert errors.max() < OPTIONS.homography_threshold_px * 1500 / LONGEST + 1e-6
 
 
+@pytest.mark.slow
 def test_the_fundamental_matrix_of_large_images_comes_back_at_their_own_size(art: tuple) -> None:
     left, right, points0, points1 = art
     (large, up), (other, also_up) = resized(left, 1389, 1110), resized(right, 926, 740)

@@ -65,6 +65,7 @@ def test_unguided_gives_fewer(photo: np.ndarray, second: np.ndarray) -> None:
     assert guided.inliers.sum() > unguided.inliers.sum()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_trusted_is_unguided_and_says_so(photo: np.ndarray) -> None:
     data = pytest.importorskip("skimage.data")
     other = np.ascontiguousarray(data.coffee()[:256, :256])
@@ -130,6 +131,7 @@ def test_a_plane_that_is_asked_for_guides(shared: Path, name: str) -> None:
     assert match_images(pair.left, pair.right, Everywhere()).guide.model == "fundamental"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model", ["fundamental", pytest.param("essential", marks=pytest.mark.slow)]
 )

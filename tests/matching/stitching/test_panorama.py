@@ -57,6 +57,7 @@ def test_the_panorama_is_the_photograph(panorama: Panorama, views) -> None:
     assert set(panorama.seconds) == {"reading", "registration", "compositing"}
 
 
+@pytest.mark.slow
 def test_it_is_the_same_again_and_from_files(panorama: Panorama, views, tmp_path: Path) -> None:
     paths = []
     for name in (2, 0, 1):
@@ -152,6 +153,7 @@ def test_the_oxford_boat_takes_little_memory(shared: Path) -> None:
     assert int(peak_bytes) < 2.5e9
 
 
+@pytest.mark.slow
 def test_options_reach_their_stages(panorama: Panorama, views) -> None:
     images = [views.images[2], views.images[0], views.images[1]]
     few = StitchingOptions(max_keypoints=2000, num_bands=1, huber_threshold_px=0.1)
