@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.distance import cdist
 
-from deepdetect import DeepDetectError
+from deepdetect import DeepDetectError, ImageError
 from deepdetect.evaluation import context as context_module
 from deepdetect.evaluation.baselines.method import BaselineError, LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
