@@ -57,6 +57,7 @@ def test_options_of_the_geometry_are_not_taken(photo: np.ndarray, name: str) -> 
         register(photo, photo, **{name: "none"})
 
 
+@pytest.mark.slow
 def test_other_options_are_taken(photo: np.ndarray, second: np.ndarray) -> None:
     few = register(photo, second, max_keypoints=2000, seed=3, mutual=True)
     assert 0 < few.matches <= 2000

@@ -158,6 +158,7 @@ def test_what_is_covered_in_the_second_image_is_not_matched(photo: np.ndarray) -
     assert np.count_nonzero(column > 145) < 0.05 * np.count_nonzero(column < 111)
 
 
+@pytest.mark.slow
 def test_a_wrong_homography_matches_next_to_nothing(photo: np.ndarray) -> None:
     gray = luma(photo)
     xy = every_pixel(gray)

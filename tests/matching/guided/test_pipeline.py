@@ -78,6 +78,7 @@ def test_what_cannot_be_trusted_is_unguided_and_says_so(photo: np.ndarray) -> No
     np.testing.assert_array_equal(matches.points1, plain.points1)
 
 
+@pytest.mark.slow
 def test_the_command_says_what_guided(
     photo: np.ndarray, second: np.ndarray, tmp_path: Path
 ) -> None:

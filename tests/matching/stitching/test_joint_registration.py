@@ -19,6 +19,7 @@ def strange() -> np.ndarray:
     return np.ascontiguousarray(data.rocket()[:300, :300])
 
 
+@pytest.mark.slow
 def test_views_of_one_photograph(views, detector: DeepDetect) -> None:
     found = register_jointly(views.images, detector)
     assert sorted(found.homographies) == [0, 1, 2]
