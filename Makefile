@@ -6,8 +6,9 @@ VENV_LOWEST ?= .venv-lowest
 DEMO_OUTPUT ?= demo-output
 # What installs the lock files: uv is eight times as fast as pip, which does the same.
 INSTALLER ?= uv
-# Two processes, each with whole files (what a file sets up is set up once), on one thread each.
-PYTEST := -m pytest -n 2 --dist loadfile
+# Two processes, each with whole files (what a file sets up is set up once), on one thread each. One
+# that crashes ends the run: with a new one in its place pytest-xdist may wait for ever.
+PYTEST := -m pytest -n 2 --dist loadfile --max-worker-restart 0
 export OMP_NUM_THREADS ?= 1
 
 # What calls the parts of OpenCV that moved between its versions 4 and 5.

@@ -12,6 +12,7 @@ from deepdetect import MissingExtraError, TrainingOptions, train
 from deepdetect.training import DeviceOptions, Stage, profile
 
 
+@pytest.mark.slow
 def test_a_profile_times_each_stage_and_writes_no_weights(
     photographs: Path, tmp_path: Path
 ) -> None:
