@@ -10,6 +10,8 @@ INSTALLER ?= uv
 # that crashes ends the run: with a new one in its place pytest-xdist may wait for ever.
 PYTEST := -m pytest -n 2 --dist loadfile --max-worker-restart 0
 export OMP_NUM_THREADS ?= 1
+# The tests start many interpreters: what one has compiled, the next should find.
+unexport PYTHONDONTWRITEBYTECODE
 
 # What calls the parts of OpenCV that moved between its versions 4 and 5.
 TESTS_OPENCV4 ?= tests/labels tests/features tests/geometry tests/evaluation/baselines
