@@ -251,6 +251,7 @@ def test_an_error_of_a_worker_is_one_sentence(
     with pytest.raises(ImageError) as caught, loading(loader(lost, workers=workers)) as made:
         next(made)
     assert one_line(caught.value).startswith("there is no mask")
+    assert not multiprocessing.active_children(), "they end with the block, whoever holds the error"
 
 
 def test_a_label_of_another_size_is_refused(photographs: Path, tmp_path: Path) -> None:

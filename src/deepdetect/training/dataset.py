@@ -223,8 +223,10 @@ def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
     threads = cv2.getNumThreads()
     if loader.num_workers:
         cv2.setNumThreads(1)
+    batches: Any = None
     try:
-        yield iter(loader)
+        batches = iter(loader)
+        yield batches
     except DeepDetectError as error:
         # torch puts the whole traceback into the message.
         text = str(error).strip()
@@ -233,3 +235,7 @@ def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
         raise type(error)(text.splitlines()[-1].partition(": ")[2]) from None
     finally:
         cv2.setNumThreads(threads)
+        # torch ends the processes with the iterator, which an error keeps alive; left to the
+        # garbage collector, that takes five seconds (their queues are collected first).
+        if loader.num_workers and batches is not None:
+            batches._shutdown_workers()
