@@ -52,6 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_protocol")
 def test_shifted_images_repeat_and_match(folder: Path) -> None:
     found = evaluate_oxford(DeepDetect(), load_oxford(folder))

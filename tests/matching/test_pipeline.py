@@ -226,6 +226,7 @@ def test_equals_a_pipeline_of_opencv(photo: np.ndarray, options: MatchingOptions
     np.testing.assert_allclose(matches.scores, 1 - ratios, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_published_preset_equals_the_published_pipeline(
     photo: np.ndarray, network: DeepDetect
 ) -> None:

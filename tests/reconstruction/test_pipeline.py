@@ -141,6 +141,7 @@ def test_a_pair_that_is_not_rectified_has_true_depths(posed: Any, turned: Any) -
         posed.disparity_map()
 
 
+@pytest.mark.slow
 def test_a_post_before_a_wall_is_not_left_out(
     facade: Any, detector: DeepDetect, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,6 +55,7 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
     assert len(np.unique(matches.points0, axis=0)) == len(matches)
 
 
+@pytest.mark.slow
 def test_unguided_gives_fewer(photo: np.ndarray, second: np.ndarray) -> None:
     guided, unguided = (
         match_images(photo, second, Everywhere(), guided=guided, model="homography")
