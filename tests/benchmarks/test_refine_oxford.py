@@ -12,6 +12,8 @@ import pytest
 from deepdetect.datasets.oxford import SCENES, load_oxford
 from deepdetect.datasets.types import read_homography
 
+pytestmark = pytest.mark.slow
+
 MOVE = np.array([[1.01, 0.02, 3.0], [-0.02, 0.99, 2.0], [1e-4, 0, 1.0]])
 WRONG = np.array([[1.0, 0, 1.6], [0, 1, -1.2], [0, 0, 1]])
 

@@ -316,6 +316,7 @@ def test_the_seed_reaches_the_matcher(photo: np.ndarray) -> None:
     )
 
 
+@pytest.mark.slow
 def test_options_and_changes_add_up(photo: np.ndarray) -> None:
     options = MatchingOptions(
         selection=SelectionOptions(max_keypoints=200), ratio=0.7, matcher="exact"
@@ -403,6 +404,7 @@ def test_heatmap_options_reach_the_network_and_leave_the_detector(
     assert not np.array_equal(matches.keypoints0.xy, native.xy)
 
 
+@pytest.mark.slow
 def test_without_a_detector_the_pretrained_weights_are_used(
     photo: np.ndarray, network: DeepDetect
 ) -> None:

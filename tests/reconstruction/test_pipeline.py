@@ -290,6 +290,7 @@ def test_is_the_same_for_any_number_of_threads(
         np.testing.assert_array_equal(one, three)
 
 
+@pytest.mark.slow
 def test_options_reach_their_stages(level: Any, detector: DeepDetect) -> None:
     pair = level.left, level.right, detector
     known = {"calibration": level.calibration}
@@ -335,6 +336,7 @@ def test_what_the_right_image_does_not_show_is_filled_only_when_asked_for() -> N
     assert replace(every, disparity=own).disparity_options is own
 
 
+@pytest.mark.slow
 def test_stages_are_reported_as_they_end(level: Any, turned: Any, detector: DeepDetect) -> None:
     for pair, expected in (
         (level, ["rectified or not", "keypoints", "matching", "triangulation", "outlier removal"]),

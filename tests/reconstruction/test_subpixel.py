@@ -76,6 +76,7 @@ def test_a_turn_is_followed(gray: np.ndarray, pixels: np.ndarray) -> None:
     np.testing.assert_allclose(similarity(pixels, true), turn[:, :2], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_real_matches_come_nearer_to_the_truth(
     turned: Any, turned_matches: tuple[np.ndarray, np.ndarray]
 ) -> None:

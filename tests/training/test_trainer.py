@@ -148,6 +148,7 @@ def test_one_seed_gives_one_result(run: Path, tmp_path: Path, fit) -> None:
     assert result.images_per_second > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "count"), [("training_step", 6), pytest.param("score", 1, marks=pytest.mark.slow)]
 )

@@ -124,6 +124,7 @@ def test_matches_lie_within_reach_of_where_the_homography_takes_them(photo: np.n
     assert len(rows0) > 0.9 * np.count_nonzero(inside & partner)
 
 
+@pytest.mark.slow
 def test_scores_are_under_one_and_smaller_where_both_look_more_alike(photo: np.ndarray) -> None:
     gray = luma(photo)
     xy = every_pixel(gray)

@@ -263,6 +263,7 @@ def test_the_fundamental_matrix_of_a_plane_is_given_when_asked_for(photo: np.nda
     check_agreeing(found)
 
 
+@pytest.mark.slow
 def test_a_large_image_is_shrunk_and_its_matrix_comes_back_at_its_own_size(
     picture: Callable[..., np.ndarray],
 ) -> None:

@@ -192,6 +192,7 @@ def test_up_to_a_megapixel_the_seed_does_not_matter(photo: np.ndarray) -> None:
     np.testing.assert_array_equal(found[0], found[1])
 
 
+@pytest.mark.slow
 def test_what_is_known_of_the_unmoved_image_is_not_described_again_and_the_same(
     photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -240,6 +241,7 @@ def test_flat_images_tell_nothing(photo: np.ndarray) -> None:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "width",
     [120, pytest.param(180, marks=pytest.mark.slow), pytest.param(260, marks=pytest.mark.slow)],
