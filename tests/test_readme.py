@@ -65,6 +65,7 @@ def test_it_starts_as_promised() -> None:
     assert commands[:2] == ["deepdetect detect left.png", "deepdetect match left.png right.png"]
 
 
+@pytest.mark.slow
 def test_the_python_lines_run(folder: Path) -> None:
     for block in PYTHON:
         done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True)
@@ -159,6 +160,7 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
     run([places.get(word, word) for word in words])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", re.findall(r"\| `([^`]*\([^`]*\))` \|$", README, re.M))
 def test_the_calls_of_the_table_run(folder: Path, line: str) -> None:
     import deepdetect

@@ -18,6 +18,7 @@ from deepdetect.detector.network.weights import (
 from deepdetect.detector.pretrained import pretrained_weights
 
 
+@pytest.mark.slow
 def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo) -> None:
     result = run("average", "default", "default", "dense", "-o", tmp_path, "--json")
     assert result.exit_code == 0, result.output

@@ -10,6 +10,7 @@ from PIL import Image
 from deepdetect.cli import main
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_row_for_each(photo: np.ndarray, tmp_path: Path) -> None:
     left, right = photo[:80, 60:174], photo[:80, 66:180]
     for name, image in (("left", left), ("right", right)):

@@ -105,6 +105,7 @@ def test_an_unknown_ending_ends_before_the_work(
     assert "must end in .png, .jpg or .jpeg" in refused(*files, "-o", output)
 
 
+@pytest.mark.slow
 def test_errors_speak_of_files_and_flags(
     files: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

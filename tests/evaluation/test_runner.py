@@ -303,6 +303,7 @@ def test_the_figures_are_pictures(runs: Runs) -> None:
         assert picture.std() > 1
 
 
+@pytest.mark.slow
 def test_a_method_that_fails_is_skipped_and_the_others_stay(
     low_visibility_folder: Path, options: BenchmarkOptions
 ) -> None:

@@ -124,6 +124,7 @@ def test_one_view_stored_badly(level: Any, detector: DeepDetect, one_line) -> No
     assert "nothing moves between the images" in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guide", ["auto", pytest.param("fundamental", marks=pytest.mark.slow)])
 def test_a_camera_that_only_rotated(
     level: Any, only_turned: np.ndarray, detector: DeepDetect, guide: str, one_line
