@@ -6,7 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect import GeometryOptions, estimate_geometry
-from deepdetect.geometry.model_selection import select_model
+from deepdetect.geometry.model_selection import (
+    ModelSelectionOptions,
+    measure_parallax,
+    select_model,
+)
 
 CAMERA = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], float)
 PLANE = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 30.0], [1e-4, 5e-5, 1.0]])
@@ -49,3 +53,60 @@ def test_depth_needs_a_share_of_the_rest_and_of_all() -> None:
     assert select_model(index < 800, index < 950) == "fundamental"
     assert select_model(index < 800, index < 880) == "homography"  # less than half of the rest
     assert select_model(index < 950, index < 1000) == "homography"  # next to nothing of all
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
+def test_depth_is_seen_among_wrong_matches(outliers: float) -> None:
+    points0, points1 = matches(3.0, outliers)
+    wall = np.array([[1, 0, -60], [0, 1, -4], [0, 0, 1.0]])  # what lies at a distance of 5
+    found = measure_parallax(points0, points1, wall)
+    assert found.is_seen()
+    # All parallax is along (300, 20): the epipole lies there, at infinity.
+    direction = found.epipole[:2] / np.linalg.norm(found.epipole[:2])
+    assert abs(direction @ (20, -300)) / np.hypot(300, 20) < 0.02
+    right = (1 - outliers) * (found.on_plane + found.off_plane)
+    assert found.agreeing > 0.85 * (right - found.on_plane)
+    assert found.is_depth() == (outliers < 0.6), "too many wrong ones: the images decide"
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
+def test_wrong_matches_on_a_plane_are_no_depth(outliers: float) -> None:
+    points0, points1 = matches(0.0, outliers)
+    wall = np.array([[1, 0, -60], [0, 1, -4], [0, 0, 1.0]])
+    found = measure_parallax(points0, points1, wall)
+    assert not found.is_seen()
+    assert not found.is_depth()
+
+
+def test_a_pattern_that_is_matched_one_period_off_is_no_depth() -> None:
+    points = np.random.default_rng(0).uniform((0, 0), (640, 480), (540, 2))
+    moved = points + np.where(np.arange(540) < 500, 0, 25)[:, None] * (1, 0)
+    found = measure_parallax(points, moved, np.eye(3))
+    assert (found.on_plane, found.off_plane, found.agreeing) == (500, 40, 40)
+    assert found.is_seen()
+    assert not found.is_depth()
+    assert found.is_depth(ModelSelectionOptions(min_fraction_of_plane=0.05))
+
+
+def test_parallax_is_the_same_wherever_the_origin_is_and_for_one_seed() -> None:
+    points0, points1 = matches(3.0)
+    wall = np.array([[1, 0, -60], [0, 1, -4], [0, 0, 1.0]])
+    found = measure_parallax(points0, points1, wall, seed=3)
+    again = measure_parallax(points0 + 1000, points1 + 1000, wall, seed=3)
+    assert (
+        found.agreeing
+        == again.agreeing
+        == measure_parallax(points0, points1, wall, seed=3).agreeing
+    )
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_few_matches_show_nothing(count: int) -> None:
+    points0, points1 = (points[:count] for points in matches(3.0))
+    found = measure_parallax(points0, points1, np.eye(3))
+    assert not found.is_seen()
+
+
+def test_matches_in_one_place_show_nothing() -> None:
+    here = np.full((9, 2), 7.0)
+    assert not measure_parallax(here, here + 50, np.eye(3)).is_depth()

@@ -48,9 +48,10 @@ def log10_nfa(
         chance = pi * inlier_threshold**2 / (width * height)
     else:  # a band along a line through the image
         chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
-    tests = log(count - sample) + _log_binomial(count, inliers) + _log_binomial(inliers, sample)
+    tests = log(count - sample) + log_binomial(count, inliers) + log_binomial(inliers, sample)
     return (tests + (inliers - sample) * log(min(chance, 1.0))) / log(10)
 
 
-def _log_binomial(count: int, chosen: int) -> float:
+def log_binomial(count: int, chosen: int) -> float:
+    """Return the natural logarithm of a binomial coefficient."""
     return lgamma(count + 1) - lgamma(chosen + 1) - lgamma(count - chosen + 1)

@@ -1,43 +1,183 @@
-"""Homography or fundamental matrix: whether the matches of a scene show depth."""
+"""Homography or fundamental matrix: whether the matches of a scene show depth.
+
+Plane and parallax: what a homography leaves of the matches of a static scene moves along lines
+through one point, the epipole. Chum, Werner and Matas, "Two-view geometry estimation unaffected by
+a dominant plane", 2005. Wrong matches move anywhere, and those of a repeated pattern in one
+direction, but they are few beside what lies on the plane; whether more matches agree on an epipole
+than chance explains is decided a contrario (`acontrario`).
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from .._shared.options import check_ranges
+from .acontrario import MAX_LOG10_NFA, log_binomial
+from .residuals import transfer_errors, transform_points
 
 
 @dataclass(frozen=True)
 class ModelSelectionOptions:
-    """When a scene has depth.
-
-    A fundamental matrix explains some matches of a plane, too, as its band is easily hit, but few
-    of those that the homography does not explain.
+    """When the matches of a scene show depth.
 
     Attributes:
-        min_fraction_of_rest: of the matches that the homography leaves, the fundamental matrix must
-            explain at least this fraction.
-        min_fraction_of_all: these must be at least this fraction of all that it explains.
+        min_parallax_px: matches whose transfer error is at least this are off the plane.
+        max_epipolar_distance_px: by which one of them may miss the line through the epipole.
+        max_log10_nfa: they agree when the logarithm of their number of false alarms is below this.
+        min_fraction_of_plane: as many of them must agree, relative to the matches on the plane: a
+            repeated pattern, or a thing that moved, gives few.
+        min_fraction_of_rest: this fraction of all matches off the plane must agree, where the
+            matches alone decide.
+        samples: pairs of matches whose lines are intersected.
 
     Raises:
         OptionError: a value is out of its range.
     """
 
+    min_parallax_px: float = 3.0
+    max_epipolar_distance_px: float = 1.5
+    max_log10_nfa: float = MAX_LOG10_NFA
+    min_fraction_of_plane: float = 0.2
     min_fraction_of_rest: float = 0.5
-    min_fraction_of_all: float = 0.1
+    samples: int = 1000
 
     def __post_init__(self) -> None:
-        check_ranges(self, fractions=("min_fraction_of_rest", "min_fraction_of_all"))
+        check_ranges(
+            self,
+            positive=("min_parallax_px", "max_epipolar_distance_px", "samples"),
+            fractions=("min_fraction_of_plane", "min_fraction_of_rest"),
+            between={"max_log10_nfa": (-math.inf, 0)},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Parallax:
+    """The matches off a plane, and how many of them agree on an epipole.
+
+    Attributes:
+        on_plane: number of matches that the homography explains.
+        off_plane: number of those that it does not.
+        agreeing: number of the latter that move along lines through the epipole.
+        epipole: (3,) homogeneous, in the second image; None without any.
+        log10_nfa: decimal logarithm of the number of false alarms of that agreement.
+    """
+
+    on_plane: int
+    off_plane: int
+    agreeing: int
+    epipole: np.ndarray | None
+    log10_nfa: float
+
+    def is_seen(self, options: ModelSelectionOptions = ModelSelectionOptions()) -> bool:
+        """Whether more agree than chance explains."""
+        return self.log10_nfa < options.max_log10_nfa
+
+    def is_depth(self, options: ModelSelectionOptions = ModelSelectionOptions()) -> bool:
+        """Whether these matches alone show that the scene has depth."""
+        return (
+            self.is_seen(options)
+            and self.agreeing >= options.min_fraction_of_plane * self.on_plane
+            and self.agreeing >= options.min_fraction_of_rest * self.off_plane
+        )
+
+
+def measure_parallax(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    homography: np.ndarray,
+    options: ModelSelectionOptions = ModelSelectionOptions(),
+    seed: int = 0,
+) -> Parallax:
+    """Look for an epipole among the matches that a homography leaves.
+
+    Args:
+        points0, points1: (M, 2) matches, some of them wrong.
+        homography: (3, 3) from the first image to the second.
+        options: the thresholds.
+        seed: of the random pairs of matches.
+
+    Example:
+        >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
+        >>> depth = np.repeat([0, 1.0], 150) * np.linspace(8, 40, 300)  # half of it before a wall
+        >>> moved = points + np.column_stack([depth, np.zeros(300)])
+        >>> measure_parallax(points, moved, np.eye(3)).is_depth()
+        True
+        >>> wrong = np.random.default_rng(1).uniform(0, 500, (150, 2))
+        >>> moved = np.concatenate([points[:150], wrong])
+        >>> measure_parallax(points, moved, np.eye(3)).is_depth()
+        False
+    """
+    points0 = np.asarray(points0, np.float64).reshape(-1, 2)
+    points1 = np.asarray(points1, np.float64).reshape(-1, 2)
+    off = transfer_errors(points0, points1, homography) >= options.min_parallax_px
+    on_plane = len(off) - int(np.count_nonzero(off))
+    predicted, found = transform_points(points0[off], homography), points1[off]
+    finite = np.isfinite(predicted).all(axis=1)
+    predicted, found = predicted[finite], found[finite]
+    nothing = Parallax(on_plane, len(found), 0, None, math.inf)
+    if len(found) < 3:
+        return nothing
+    low, size = points1.min(axis=0), np.ptp(points1, axis=0)
+    if not size.all():  # all on one row or column
+        return nothing
+    scale = float(size.max())
+    first, second = (
+        np.column_stack([(points - low) / scale - 0.5, np.ones(len(points))])
+        for points in (predicted, found)
+    )
+    lines = np.cross(first, second)
+    chosen = np.random.default_rng(seed).integers(0, len(lines), (options.samples, 2))
+    epipoles = np.cross(lines[chosen[:, 0]], lines[chosen[:, 1]])
+    length = np.linalg.norm(epipoles, axis=1)
+    epipoles = epipoles[length > 1e-12] / length[length > 1e-12, None]
+    if not len(epipoles):
+        return nothing
+    limit = options.max_epipolar_distance_px / scale
+    counts = [np.count_nonzero(_misses(epipole, first, second) < limit) for epipole in epipoles]
+    best = int(np.argmax(counts))
+    to_pixels = np.array(
+        [[scale, 0, low[0] + scale / 2], [0, scale, low[1] + scale / 2], [0, 0, 1]]
+    )
+    band = (
+        2 * options.max_epipolar_distance_px * float(np.hypot(*size)) / max(float(size.prod()), 1)
+    )
+    return Parallax(
+        on_plane,
+        len(found),
+        int(counts[best]),
+        to_pixels @ epipoles[best],
+        _log10_nfa(len(found), int(counts[best]), band),
+    )
+
+
+def _misses(epipole: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the distances of points from the lines through the epipole and their predictions."""
+    lines = np.cross(epipole, first)
+    normal = np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12)
+    return np.abs((lines * second).sum(axis=1)) / normal
+
+
+def _log10_nfa(count: int, agreeing: int, chance: float) -> float:
+    """Return the logarithm of the number of false alarms of an epipole, which two matches give."""
+    if agreeing <= 2:
+        return math.inf
+    tests = math.log(count - 2) + log_binomial(count, agreeing) + log_binomial(agreeing, 2)
+    return (tests + (agreeing - 2) * math.log(min(chance, 1.0))) / math.log(10)
 
 
 def select_model(
     homography_inliers: np.ndarray,
     fundamental_inliers: np.ndarray,
-    options: ModelSelectionOptions = ModelSelectionOptions(),
+    min_fraction_of_rest: float = 0.5,
+    min_fraction_of_all: float = 0.1,
 ) -> str:
-    """Return the model of a scene: "homography" (no depth) or "fundamental".
+    """Return the model of a scene by its inliers alone: "homography" (no depth) or "fundamental".
+
+    Of the matches that the homography leaves, the fundamental matrix must explain the first
+    fraction, and these must be the second fraction of all that it explains.
 
     Example:
         >>> plane = np.arange(100) < 60
@@ -46,8 +186,8 @@ def select_model(
     """
     gained = np.count_nonzero(fundamental_inliers & ~homography_inliers)
     needed = max(
-        options.min_fraction_of_rest * np.count_nonzero(~homography_inliers),
-        options.min_fraction_of_all * np.count_nonzero(fundamental_inliers),
+        min_fraction_of_rest * np.count_nonzero(~homography_inliers),
+        min_fraction_of_all * np.count_nonzero(fundamental_inliers),
         1,
     )
     return "fundamental" if gained >= needed else "homography"

@@ -25,7 +25,7 @@ MILD = np.array([[0.95, -0.06, 15.0], [0.08, 0.97, -5.0], [1e-4, -1e-4, 1.0]])
 def matched(
     gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray, xy1: np.ndarray, homography: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    found = match_by_homography(ImagePair(gray0, gray1, xy0, xy1), homography)
+    found, _ = match_by_homography(ImagePair(gray0, gray1, xy0, xy1), homography)
     return found.rows0, found.rows1, found.ratios
 
 

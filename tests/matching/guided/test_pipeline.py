@@ -102,6 +102,33 @@ def test_the_command_says_what_guided(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("pair", ["fountain 0-5", "fountain 3-10", "clip 24-44"])
+def test_a_plane_guides_no_scene_with_depth(shared: Path, pair: str) -> None:
+    name, numbers = pair.split()
+    if name == "fountain":
+        images = [shared / f"data/fountain/{int(n):04d}.jpg" for n in numbers.split("-")]
+    else:
+        images = [shared / f"data/kitti-clip/{int(n):06d}.jpg" for n in numbers.split("-")]
+    matches = match_images(*images, density=0.02)
+    assert matches.guide.model != "homography"
+
+
+def test_a_plane_that_the_images_do_not_show_does_not_guide(photo: np.ndarray) -> None:
+    # A poster that fills a ninth of an otherwise different picture, and all of the first one.
+    gray = luma(photo)
+    other = np.random.default_rng(0).integers(0, 256, gray.shape).astype(np.uint8)
+    other[85:171, 85:171] = gray[85:171, 85:171]
+    xy = np.stack(np.meshgrid(np.arange(256), np.arange(256)), -1).reshape(-1, 2)
+    guide, found = guided_matches(gray, other, xy, xy, "auto")
+    assert (guide.model, found) == ("none", None)
+    assert guide.sparse_inliers == 0
+    asked, found = guided_matches(gray, other, xy, xy, "homography")
+    assert asked.model == "homography"
+    inside = ((xy[found.rows0] > 80) & (xy[found.rows0] < 176)).all(axis=1)
+    assert inside.mean() > 0.95
+
+
+@pytest.mark.slow
 def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> None:
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
     detector = DeepDetect("dense")

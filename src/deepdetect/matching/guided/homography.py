@@ -36,23 +36,24 @@ def match_by_homography(
     options: HomographyMatchingOptions = HomographyMatchingOptions(),
     verification: VerificationOptions = VerificationOptions(),
     seed: int = 0,
-) -> DescriptorMatches:
+) -> tuple[DescriptorMatches, int]:
     """Match keypoints by a homography, and keep those whose patches are the same.
 
     Returns:
-        The matches, their ratios the `dissimilarity` of their patches, under 1. Each keypoint of
-        the first image is matched once at most, those of the second image perhaps more often.
+        The matches, their ratios the `dissimilarity` of their patches, under 1, and the number of
+        pairs that the homography proposed. Each keypoint of the first image is matched once at
+        most, those of the second image perhaps more often.
     """
     gray0, gray1 = pair.gray0, pair.gray1
     places = transform_points(pair.xy0, homography)
     rows1, distances = nearest_keypoint(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
     rows0 = np.flatnonzero(distances < options.max_distance_px)
     if not len(rows0):
-        return DescriptorMatches(rows0, rows0, np.empty(0, np.float32))
+        return DescriptorMatches(rows0, rows0, np.empty(0, np.float32)), 0
     warped, valid = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
     ratios = dissimilarity(gray0, warped, valid, pair.xy0[rows0], verification, seed)
     kept = rows0[ratios < 1]
-    return DescriptorMatches(kept, rows1[kept], ratios[ratios < 1])
+    return DescriptorMatches(kept, rows1[kept], ratios[ratios < 1]), len(rows0)
 
 
 def refine_guiding_homography(

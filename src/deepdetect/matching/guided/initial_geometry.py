@@ -17,7 +17,7 @@ from ...features.matchers import get_matcher, match_descriptors
 from ...features.sift_detector import detect_sift
 from ...geometry import GeometryOptions, estimate_geometry
 from ...geometry.acontrario import log10_nfa
-from ...geometry.model_selection import select_model
+from ...geometry.model_selection import Parallax, measure_parallax
 from ...geometry.rescaling import downscale, scaled_fundamental, scaled_homography, scaled_points
 from ...geometry.residuals import epipolar_errors, transfer_errors
 from .asift import simulated_views
@@ -39,6 +39,9 @@ class InitialGeometry:
         num_matches: sparse matches that it was estimated from.
         log10_nfa: decimal logarithm of its number of false alarms.
         num_views: simulated views that it took.
+        parallax: of a homography that was chosen, not asked for: what it leaves.
+        alternative: the fundamental matrix, where both can be trusted and the homography was
+            chosen: the images decide.
     """
 
     model: str
@@ -48,6 +51,8 @@ class InitialGeometry:
     num_matches: int
     log10_nfa: float
     num_views: int
+    parallax: Parallax | None = None
+    alternative: InitialGeometry | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +122,7 @@ def estimate_initial_geometry(
     Args:
         initial: the sparse matches.
         model: "homography", "fundamental", or "auto": the homography, but the fundamental matrix
-            for scenes with depth (`select_model`).
+            where the matches alone show depth (`measure_parallax`).
         seed: of the random samples.
         options: thresholds, and which views are simulated.
         simulate_views: whether views are simulated where the sparse matches alone give nothing.
@@ -201,7 +206,6 @@ def _estimate(
     """Estimate the models that are asked for and return the one that fits."""
     points0, points1 = points
     found: dict[str, InitialGeometry] = {}
-    explained: dict[str, np.ndarray] = {}
     for name in MODELS if model == "auto" else (model,):
         threshold = options.threshold_px(name)
         chosen = GeometryOptions(model=name, inlier_threshold=threshold, seed=seed)
@@ -210,7 +214,6 @@ def _estimate(
             continue
         errors_of = transfer_errors if name == "homography" else epipolar_errors
         errors = errors_of(points0, points1, geometry.matrix)
-        explained[name] = geometry.inliers
         found[name] = InitialGeometry(
             name,
             geometry.matrix,
@@ -221,14 +224,29 @@ def _estimate(
             0,
         )
     trusted = {name: one for name, one in found.items() if one.log10_nfa < options.max_log10_nfa}
-    if len(trusted) == 2:
-        return trusted[select_model(explained["homography"], explained["fundamental"])]
+    if model == "auto" and "homography" in trusted:
+        return _plane_or_depth(points, trusted, seed, options)
     candidates = (trusted or found).values()
     return min(candidates, key=lambda one: one.log10_nfa, default=_nothing(len(points0)))
 
 
+def _plane_or_depth(
+    points: Points, trusted: dict[str, InitialGeometry], seed: int, options: InitialGeometryOptions
+) -> InitialGeometry:
+    """Return the fundamental matrix where the matches alone show depth, else the homography."""
+    plane, depth = trusted["homography"], trusted.get("fundamental")
+    assert plane.matrix is not None
+    parallax = measure_parallax(*points, plane.matrix, options.model_selection, seed)
+    if depth is not None and parallax.is_depth(options.model_selection):
+        return depth
+    return replace(plane, parallax=parallax, alternative=depth)
+
+
 def _upscale(found: InitialGeometry, scale0: float, scale1: float) -> InitialGeometry:
     """Return a geometry of scaled images as one of the images themselves."""
+    if found.alternative is not None:
+        alternative = _upscale(found.alternative, scale0, scale1)
+        found = replace(found, alternative=alternative)
     assert found.matrix is not None
     convert = scaled_homography if found.model == "homography" else scaled_fundamental
     return replace(

@@ -14,6 +14,7 @@ from ..._shared.options import check_ranges
 from ...features.sift_detector import SiftOptions
 from ...geometry.acontrario import MAX_LOG10_NFA
 from ...geometry.homography_refinement import RefinementOptions
+from ...geometry.model_selection import ModelSelectionOptions
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class InitialGeometryOptions:
             in pixels of the scaled images.
         max_log10_nfa: a geometry is trusted when the logarithm of its number of false alarms is
             below this.
+        model_selection: when the matches alone show that a scene has depth.
         tilts: of the simulated views: how many times shorter one direction is seen.
         rotation_step_deg: between the directions of the views for a tilt of 1; the step is
             inversely proportional to the tilt.
@@ -44,6 +46,7 @@ class InitialGeometryOptions:
     homography_threshold_px: float = 3.0
     fundamental_threshold_px: float = 1.5
     max_log10_nfa: float = MAX_LOG10_NFA
+    model_selection: ModelSelectionOptions = field(default_factory=ModelSelectionOptions)
     tilts: tuple[float, ...] = (2.0, 2.0 * 2**0.5, 4.0)
     rotation_step_deg: float = 72.0
 
@@ -111,6 +114,10 @@ class HomographyMatchingOptions:
         max_side_px: longer sides are scaled down to this while the homography is refined.
         refinement: how it is refined.
         max_distance_px: from where the homography takes a keypoint to its partner.
+        min_verified_fraction: of the pairs it proposes, this fraction must have the same patches on
+            both sides: with fewer, little of the scene lies on the plane.
+        min_verified_fraction_of_depth: the same where matches off the plane agree on an epipole.
+        min_parallax_fraction: as many must agree, relative to those on the plane.
 
     Raises:
         OptionError: a value is out of its range.
@@ -123,9 +130,19 @@ class HomographyMatchingOptions:
         )
     )
     max_distance_px: float = 1.0
+    min_verified_fraction: float = 0.15
+    min_verified_fraction_of_depth: float = 0.6
+    min_parallax_fraction: float = 0.1
 
     def __post_init__(self) -> None:
-        check_ranges(self, positive=("max_side_px", "max_distance_px"))
+        check_ranges(
+            self,
+            positive=("max_side_px", "max_distance_px"),
+            fractions=(
+                *("min_verified_fraction", "min_verified_fraction_of_depth"),
+                "min_parallax_fraction",
+            ),
+        )
 
 
 @dataclass(frozen=True)

@@ -58,15 +58,39 @@ def guided_matches(
     if first.matrix is None:
         return _guide(first, None), None
     pair = ImagePair(gray0, gray1, xy0, xy1)
+    matrix, found = first.matrix, None
     if first.model == "homography":
-        by_homography = options.homography_matching
-        matrix = refine_guiding_homography(gray0, gray1, first.matrix, by_homography)
-        found = match_by_homography(pair, matrix, by_homography, options.verification, seed)
-    else:
+        matrix, found = _match_plane(pair, first, options, seed)
+        if found is None:
+            assert first.parallax is not None
+            # Without parallax a fundamental matrix is any that holds the plane.
+            if first.alternative is None or first.parallax.log10_nfa >= 0:
+                return _guide(replace(first, model="none", points0=first.points0[:0]), None), None
+            first = replace(first.alternative, num_views=first.num_views)
+    if found is None:
         matrix, found = _match_scene_with_depth(pair, first, options, seed)
     if len(found) < options.min_matched_fraction * min(len(xy0), len(xy1)):
         return _guide(replace(first, model="none", points0=first.points0[:0]), None), None
     return _guide(first, matrix), found
+
+
+def _match_plane(
+    pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
+) -> tuple[np.ndarray, DescriptorMatches | None]:
+    """Match by a homography; None where the images show that the scene is no plane."""
+    assert first.matrix is not None
+    plane = options.homography_matching
+    matrix = refine_guiding_homography(pair.gray0, pair.gray1, first.matrix, plane)
+    found, proposed = match_by_homography(pair, matrix, plane, options.verification, seed)
+    parallax = first.parallax
+    if parallax is None:  # a homography was asked for
+        return matrix, found
+    seen = parallax.is_seen(options.initial_geometry.model_selection)
+    agree = parallax.agreeing >= plane.min_parallax_fraction * parallax.on_plane
+    least = plane.min_verified_fraction
+    if seen and agree:
+        least = max(least, plane.min_verified_fraction_of_depth)
+    return matrix, found if len(found) >= least * proposed else None
 
 
 def _match_scene_with_depth(
