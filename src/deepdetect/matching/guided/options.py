@@ -2,7 +2,8 @@
 
 The bounds of the verification and the sizes of its windows were chosen on nine pairs of Oxford,
 with parts of their second images covered; those along epipolar lines on Middlebury's cones, teddy
-and art, as they are and rotated (docs/matching.md).
+and art, as they are and rotated (docs/matching.md); what tells a plane from depth, on all of
+Oxford and Middlebury, Strecha's fountain and a KITTI clip.
 """
 
 from __future__ import annotations
