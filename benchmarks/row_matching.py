@@ -35,7 +35,7 @@ from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.protocols.stereo import ground_truths
 from deepdetect.evaluation.protocols.stereo_pipelines import sgbm_disparity
 from deepdetect.io.image import load_image
-from deepdetect.reconstruction.stereo import DENSE, DisparityOptions, match_rectified
+from deepdetect.matching.stereo import DENSE, DisparityOptions, match_rectified
 
 TOLERANCES = (0.5, 1.0, 2.0, 4.0)
 AT_EDGES = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0)

@@ -44,7 +44,7 @@ from .reconstruction.pipeline import (
     reconstruct as reconstruct,
 )
 from .reconstruction.result import Reconstruction as Reconstruction
-from .reconstruction.stereo.matching import (
+from .matching.stereo.matching import (
     DisparityMap as DisparityMap,
     DisparityOptions as DisparityOptions,
     disparity_map as disparity_map,

@@ -21,10 +21,10 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.baselines.random import AllPixels
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.point_cloud import PointCloud
+from deepdetect.matching.stereo import DENSE, DisparityOptions, disparity_map
 from deepdetect.reconstruction.outliers import PointFilterOptions
 from deepdetect.reconstruction.pipeline import ReconstructionOptions, reconstruct
 from deepdetect.reconstruction.result import Reconstruction
-from deepdetect.reconstruction.stereo import DENSE, DisparityOptions, disparity_map
 
 CONES_POINTS = 49_979
 """The paper's count."""

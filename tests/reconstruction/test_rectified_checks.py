@@ -13,6 +13,7 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
+from deepdetect.matching.stereo import DENSE, DisparityOptions, match_rectified
 from deepdetect.reconstruction.rectified_checks import (
     RectifiedCheckOptions,
     check_cameras,
@@ -22,7 +23,6 @@ from deepdetect.reconstruction.rectified_checks import (
     check_matched,
     check_pure_rotation,
 )
-from deepdetect.reconstruction.stereo import DENSE, DisparityOptions, match_rectified
 
 
 @pytest.mark.parametrize(("unique", "least"), [(True, 0.1), (False, 0.25)])

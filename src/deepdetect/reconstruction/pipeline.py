@@ -24,6 +24,7 @@ from ..io.image import load_image, luma
 from ..matching.guided import InitialMatches, initial_matches
 from ..matching.options import get_preset
 from ..matching.pipeline import match_images
+from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .checks import check_images
 from .outliers import PointFilterOptions, sor_inliers_on_grid
 from .rectification import Rectification, RectificationOptions, detect_rectification
@@ -37,7 +38,6 @@ from .rectified_checks import (
     check_pure_rotation,
 )
 from .result import Reconstruction
-from .stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .two_view import TwoViewOptions, reconstruct_two_view
 
 

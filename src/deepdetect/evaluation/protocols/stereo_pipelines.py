@@ -19,8 +19,8 @@ from ...detector.heatmap import HeatmapOptions
 from ...features.matchers import match_descriptors
 from ...features.matchers.approximate import flann_neighbours
 from ...matching.pipeline import check_memory
+from ...matching.stereo.matching import find_disparity_range
 from ...reconstruction.pipeline import reconstruct
-from ...reconstruction.stereo.matching import find_disparity_range
 from ..baselines.method import LocalFeature, deepdetect_feature
 from ..baselines.opencv import self_described
 from ..baselines.random import AllPixels, RandomDetector

@@ -11,14 +11,14 @@ import pytest
 from deepdetect import DeepDetect, ImageError, OptionError
 from deepdetect._shared import parallel
 from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.reconstruction.stereo import (
+from deepdetect.matching.stereo import (
     DENSE,
     DisparityOptions,
     RectifiedMatches,
     disparity_map,
     match_rectified,
 )
-from deepdetect.reconstruction.stereo.matching import RangeSearchOptions, find_disparity_range
+from deepdetect.matching.stereo.matching import RangeSearchOptions, find_disparity_range
 
 SHAPE = (96, 160)
 ROW, COLUMN = np.indices(SHAPE)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deepdetect.reconstruction.stereo.consistency import (
+from deepdetect.matching.stereo.consistency import (
     fill_occlusions,
     filter_speckles,
     near_discontinuity,

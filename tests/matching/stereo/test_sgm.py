@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from deepdetect import OptionError
-from deepdetect.reconstruction.stereo import sgm as module
-from deepdetect.reconstruction.stereo.sgm import (
+from deepdetect.matching.stereo import sgm as module
+from deepdetect.matching.stereo.sgm import (
     CENSUS_RADIUS_X,
     CENSUS_RADIUS_Y,
     DisparityRange,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from deepdetect import OptionError
-from deepdetect.reconstruction.stereo.refinement import DisparityRefinementOptions, refine_disparity
+from deepdetect.matching.stereo.refinement import DisparityRefinementOptions, refine_disparity
 
 SHAPE = (60, 120)
 ROW, COLUMN = np.indices(SHAPE)
