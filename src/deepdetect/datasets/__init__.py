@@ -8,6 +8,7 @@ from .download import RemoteDataset, RemoteFile, get_dataset
 from .hpatches import HPATCHES
 from .middlebury import MIDDLEBURY, load_motorcycle
 from .oxford import OXFORD
+from .posed_images import PosedImage, PosedScene, load_posed_scenes
 from .types import StereoPair
 
 STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {
@@ -40,10 +41,13 @@ def load_stereo_pair(name: str) -> StereoPair:
 __all__ = [
     "REMOTE_DATASETS",
     "STEREO_PAIRS",
+    "PosedImage",
+    "PosedScene",
     "RemoteDataset",
     "RemoteFile",
     "StereoPair",
     "find_remote_dataset",
     "get_dataset",
+    "load_posed_scenes",
     "load_stereo_pair",
 ]

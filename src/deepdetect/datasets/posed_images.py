@@ -1,0 +1,369 @@
+"""Folders of images with known cameras, in three public layouts.
+
+- Strecha's (Strecha et al., 2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
+- KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt, whose first line is the
+  projection matrix of the images' camera, and poses.txt, whose line N belongs to image N.
+- COLMAP's text model (Schönberger and Frahm, 2016): cameras.txt and images.txt in the folder, or
+  in its sparse/ or sparse/0/; the images in the folder or in its images/. Without distortion.
+
+Intrinsics are of the images as they are: where a file names another size, they are scaled to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from .._shared.errors import ImageError
+from ..geometry.triangulation import cross_matrix
+from ..io.image import load_image
+from .pair_selection import PairSelectionOptions, sequence_pairs, unordered_pairs
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+
+MAX_ROTATION_ERROR = 1e-3
+"""By which a rotation's columns may fail to be orthonormal: files have few digits."""
+
+MAX_ASPECT_ERROR = 0.01
+"""By which an image may be stretched against the size that its camera is for: sizes are whole."""
+
+COLMAP_MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
+"""Number of the parameters: focal length, or two, and the principal point."""
+
+ORIENTATION_TAG = 0x0112
+"""Of EXIF."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image and its camera; centre of the first pixel (0, 0).
+
+    Attributes:
+        path: the image's file.
+        intrinsics: (3, 3) float64 camera matrix in pixels of this file.
+        rotation, translation: (3, 3) and (3,) float64, world to camera: X_camera = rotation @
+            X_world + translation, in the scene's unit of length.
+    """
+
+    path: Path
+    intrinsics: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class PosedPair:
+    """Two images of a scene.
+
+    Attributes:
+        scene: the scene's name.
+        first, second: the images.
+        frame_distance: how many frames of a sequence lie between them; None for other images.
+    """
+
+    scene: str
+    first: PosedImage
+    second: PosedImage
+    frame_distance: int | None = None
+
+    @property
+    def name(self) -> str:
+        """As in "fountain 0000-0005"."""
+        return f"{self.scene} {self.first.path.stem}-{self.second.path.stem}"
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """The (3, 3) relative rotation: X_second = rotation @ X_first + translation."""
+        return self.second.rotation @ self.first.rotation.T
+
+    @property
+    def translation(self) -> np.ndarray:
+        """The (3,) relative translation, in the scene's unit of length."""
+        return self.second.translation - self.rotation @ self.first.translation
+
+    @property
+    def fundamental(self) -> np.ndarray:
+        """The (3, 3) fundamental matrix in pixels, x1^T F x0 = 0."""
+        essential = cross_matrix(self.translation) @ self.rotation
+        inverses = [np.linalg.inv(image.intrinsics) for image in (self.first, self.second)]
+        return inverses[1].T @ essential @ inverses[0]
+
+
+@dataclass(frozen=True, eq=False)
+class PosedScene:
+    """A scene.
+
+    Attributes:
+        name: the folder's.
+        images: all of them, by name.
+        pairs: those that were chosen.
+    """
+
+    name: str
+    images: tuple[PosedImage, ...]
+    pairs: tuple[PosedPair, ...]
+
+
+def load_posed_scenes(
+    folder: str | Path, options: PairSelectionOptions = PairSelectionOptions()
+) -> list[PosedScene]:
+    """Read the scene that a folder is, or those that its subfolders are.
+
+    Args:
+        folder: a scene in one of the three layouts, or a folder of scenes.
+        options: which pairs are chosen.
+
+    Raises:
+        ImageError: there is no scene, or a file of one is missing or damaged.
+    """
+    root = Path(folder).resolve()
+    below = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+    folders = [root] if _reader(root) else [path for path in below if _reader(path)]
+    if not folders:
+        raise ImageError(
+            f"there are no images with cameras in {folder}: it, or each of its folders, must hold "
+            "NNNN.camera files (Strecha), calib.txt and poses.txt (KITTI), or cameras.txt and "
+            "images.txt (COLMAP)"
+        )
+    return [_load_scene(path, options) for path in folders]
+
+
+def _reader(folder: Path) -> Callable[[Path], list[PosedImage]] | None:
+    """Return the function that reads the layout of a folder."""
+    if any(folder.glob("*.camera")):
+        return _read_strecha
+    if _is_sequence(folder):
+        return _read_kitti
+    return None if _colmap_model(folder) is None else _read_colmap
+
+
+def _is_sequence(folder: Path) -> bool:
+    return (folder / "calib.txt").is_file() and (folder / "poses.txt").is_file()
+
+
+def _load_scene(folder: Path, options: PairSelectionOptions) -> PosedScene:
+    read = _reader(folder)
+    images = read(folder) if read is not None else []
+    frames = [int(image.path.stem) for image in images] if read is _read_kitti else None
+    if frames is None:
+        chosen = unordered_pairs(len(images), options.max_pairs) if len(images) > 1 else []
+    else:
+        rows = {frame: row for row, frame in enumerate(frames)}
+        chosen = [(rows[a], rows[b]) for a, b in sequence_pairs(frames, options)]
+    if not chosen:
+        distances = "" if frames is None else f" at the frame distances {options.frame_distances}"
+        raise ImageError(
+            f"there are no two images with cameras{distances} in {folder}: put more images there"
+        )
+    pairs = (
+        PosedPair(
+            folder.name, images[a], images[b], None if frames is None else frames[b] - frames[a]
+        )
+        for a, b in chosen
+    )
+    return PosedScene(folder.name, tuple(images), tuple(pairs))
+
+
+def _read_strecha(folder: Path) -> list[PosedImage]:
+    """Read K, a row of zeros, the camera's axes and its centre in the world, and the size."""
+    images = []
+    for file in sorted(folder.glob("*.camera")):
+        numbers = _numbers(_text(file).split(), 26, str(file))
+        size = (numbers[24], numbers[25])
+        stem = folder / file.name.removesuffix(".camera")
+        found = [
+            path for path in (stem, *(Path(f"{stem}{end}") for end in SUFFIXES)) if path.is_file()
+        ]
+        if not found:
+            raise ImageError(f"there is no image {stem}.jpg or .png for {file}: put it there")
+        images.append(
+            _posed_image(
+                found[0],
+                _scaled(numbers[:9].reshape(3, 3), size, found[0], file),
+                *_world_to_camera(numbers[12:21].reshape(3, 3), numbers[21:24]),
+                file,
+            )
+        )
+    return images
+
+
+def _read_kitti(folder: Path) -> list[PosedImage]:
+    calibration, poses = folder / "calib.txt", folder / "poses.txt"
+    words = (_text(calibration).splitlines() or [""])[0].split()
+    if words and words[0].endswith(":"):
+        words = words[1:]
+    projection = _numbers(words, 12, f"the first line of {calibration}").reshape(3, 4)
+    lines = [line for line in _text(poses).splitlines() if line.strip()]
+    images = []
+    for path in sorted(folder.iterdir()):
+        if path.suffix not in SUFFIXES or not path.stem.isdecimal():
+            continue
+        frame = int(path.stem)
+        if frame >= len(lines):
+            raise ImageError(
+                f"{poses} has {len(lines)} lines and so no pose of {path.name}: line 1 belongs to "
+                "image 000000"
+            )
+        where = f"line {frame + 1} of {poses}"
+        pose = _numbers(lines[frame].split(), 12, where).reshape(3, 4)
+        rotation, translation = _world_to_camera(pose[:, :3], pose[:, 3])
+        image = _posed_image(path, projection[:, :3], rotation, translation, where)
+        _image_size(path)  # damaged images are an error, and those that are to be turned
+        # The poses are of the first camera; the last column leads from it to the images' own.
+        offset = np.linalg.solve(image.intrinsics, projection[:, 3])
+        images.append(replace(image, translation=translation + offset))
+    return images
+
+
+def _colmap_model(folder: Path) -> Path | None:
+    """Return where cameras.txt and images.txt lie, or None."""
+    places = [folder, folder / "sparse", folder / "sparse" / "0"]
+    for place in places:
+        if all((place / name).is_file() for name in ("cameras.txt", "images.txt")):
+            return place
+    for place in places:
+        if (place / "cameras.bin").is_file():
+            raise ImageError(
+                f"{place} holds COLMAP's binary model only: write it as text with "
+                "colmap model_converter --output_type TXT"
+            )
+    return None
+
+
+def _read_colmap(folder: Path) -> list[PosedImage]:
+    model = _colmap_model(folder) or folder
+    cameras = {}
+    for line in _text(model / "cameras.txt").splitlines():
+        if line.strip() and line[0] != "#":
+            cameras[line.split()[0]] = line.split()
+    # Two lines an image; the second, triples of its points, may be empty.
+    lines = [line for line in _text(model / "images.txt").splitlines() if line[:1] != "#"]
+    if any(len(points.split()) % 3 for points in lines[1::2]):
+        raise ImageError(
+            f"{model / 'images.txt'} must hold two lines for each image, the second with its "
+            "points or empty: write it with COLMAP"
+        )
+    images = []
+    for line in lines[::2]:
+        words = line.split(maxsplit=9)
+        where = f"the line {line[:40]!r} of {model / 'images.txt'}"
+        if not words:
+            continue
+        numbers = _numbers(words[1:8], 7, where)
+        if len(words) < 10 or words[8] not in cameras:
+            raise ImageError(
+                f"{where} names no camera of cameras.txt, or no image: write both files with COLMAP"
+            )
+        name = words[9].strip()
+        paths = [path for part in ("", "images") if (path := folder / part / name).is_file()]
+        if not paths:
+            raise ImageError(f"there is no image {name} in {folder} or its images: put it there")
+        intrinsics = _colmap_intrinsics(cameras[words[8]], paths[0], model / "cameras.txt")
+        rotation = _rotation_of_quaternion(numbers[:4], where)
+        images.append(_posed_image(paths[0], intrinsics, rotation, numbers[4:], where))
+    return sorted(images, key=lambda image: image.path)
+
+
+def _colmap_intrinsics(words: Sequence[str], image: Path, file: Path) -> np.ndarray:
+    """Return the intrinsics of a camera: id, model, width, height, parameters."""
+    model = words[1] if len(words) > 1 else ""
+    if model not in COLMAP_MODELS:
+        raise ImageError(
+            f"the camera {words[0]} of {file} is of the model {model}, not PINHOLE: undistort the "
+            "images first (colmap image_undistorter)"
+        )
+    count = COLMAP_MODELS[model]
+    numbers = _numbers(words[2:], 2 + count, f"the camera {words[0]} of {file}")
+    focal = numbers[2:count]
+    cx, cy = numbers[count:] - 0.5  # the centre of COLMAP's first pixel is (0.5, 0.5)
+    matrix = np.array([[focal[0], 0, cx], [0, focal[-1], cy], [0, 0, 1]])
+    return _scaled(matrix, (numbers[0], numbers[1]), image, file)
+
+
+def _rotation_of_quaternion(quaternion: np.ndarray, where: str) -> np.ndarray:
+    """Return the rotation of a quaternion (w, x, y, z) of any length."""
+    length = np.linalg.norm(quaternion)
+    if length == 0:
+        raise ImageError(f"{where} holds no rotation: its quaternion is 0; make the file again")
+    w, *axis = quaternion / length
+    skew = cross_matrix(np.array(axis))
+    return np.eye(3) + 2 * w * skew + 2 * skew @ skew
+
+
+def _world_to_camera(axes: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose of a camera with these axes, as columns, and this centre in the world."""
+    return axes.T, -axes.T @ centre
+
+
+def _posed_image(
+    path: Path,
+    intrinsics: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    where: str | Path,
+) -> PosedImage:
+    """Check the camera of an image."""
+    wrong = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if wrong > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
+        raise ImageError(f"{where} holds no rotation: its columns must be orthonormal")
+    lower = [intrinsics[1, 0], intrinsics[2, 0], intrinsics[2, 1], intrinsics[2, 2] - 1]
+    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or np.any(lower):
+        raise ImageError(
+            f"the camera of {path.name} has no camera matrix with focal lengths above 0 and a last "
+            f"row 0 0 1: correct the file that {where} belongs to"
+        )
+    return PosedImage(path, intrinsics, rotation, translation)
+
+
+def _scaled(
+    intrinsics: np.ndarray, size: tuple[float, float], image: Path, file: Path
+) -> np.ndarray:
+    """Scale intrinsics for a (width, height) to the image: pixels are areas, so edges map."""
+    own = _image_size(image)
+    if min(size) <= 0 or abs(own[0] * size[1] / (own[1] * size[0]) - 1) > MAX_ASPECT_ERROR:
+        raise ImageError(
+            f"{image} is {own[0]}x{own[1]} pixels, but {file} is for {size[0]:g}x{size[1]:g}: take "
+            "images of the same shape"
+        )
+    x, y = (mine / its for mine, its in zip(own, size, strict=True))
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]]) @ intrinsics
+
+
+def _image_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) without decoding the pixels."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as opened:
+            size, turned = opened.size, opened.getexif().get(ORIENTATION_TAG, 1) != 1
+    except Exception:  # Pillow raises many kinds; this says what is wrong
+        height, width = load_image(path).shape[:2]
+        return width, height
+    if turned:
+        raise ImageError(
+            f"{path} is to be turned by its EXIF orientation, its camera is not: save it upright "
+            "without that tag"
+        )
+    return size
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check the folder") from None
+    except UnicodeDecodeError:
+        raise ImageError(f"{path} is no text: get it again") from None
+
+
+def _numbers(words: Sequence[str], count: int, where: str) -> np.ndarray:
+    try:
+        numbers = np.array(words, np.float64)
+    except ValueError:
+        numbers = np.empty(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise ImageError(f"{where} must hold {count} numbers: get the file again")
+    return numbers
