@@ -10,7 +10,10 @@ import click
 from ._generated import generated_command
 from ._options import DETECTOR, PATH, json_option, make_detector, print_json
 
-NAMES = ("oxford", "hpatches", "middlebury", "foreground", "low-visibility", "speed", "all")
+NAMES = (
+    *("oxford", "hpatches", "middlebury", "pose", "foreground", "low-visibility", "speed"),
+    "all",
+)
 
 
 @generated_command(DETECTOR, short_help="The tables and figures of the paper, with baselines.")
@@ -58,6 +61,13 @@ NAMES = ("oxford", "hpatches", "middlebury", "foreground", "low-visibility", "sp
     default=("dense",),
     help="Weights for stereo pairs, as --weights; may be repeated.  [default: dense]",
 )
+@click.option(
+    "--max-pairs",
+    type=int,
+    default=60,
+    show_default=True,
+    help="pose: of each scene at most this many pairs, evenly spaced.",
+)
 @json_option
 def benchmark(
     name: str,
@@ -69,6 +79,7 @@ def benchmark(
     preset: str,
     cache: Path | None,
     geometry_weights: tuple[str, ...],
+    max_pairs: int,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -80,9 +91,11 @@ def benchmark(
     deepdetect benchmark oxford --data data -o report
     deepdetect benchmark oxford --data data -o report --method xfeat.onnx
     deepdetect benchmark foreground --data data --baselines sift,fast-low -o report
+    deepdetect benchmark pose --data data/fountain -o report
     """
     from .._shared.errors import OptionError
     from .._shared.registry import look_up
+    from ..datasets.pair_selection import PairSelectionOptions
     from ..evaluation.baselines.opencv import CLASSICAL
     from ..evaluation.baselines.plugin import find_feature
     from ..evaluation.benchmarks import BENCHMARKS
@@ -109,6 +122,7 @@ def benchmark(
         tuple(find_feature(word) for word in words),
         "rgb" if heatmap is None else heatmap.channels,
         geometry_weights,
+        PairSelectionOptions(max_pairs),
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)
     paths = report.save(output)
@@ -116,7 +130,8 @@ def benchmark(
         print_json({**report.values(), "files": paths})
         return
     for table in report.tables():
-        click.echo(f"{table.title}\n\n{table.to_markdown()}\n")
+        if table.in_text:
+            click.echo(f"{table.title}\n\n{table.to_markdown()}\n")
     for reason in report.skipped:
         click.echo(f"skipped: {reason}")
     click.echo(f"report: {paths[0]}")

@@ -15,6 +15,7 @@ from ..datasets.foreground import load_foreground
 from ..datasets.hpatches import in_d2net_subset, is_illumination, load_hpatches
 from ..datasets.low_visibility import load_low_visibility
 from ..datasets.oxford import find_scene, load_oxford
+from ..datasets.posed_images import load_posed_scenes
 from ..datasets.types import PlanarPair, PlanarScene
 from .baselines.method import LocalFeature
 from .baselines.opencv import CLASSICAL, with_kd_trees
@@ -44,6 +45,7 @@ from .protocols.paper_numbers import (
     OXFORD_REPEATABILITY,
     with_paper_rows,
 )
+from .protocols.pose import pose_section
 from .protocols.speed import PAIR, speed_part
 from .protocols.standard import standard_part
 from .protocols.stereo import STEREO_TEXT, stereo_parts
@@ -365,6 +367,12 @@ def plan_middlebury(context: BenchmarkContext, options: BenchmarkOptions) -> Pla
     return [SectionPlan("Middlebury stereo, and Figure 8", (STEREO_TEXT,), parts)]
 
 
+def plan_pose(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
+    """Relative poses from matches, in any images with known cameras."""
+    scenes = load_posed_scenes(context.folder("pose"), options.pair_selection)
+    return [pose_section(context, options, scenes)]
+
+
 def plan_foreground(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
     """Table I's second half."""
     photographs = load_foreground(context.folder("foreground"))
@@ -384,6 +392,7 @@ BENCHMARKS: dict[str, Benchmark] = {
         Benchmark("oxford", plan_oxford),
         Benchmark("hpatches", plan_hpatches),
         Benchmark("middlebury", plan_middlebury, ("dense",)),
+        Benchmark("pose", plan_pose),
         Benchmark("foreground", plan_foreground),
         Benchmark("low-visibility", plan_low_visibility),
         Benchmark("speed", plan_speed),

@@ -22,6 +22,7 @@ STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "matches": (1, ("keypoints",)),
     "guided": (1, ("keypoints",)),
     "stereo": (1, ()),
+    "pose": (1, ("matches", "guided")),
     "repeatability_paper": (1, ("keypoints",)),
     "repeatability_mutual_nn": (1, ("keypoints",)),
     "coverage": (1, ("keypoints",)),

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
+from ..datasets.pair_selection import PairSelectionOptions
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
 from ..features.selection import SelectionOptions
@@ -37,6 +38,7 @@ class BenchmarkOptions:
         channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
             feeds its own weights.
         geometry_weights: the weights for stereo pairs, one or more.
+        pair_selection: which pairs of images with cameras are matched.
 
     Raises:
         OptionError: a name is unknown, or nothing is left to do.
@@ -48,6 +50,7 @@ class BenchmarkOptions:
     others: tuple[LocalFeature, ...] = ()
     channels: Literal["rgb", "bgr"] = "rgb"
     geometry_weights: tuple[str | Path, ...] = ("dense",)
+    pair_selection: PairSelectionOptions = field(default_factory=PairSelectionOptions)
 
     def __post_init__(self) -> None:
         for protocol in self.protocols:

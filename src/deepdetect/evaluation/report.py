@@ -50,6 +50,7 @@ class Table:
         columns: from left to right.
         rows: cells, as many as columns in each.
         note: what a reader must know to read it.
+        in_text: False for a long one: report.md names its file instead of showing its rows.
 
     Raises:
         OptionError: a row has another length, or two columns have one title.
@@ -60,6 +61,7 @@ class Table:
     columns: tuple[Column, ...]
     rows: tuple[tuple[Cell, ...], ...]
     note: str = ""
+    in_text: bool = True
 
     def __post_init__(self) -> None:
         titles = [column.title for column in self.columns]
@@ -199,7 +201,8 @@ def _save_markdown(report: Report, folder: Path) -> list[Path]:
     for section in report.sections:
         parts += [f"## {section.title}", *section.text]
         for table in section.tables:
-            parts += [f"**{table.title}**", table.to_markdown(), *filter(None, [table.note])]
+            shown = table.to_markdown() if table.in_text else f"In `tables/{table.key}.csv`."
+            parts += [f"**{table.title}**", shown, *filter(None, [table.note])]
         parts += [f"![{f.title}](figures/{f.key}.png)\n\n{f.title}" for f in section.figures]
     parts += ["## Skipped", "\n".join(f"- {reason}" for reason in report.skipped) or "- nothing"]
     parts += ["## How this was made"]
