@@ -128,6 +128,8 @@ def test_no_classical_method_may_be_wanted(made, folder: Path, run) -> None:
         ("middlebury", "stereo"),
         ("low-visibility", "dusty"),
         ("speed", "img1"),
+        ("pose", "no images with cameras"),
+        ("pose --max-pairs 0", "--max-pairs must be above 0"),
     ],
 )
 def test_a_wrong_name_ends_with_one_line_and_exit_code_2(

@@ -176,3 +176,13 @@ def test_a_second_report_takes_the_place_of_the_first(report: Report, tmp_path: 
 def test_infinity_survives_in_csv(folder: Path) -> None:
     with (folder / "tables" / "first.csv").open(newline="", encoding="utf-8") as file:
         assert math.isinf(float(list(csv.reader(file))[4][1]))
+
+
+def test_a_table_out_of_the_text_is_named_there_and_written_as_csv(tmp_path: Path) -> None:
+    table = Table("long", "All", (Column("a"),), (("cell 1",), ("cell 2",)), "note", in_text=False)
+    Report("title", {}, (Section("one", (), (table,)),)).save(tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert "**All**\n\nIn `tables/long.csv`.\n\nnote" in text
+    assert "cell" not in text
+    assert (tmp_path / "tables" / "long.csv").read_text().split() == ["a", "cell", "1", "cell", "2"]
+    assert len(json.loads((tmp_path / "report.json").read_text())["tables"]["long"]["rows"]) == 2

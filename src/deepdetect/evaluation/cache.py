@@ -22,11 +22,11 @@ STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "matches": (1, ("keypoints",)),
     "guided": (1, ("keypoints",)),
     "stereo": (1, ()),
-    "pose": (1, ("matches", "guided")),
     "repeatability_paper": (1, ("keypoints",)),
     "repeatability_mutual_nn": (1, ("keypoints",)),
     "coverage": (1, ("keypoints",)),
     "corner_errors": (1, ("matches",)),
+    "pose": (1, ("matches", "guided")),
     "foreground": (1, ("keypoints",)),
 }
 """Version of each stage, and the stages it is made from.
