@@ -81,7 +81,7 @@ def check_ranges(
             continue
         values = _numbers(value)
         fits = bool(values) and all(smallest <= one <= largest for one in values)
-        if not fits or (name in odd and value % 2 != 1):
+        if not fits or (name in odd and any(one % 2 != 1 for one in values)):
             raise OptionError(f"`{name}` must {expected}, not {value}")
 
 

@@ -51,12 +51,18 @@ def describe_tiles(  # type: ignore[no-untyped-def]
     summed = np.zeros((TILE_HEIGHT + 2 * reach, TILE_WIDTH, 32), np.float32)
     histogram = np.zeros((4, 32), np.float32)
     line = np.zeros(8, np.float32)
+    needed = np.zeros(TILE_WIDTH, np.bool_)
     for tile in range(first, last):
         if starts[tile] == starts[tile + 1]:
             continue
         top = (tile // tiles_across) * TILE_HEIGHT
         left = (tile % tiles_across) * TILE_WIDTH
-        for j in range(TILE_HEIGHT + 2 * reach):
+        needed[:] = False
+        lowest, highest = TILE_HEIGHT, -1
+        for k in order[starts[tile] : starts[tile + 1]]:
+            needed[columns[k] - left] = True
+            lowest, highest = min(lowest, rows[k] - top), max(highest, rows[k] - top)
+        for j in range(lowest, highest + 2 * reach + 1):
             y = top + j - reach
             if y < 1 or y >= height - 1:
                 summed[j] = 0
@@ -69,7 +75,9 @@ def describe_tiles(  # type: ignore[no-untyped-def]
                 weight = magnitude[y, left + i - reach]
                 soft[i, whole & 7] = weight * (np.float32(1) - part)
                 soft[i, (whole + 1) & 7] = weight * part
-            for i in range(min(TILE_WIDTH, width - left)):
+            for i in range(TILE_WIDTH):
+                if not needed[i]:
+                    continue
                 for b in range(4):
                     line[:] = 0
                     for t in range(spans[b, 0], spans[b, 1]):

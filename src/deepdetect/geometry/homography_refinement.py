@@ -225,7 +225,8 @@ def _track(
     options: RefinementOptions,
 ) -> np.ndarray | None:
     """Return the homography from the first image to the warped second one, by corners."""
-    corners = track_corners(gray0, warped, valid_mask, window_px, options)
+    equalised = equalise(gray0), equalise(warped)
+    corners = track_corners(*equalised, valid_mask, window_px, options)
     if corners is None:
         return None
     return cv2.findHomography(
@@ -238,18 +239,23 @@ def _track(
 
 
 def track_corners(
-    gray0: np.ndarray,
-    warped: np.ndarray,
+    first: np.ndarray,
+    second: np.ndarray,
     valid_mask: np.ndarray,
     window_px: int,
     options: RefinementOptions = RefinementOptions(),
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Track corners from the first image to the warped second one and back.
+    """Track corners from one image to another in the same frame, and back.
+
+    Args:
+        first, second: (H, W) uint8, after `equalise`.
+        valid_mask: (H, W) bool, where the second has content.
+        window_px: side of the tracked windows.
+        options: of the tracking.
 
     Returns:
         (N, 2) float32 positions in both; None with fewer than `min_tracks`.
     """
-    first, second = _equalise(gray0), _equalise(warped)
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
     corners = cv2.goodFeaturesToTrack(first, options.max_corners, 0.001, 5, mask=inside)
@@ -282,7 +288,8 @@ def refine_homography_irls(
     """
     size = (gray0.shape[1], gray0.shape[0])
     warped, valid_mask = warp_to_reference(gray1, homography, size)
-    corners = track_corners(gray0, warped, valid_mask, options.window_px)
+    equalised = equalise(gray0), equalise(warped)
+    corners = track_corners(*equalised, valid_mask, options.window_px)
     if corners is None:
         return homography
     correction = fit_homography_irls(*corners, options)
@@ -353,7 +360,7 @@ def aligned_fraction(
     """
     if not valid_mask.any():
         return 0.0
-    first, second = (gaussian_blur(_equalise(gray), 1) for gray in (gray0, warped))
+    first, second = (gaussian_blur(equalise(gray), 1) for gray in (gray0, warped))
     x, y = (cv2.Scharr(first, cv2.CV_32F, *order) / 32 for order in ((1, 0), (0, 1)))
     window = (options.alignment_window_px, options.alignment_window_px)
     change = second - first
@@ -366,6 +373,6 @@ def aligned_fraction(
     return float((error_px[valid_mask] <= options.max_alignment_error_px).mean())
 
 
-def _equalise(gray: np.ndarray) -> np.ndarray:
+def equalise(gray: np.ndarray) -> np.ndarray:
     """Equalise an image locally, so that changes of light are not taken for motion."""
     return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)

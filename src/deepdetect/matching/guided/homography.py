@@ -7,12 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...features.matchers import DescriptorMatches
-from ...geometry.homography_refinement import refine_homography, refine_homography_irls
 from ...geometry.rescaling import downscale, scaled_homography
 from ...geometry.residuals import transform_points
+from ...geometry.validated_refinement import refine_homography_validated
 from ...geometry.zncc import warp_to_reference
 from .options import HomographyMatchingOptions, VerificationOptions
 from .verification import dissimilarity
+
+MIN_SCALE = 1 / 16
+"""Of one image in the other; beyond it a homography shows nothing that could be refined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +62,38 @@ def match_by_homography(
 def refine_guiding_homography(
     gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray, options: HomographyMatchingOptions
 ) -> np.ndarray:
-    """Refine a homography on the images, scaled down to what that needs; (3, 3)."""
+    """Refine a homography on the images, scaled down to what that needs; (3, 3).
+
+    Where one image shows the scene much finer it is scaled down to the other: corners of different
+    scales are not at the same place.
+    """
+    coarser0, coarser1 = _scales_at_centre(homography, gray0.shape, options.max_scale_ratio)
     (small0, scale0), (small1, scale1) = (
-        downscale(gray, options.max_side_px) for gray in (gray0, gray1)
+        downscale(gray, min(options.max_side_px, round(max(gray.shape) * scale)))
+        for gray, scale in ((gray0, coarser0), (gray1, coarser1))
     )
     start = scaled_homography(homography, scale0, scale1)
-    found = refine_homography(small0, small1, start, options.refinement).homography
-    found = refine_homography_irls(small0, small1, found)
+    found = refine_homography_validated(small0, small1, start, options.refinement)
     return scaled_homography(found, 1 / scale0, 1 / scale1)
+
+
+def _scales_at_centre(
+    homography: np.ndarray, shape: tuple[int, ...], max_ratio: float
+) -> tuple[float, float]:
+    """Return the scales of both images at which the finer one is as coarse as the other.
+
+    Finer: in every direction, by more than `max_ratio`, in the middle of the first image.
+    """
+    centre = np.array([shape[1] / 2, shape[0] / 2])
+    places = transform_points(centre + [[0, 0], [1, 0], [0, 1]], homography)
+    if not np.isfinite(places).all():
+        return 1.0, 1.0
+    largest, smallest = np.linalg.svd(places[1:] - places[0], compute_uv=False)
+    if largest * max_ratio < 1:
+        return max(float(largest), MIN_SCALE), 1.0
+    if smallest > max_ratio:
+        return 1.0, max(1 / float(smallest), MIN_SCALE)
+    return 1.0, 1.0
 
 
 def nearest_keypoint(

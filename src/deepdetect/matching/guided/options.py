@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from ..._shared.options import check_ranges
 from ...features.sift_detector import SiftOptions
 from ...geometry.acontrario import MAX_LOG10_NFA
-from ...geometry.homography_refinement import RefinementOptions
 from ...geometry.model_selection import ModelSelectionOptions
+from ...geometry.validated_refinement import ValidatedRefinementOptions
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,7 @@ class VerificationOptions:
 
     Attributes:
         keypoint_sizes_px: diameters of the keypoints of the descriptors that are compared.
+        lattice_px: between the points that are described, along rows and columns.
         false_positive_rate: fraction of null pairs (unrelated patches of the two images) that pass.
         smoothing_sigma_px: of the Gaussian mean over neighbouring points.
         window_px: side of the window around a point in which most points must pass, odd.
@@ -88,6 +89,7 @@ class VerificationOptions:
     """
 
     keypoint_sizes_px: tuple[float, ...] = (3.0, 8.0)
+    lattice_px: int = 3
     false_positive_rate: float = 0.01
     smoothing_sigma_px: float = 2.5
     window_px: int = 81
@@ -100,7 +102,7 @@ class VerificationOptions:
         check_ranges(
             self,
             positive=(
-                *("keypoint_sizes_px", "smoothing_sigma_px", "window_px"),
+                *("keypoint_sizes_px", "lattice_px", "smoothing_sigma_px", "window_px"),
                 *("null_block_px", "max_null_blocks"),
             ),
             fractions=("false_positive_rate", "min_support", "null_shifts"),
@@ -113,6 +115,8 @@ class HomographyMatchingOptions:
 
     Attributes:
         max_side_px: longer sides are scaled down to this while the homography is refined.
+        max_scale_ratio: of the two images; where one shows the scene finer by more than this, it is
+            scaled down to the other for the refinement.
         refinement: how it is refined.
         max_distance_px: from where the homography takes a keypoint to its partner.
         min_verified_fraction: of the pairs it proposes, this fraction must have the same patches on
@@ -125,11 +129,8 @@ class HomographyMatchingOptions:
     """
 
     max_side_px: int = 1600
-    refinement: RefinementOptions = field(
-        default_factory=lambda: RefinementOptions(
-            max_rounds=2, windows_px=(15, 21, 41), inlier_threshold=0.5
-        )
-    )
+    max_scale_ratio: float = 1.5
+    refinement: ValidatedRefinementOptions = field(default_factory=ValidatedRefinementOptions)
     max_distance_px: float = 1.0
     min_verified_fraction: float = 0.15
     min_verified_fraction_of_depth: float = 0.6
@@ -139,6 +140,7 @@ class HomographyMatchingOptions:
         check_ranges(
             self,
             positive=("max_side_px", "max_distance_px"),
+            between={"max_scale_ratio": (1, math.inf)},
             fractions=(
                 *("min_verified_fraction", "min_verified_fraction_of_depth"),
                 "min_parallax_fraction",

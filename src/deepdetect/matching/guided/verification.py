@@ -8,8 +8,8 @@ What unrelated patches look like is measured on the pair itself, by null pairs: 
 shifted by a third of its size and more, and what then lies under a point is unrelated to it, but of
 the same kind of scene and light. A point passes when its descriptors, averaged with those of its
 neighbours, are more similar than all but `false_positive_rate` of the null pairs, and when most
-points around it pass, too. Every second point is described, as on a chessboard: neighbours have
-nearly the same descriptors.
+points around it pass, too. Only points on a lattice are described: neighbours have nearly the same
+descriptors.
 """
 
 from __future__ import annotations
@@ -28,9 +28,6 @@ from .options import VerificationOptions
 DESCRIPTOR_REACH = 36
 """Pixels that the largest descriptors see, with their gradient and blur. Further from all edges the
 descriptors of a shifted image are those of the image itself, described once for all shifts."""
-
-NEIGHBOURHOOD = 5
-"""Side in pixels of the window around a point in which one of the described points must lie."""
 
 MIN_POINTS_OF_MEAN = 100
 """With fewer points no mean descriptor is subtracted: it would be close to their own."""
@@ -98,7 +95,7 @@ def dissimilarity(
     if not len(known):
         return result
     here, shape = pixels[known], gray0.shape
-    described = here[_every_second(here, shape)]
+    described = here[_on_lattice(here, shape, options.lattice_px)]
     null_pairs = sample_null_pairs(described, warped, valid, options, seed)
     distances, null_distances = _distances(gray0, warped, described, null_pairs, options)
     sigma = options.smoothing_sigma_px
@@ -196,14 +193,17 @@ def _distances(
     return distances, null_distances
 
 
-def _every_second(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-    """Return the rows of every second point, and of those with none of these near."""
-    second = pixels.sum(axis=1) % 2 == 0
-    image = np.zeros(tuple(shape[:2]), np.float32)
-    image[pixels[:, 1], pixels[:, 0]] = second
-    window = np.ones((NEIGHBOURHOOD, NEIGHBOURHOOD), np.uint8)
-    near = cv2.dilate(image, window)[pixels[:, 1], pixels[:, 0]] > 0
-    return np.flatnonzero(second | ~near)
+def _on_lattice(pixels: np.ndarray, shape: Sequence[int], step_px: int) -> np.ndarray:
+    """Return the rows of the points on every `step_px`-th row and column, and those far from them.
+
+    Far: with none of these in the window that reaches one step in each direction.
+    """
+    chosen = (pixels % step_px == step_px // 2).all(axis=1)
+    image = np.zeros(tuple(shape[:2]), np.uint8)
+    image[pixels[:, 1], pixels[:, 0]] = chosen
+    side = 2 * step_px + 1
+    near = cv2.dilate(image, np.ones((side, side), np.uint8))[pixels[:, 1], pixels[:, 0]] > 0
+    return np.flatnonzero(chosen | ~near)
 
 
 def _sample_blocks(pixels: np.ndarray, options: VerificationOptions, seed: int) -> list[np.ndarray]:
