@@ -136,7 +136,7 @@ def measure_parallax(
     if not len(epipoles):
         return nothing
     limit = options.max_epipolar_distance_px / scale
-    counts = [np.count_nonzero(_misses(epipole, first, second) < limit) for epipole in epipoles]
+    counts = np.count_nonzero(_misses(epipoles, first, second) < limit, axis=1)
     best = int(np.argmax(counts))
     to_pixels = np.array(
         [[scale, 0, low[0] + scale / 2], [0, scale, low[1] + scale / 2], [0, 0, 1]]
@@ -153,11 +153,11 @@ def measure_parallax(
     )
 
 
-def _misses(epipole: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the distances of points from the lines through the epipole and their predictions."""
-    lines = np.cross(epipole, first)
-    normal = np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12)
-    return np.abs((lines * second).sum(axis=1)) / normal
+def _misses(epipoles: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the distances of points from the lines through epipoles and predictions, (E, N)."""
+    x, y, scale = epipoles.T[:, :, None]
+    normal = np.hypot(y - scale * first[:, 1], scale * first[:, 0] - x)
+    return np.abs(epipoles @ np.cross(first, second).T) / np.maximum(normal, 1e-12)
 
 
 def _log10_nfa(count: int, agreeing: int, chance: float) -> float:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..._shared.parallel import parallel_for
 from ...features.matchers import DescriptorMatches
 from ...geometry.rescaling import downscale, scaled_homography
 from ...geometry.residuals import transform_points
@@ -115,21 +116,13 @@ def nearest_keypoint(
         >>> rows[0], far.round(2).tolist()
         (np.int32(0), [0.2, inf])
     """
-    width, height = size
-    grid = np.full((height + 4, width + 4), -1, np.int32)  # two pixels of border
+    from .homography_kernel import nearest_of_nine
+
+    grid = np.full((size[1], size[0]), -1, np.int32)
     pixels = np.asarray(xy).astype(np.int64)
-    grid[pixels[:, 1] + 2, pixels[:, 0] + 2] = np.arange(len(pixels))
-    inside = (
-        np.isfinite(places).all(1) & (places > -1.5).all(1) & (places < np.array(size) + 0.5).all(1)
-    )
-    middle = np.rint(np.where(inside[:, None], places, 0)).astype(np.int64)
+    grid[pixels[:, 1], pixels[:, 0]] = np.arange(len(pixels))
+    places = np.ascontiguousarray(places, np.float64)
     rows = np.full(len(places), -1, np.int32)
     best = np.full(len(places), np.inf)
-    for down in (-1, 0, 1):
-        for across in (-1, 0, 1):
-            x, y = middle[:, 0] + across, middle[:, 1] + down
-            found = grid[y + 2, x + 2]
-            gap = np.hypot(x - places[:, 0], y - places[:, 1])
-            nearer = inside & (found >= 0) & (gap < best)
-            rows[nearer], best[nearer] = found[nearer], gap[nearer]
+    parallel_for(len(places), nearest_of_nine, places, grid, rows, best)
     return rows, best

@@ -1,7 +1,8 @@
 """The initial geometry of a pair, from sparse SIFT matches, or that none can be trusted.
 
-Plain SIFT first; simulated views (`asift`) only when that gives nothing. No DeepDetect keypoint
-takes part.
+A look at small copies first, which is enough where the pair is clearly a plane; then plain SIFT on
+larger ones; simulated views (`asift`) only when that gives nothing. No DeepDetect keypoint takes
+part.
 """
 
 from __future__ import annotations
@@ -110,6 +111,54 @@ def initial_matches(
     return InitialMatches((view0, view1), (scale0, scale1), features, matched)
 
 
+def find_initial_geometry(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    model: str = "auto",
+    seed: int = 0,
+    options: InitialGeometryOptions = InitialGeometryOptions(),
+    initial: InitialMatches | None = None,
+) -> InitialGeometry:
+    """Find the geometry of a pair, by the least effort that it takes.
+
+    Args:
+        gray0, gray1: (H, W) uint8 luma.
+        model: as of `estimate_initial_geometry`.
+        seed: of the random samples.
+        options: sizes, thresholds, and which views are simulated.
+        initial: sparse matches, where `initial_matches` has made them already.
+
+    Returns:
+        The geometry, or one with the model "none".
+
+    Raises:
+        OptionError: the model is unknown.
+
+    Example:
+        >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
+        >>> find_initial_geometry(image, image).model
+        'homography'
+    """
+    longest = max(*gray0.shape, *gray1.shape)
+    first_side = min(options.first_side_px, options.max_side_px)
+    if initial is None and longest > first_side and model != "fundamental":
+        small = replace(options, max_side_px=first_side)
+        look = initial_matches(gray0, gray1, options=small)
+        found = estimate_initial_geometry(look, model, seed, small, simulate_views=False)
+        if _is_clearly_a_plane(found, options):
+            return found
+    if initial is None:
+        initial = initial_matches(gray0, gray1, options=options)
+    found = estimate_initial_geometry(initial, model, seed, options, simulate_views=False)
+    if found.matrix is not None:
+        return found
+    simulated_side = min(options.simulated_side_px, options.max_side_px)
+    if longest > simulated_side:
+        options = replace(options, max_side_px=simulated_side)
+        initial = initial_matches(gray0, gray1, options=options)
+    return estimate_initial_geometry(initial, model, seed, options)
+
+
 def estimate_initial_geometry(
     initial: InitialMatches,
     model: str = "auto",
@@ -148,6 +197,14 @@ def estimate_initial_geometry(
         if not simulate_views:
             break
     return replace(_nothing(best.num_matches), log10_nfa=best.log10_nfa, num_views=num_views)
+
+
+def _is_clearly_a_plane(found: InitialGeometry, options: InitialGeometryOptions) -> bool:
+    """Whether most matches agree with a homography, and no others on an epipole."""
+    needed = max(options.min_first_inliers, options.min_first_fraction * found.num_matches)
+    if found.model != "homography" or len(found.points0) < needed:
+        return False
+    return found.parallax is None or not found.parallax.is_seen(options.model_selection)
 
 
 def _nothing(num_matches: int) -> InitialGeometry:

@@ -23,7 +23,12 @@ class InitialGeometryOptions:
     """How a geometry is estimated from sparse SIFT matches.
 
     Attributes:
+        first_side_px: longer sides are scaled down to this for a first look, which decides where
+            the pair is clearly a plane.
+        min_first_inliers, min_first_fraction: number and fraction of the matches of the first look
+            that agree with a homography, for it to decide.
         max_side_px: longer sides are scaled down to this: the initial geometry need not be fine.
+        simulated_side_px: the same where views are simulated.
         sift: the keypoints of each image; each simulated view gets half as many.
         ratio: of the ratio test.
         min_separation_px: matches that begin or end nearer together than this count as one.
@@ -40,7 +45,11 @@ class InitialGeometryOptions:
         OptionError: a value is out of its range.
     """
 
+    first_side_px: int = 640
+    min_first_inliers: int = 50
+    min_first_fraction: float = 0.5
     max_side_px: int = 1200
+    simulated_side_px: int = 640
     sift: SiftOptions = field(default_factory=SiftOptions)
     ratio: float = 0.85
     min_separation_px: float = 2.0
@@ -55,10 +64,11 @@ class InitialGeometryOptions:
         check_ranges(
             self,
             positive=(
-                *("max_side_px", "min_separation_px", "tilts", "rotation_step_deg"),
+                *("first_side_px", "max_side_px", "simulated_side_px", "min_first_inliers"),
+                *("min_separation_px", "tilts", "rotation_step_deg"),
                 *("homography_threshold_px", "fundamental_threshold_px"),
             ),
-            fractions=("ratio",),
+            fractions=("ratio", "min_first_fraction"),
             between={"max_log10_nfa": (-math.inf, 0)},
         )
 
@@ -81,6 +91,8 @@ class VerificationOptions:
         min_support: fraction of the points in the window that must pass.
         null_shifts: shifts between the patches of a null pair, in shares of width and height.
         null_block_px: side of the blocks of the image that null pairs are taken from.
+        enough_null_pairs: of one shift; with so many those whose descriptors reach over an edge of
+            the image, which are described for each shift anew, are left out.
         max_null_blocks: at most this many blocks for each shift, chosen at random: all of them up
             to a megapixel.
 
@@ -96,6 +108,7 @@ class VerificationOptions:
     min_support: float = 0.5
     null_shifts: tuple[tuple[float, float], ...] = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
     null_block_px: int = 64
+    enough_null_pairs: int = 1000
     max_null_blocks: int = 256
 
     def __post_init__(self) -> None:
@@ -103,7 +116,7 @@ class VerificationOptions:
             self,
             positive=(
                 *("keypoint_sizes_px", "lattice_px", "smoothing_sigma_px", "window_px"),
-                *("null_block_px", "max_null_blocks"),
+                *("null_block_px", "enough_null_pairs", "max_null_blocks"),
             ),
             fractions=("false_positive_rate", "min_support", "null_shifts"),
         )

@@ -19,8 +19,7 @@ from .homography import ImagePair, match_by_homography, refine_guiding_homograph
 from .initial_geometry import (
     InitialGeometry,
     InitialMatches,
-    estimate_initial_geometry,
-    initial_matches,
+    find_initial_geometry,
 )
 from .options import GuidedOptions
 from .prewarp import estimate_affinity, prewarp
@@ -52,9 +51,7 @@ def guided_matches(
     Raises:
         OptionError: the model is unknown.
     """
-    if initial is None:
-        initial = initial_matches(gray0, gray1, options=options.initial_geometry)
-    first = estimate_initial_geometry(initial, model, seed, options.initial_geometry)
+    first = find_initial_geometry(gray0, gray1, model, seed, options.initial_geometry, initial)
     if first.matrix is None:
         return _guide(first, None), None
     pair = ImagePair(gray0, gray1, xy0, xy1)
