@@ -71,8 +71,10 @@ def match(
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores,
     the estimated geometry and which matches agree with it, and a picture of them. The options
-    --descriptor, --keypoint-size, --angle, --matcher and --ratio apply with --unguided, and
-    where no geometry can be trusted.
+    --descriptor, --keypoint-size, --angle, --matcher and --ratio apply with --unguided.
+
+    Ends with exit code 3 where no geometry between the images can be trusted; the file then holds
+    no matches.
 
     \b
     deepdetect match left.jpg right.jpg
@@ -142,12 +144,21 @@ def match(
         ],
         f"{image0} and {image1}",
     )
+    if matches.lost:
+        click.echo(
+            "no geometry between these images can be trusted, so there are no matches: if they "
+            "show the same scene, --unguided matches by descriptors alone",
+            err=True,
+        )
+        raise click.exceptions.Exit(NO_GEOMETRY)
     if as_json:
         return
-    if matches.guide is not None and not matches.guided:
-        click.echo("no geometry could be trusted: these matches are unguided", err=True)
     if matches.matrix is None and matches.model != "none":
         click.echo(f"no {matches.model} could be estimated from these matches", err=True)
+
+
+NO_GEOMETRY = 3
+"""Exit code where no geometry can be trusted."""
 
 
 def _guide_numbers(matches: Any) -> dict[str, Any] | None:

@@ -15,8 +15,8 @@ class Guide:
     """The geometry that guided the matching of two images.
 
     Attributes:
-        model: "homography", "fundamental", or "none": no geometry could be trusted, and the
-            matches are by descriptors alone.
+        model: "homography", "fundamental", or "none": no geometry could be trusted, and there are
+            no matches.
         matrix: (3, 3) float64, refined, of the first image to the second; None without one.
         sparse_matches: number of sparse matches that it was first estimated from.
         sparse_inliers: number of those that agree with it.
@@ -38,10 +38,14 @@ class Matches:
 
     Attributes:
         points0, points1: (M, 2) float32 positions in the first and in the second
-            image, matched row by row; centre of the first pixel (0, 0).
-        scores: (M,) float32 in [0, 1], higher is better. Guided, 1 - the dissimilarity of the two
-            patches (0: only just more similar than unrelated patches); else 1 - Lowe's ratio.
-        inliers: (M,) bool, the matches that agree with the geometry.
+            image, matched row by row; centre of the first pixel (0, 0). Those of the first image
+            are keypoints of it; those of the second are, too, except where a fundamental matrix
+            guided: then they are sub-pixel positions.
+        scores: (M,) float32 in [0, 1], higher is better. Guided by a homography, 1 - the
+            dissimilarity of the two patches (0: only just more similar than unrelated patches); by
+            a fundamental matrix, their correlation; else 1 - Lowe's ratio.
+        inliers: (M,) bool, the matches whose error under the geometry is below
+            `GeometryOptions.inlier_threshold`; all of them where none was asked for.
         model: which geometry that is: "homography", "fundamental", "essential" or "none".
         matrix: (3, 3) float64, the geometry; None when it could not be estimated, or was not
             asked for. A homography maps the first image to the second; else x1^T M x0 = 0
@@ -79,6 +83,11 @@ class Matches:
     def guided(self) -> bool:
         """Whether a geometry guided these matches."""
         return self.guide is not None and self.guide.model != "none"
+
+    @property
+    def lost(self) -> bool:
+        """Whether a geometry was to guide these matches and none could be trusted."""
+        return self.guide is not None and self.guide.model == "none"
 
     def __len__(self) -> int:
         return len(self.points0)

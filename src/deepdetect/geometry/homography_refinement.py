@@ -48,6 +48,8 @@ class RefinementOptions:
         windows_px: sides of the tracked windows in pixels.
         blur_sigmas_px: of the blur before the steps that use all pixels.
         pyramid_levels: above the image; each doubles how far a track can move.
+        tracking_iterations: of each track and level, at most.
+        tracking_step_px: a track that moves by less than this has arrived.
         max_round_trip_px: a track counts when it ends this near to its start, forth and back.
         inlier_threshold: of MAGSAC, in pixels.
         ignored_fraction: of the pixels, those that agree least, are ignored by the steps that use
@@ -65,6 +67,8 @@ class RefinementOptions:
     windows_px: tuple[int, ...] = (21, 31, 41)
     blur_sigmas_px: tuple[float, ...] = (2.0, 1.0)
     pyramid_levels: int = 3
+    tracking_iterations: int = 50
+    tracking_step_px: float = 0.005
     max_round_trip_px: float = 0.3
     inlier_threshold: float = 1.0
     ignored_fraction: float = 0.2
@@ -264,7 +268,11 @@ def track_corners(
     parameters = {
         "winSize": (window_px, window_px),
         "maxLevel": options.pyramid_levels,
-        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 0.005),
+        "criteria": (
+            cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT,
+            options.tracking_iterations,
+            options.tracking_step_px,
+        ),
     }
     there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, **parameters)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, **parameters)

@@ -31,6 +31,7 @@ class ModelSelectionOptions:
             repeated pattern, or a thing that moved, gives few.
         min_fraction_of_rest: this fraction of all matches off the plane must agree, where the
             matches alone decide.
+        max_matches: off the plane; of more, so many are drawn at random.
         samples: pairs of matches whose lines are intersected.
 
     Raises:
@@ -42,12 +43,13 @@ class ModelSelectionOptions:
     max_log10_nfa: float = MAX_LOG10_NFA
     min_fraction_of_plane: float = 0.2
     min_fraction_of_rest: float = 0.5
+    max_matches: int = 2000
     samples: int = 1000
 
     def __post_init__(self) -> None:
         check_ranges(
             self,
-            positive=("min_parallax_px", "max_epipolar_distance_px", "samples"),
+            positive=("min_parallax_px", "max_epipolar_distance_px", "samples", "max_matches"),
             fractions=("min_fraction_of_plane", "min_fraction_of_rest"),
             between={"max_log10_nfa": (-math.inf, 0)},
         )
@@ -117,9 +119,14 @@ def measure_parallax(
     predicted, found = transform_points(points0[off], homography), points1[off]
     finite = np.isfinite(predicted).all(axis=1)
     predicted, found = predicted[finite], found[finite]
-    nothing = Parallax(on_plane, len(found), 0, None, math.inf)
-    if len(found) < 3:
+    off_plane = len(found)
+    nothing = Parallax(on_plane, off_plane, 0, None, math.inf)
+    if off_plane < 3:
         return nothing
+    random = np.random.default_rng(seed)
+    if off_plane > options.max_matches:
+        drawn = random.choice(off_plane, options.max_matches, replace=False)
+        predicted, found = predicted[drawn], found[drawn]
     low, size = points1.min(axis=0), np.ptp(points1, axis=0)
     if not size.all():  # all on one row or column
         return nothing
@@ -129,7 +136,7 @@ def measure_parallax(
         for points in (predicted, found)
     )
     lines = np.cross(first, second)
-    chosen = np.random.default_rng(seed).integers(0, len(lines), (options.samples, 2))
+    chosen = random.integers(0, len(lines), (options.samples, 2))
     epipoles = np.cross(lines[chosen[:, 0]], lines[chosen[:, 1]])
     length = np.linalg.norm(epipoles, axis=1)
     epipoles = epipoles[length > 1e-12] / length[length > 1e-12, None]
@@ -144,12 +151,13 @@ def measure_parallax(
     band = (
         2 * options.max_epipolar_distance_px * float(np.hypot(*size)) / max(float(size.prod()), 1)
     )
+    agreeing = int(counts[best])
     return Parallax(
         on_plane,
-        len(found),
-        int(counts[best]),
+        off_plane,
+        round(agreeing * off_plane / len(found)),
         to_pixels @ epipoles[best],
-        _log10_nfa(len(found), int(counts[best]), band),
+        _log10_nfa(len(found), agreeing, band),
     )
 
 

@@ -48,6 +48,8 @@ class ValidatedRefinementOptions:
         min_tracks: that a homography is fitted to.
         pyramid_levels: above the image; each doubles how far a track can move. After the first
             round one is enough.
+        tracking_iterations: of each track and level, at most.
+        tracking_step_px: a track that moves by less than this has arrived.
         max_round_trip_px: a track counts when it ends this near to its start, forth and back.
         inlier_threshold_px: of MAGSAC.
         alignment_side_px: longer side of the copies on which all pixels are aligned, where the
@@ -68,6 +70,8 @@ class ValidatedRefinementOptions:
     max_corners: int = 3000
     min_tracks: int = 15
     pyramid_levels: int = 3
+    tracking_iterations: int = 15
+    tracking_step_px: float = 0.02
     max_round_trip_px: float = 0.3
     inlier_threshold_px: float = 0.5
     alignment_side_px: int = 480
@@ -84,6 +88,7 @@ class ValidatedRefinementOptions:
             positive=(
                 *("max_corners", "squares", "blur_sigma_px", "alignment_sigma_px"),
                 *("max_round_trip_px", "inlier_threshold_px"),
+                *("tracking_iterations", "tracking_step_px"),
                 *("alignment_side_px", "alignment_iterations"),
             ),
             not_negative=("pyramid_levels", "min_gain"),
@@ -98,6 +103,8 @@ class ValidatedRefinementOptions:
             max_corners=max(self.max_corners, self.min_tracks),
             min_tracks=self.min_tracks,
             pyramid_levels=self.pyramid_levels if first else min(1, self.pyramid_levels),
+            tracking_iterations=self.tracking_iterations,
+            tracking_step_px=self.tracking_step_px,
             max_round_trip_px=self.max_round_trip_px,
         )
 

@@ -14,13 +14,14 @@ from .._shared.parallel import available_memory
 from .._shared.timing import StageTimer
 from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
 from ..detector.heatmap import HeatmapOptions
-from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors, unique_matches
+from ..features.keypoints import Keypoints
+from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors
 from ..features.matches import Guide, Matches
 from ..features.sift import get_descriptor
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
-from ..geometry.residuals import transfer_errors
+from ..geometry.residuals import epipolar_errors, transfer_errors
 from ..io.image import load_image, luma
-from .guided import GuidedOptions, InitialMatches, guided_matches
+from .guided import GuidedMatches, GuidedOptions, InitialMatches, guided_matches
 from .options import MatchingOptions, get_preset
 
 BYTES_PER_KEYPOINT = 1500
@@ -93,7 +94,8 @@ def match_images(
         guided_options: all tuned numbers of guided matching.
 
     Returns:
-        The matches, the geometry, and which agree with it.
+        The matches, the geometry, and which agree with it. Where guided matching can trust no
+        geometry there are none (`Matches.lost`); `guided=False` matches by descriptors alone.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
@@ -147,10 +149,10 @@ def match_images(
     with timer.stage("keypoints"):
         keypoints = [find_keypoints(detector, image, chosen.selection) for image in rgb]
     grays = luma(rgb[0]), luma(rgb[1])
-    found_guide, found = None, None
+    found_guide = None
     if chosen.guided:
         with timer.stage("guided matching"):
-            found_guide, found = guided_matches(
+            found_guide, guided_pair = guided_matches(
                 grays[0],
                 grays[1],
                 np.rint(keypoints[0].xy),
@@ -160,18 +162,17 @@ def match_images(
                 initial,
                 chosen.guided_options,
             )
-    if found is None:
+        points0, points1, scores = _guided_points(guided_pair, keypoints, chosen.mutual)
+    else:
         found = unguided_matches(grays, [points.xy for points in keypoints], chosen, timer)
-    elif chosen.mutual:
-        found = unique_matches(found)
-    points0 = keypoints[0].xy[found.rows0]
-    points1 = keypoints[1].xy[found.rows1]
+        points0, points1 = keypoints[0].xy[found.rows0], keypoints[1].xy[found.rows1]
+        scores = np.clip(1 - found.ratios, 0, 1)
     with timer.stage("geometry"):
         geometry = _final_geometry(points0, points1, chosen.geometry, found_guide)
     return Matches(
         points0,
         points1,
-        np.clip(1 - found.ratios, 0, 1),
+        scores,
         geometry.inliers,
         geometry.model,
         geometry.matrix,
@@ -180,6 +181,19 @@ def match_images(
         timer.seconds,
         found_guide,
     )
+
+
+def _guided_points(
+    found: GuidedMatches | None, keypoints: Sequence[Keypoints], mutual: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return positions in both images and scores; none where no geometry could be trusted."""
+    if found is None:
+        nowhere = np.empty((0, 2), np.float32)
+        return nowhere, nowhere, np.empty(0, np.float32)
+    if mutual:
+        found = found.unique()
+    points1 = found.points1.astype(np.float32)
+    return keypoints[0].xy[found.rows0], points1, found.scores
 
 
 def unguided_matches(
@@ -216,15 +230,15 @@ def unguided_matches(
 def _final_geometry(
     points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, guide: Guide | None
 ) -> Geometry:
-    """Return the guide's own geometry where that is asked for, else estimate one of its kind."""
-    if guide is None or guide.model == "none" or options.homography is not None:
+    """Return the guide's own geometry where that is asked for, else estimate one."""
+    if guide is None or options.homography is not None:
         return estimate_geometry(points0, points1, options)
-    if guide.model == "homography" and options.model in ("auto", "homography"):
-        assert guide.matrix is not None
-        errors = transfer_errors(points0, points1, guide.matrix)
-        return Geometry("homography", guide.matrix, errors < options.inlier_threshold)
-    if options.model == "auto":  # plane or depth is decided once
-        options = dataclasses.replace(options, model=guide.model)
+    if guide.matrix is None:
+        return Geometry("none", None, np.zeros(len(points0), bool))
+    if options.model in ("auto", guide.model):
+        errors_of = transfer_errors if guide.model == "homography" else epipolar_errors
+        errors = errors_of(points0, points1, guide.matrix)
+        return Geometry(guide.model, guide.matrix, errors < options.inlier_threshold)
     return estimate_geometry(points0, points1, options)
 
 

@@ -13,15 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.options import replace_options
 from ...datasets.types import PlanarPair
 from ...geometry import transform_points
 from ...geometry.residuals import transfer_errors
 from ...io.image import load_image, luma
 from ...matching.guided import guided_matches
 from ...matching.guided.homography import nearest_keypoint
-from ...matching.options import get_preset
-from ...matching.pipeline import unguided_matches
 from ..baselines.method import LocalFeature
 from ..cache import Arrays
 from ..context import BenchmarkContext, feature_key, pack_profile, unpack_profile
@@ -57,8 +54,8 @@ NOTE = (
     "near to their true place. Unique: correct matches, each point of the second image once. "
     f"Guided: the seed of the median count, the lower of two, of {SEEDS} seeds; ± is the counts' "
     "standard deviation, lowest the smallest of them as a fraction of the matchable. A seed by "
-    "which no geometry is trusted counts with the matches by descriptors alone that match_images "
-    "gives then; the row says how many seeds were guided where not all were. Corner error: median "
+    "which no geometry is trusted has no matches, as from match_images; the row says how many "
+    "seeds were guided where not all were. Corner error: median "
     "over the seeds that a homography guided. Seconds: median of the guided matching alone, "
     "without heat map, keypoints and matches by descriptors; they may be those of an earlier run, "
     "from the cache. The count of the baselines is what the same geometry makes of points that "
@@ -71,11 +68,11 @@ class GuidedPair:
     """The matches of a pair by one seed, as `match_images` gives them.
 
     Attributes:
-        kind: what guided, as of `Guide`; with "none" the matches are by descriptors alone.
+        kind: what guided, as of `Guide`; with "none" there are no matches.
         matrix: the geometry, or None.
         points0, points1: (M, 2) matched positions.
-        profile: of the guided matching alone, also where it found nothing: neither heat map and
-            keypoints nor matches by descriptors are included.
+        profile: of the guided matching alone, also where it found nothing: heat map and keypoints
+            are not included.
     """
 
     kind: str
@@ -195,7 +192,7 @@ def _correct(points0: np.ndarray, points1: np.ndarray, pair: PlanarPair) -> np.n
 def match_guided(
     context: BenchmarkContext, feature: LocalFeature, pair: PlanarPair, seed: int
 ) -> GuidedPair:
-    """Match a pair guided, by descriptors alone where no geometry is trusted, or read that.
+    """Match a pair guided, or read that.
 
     Args:
         context: with the cache.
@@ -210,14 +207,11 @@ def match_guided(
         gray0, gray1 = (luma(load_image(image)) for image in images)
         with profiled() as profile:
             guide, found = guided_matches(gray0, gray1, first, second, seed=seed)
-        if found is None:
-            options = replace_options(get_preset("default"), seed=seed)
-            found = unguided_matches((gray0, gray1), (first, second), options)
         return {
             "kind": np.array(guide.model),
             "matrix": np.empty((0, 3)) if guide.matrix is None else guide.matrix,
-            "rows0": found.rows0.astype(np.int32),
-            "rows1": found.rows1.astype(np.int32),
+            "rows0": np.empty(0, np.int32) if found is None else found.rows0.astype(np.int32),
+            "points1": np.empty((0, 2)) if found is None else found.points1,
             **pack_profile("guided", profile),
         }
 
@@ -226,6 +220,6 @@ def match_guided(
         str(found["kind"]),
         found["matrix"] if len(found["matrix"]) else None,
         first[found["rows0"]],
-        second[found["rows1"]],
+        found["points1"],
         unpack_profile("guided", found),
     )

@@ -2,6 +2,6 @@
 
 from .initial_geometry import InitialMatches, initial_matches
 from .options import GuidedOptions
-from .pipeline import guided_matches
+from .pipeline import GuidedMatches, guided_matches
 
-__all__ = ["GuidedOptions", "InitialMatches", "guided_matches", "initial_matches"]
+__all__ = ["GuidedMatches", "GuidedOptions", "InitialMatches", "guided_matches", "initial_matches"]

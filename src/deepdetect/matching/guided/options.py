@@ -14,8 +14,10 @@ from dataclasses import dataclass, field
 from ..._shared.options import check_ranges
 from ...features.sift_detector import SiftOptions
 from ...geometry.acontrario import MAX_LOG10_NFA
+from ...geometry.epipolar_rectification import RectificationFrameOptions
 from ...geometry.model_selection import ModelSelectionOptions
 from ...geometry.validated_refinement import ValidatedRefinementOptions
+from ..stereo.matching import DisparityOptions
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class InitialGeometryOptions:
     min_first_inliers: int = 50
     min_first_fraction: float = 0.5
     max_side_px: int = 1200
-    simulated_side_px: int = 640
+    simulated_side_px: int = 320
     sift: SiftOptions = field(default_factory=SiftOptions)
     ratio: float = 0.85
     min_separation_px: float = 2.0
@@ -57,7 +59,7 @@ class InitialGeometryOptions:
     fundamental_threshold_px: float = 1.5
     max_log10_nfa: float = MAX_LOG10_NFA
     model_selection: ModelSelectionOptions = field(default_factory=ModelSelectionOptions)
-    tilts: tuple[float, ...] = (2.0, 2.0 * 2**0.5, 4.0)
+    tilts: tuple[float, ...] = (2.0, 4.0)
     rotation_step_deg: float = 72.0
 
     def __post_init__(self) -> None:
@@ -222,6 +224,70 @@ class EpipolarMatchingOptions:
 
 
 @dataclass(frozen=True)
+class RectifiedMatchingOptions:
+    """How a pair is rectified by a fundamental matrix and its rows are matched.
+
+    Attributes:
+        frame: in which both images are rectified.
+        disparity: how rows are matched; its range is found.
+        max_volume: pixels of the frame times disparities; with more, the images are scaled down.
+        tail_fraction: of the disparities of the sparse matches at each end, which may be wrong.
+        margin_px, margin_fraction: added to the range of disparities at both ends, in pixels, and
+            as a fraction of it.
+        correlation_window_px: side of the window in which both images are compared after matching,
+            odd.
+        min_correlation: a match whose windows correlate less is left out.
+        max_refits: the fundamental matrix is estimated again from tracked corners at most this
+            often,
+        max_row_error_px: where half of them leave their rows by more than this.
+        refit_corners: that are tracked.
+        refit_window_px: side of the windows in which they are tracked, odd.
+        max_round_trip_px: a track counts when it ends this near to its start, forth and back.
+        max_track_px: a track that moves further than this from its match is wrong.
+        min_tracks: that a matrix is estimated from.
+        refit_threshold_px: inlier threshold of the estimate.
+        min_matched_fraction: with a smaller fraction of the keypoints matched, a search along
+            epipolar lines is tried, too, and what gives more matches is taken.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    frame: RectificationFrameOptions = field(default_factory=RectificationFrameOptions)
+    disparity: DisparityOptions = field(
+        default_factory=lambda: DisparityOptions(discontinuity_margin_px=1)
+    )
+    max_volume: float = 1e8
+    tail_fraction: float = 0.01
+    margin_px: float = 4.0
+    margin_fraction: float = 0.25
+    correlation_window_px: int = 9
+    min_correlation: float = 0.3
+    max_refits: int = 1
+    max_row_error_px: float = 0.1
+    refit_corners: int = 2000
+    refit_window_px: int = 15
+    max_round_trip_px: float = 0.3
+    max_track_px: float = 4.0
+    min_tracks: int = 50
+    refit_threshold_px: float = 0.5
+    min_matched_fraction: float = 0.05
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=(
+                *("max_volume", "margin_px", "max_row_error_px", "refit_corners"),
+                *("max_round_trip_px", "max_track_px", "refit_threshold_px"),
+            ),
+            not_negative=("max_refits", "margin_fraction"),
+            fractions=("min_correlation", "min_matched_fraction"),
+            odd=("correlation_window_px", "refit_window_px"),
+            between={"tail_fraction": (0, 0.5), "min_tracks": (8, math.inf)},
+        )
+
+
+@dataclass(frozen=True)
 class PrewarpOptions:
     """When and how a second image is warped by an affinity before it is matched.
 
@@ -257,7 +323,8 @@ class GuidedOptions:
     Attributes:
         initial_geometry: the geometry that guides at first.
         homography_matching: planes and rotating cameras.
-        epipolar_matching: scenes with depth.
+        rectified_matching: scenes with depth.
+        epipolar_matching: scenes with depth that cannot be rectified, or hardly match by rows.
         prewarp: second images that are rotated, zoomed or sheared, of scenes with depth.
         verification: when two patches count as the same.
         min_matched_fraction: with a smaller fraction of the keypoints matched, the geometry is not
@@ -271,6 +338,7 @@ class GuidedOptions:
     homography_matching: HomographyMatchingOptions = field(
         default_factory=HomographyMatchingOptions
     )
+    rectified_matching: RectifiedMatchingOptions = field(default_factory=RectifiedMatchingOptions)
     epipolar_matching: EpipolarMatchingOptions = field(default_factory=EpipolarMatchingOptions)
     prewarp: PrewarpOptions = field(default_factory=PrewarpOptions)
     verification: VerificationOptions = field(default_factory=VerificationOptions)

@@ -1,13 +1,13 @@
 """Guided matching: an initial geometry, refined, then all keypoints where it predicts them.
 
-Geometry only proposes: a pair is kept when its patches are the same once the geometry is taken out
-(`verification`), or when it is similar, moves like its neighbours and lies among other matches
-(`epipolar`).
+Geometry only proposes. A pair is kept when its patches are the same once the geometry is taken out
+(`verification`); when it is the best on its row in both images (`rectified`); or when it is
+similar, moves like its neighbours and lies among other matches (`epipolar`).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,13 +16,37 @@ from ...features.matches import Guide
 from ...geometry import GeometryOptions, estimate_geometry
 from .epipolar import match_along_epipolar_lines
 from .homography import ImagePair, match_by_homography, refine_guiding_homography
-from .initial_geometry import (
-    InitialGeometry,
-    InitialMatches,
-    find_initial_geometry,
-)
+from .initial_geometry import InitialGeometry, InitialMatches, find_initial_geometry
 from .options import GuidedOptions
 from .prewarp import estimate_affinity, prewarp
+from .rectified import match_by_rectification
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedMatches:
+    """Matches of keypoints of the first image.
+
+    Attributes:
+        rows0: (M,) int64 keypoints of the first image, rising, each once.
+        points1: (M, 2) float64 positions in the second image: keypoints of it where a homography
+            guided, sub-pixel positions where the pair was rectified.
+        scores: (M,) float32 in [0, 1], higher is better.
+    """
+
+    rows0: np.ndarray
+    points1: np.ndarray
+    scores: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rows0)
+
+    def unique(self) -> GuidedMatches:
+        """Keep the best match of those that end on the same pixel of the second image."""
+        pixels = np.rint(self.points1).astype(np.int64)
+        best_first = np.lexsort((self.rows0, -self.scores))
+        _, first = np.unique(pixels[best_first], axis=0, return_index=True)
+        kept = np.sort(best_first[first])
+        return GuidedMatches(self.rows0[kept], self.points1[kept], self.scores[kept])
 
 
 def guided_matches(
@@ -34,7 +58,7 @@ def guided_matches(
     seed: int = 0,
     initial: InitialMatches | None = None,
     options: GuidedOptions = GuidedOptions(),
-) -> tuple[Guide, DescriptorMatches | None]:
+) -> tuple[Guide, GuidedMatches | None]:
     """Match the keypoints of two images by their geometry.
 
     Args:
@@ -62,23 +86,24 @@ def guided_matches(
             assert first.parallax is not None
             # Without parallax a fundamental matrix is any that holds the plane.
             if first.alternative is None or first.parallax.log10_nfa >= 0:
-                return _guide(replace(first, model="none", points0=first.points0[:0]), None), None
+                return _no_guide(first), None
             first = replace(first.alternative, num_views=first.num_views)
     if found is None:
         matrix, found = _match_scene_with_depth(pair, first, options, seed)
     if len(found) < options.min_matched_fraction * min(len(xy0), len(xy1)):
-        return _guide(replace(first, model="none", points0=first.points0[:0]), None), None
+        return _no_guide(first), None
     return _guide(first, matrix), found
 
 
 def _match_plane(
     pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
-) -> tuple[np.ndarray, DescriptorMatches | None]:
+) -> tuple[np.ndarray, GuidedMatches | None]:
     """Match by a homography; None where the images show that the scene is no plane."""
     assert first.matrix is not None
     plane = options.homography_matching
     matrix = refine_guiding_homography(pair.gray0, pair.gray1, first.matrix, plane)
-    found, proposed = match_by_homography(pair, matrix, plane, options.verification, seed)
+    matches, proposed = match_by_homography(pair, matrix, plane, options.verification, seed)
+    found = _at_keypoints(pair, matches)
     parallax = first.parallax
     if parallax is None:  # a homography was asked for
         return matrix, found
@@ -92,8 +117,34 @@ def _match_plane(
 
 def _match_scene_with_depth(
     pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
+) -> tuple[np.ndarray, GuidedMatches]:
+    """Match by rectification; along epipolar lines where that gives hardly anything."""
+    assert first.matrix is not None
+    rectified = options.rectified_matching
+    found = match_by_rectification(
+        pair.gray0,
+        pair.gray1,
+        pair.xy0,
+        first.points0,
+        first.points1,
+        first.matrix,
+        rectified,
+        seed,
+    )
+    if found is not None:
+        matches = GuidedMatches(found.rows0, found.points1, found.scores)
+        if len(found) >= rectified.min_matched_fraction * len(pair.xy0):
+            return found.matrix, matches
+    matrix, searched = _search_epipolar_lines(pair, first, options, seed)
+    if found is not None and len(found) >= len(searched):
+        return found.matrix, matches
+    return matrix, _at_keypoints(pair, searched)
+
+
+def _search_epipolar_lines(
+    pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
 ) -> tuple[np.ndarray, DescriptorMatches]:
-    """Match by a fundamental matrix; estimate it again while that gives more matches.
+    """Match along epipolar lines; estimate them again while that gives more matches.
 
     The second image is aligned with the first where it is not already.
     """
@@ -121,6 +172,15 @@ def _match_scene_with_depth(
             break
         best, found = matrix, again
     return best, found
+
+
+def _at_keypoints(pair: ImagePair, found: DescriptorMatches) -> GuidedMatches:
+    scores = np.clip(1 - found.ratios, 0, 1)
+    return GuidedMatches(found.rows0, pair.xy1[found.rows1].astype(np.float64), scores)
+
+
+def _no_guide(first: InitialGeometry) -> Guide:
+    return _guide(replace(first, model="none", points0=first.points0[:0]), None)
 
 
 def _guide(first: InitialGeometry, matrix: np.ndarray | None) -> Guide:

@@ -1,0 +1,334 @@
+"""Rectification of two views by their fundamental matrix: epipolar lines become rows.
+
+Two frames, for two kinds of motion. `PlanarFrame` warps each view by a homography (Hartley, "Theory
+and practice of projective rectification", 1999); it suits cameras side by side. `PolarFrame` has a
+row for each direction from the epipole, as Pollefeys, Koch and Van Gool ("A simple and efficient
+rectification method for general motion", 1999), and is right wherever the epipole lies, also in the
+picture. Its columns are logarithms of the distance from the epipole: where a camera moves forward,
+everything grows about the epipole, and growth by a factor is a shift.
+
+In both frames the match of (x, y) in the first view is (x - disparity, y) in the second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from .._shared.options import check_ranges
+from .residuals import transform_points
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class RectificationFrameOptions:
+    """Which frame is taken, and how fine it is.
+
+    Attributes:
+        max_stretch: a planar frame may stretch or shrink a part of a view by this factor, relative
+            to its middle; beyond it the epipole is too near, and the frame is polar.
+        max_area: of a planar frame, relative to the larger view.
+        resolved_quantile: quantile of the distances of the pixels from the epipole at which a polar
+            frame has the resolution of the first view: it is finer nearer to the epipole, and
+            coarser farther away.
+        min_radius_px: nearer to the epipole nothing is rectified: nothing moves there, and few
+            pixels fill many rows.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    max_stretch: float = 2.0
+    max_area: float = 3.0
+    resolved_quantile: float = 0.6
+    min_radius_px: float = 8.0
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("max_stretch", "max_area", "min_radius_px"),
+            fractions=("resolved_quantile",),
+        )
+
+
+class RectifiedFrame(Protocol):
+    """A common frame of two views, in which matches lie on the same row.
+
+    `view` is 0 for the first and 1 for the second view.
+    """
+
+    @property
+    def size(self) -> Size:
+        """Width and height of the frame in pixels."""
+
+    def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
+        """Take (N, 2) positions of a view into the frame, (N, 2) float64."""
+
+    def from_frame(self, points: np.ndarray, view: int) -> np.ndarray:
+        """Take (N, 2) positions of the frame into a view, (N, 2) float64."""
+
+    def warp(self, image: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Show a view in the frame: its image, and the (H, W) bool mask of what it shows."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarFrame:
+    """Two views rectified by homographies.
+
+    Attributes:
+        homographies: (3, 3) of each view, from its pixels to those of the frame.
+        size: (width, height) of the frame.
+    """
+
+    homographies: tuple[np.ndarray, np.ndarray]
+    size: Size
+
+    def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
+        """Take positions of a view into the frame."""
+        return transform_points(points, self.homographies[view])
+
+    def from_frame(self, points: np.ndarray, view: int) -> np.ndarray:
+        """Take positions of the frame into a view."""
+        return transform_points(points, np.linalg.inv(self.homographies[view]))
+
+    def warp(self, image: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Show a view in the frame."""
+        matrix = self.homographies[view]
+        whole = np.full(image.shape[:2], 255, np.uint8)
+        return (
+            cv2.warpPerspective(image, matrix, self.size, flags=cv2.INTER_CUBIC),
+            cv2.warpPerspective(whole, matrix, self.size, flags=cv2.INTER_NEAREST) > 0,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PolarFrame:
+    """Two views rectified about their epipoles.
+
+    Attributes:
+        fundamental: (3, 3) with x1^T F x0 = 0.
+        epipoles: (2,) of each view, in pixels.
+        orientation: 1 or -1: which half of an epipolar line of the second view belongs to the half
+            of the first.
+        middle: angle of the middle row in the first view, in radians.
+        first_angle: angle of the first row, relative to the middle one.
+        step: between rows in radians, and between columns in natural logarithms of the radius.
+        min_radius_px: radius of the first column.
+        size: (width, height) of the frame.
+        wrapped: whether the rows go around the epipole, and begin again after the last one.
+    """
+
+    fundamental: np.ndarray
+    epipoles: tuple[np.ndarray, np.ndarray]
+    orientation: float
+    middle: float
+    first_angle: float
+    step: float
+    min_radius_px: float
+    size: Size
+    wrapped: bool = field(default=False)
+
+    def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
+        """Take positions of a view into the frame; not finite for those at the epipole."""
+        offset = np.asarray(points, np.float64).reshape(-1, 2) - self.epipoles[view]
+        angle = np.arctan2(offset[:, 1], offset[:, 0])
+        if view:  # the direction in the first view whose epipolar line this point lies on
+            lines = np.column_stack([points, np.ones(len(offset))]) @ self.fundamental
+            angle = np.arctan2(-lines[:, 0], lines[:, 1])
+            same = (self._directions(angle, 1) * offset).sum(axis=1) > 0
+            angle = np.where(same, angle, angle + np.pi)
+        relative = (angle - self.middle + np.pi) % (2 * np.pi) - np.pi
+        with np.errstate(divide="ignore"):
+            radius = np.log(np.hypot(*offset.T) / self.min_radius_px)
+        return np.column_stack([radius, relative - self.first_angle]) / self.step
+
+    def from_frame(self, points: np.ndarray, view: int) -> np.ndarray:
+        """Take positions of the frame into a view."""
+        points = np.asarray(points, np.float64).reshape(-1, 2)
+        directions = self._directions(self._angles(points[:, 1]), view)
+        radius = self.min_radius_px * np.exp(points[:, :1] * self.step)
+        return self.epipoles[view] + directions * radius
+
+    def warp(self, image: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
+        """Show a view in the frame."""
+        width, height = self.size
+        directions = self._directions(self._angles(np.arange(height)), view)
+        radius = self.min_radius_px * np.exp(np.arange(width) * self.step)
+        x, y = (
+            (self.epipoles[view][axis] + directions[:, axis, None] * radius).astype(np.float32)
+            for axis in (0, 1)
+        )
+        rows, columns = image.shape[:2]
+        shown = (x >= -0.5) & (x <= columns - 0.5) & (y >= -0.5) & (y <= rows - 0.5)
+        return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), shown
+
+    def _angles(self, rows: np.ndarray) -> np.ndarray:
+        """Return the angles of rows in the first view."""
+        return self.middle + self.first_angle + rows * self.step
+
+    def _directions(self, angles: np.ndarray, view: int) -> np.ndarray:
+        """Return unit vectors from the epipole along the lines of these angles, (N, 2)."""
+        first = np.column_stack([np.cos(angles), np.sin(angles)])
+        if not view:
+            return first
+        # The line of the point at infinity in this direction is that of all points of the line.
+        lines = first @ self.fundamental[:, :2].T
+        along = self.orientation * np.column_stack([lines[:, 1], -lines[:, 0]])
+        return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+
+
+def rectified_frame(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    fundamental: np.ndarray,
+    size0: Size,
+    size1: Size,
+    options: RectificationFrameOptions = RectificationFrameOptions(),
+) -> RectifiedFrame | None:
+    """Choose a frame in which the matches of two views lie on rows.
+
+    Args:
+        points0, points1: (N, 2) matches that fit the fundamental matrix.
+        fundamental: (3, 3) with x1^T F x0 = 0.
+        size0, size1: (width, height) of the views.
+        options: which frame, and how fine.
+
+    Returns:
+        A planar frame where one distorts the views little, else a polar one; None where neither is
+        possible.
+
+    Example:
+        >>> grid = np.stack(np.meshgrid(np.arange(5), np.arange(5)), -1).reshape(-1, 2) * 20.0
+        >>> forward = 1.1 * (grid - 40) + 40  # everything grows about the middle
+        >>> about_the_middle = np.array([[0, 1, -40], [-1, 0, 40], [40, -40, 0.0]])
+        >>> frame = rectified_frame(grid, forward, about_the_middle, (81, 81), (81, 81))
+        >>> first, second = frame.to_frame(grid[:4], 0), frame.to_frame(forward[:4], 1)
+        >>> type(frame).__name__, bool(np.allclose(first[:, 1], second[:, 1]))
+        ('PolarFrame', True)
+    """
+    points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
+    if len(points0) < 8:
+        return None
+    planar = _planar_frame(points0, points1, fundamental, size0, size1, options)
+    if planar is not None:
+        return planar
+    return _polar_frame(points0, points1, fundamental, size0, size1, options)
+
+
+def _planar_frame(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    fundamental: np.ndarray,
+    size0: Size,
+    size1: Size,
+    options: RectificationFrameOptions,
+) -> PlanarFrame | None:
+    """Rectify by homographies, or return None where they distort too much."""
+    found, *matrices = cv2.stereoRectifyUncalibrated(
+        points0, points1, fundamental, size0, threshold=0
+    )
+    if not found or not all(np.isfinite(matrix).all() for matrix in matrices):
+        return None
+    corners = _corners(size0), _corners(size1)
+    middles = np.median(points0, axis=0), np.median(points1, axis=0)
+    for matrix, border, middle in zip(matrices, corners, middles, strict=True):
+        depth = (border @ matrix[2, :2] + matrix[2, 2]) / (middle @ matrix[2, :2] + matrix[2, 2])
+        # Lengths across the line at infinity change with the square of this.
+        if depth.min() <= 0 or max(depth.max(), 1 / depth.min()) ** 2 > options.max_stretch**2:
+            return None
+    jacobian = _jacobian(matrices[0], middles[0])
+    if np.linalg.det(jacobian) <= 0 or np.linalg.det(_jacobian(matrices[1], middles[1])) <= 0:
+        return None
+    scale = 1 / np.sqrt(np.linalg.det(jacobian))  # the first view keeps its size
+    if jacobian[0, 0] < 0:  # upside down
+        scale = -scale
+    first, second = (np.diag([scale, scale, 1]) @ matrix for matrix in matrices)
+    moved = transform_points(points0, first) - transform_points(points1, second)
+    second = _translation(np.round(np.median(moved[:, 0])), 0) @ second
+    frames = transform_points(corners[0], first), transform_points(corners[1], second)
+    top = max(frame[:, 1].min() for frame in frames)
+    bottom = min(frame[:, 1].max() for frame in frames)
+    left = min(frame[:, 0].min() for frame in frames)
+    right = max(frame[:, 0].max() for frame in frames)
+    width, height = int(np.ceil(right - left)) + 1, int(np.ceil(bottom - top)) + 1
+    largest = max(np.prod(size0), np.prod(size1))
+    if height < 2 or width * height > options.max_area * largest:
+        return None
+    shift = _translation(-np.floor(left), -np.floor(top))
+    return PlanarFrame((shift @ first, shift @ second), (width, height))
+
+
+def _polar_frame(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    fundamental: np.ndarray,
+    size0: Size,
+    size1: Size,
+    options: RectificationFrameOptions,
+) -> PolarFrame | None:
+    """Rectify about the epipoles, or return None where one lies at infinity."""
+    left, _, right = np.linalg.svd(fundamental)
+    homogeneous = right[2], left[:, 2]
+    if any(abs(epipole[2]) < 1e-12 for epipole in homogeneous):
+        return None
+    epipoles = (
+        homogeneous[0][:2] / homogeneous[0][2],
+        homogeneous[1][:2] / homogeneous[1][2],
+    )
+    border = _corners(size0) - epipoles[0]
+    wrapped = bool(((epipoles[0] > 0) & (epipoles[0] < np.array(size0) - 1)).all())
+    middle, first_angle, last_angle = 0.0, -np.pi, np.pi
+    if not wrapped:
+        centre = border.mean(axis=0)
+        middle = float(np.arctan2(centre[1], centre[0]))
+        angles = np.arctan2(border[:, 1], border[:, 0]) - middle
+        relative = (angles + np.pi) % (2 * np.pi) - np.pi
+        first_angle, last_angle = float(relative.min()), float(relative.max())
+    pixels = np.mgrid[0 : size0[0] : 16, 0 : size0[1] : 16].reshape(2, -1).T - epipoles[0]
+    radii = np.hypot(*pixels.T)
+    step = 1 / max(float(np.quantile(radii, options.resolved_quantile)), 1.0)
+    farthest = max(
+        np.hypot(*(_corners(size) - epipole).T).max()
+        for size, epipole in zip((size0, size1), epipoles, strict=True)
+    )
+    nearest = options.min_radius_px if wrapped else max(float(radii.min()), options.min_radius_px)
+    width = int(np.ceil(np.log(farthest / nearest) / step)) + 1
+    height = int(np.ceil((last_angle - first_angle) / step)) + 1
+    made = [
+        PolarFrame(
+            fundamental,
+            epipoles,
+            sign,
+            middle,
+            first_angle,
+            step,
+            nearest,
+            (width, height),
+            wrapped,
+        )
+        for sign in (1.0, -1.0)
+    ]
+    # The half-line on which the matches lie.
+    angles = np.arctan2(*(points0 - epipoles[0]).T[::-1])
+    along = (made[0]._directions(angles, 1) * (points1 - epipoles[1])).sum(axis=1)
+    return made[0] if np.median(np.sign(along)) >= 0 else made[1]
+
+
+def _corners(size: Size) -> np.ndarray:
+    right, bottom = size[0] - 1, size[1] - 1
+    return np.array([[0, 0], [right, 0], [right, bottom], [0, bottom]], np.float64)
+
+
+def _translation(x: float, y: float) -> np.ndarray:
+    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
+
+
+def _jacobian(homography: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Return the (2, 2) derivative of a homography at a point."""
+    mapped = homography @ np.append(point, 1)
+    place = mapped[:2] / mapped[2]
+    return (homography[:2, :2] - np.outer(place, homography[2, :2])) / mapped[2]

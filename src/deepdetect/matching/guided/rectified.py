@@ -1,0 +1,280 @@
+"""Dense matches of a scene with depth, by rectification: epipolar lines become rows.
+
+Both images are warped into a frame in which matches lie on the same row
+(`geometry.epipolar_rectification`), the row matcher finds a disparity for each pixel
+(`matching.stereo`), and its matches are taken back to the photographs. They are sub-pixel
+positions, not keypoints of the second image.
+
+A fundamental matrix from few matches may miss by some pixels where none of them was. So corners are
+tracked in both directions around their matches: where they leave their rows, the matrix is
+estimated again from them, and the images are rectified again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from ...geometry import GeometryOptions, estimate_geometry
+from ...geometry.epipolar_rectification import RectifiedFrame, rectified_frame
+from ...geometry.homography_refinement import equalise
+from ...geometry.rescaling import downscale, scaled_fundamental, scaled_points
+from ...geometry.zncc import gaussian_blur, local_zncc
+from ..stereo.matching import DisparityMap, compute_disparity, find_disparity_range
+from .options import RectifiedMatchingOptions
+
+Range = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedView:
+    """Two images in their frame, and the disparities between them.
+
+    Attributes:
+        frame: the frame, of the images at `scale`.
+        scale: of both images, at most 1.
+        first, second: (H, W) uint8, the warped images.
+        disparities: of every pixel of the first.
+        correlation: (H, W) float32 local ZNCC of both after the disparity, NaN without one.
+    """
+
+    frame: RectifiedFrame
+    scale: float
+    first: np.ndarray
+    second: np.ndarray
+    disparities: DisparityMap
+    correlation: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedPairMatches:
+    """Matches of keypoints of the first image.
+
+    Attributes:
+        matrix: (3, 3) the fundamental matrix that rectified the pair.
+        rows0: (M,) int64 of the keypoints that have a match.
+        points1: (M, 2) float64 its position in the second image.
+        scores: (M,) float32 in [0, 1], the correlation of both places.
+    """
+
+    matrix: np.ndarray
+    rows0: np.ndarray
+    points1: np.ndarray
+    scores: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rows0)
+
+
+def match_by_rectification(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    xy0: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    fundamental: np.ndarray,
+    options: RectifiedMatchingOptions = RectifiedMatchingOptions(),
+    seed: int = 0,
+) -> RectifiedPairMatches | None:
+    """Match keypoints of the first image by rectifying the pair.
+
+    Args:
+        gray0, gray1: (H, W) uint8 luma.
+        xy0: (N, 2) keypoints of the first image.
+        points0, points1: (K, 2) sparse matches that fit the fundamental matrix.
+        fundamental: (3, 3) with x1^T F x0 = 0.
+        options: how.
+        seed: of the random samples of further estimates.
+
+    Returns:
+        The matches; None where the pair cannot be rectified.
+    """
+    view = _rectify(gray0, gray1, points0, points1, fundamental, options)
+    for _ in range(options.max_refits):
+        if view is None:
+            return None
+        tracks = _track(view, options)
+        if tracks is None or np.median(np.abs(tracks[2])) < options.max_row_error_px:
+            break
+        refit = GeometryOptions(
+            model="fundamental", inlier_threshold=options.refit_threshold_px, seed=seed
+        )
+        found = estimate_geometry(tracks[0], tracks[1], refit)
+        if found.matrix is None:
+            break
+        inliers = found.inliers
+        again = _rectify(
+            gray0, gray1, tracks[0][inliers], tracks[1][inliers], found.matrix, options
+        )
+        if again is None or _matched(again) < _matched(view):
+            break
+        view, fundamental = again, found.matrix
+    if view is None:
+        return None
+    rows, places, scores = _sample(view, xy0)
+    height, width = gray1.shape
+    inside = ((places > -0.5) & (places < (width - 0.5, height - 0.5))).all(axis=1)
+    return RectifiedPairMatches(fundamental, rows[inside], places[inside], scores[inside])
+
+
+def _matched(view: RectifiedView) -> int:
+    return int(np.count_nonzero(view.disparities.matched))
+
+
+def _rectify(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    fundamental: np.ndarray,
+    options: RectifiedMatchingOptions,
+) -> RectifiedView | None:
+    """Rectify both images, smaller where there would be too much to search, and match rows."""
+    scale, sizes = 1.0, (gray0.shape[::-1], gray1.shape[::-1])
+    frame = rectified_frame(points0, points1, fundamental, *sizes, options.frame)
+    if frame is None:
+        return None
+    low, high = _range_of_matches(frame, points0, points1, options)
+    volume = float(np.prod(frame.size)) * (high - low + 1)
+    if volume > options.max_volume:
+        longest = max(*gray0.shape, *gray1.shape)
+        side = max(1, round(longest * (options.max_volume / volume) ** (1 / 3)))
+        scale = side / longest
+        gray0, gray1 = (
+            downscale(gray, round(max(gray.shape) * scale))[0] for gray in (gray0, gray1)
+        )
+        points0, points1 = scaled_points(points0, scale), scaled_points(points1, scale)
+        fundamental = scaled_fundamental(fundamental, scale, scale)
+        sizes = (gray0.shape[::-1], gray1.shape[::-1])
+        frame = rectified_frame(points0, points1, fundamental, *sizes, options.frame)
+        if frame is None:
+            return None
+    (first, valid0), (second, valid1) = frame.warp(gray0, 0), frame.warp(gray1, 1)
+    low, high = _range_of_matches(frame, points0, points1, options)
+    seen = find_disparity_range(first, second, options.disparity)
+    if seen is not None:
+        low, high = min(low, seen.min_disparity), max(high, seen.max_disparity)
+        # What both views agree on may be far off where much of a frame shows nothing.
+        limit = int(options.max_volume / float(np.prod(frame.size)))
+        if high - low > limit:
+            low, high = _range_of_matches(frame, points0, points1, options)
+    widest = frame.size[0] - 1
+    low, high = max(low, -widest), min(high, widest)
+    if low >= high:
+        return None
+    found = compute_disparity(
+        first, second, replace(options.disparity, disparity_range=(low, high))
+    )
+    disparity = found.disparity
+    row, column = np.indices(disparity.shape, dtype=np.float32)
+    there = np.where(np.isfinite(disparity), column - disparity, -1).astype(np.float32)
+    aligned = cv2.remap(second, there, row, cv2.INTER_LINEAR)
+    shown = cv2.remap(valid1.astype(np.uint8), there, row, cv2.INTER_NEAREST) > 0
+    kept = found.matched & valid0 & shown
+    correlation = local_zncc(
+        gaussian_blur(first, 1),
+        gaussian_blur(aligned, 1),
+        np.ones(kept.shape, bool),
+        options.correlation_window_px,
+    )
+    kept &= ~(correlation < options.min_correlation)
+    disparity = np.where(kept, disparity, np.float32(np.nan))
+    return RectifiedView(
+        frame,
+        scale,
+        first,
+        second,
+        DisparityMap(disparity, kept, found.disparity_range),
+        np.where(kept, np.nan_to_num(correlation), np.float32(np.nan)),
+    )
+
+
+def _range_of_matches(
+    frame: RectifiedFrame,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    options: RectifiedMatchingOptions,
+) -> Range:
+    """Return the disparities of sparse matches, with a margin on both sides."""
+    disparity = frame.to_frame(points0, 0)[:, 0] - frame.to_frame(points1, 1)[:, 0]
+    disparity = disparity[np.isfinite(disparity)]
+    if not len(disparity):
+        return 0, 0
+    tail = options.tail_fraction
+    low, high = np.quantile(disparity, [tail, 1 - tail])
+    margin = options.margin_px + options.margin_fraction * (high - low)
+    return int(np.floor(low - margin)), int(np.ceil(high + margin))
+
+
+def _track(
+    view: RectifiedView, options: RectifiedMatchingOptions
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Track corners around their matches.
+
+    Returns:
+        (N, 2) positions in both images at their own size, and (N,) by how many pixels of the frame
+        each has left its row; None with fewer than `min_tracks`.
+    """
+    first, second = equalise(view.first), equalise(view.second)
+    mask = view.disparities.matched.astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(first, options.refit_corners, 0.001, 5, mask=mask)
+    if corners is None or len(corners) < options.min_tracks:
+        return None
+    start = corners.reshape(-1, 2)
+    column, row = np.rint(start).astype(np.int64).T
+    expected = start - np.column_stack(
+        [view.disparities.disparity[row, column], np.zeros(len(start))]
+    ).astype(np.float32)
+    window = {
+        "winSize": (options.refit_window_px, options.refit_window_px),
+        "maxLevel": 1,
+        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+    }
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        first, second, corners, expected[:, None].copy(), **window
+    )
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+        second, first, there, (there.reshape(-1, 2) + start - expected)[:, None].copy(), **window
+    )
+    there, back = there.reshape(-1, 2), back.reshape(-1, 2)
+    good = (found.ravel() > 0) & (found_back.ravel() > 0)
+    good &= np.linalg.norm(back - start, axis=1) < options.max_round_trip_px
+    good &= np.abs(there - expected).max(axis=1) < options.max_track_px
+    if np.count_nonzero(good) < options.min_tracks:
+        return None
+    places = view.frame.from_frame(start[good], 0), view.frame.from_frame(there[good], 1)
+    own = [scaled_points(points, 1 / view.scale) for points in places]
+    return own[0], own[1], (there - start)[good, 1]
+
+
+def _sample(view: RectifiedView, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows of the keypoints that have a match, its places and its scores."""
+    disparity = view.disparities.disparity
+    height, width = disparity.shape
+    places = view.frame.to_frame(scaled_points(xy0, view.scale), 0)
+    nearest = np.rint(np.where(np.isfinite(places), places, -1)).astype(np.int64)
+    inside = ((nearest >= 0) & (nearest < (width, height))).all(axis=1)
+    rows = np.flatnonzero(inside)
+    column, row = nearest[rows].T
+    known = np.isfinite(disparity[row, column])
+    rows, column, row = rows[known], column[known], row[known]
+    places, own = places[rows], disparity[row, column]
+    scores = view.correlation[row, column]
+    # Bilinear, of the neighbours on the same surface.
+    left, top = np.floor(places).astype(np.int64).T
+    total, weights = np.zeros(len(rows)), np.full(len(rows), 1e-9)
+    for down in (0, 1):
+        for across in (0, 1):
+            x, y = np.clip(left + across, 0, width - 1), np.clip(top + down, 0, height - 1)
+            value = disparity[y, x]
+            weight = np.abs(1 - across - (places[:, 0] - left)) * np.abs(
+                1 - down - (places[:, 1] - top)
+            )
+            weight *= np.abs(value - own) <= 1  # not for NaN
+            total += weight * np.nan_to_num(value - own)
+            weights += weight
+    shift = np.column_stack([own + total / weights, np.zeros(len(rows))])
+    there = scaled_points(view.frame.from_frame(places - shift, 1), 1 / view.scale)
+    return rows, there, np.clip(scores, 0, 1)
