@@ -147,7 +147,7 @@ class HomographyMatchingOptions:
     max_scale_ratio: float = 1.5
     refinement: ValidatedRefinementOptions = field(default_factory=ValidatedRefinementOptions)
     max_distance_px: float = 1.0
-    min_verified_fraction: float = 0.15
+    min_verified_fraction: float = 0.5
     min_verified_fraction_of_depth: float = 0.6
     min_parallax_fraction: float = 0.1
 
@@ -246,8 +246,6 @@ class RectifiedMatchingOptions:
         max_track_px: a track that moves further than this from its match is wrong.
         min_tracks: that a matrix is estimated from.
         refit_threshold_px: inlier threshold of the estimate.
-        min_matched_fraction: with a smaller fraction of the keypoints matched, a search along
-            epipolar lines is tried, too, and what gives more matches is taken.
 
     Raises:
         OptionError: a value is out of its range.
@@ -271,7 +269,6 @@ class RectifiedMatchingOptions:
     max_track_px: float = 4.0
     min_tracks: int = 50
     refit_threshold_px: float = 0.5
-    min_matched_fraction: float = 0.05
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -281,7 +278,7 @@ class RectifiedMatchingOptions:
                 *("max_round_trip_px", "max_track_px", "refit_threshold_px"),
             ),
             not_negative=("max_refits", "margin_fraction"),
-            fractions=("min_correlation", "min_matched_fraction"),
+            fractions=("min_correlation",),
             odd=("correlation_window_px", "refit_window_px"),
             between={"tail_fraction": (0, 0.5), "min_tracks": (8, math.inf)},
         )
@@ -324,11 +321,12 @@ class GuidedOptions:
         initial_geometry: the geometry that guides at first.
         homography_matching: planes and rotating cameras.
         rectified_matching: scenes with depth.
-        epipolar_matching: scenes with depth that cannot be rectified, or hardly match by rows.
+        epipolar_matching: scenes with depth that cannot be rectified.
         prewarp: second images that are rotated, zoomed or sheared, of scenes with depth.
         verification: when two patches count as the same.
-        min_matched_fraction: with a smaller fraction of the keypoints matched, the geometry is not
-            trusted after all.
+        min_matched_fraction: with a smaller fraction of the keypoints of a scene with depth
+            matched, only the sparse matches that agree with its geometry are taken.
+        min_matches: with fewer the geometry is not trusted after all.
 
     Raises:
         OptionError: a value is out of its range.
@@ -343,6 +341,7 @@ class GuidedOptions:
     prewarp: PrewarpOptions = field(default_factory=PrewarpOptions)
     verification: VerificationOptions = field(default_factory=VerificationOptions)
     min_matched_fraction: float = 0.02
+    min_matches: int = 8
 
     def __post_init__(self) -> None:
-        check_ranges(self, fractions=("min_matched_fraction",))
+        check_ranges(self, positive=("min_matches",), fractions=("min_matched_fraction",))

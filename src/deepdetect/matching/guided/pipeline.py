@@ -15,7 +15,12 @@ from ...features.matchers import DescriptorMatches
 from ...features.matches import Guide
 from ...geometry import GeometryOptions, estimate_geometry
 from .epipolar import match_along_epipolar_lines
-from .homography import ImagePair, match_by_homography, refine_guiding_homography
+from .homography import (
+    ImagePair,
+    match_by_homography,
+    nearest_keypoint,
+    refine_guiding_homography,
+)
 from .initial_geometry import InitialGeometry, InitialMatches, find_initial_geometry
 from .options import GuidedOptions
 from .prewarp import estimate_affinity, prewarp
@@ -83,14 +88,19 @@ def guided_matches(
     if first.model == "homography":
         matrix, found = _match_plane(pair, first, options, seed)
         if found is None:
-            assert first.parallax is not None
-            # Without parallax a fundamental matrix is any that holds the plane.
-            if first.alternative is None or first.parallax.log10_nfa >= 0:
+            if first.alternative is None:
                 return _no_guide(first), None
             first = replace(first.alternative, num_views=first.num_views)
+    enough = options.min_matched_fraction * min(len(xy0), len(xy1))
+    if found is not None and len(found) < enough:
+        return _no_guide(first), None
     if found is None:
         matrix, found = _match_scene_with_depth(pair, first, options, seed)
-    if len(found) < options.min_matched_fraction * min(len(xy0), len(xy1)):
+        if len(found) < enough:
+            # Too little around them is alike; the sparse matches are distinct, and agree.
+            assert first.matrix is not None
+            matrix, found = first.matrix, _sparse_matches(pair, first)
+    if len(found) < options.min_matches:
         return _no_guide(first), None
     return _guide(first, matrix), found
 
@@ -118,7 +128,7 @@ def _match_plane(
 def _match_scene_with_depth(
     pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
 ) -> tuple[np.ndarray, GuidedMatches]:
-    """Match by rectification; along epipolar lines where that gives hardly anything."""
+    """Match by rectification; along epipolar lines where the pair cannot be rectified."""
     assert first.matrix is not None
     rectified = options.rectified_matching
     found = match_by_rectification(
@@ -132,13 +142,22 @@ def _match_scene_with_depth(
         seed,
     )
     if found is not None:
-        matches = GuidedMatches(found.rows0, found.points1, found.scores)
-        if len(found) >= rectified.min_matched_fraction * len(pair.xy0):
-            return found.matrix, matches
+        return found.matrix, GuidedMatches(found.rows0, found.points1, found.scores)
     matrix, searched = _search_epipolar_lines(pair, first, options, seed)
-    if found is not None and len(found) >= len(searched):
-        return found.matrix, matches
     return matrix, _at_keypoints(pair, searched)
+
+
+def _sparse_matches(pair: ImagePair, first: InitialGeometry) -> GuidedMatches:
+    """Return the sparse matches that agree with the geometry, moved to the keypoints near them."""
+    height, width = pair.gray0.shape
+    rows, distances = nearest_keypoint(first.points0, pair.xy0, (width, height))
+    near = np.isfinite(distances)
+    moved = first.points1[near] + pair.xy0[rows[near]] - first.points0[near]
+    found = GuidedMatches(
+        rows[near].astype(np.int64), moved, np.full(np.count_nonzero(near), 0.5, np.float32)
+    )
+    order = np.unique(found.rows0, return_index=True)[1]
+    return GuidedMatches(found.rows0[order], found.points1[order], found.scores[order])
 
 
 def _search_epipolar_lines(
