@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, match_images
+from deepdetect import DeepDetect, load_matches, match_images
 
 
 def test_writes_matches_and_a_picture(run, photos: Path) -> None:
@@ -86,9 +86,23 @@ def test_csv(run, photos: Path) -> None:
 def test_a_failed_estimate_is_said(run, tmp_path: Path) -> None:
     for name in "ab":
         Image.new("RGB", (64, 64), (90, 90, 90)).save(tmp_path / f"{name}.png")
-    result = run("match", "a.png", "b.png", "-o", "out")
+    result = run("match", "a.png", "b.png", "-o", "out", "--unguided")
     assert result.exit_code == 0
     assert "no fundamental could be estimated" in result.stderr
+
+
+@pytest.mark.parametrize("more", [[], ["--json"]])
+def test_a_pair_without_a_geometry_has_its_own_exit_code(run, tmp_path: Path, more) -> None:
+    rng = np.random.default_rng(0)
+    for name in "ab":
+        noise = rng.integers(0, 256, (96, 128), np.uint8)
+        Image.fromarray(noise).save(tmp_path / f"{name}.png")
+    result = run("match", "a.png", "b.png", "-o", "out", *more)
+    assert result.exit_code == 3
+    assert result.stderr.count("no geometry between these images can be trusted") == 1
+    assert len(load_matches(Path("out/a_b_matches.npz"))) == 0
+    if more:
+        assert json.loads(result.stdout)["matches"] == 0
 
 
 def test_an_essential_matrix_from_camera_files(run, photos: Path) -> None:

@@ -24,7 +24,7 @@ class GeometryOptions:
 
     Attributes:
         model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto"
-            (one of these two; `select_model`), "essential" (known cameras), or "none".
+            (one of these two; `measure_parallax`), "essential" (known cameras), or "none".
         estimator: "magsac" or "ransac".
         inlier_threshold: a match is an inlier when its error is below this, in pixels: the
             transfer error of a homography, else the Sampson distance (in a rectified pair an
@@ -193,17 +193,16 @@ def _fit_fundamental(
 def _fit_essential(
     points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, method: int
 ) -> np.ndarray | None:
-    # Both images as of one camera with the mean focal length: OpenCV 5 is less accurate in
-    # normalised coordinates (a rotation off by .13 degrees instead of .05 on a KITTI clip).
+    # Both images in normalised coordinates; the threshold shrinks with the focal length.
     camera0, camera1 = _cameras(options)
-    focal = float(camera0[0, 0] + camera1[0, 0]) / 2
+    focal = (camera0[0, 0] + camera1[0, 0]) / 2
     matrix, _ = cv2.findEssentialMat(
-        _normalised(points0, camera0) * focal,
-        _normalised(points1, camera1) * focal,
-        np.diag([focal, focal, 1]),
+        _normalised(points0, camera0),
+        _normalised(points1, camera1),
+        np.eye(3),
         method=method,
         prob=options.confidence,
-        threshold=options.inlier_threshold,
+        threshold=options.inlier_threshold / focal,
         maxIters=options.iterations,
     )
     return None if matrix is None else matrix[:3]

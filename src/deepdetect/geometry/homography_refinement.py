@@ -80,7 +80,10 @@ class RefinementOptions:
             raise OptionError("windows_px must not be empty, nor max_corners below min_tracks")
         check_ranges(
             self,
-            positive=("max_round_trip_px", "inlier_threshold"),
+            positive=(
+                *("tracking_iterations", "tracking_step_px"),
+                *("max_round_trip_px", "inlier_threshold"),
+            ),
             not_negative=("pyramid_levels", "min_track_gain", "min_pixel_gain"),
             between={
                 "max_rounds": (1, math.inf),

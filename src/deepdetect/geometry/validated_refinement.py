@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -177,16 +178,15 @@ Step = Callable[[np.ndarray, np.ndarray], Iterator[Fit]]
 def _steps(gray0: np.ndarray, options: ValidatedRefinementOptions) -> Iterator[Step]:
     equalised = equalise(gray0)
     for window_px in options.windows_px:
-        yield lambda warped, valid_mask, side=window_px: _fits_to_corners(
-            equalised, warped, valid_mask, side, options
-        )
-    yield lambda warped, valid_mask: _fits_to_pixels(gray0, warped, valid_mask, options)
+        yield partial(_fits_to_corners, equalised, window_px=window_px, options=options)
+    yield partial(_fits_to_pixels, gray0, options=options)
 
 
 def _fits_to_corners(
     equalised: np.ndarray,
     warped: np.ndarray,
     valid_mask: np.ndarray,
+    *,
     window_px: int,
     options: ValidatedRefinementOptions,
 ) -> Iterator[Fit]:
@@ -228,6 +228,7 @@ def _fits_to_pixels(
     gray0: np.ndarray,
     warped: np.ndarray,
     valid_mask: np.ndarray,
+    *,
     options: ValidatedRefinementOptions,
 ) -> Iterator[Fit]:
     """Yield the alignment of all pixels (ECC), which has the least noise."""
