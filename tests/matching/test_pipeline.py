@@ -19,6 +19,7 @@ from deepdetect import (
     match_images,
     select_keypoints,
 )
+from deepdetect.evaluation.baselines.random import RandomDetector
 from deepdetect.features.sift import sift_descriptors
 from deepdetect.geometry import transfer_errors
 from deepdetect.matching.options import PRESETS
@@ -525,3 +526,56 @@ def test_the_published_system_is_reproduced(shared: Path, scene: str, correct: i
     )
     assert matches.model == "homography"
     assert matches.inliers.sum() == pytest.approx(correct, rel=0.03)
+
+
+# Seeds, and pairs without a geometry
+
+
+def test_seeds_take_the_place_of_our_own_matches(photo: np.ndarray) -> None:
+    shift = np.array([[1, 0, 9.0], [0, 1, -4], [0, 0, 1]])
+    second = warped(photo, shift)
+    places = np.random.default_rng(0).uniform(20, 180, (40, 2))
+    seeds = places, places + (9, -4)
+    seeds[1][::4] = np.random.default_rng(1).uniform(20, 180, (10, 2))  # these are wrong
+    matches = match_images(photo, second, RandomDetector(), seeds=seeds)
+    assert matches.guide is not None
+    assert (matches.model, matches.guide.sparse_matches) == ("homography", 40)
+    assert share_correct(matches, shift, 1.01) > 0.99
+    assert len(matches) > 1000
+
+
+def test_seeds_that_do_not_agree_guide_nothing(photo: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    seeds = rng.uniform(0, 200, (40, 2)), rng.uniform(0, 200, (40, 2))
+    matches = match_images(photo, photo, RandomDetector(), seeds=seeds)
+    assert matches.lost
+    assert len(matches) == 0
+
+
+@pytest.mark.parametrize(
+    ("seeds", "message"),
+    [
+        ((np.zeros((4, 2)), np.zeros((5, 2))), "shape"),
+        ((np.zeros(4), np.zeros(4)), "shape"),
+        ((np.full((9, 2), np.nan), np.zeros((9, 2))), "finite"),
+    ],
+)
+def test_seeds_that_are_no_matches_are_refused(photo: np.ndarray, seeds, message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        match_images(photo, photo, RandomDetector(), seeds=seeds)
+
+
+def test_seeds_guide_nothing_without_guided_matching(photo: np.ndarray) -> None:
+    seeds = np.zeros((9, 2)), np.zeros((9, 2))
+    with pytest.raises(OptionError, match="seeds guide the matching"):
+        match_images(photo, photo, RandomDetector(), seeds=seeds, guided=False)
+
+
+def test_a_pair_without_a_geometry_has_no_matches() -> None:
+    rng = np.random.default_rng(0)
+    first, second = (rng.integers(0, 256, (120, 160, 3), np.uint8) for _ in range(2))
+    matches = match_images(first, second, RandomDetector())
+    assert matches.lost
+    assert not matches.guided
+    assert (len(matches), matches.model, matches.matrix) == (0, "none", None)
+    assert not match_images(first, second, RandomDetector(), guided=False).lost

@@ -37,6 +37,7 @@ def match_images(
     preset: str = "default",
     options: MatchingOptions | None = None,
     initial: InitialMatches | None = None,
+    seeds: tuple[np.ndarray, np.ndarray] | None = None,
     guided: bool | None = None,
     model: str | None = None,
     guide: str | None = None,
@@ -76,6 +77,9 @@ def match_images(
             and channels.
         options: all options at once, instead of a preset.
         initial: sparse matches of the pair, where `initial_matches` has made them already.
+        seeds: sparse matches of any other matcher (LightGlue, LoFTR, a person's clicks), two (K, 2)
+            arrays of positions, row by row; they take the place of our own SIFT matches. Some may
+            be wrong.
         guided: whether a geometry from a few matches guides the matching, or descriptors alone
             decide.
         model: the geometry, "homography" (planes, pure rotation), "fundamental" (any static
@@ -143,6 +147,8 @@ def match_images(
     chosen = replace_options(
         chosen, **{name: value for name, value in given.items() if value is not None}
     )
+    if seeds is not None and not chosen.guided:
+        raise OptionError("seeds guide the matching: leave them out, or guided=False")
     timer = StageTimer()
     rgb = load_image(image0), load_image(image1)
     detector = _configured(detector, chosen.heatmap)
@@ -161,6 +167,7 @@ def match_images(
                 chosen.geometry.seed,
                 initial,
                 chosen.guided_options,
+                seeds,
             )
         points0, points1, scores = _guided_points(guided_pair, keypoints, chosen.mutual)
     else:

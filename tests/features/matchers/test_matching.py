@@ -201,7 +201,7 @@ def test_an_unknown_name_brings_the_nearest(name: str, hint: str) -> None:
 
 @pytest.mark.parametrize("name", ["", "brute", None])
 def test_a_name_like_no_other_brings_the_whole_list(name: object) -> None:
-    with pytest.raises(OptionError, match="known: flann, exact") as caught:
+    with pytest.raises(OptionError, match="known: auto, flann, exact") as caught:
         get_matcher(name)
     assert "did you mean" not in str(caught.value)
 
@@ -229,3 +229,23 @@ def test_every_matcher_keeps_the_contract(name: str, count: int) -> None:
     assert (np.diff(distances, axis=1) >= 0).all()
     np.testing.assert_array_equal(queries, before[0])
     np.testing.assert_array_equal(base, before[1])
+
+
+@pytest.mark.parametrize(
+    ("count", "positions", "expected"),
+    [(100, True, "exact"), (30_000, True, "patchmatch"), (30_000, False, "flann")],
+)
+def test_auto_takes_the_matcher_that_fits(
+    count: int, positions: bool, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deepdetect.features.matchers import matching
+
+    called = []
+    for name in ("exact", "patchmatch", "flann"):
+        monkeypatch.setattr(
+            matching, f"{name}_neighbours", lambda *_, name=name: called.append(name)
+        )
+    some = np.zeros((count, 8), np.float32)
+    places = np.zeros((count, 2))
+    get_matcher("auto")(some, some, 1, 0, (places, places) if positions else None)
+    assert called == [expected]

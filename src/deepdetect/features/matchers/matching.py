@@ -41,7 +41,31 @@ class Matcher(Protocol):
         ...
 
 
+MAX_EXACT_PRODUCT = 4e8
+"""Keypoints of both images, multiplied, up to which all distances are computed in a moment."""
+
+
+def automatic_neighbours(
+    queries: np.ndarray,
+    base: np.ndarray,
+    count: int,
+    seed: int,
+    positions: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find neighbours exactly where keypoints are few, else by PatchMatch, else by FLANN.
+
+    PatchMatch spreads good matches over dense keypoints, and needs their positions; FLANN does not.
+    Arguments and result as of `Matcher`.
+    """
+    if len(queries) * len(base) <= MAX_EXACT_PRODUCT:
+        return exact_neighbours(queries, base, count, seed, positions)
+    if positions is not None:
+        return patchmatch_neighbours(queries, base, count, seed, positions)
+    return flann_neighbours(queries, base, count, seed, positions)
+
+
 MATCHERS: dict[str, Matcher] = {
+    "auto": automatic_neighbours,
     "flann": flann_neighbours,
     "exact": exact_neighbours,
     "faiss": faiss_neighbours,

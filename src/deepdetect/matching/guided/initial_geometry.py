@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..._shared.errors import unknown_name
+from ..._shared.errors import OptionError, unknown_name
 from ...features.keypoints import Keypoints
 from ...features.matchers import get_matcher, match_descriptors
 from ...features.sift_detector import detect_sift
@@ -157,6 +157,52 @@ def find_initial_geometry(
         options = replace(options, max_side_px=simulated_side)
         initial = initial_matches(gray0, gray1, options=options)
     return estimate_initial_geometry(initial, model, seed, options)
+
+
+def geometry_of_seeds(
+    seeds: Points,
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+    model: str = "auto",
+    seed: int = 0,
+    options: InitialGeometryOptions = InitialGeometryOptions(),
+) -> InitialGeometry:
+    """Estimate the geometry of a pair from sparse matches that were found elsewhere.
+
+    Args:
+        seeds: (K, 2) positions in both images, some of them wrong.
+        sizes: (width, height) of both images.
+        model: as of `estimate_initial_geometry`.
+        seed: of the random samples.
+        options: thresholds; they hold for images of at most `max_side_px`.
+
+    Returns:
+        The geometry, or one with the model "none".
+
+    Raises:
+        OptionError: the model is unknown, or the seeds are not two (K, 2) arrays of finite numbers.
+
+    Example:
+        >>> points = np.random.default_rng(0).uniform(0, 99, (30, 2))
+        >>> geometry_of_seeds((points, points + 3), ((110, 110), (110, 110))).matrix[:2, 2].round(3)
+        array([3., 3.])
+    """
+    if model not in ("auto", *MODELS):
+        raise unknown_name("model", model, ("auto", *MODELS))
+    try:
+        points0, points1 = (np.array(points, np.float64) for points in seeds)
+    except (TypeError, ValueError):
+        points0 = points1 = np.empty(0)
+    if points0.ndim != 2 or points0.shape[1:] != (2,) or points0.shape != points1.shape:
+        raise OptionError("seeds must be two arrays of shape (K, 2): positions in both images")
+    if not (np.isfinite(points0).all() and np.isfinite(points1).all()):
+        raise OptionError("seeds must be finite positions: leave out those that are not")
+    scales = [min(1.0, options.max_side_px / max(size)) for size in sizes]
+    size = (round(sizes[1][0] * scales[1]), round(sizes[1][1] * scales[1]))
+    scaled = (scaled_points(points0, scales[0]), scaled_points(points1, scales[1]))
+    found = _estimate(_separate(*scaled, options.min_separation_px), model, seed, size, options)
+    if found.log10_nfa < options.max_log10_nfa:
+        return _upscale(found, scales[0], scales[1])
+    return replace(_nothing(found.num_matches), log10_nfa=found.log10_nfa)
 
 
 def estimate_initial_geometry(

@@ -234,6 +234,8 @@ class RectifiedMatchingOptions:
         tail_fraction: of the disparities of the sparse matches at each end, which may be wrong.
         margin_px, margin_fraction: added to the range of disparities at both ends, in pixels, and
             as a fraction of it.
+        min_fraction_of_one_sign: where so many sparse matches grow about an epipole, or shrink,
+            others do so by `margin_px` at most.
         correlation_window_px: side of the window in which both images are compared after matching,
             odd.
         min_correlation: a match whose windows correlate less is left out.
@@ -259,6 +261,7 @@ class RectifiedMatchingOptions:
     tail_fraction: float = 0.01
     margin_px: float = 4.0
     margin_fraction: float = 0.25
+    min_fraction_of_one_sign: float = 0.8
     correlation_window_px: int = 9
     min_correlation: float = 0.3
     max_refits: int = 1
@@ -278,7 +281,7 @@ class RectifiedMatchingOptions:
                 *("max_round_trip_px", "max_track_px", "refit_threshold_px"),
             ),
             not_negative=("max_refits", "margin_fraction"),
-            fractions=("min_correlation",),
+            fractions=("min_correlation", "min_fraction_of_one_sign"),
             odd=("correlation_window_px", "refit_window_px"),
             between={"tail_fraction": (0, 0.5), "min_tracks": (8, math.inf)},
         )

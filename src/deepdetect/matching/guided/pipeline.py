@@ -21,7 +21,12 @@ from .homography import (
     nearest_keypoint,
     refine_guiding_homography,
 )
-from .initial_geometry import InitialGeometry, InitialMatches, find_initial_geometry
+from .initial_geometry import (
+    InitialGeometry,
+    InitialMatches,
+    find_initial_geometry,
+    geometry_of_seeds,
+)
 from .options import GuidedOptions
 from .prewarp import estimate_affinity, prewarp
 from .rectified import match_by_rectification
@@ -63,6 +68,7 @@ def guided_matches(
     seed: int = 0,
     initial: InitialMatches | None = None,
     options: GuidedOptions = GuidedOptions(),
+    seeds: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[Guide, GuidedMatches | None]:
     """Match the keypoints of two images by their geometry.
 
@@ -73,14 +79,19 @@ def guided_matches(
         seed: of all random choices.
         initial: sparse matches of the pair, where `initial_matches` has made them already.
         options: all tuned numbers.
+        seeds: (K, 2) sparse matches in both images that take the place of our own.
 
     Returns:
         The geometry that guided, and the matches; None when no geometry could be trusted.
 
     Raises:
-        OptionError: the model is unknown.
+        OptionError: the model is unknown, or the seeds are no matches.
     """
-    first = find_initial_geometry(gray0, gray1, model, seed, options.initial_geometry, initial)
+    if seeds is None:
+        first = find_initial_geometry(gray0, gray1, model, seed, options.initial_geometry, initial)
+    else:
+        sizes = gray0.shape[::-1], gray1.shape[::-1]
+        first = geometry_of_seeds(seeds, sizes, model, seed, options.initial_geometry)
     if first.matrix is None:
         return _guide(first, None), None
     pair = ImagePair(gray0, gray1, xy0, xy1)

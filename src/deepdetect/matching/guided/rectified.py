@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from ...geometry import GeometryOptions, estimate_geometry
-from ...geometry.epipolar_rectification import RectifiedFrame, rectified_frame
+from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
 from ...geometry.homography_refinement import equalise
 from ...geometry.rescaling import downscale, scaled_fundamental, scaled_points
 from ...geometry.zncc import gaussian_blur, local_zncc
@@ -153,7 +153,10 @@ def _rectify(
             return None
     (first, valid0), (second, valid1) = frame.warp(gray0, 0), frame.warp(gray1, 1)
     low, high = _range_of_matches(frame, points0, points1, options)
-    seen = find_disparity_range(first, second, options.disparity)
+    # About an epipole everything grows, or everything shrinks: what small copies of the two views
+    # agree on in the other direction is wrong.
+    polar = isinstance(frame, PolarFrame)
+    seen = None if polar else find_disparity_range(first, second, options.disparity)
     if seen is not None:
         low, high = min(low, seen.min_disparity), max(high, seen.max_disparity)
         # What both views agree on may be far off where much of a frame shows nothing.
@@ -205,7 +208,13 @@ def _range_of_matches(
     tail = options.tail_fraction
     low, high = np.quantile(disparity, [tail, 1 - tail])
     margin = options.margin_px + options.margin_fraction * (high - low)
-    return int(np.floor(low - margin)), int(np.ceil(high + margin))
+    smallest, largest = low - margin, high + margin
+    if isinstance(frame, PolarFrame):
+        if np.mean(disparity > 0) > options.min_fraction_of_one_sign:
+            smallest = max(smallest, -options.margin_px)
+        if np.mean(disparity < 0) > options.min_fraction_of_one_sign:
+            largest = min(largest, options.margin_px)
+    return int(np.floor(smallest)), int(np.ceil(largest))
 
 
 def _track(

@@ -1,0 +1,108 @@
+"""Matching by rectification: a real pair with known disparities, as it is and moved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect.datasets.middlebury import load_middlebury
+from deepdetect.geometry import transform_points
+from deepdetect.io.image import luma
+from deepdetect.matching.guided.initial_geometry import find_initial_geometry
+from deepdetect.matching.guided.options import RectifiedMatchingOptions
+from deepdetect.matching.guided.rectified import RectifiedPairMatches, match_by_rectification
+
+TURNED = cv2.getRotationMatrix2D((225, 190), 30, 1.0)
+
+
+@pytest.fixture(scope="module")
+def cones(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    pair = load_middlebury(shared / "data" / "middlebury" / "cones")
+    return luma(pair.left), luma(pair.right), pair.disparity
+
+
+def match(
+    gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray, **changes: object
+) -> RectifiedPairMatches | None:
+    first = find_initial_geometry(gray0, gray1, "fundamental")
+    assert first.matrix is not None
+    options = RectifiedMatchingOptions(**changes)  # type: ignore[arg-type]
+    return match_by_rectification(
+        gray0, gray1, xy0, first.points0, first.points1, first.matrix, options
+    )
+
+
+def every_second(gray: np.ndarray) -> np.ndarray:
+    y, x = np.mgrid[: gray.shape[0] : 2, : gray.shape[1] : 2]
+    return np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
+
+
+def within(found: RectifiedPairMatches, xy0: np.ndarray, cones, move: np.ndarray) -> float:
+    """Return the share of the matches with a true place that are within a pixel of it."""
+    x, y = xy0[found.rows0].astype(int).T
+    disparity = cones[2][y, x]
+    true = transform_points(np.column_stack([x - disparity, y]), np.vstack([move, [0, 0, 1]]))
+    errors = np.linalg.norm(true - found.points1, axis=1)
+    return float((errors[np.isfinite(errors)] < 1).mean())
+
+
+@pytest.mark.parametrize(
+    ("move", "precision"),
+    [
+        (np.float64([[1, 0, 0], [0, 1, 0]]), 0.93),
+        (TURNED, 0.93),
+        (np.float64([[0.8, 0, 30], [0, 0.8, 20]]), 0.85),
+    ],
+    ids=["rectified", "rotated", "zoomed"],
+)
+def test_most_keypoints_are_matched_and_right(cones, move: np.ndarray, precision: float) -> None:
+    left, right, _ = cones
+    size = (right.shape[1], right.shape[0])
+    second = cv2.warpAffine(right, move, size, flags=cv2.INTER_CUBIC)
+    xy0 = every_second(left)
+    found = match(left, second, xy0)
+    assert found is not None
+    assert len(found) > 0.35 * len(xy0)
+    assert within(found, xy0, cones, move) > precision
+    assert ((found.scores >= 0) & (found.scores <= 1)).all()
+    assert (np.diff(found.rows0) > 0).all()
+
+
+def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(cones) -> None:
+    left, right, _ = cones
+    xy0 = every_second(left)
+    found = match(left, right, xy0, max_volume=3e6)
+    assert found is not None
+    assert len(found) > 0.25 * len(xy0)
+    move = np.float64([[1, 0, 0], [0, 1, 0]])
+    assert within(found, xy0, cones, move) > 0.85
+
+
+def test_a_geometry_that_is_off_is_estimated_again(cones) -> None:
+    """One that is turned by a third of a degree about the middle of the image."""
+    left, right, _ = cones
+    first = find_initial_geometry(left, right, "fundamental")
+    turn = np.vstack([cv2.getRotationMatrix2D((225, 190), 0.3, 1), [0, 0, 1]])
+    assert first.matrix is not None
+    wrong = np.linalg.inv(turn).T @ first.matrix
+    turned = transform_points(first.points1, turn)
+    xy0 = every_second(left)
+    rows = []
+    for rounds in (0, 1):
+        found = match_by_rectification(
+            *(left, right, xy0, first.points0, turned, wrong),
+            RectifiedMatchingOptions(max_refits=rounds),
+        )
+        assert found is not None
+        rows.append(np.abs(found.points1[:, 1] - xy0[found.rows0, 1]).mean())
+    assert rows[0] > 0.4
+    assert rows[1] < 0.3 * rows[0]
+
+
+def test_too_few_sparse_matches_give_no_frame(cones) -> None:
+    left, right, _ = cones
+    few = np.zeros((5, 2))
+    assert match_by_rectification(left, right, every_second(left), few, few, np.eye(3)) is None
