@@ -78,9 +78,10 @@ class DisparityOptions:
             outside the right image that of the first surface in sight, continued along a line as
             far as this predicts the surface itself. Such pixels have no match:
             `DisparityMap.matched`.
-        occluding_edge_px: so many of the outermost pixels of a nearer surface have no match, but
-            are filled as what it hides, or keep their disparity where that is not known: the
-            windows give them the nearer disparity too often. 0 takes them as matched.
+        occluding_edge_px: so many of the outermost pixels of a nearer surface, and of the columns
+            at both ends of the right image, have no match, but are filled as what is hidden there,
+            or keep their disparity where that is not known: the windows give them the nearer
+            disparity too often. 0 takes them as matched.
         max_speckle_area_px: patches of one surface up to this size are left out.
         max_difference_px: of neighbouring disparities on one surface.
         occlusion_slack_px: by which an occlusion may be wider than the step of disparity that
@@ -260,12 +261,12 @@ def compute_disparity(
         left, right, found.disparity, known, options.refinement, options.max_difference_px
     )
     known &= _leads_inside(disparity)
-    edge = np.zeros_like(known)
+    sure = known
     if options.occluding_edge_px:
-        edge = on_occluding_edge(
+        sure = _leads_inside(disparity, options.occluding_edge_px) & ~on_occluding_edge(
             disparity, known, options.occluding_edge_px, options.max_difference_px
         )
-    sure = known & ~edge
+        sure &= known
     kept = known
     if options.discontinuity_margin_px:
         kept = known & ~near_discontinuity(
@@ -284,11 +285,11 @@ def compute_disparity(
     return DisparityMap(np.where(kept, disparity, np.float32(np.nan)), matched, disparities)
 
 
-def _leads_inside(disparity: np.ndarray) -> np.ndarray:
-    """Return where disparities lead to a pixel of the right image; (H, W) bool."""
+def _leads_inside(disparity: np.ndarray, margin_px: int = 0) -> np.ndarray:
+    """Return where disparities lead to a column of the right image, less a margin; (H, W) bool."""
     width = disparity.shape[1]
     place = np.arange(width, dtype=np.float32) - disparity
-    return (place >= -0.5) & (place <= width - 0.5)
+    return (place >= margin_px - 0.5) & (place <= width - 0.5 - margin_px)
 
 
 def find_disparity_range(
