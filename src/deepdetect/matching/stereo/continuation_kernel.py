@@ -22,13 +22,16 @@ def _line_at(sums, first, last, x):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True)
-def continue_rows(first, last, disparity, known, sign, min_support, max_difference, out):  # type: ignore[no-untyped-def]
+def continue_rows(  # type: ignore[no-untyped-def]
+    first, last, disparity, known, carried, sign, min_support, max_difference, out
+):
     """Continue the first known surface of some rows to the left, where it is not seen.
 
     Args:
         first, last: the rows.
         disparity: (H, W) float32.
         known: (H, W) bool.
+        carried: (H, W) float32, whole disparities that the surfaces around suggest.
         sign: the other view shows x at x - sign * disparity: -1 in mirrored views.
         min_support: fewest known pixels that a line is fitted to.
         max_difference: of disparities on one surface.
@@ -64,6 +67,9 @@ def continue_rows(first, last, disparity, known, sign, min_support, max_differen
             predicted = _line_at(sums, reach, 2 * reach, 0.0)
             if abs(predicted - _line_at(sums, 0, reach, 0.0)) > max_difference:
                 break
+            # Half a pixel for the rounding.
+            if abs(carried[y, x] - disparity[y, start]) > max_difference + np.float32(0.5):
+                continue
             continued = _line_at(sums, 0, 2 * reach, np.float64(x - start))
             if np.float64(x) - sign * continued < 0:
                 out[y, x] = np.float32(continued)

@@ -76,8 +76,8 @@ class DisparityOptions:
         fill_occlusions: give what the right image does not show the disparity of the surface
             beside it: between two surfaces that of the farther one; where the counterpart lies
             outside the right image that of the first surface in sight, continued along a line as
-            far as this predicts the surface itself. Such pixels have no match:
-            `DisparityMap.matched`.
+            far as this predicts the surface itself, unless the surfaces above and below suggest
+            another. Such pixels have no match: `DisparityMap.matched`.
         occluding_edge_px: so many of the outermost pixels of a nearer surface, and of the columns
             at both ends of the right image, have no match, but are filled as what is hidden there,
             or keep their disparity where that is not known: the windows give them the nearer
@@ -276,7 +276,11 @@ def compute_disparity(
     if options.fill_occlusions:
         behind, occluded = fill_occlusions(disparity, sure, options.occlusion_slack_px)
         beyond = continue_surfaces(
-            disparity, sure, options.min_support_px, options.max_difference_px
+            disparity,
+            sure,
+            found.disparity,
+            options.min_support_px,
+            options.max_difference_px,
         )
         occluded &= ~sure
         continued = ~known & np.isfinite(beyond)
