@@ -111,6 +111,19 @@ def test_ours_is_exact_and_the_baselines_are_there(section: Section) -> None:
 
 
 @pytest.mark.slow
+def test_what_the_right_image_cannot_show_is_counted_with_offsets(section: Section) -> None:
+    keys = [table.key for table in section.tables]
+    assert "middlebury_outside_cones" in keys
+    assert "middlebury_outside_nothing-known" not in keys
+    (table,) = [table for table in section.tables if table.key == "middlebury_outside_cones"]
+    assert [row[1] for row in table.rows] == [0, 0, -40, -40, 40, 40]
+    for pipeline, offset, outside, given, share, *_ in table.rows:
+        assert 0 < given <= outside
+        if pipeline != "OpenCV's SGBM" and offset == 0:
+            assert share > 0.6
+
+
+@pytest.mark.slow
 def test_every_pipeline_tells_what_its_stages_took(section: Section) -> None:
     for name, row in rows(section, "middlebury_cones").items():
         seconds = [row[f"{stage}, s"] for stage in STAGES]
