@@ -226,6 +226,7 @@ def test_the_result_does_not_depend_on_threads(
     for other in found[1:]:
         np.testing.assert_array_equal(found[0].indices, other.indices)
         np.testing.assert_array_equal(found[0].disparity, other.disparity)
+        np.testing.assert_array_equal(found[0].matched, other.matched)
 
 
 def test_a_part_of_cones_against_the_truth(shared: Path, every_pixel) -> None:

@@ -76,8 +76,7 @@ def stereo_parts(
 
 def _scene_part(context: BenchmarkContext, compared: Sequence[Pipeline], folder: Path) -> Part:
     dense = [pipeline for pipeline in compared if pipeline.every_pixel]
-    runs = [(pipeline, 0) for pipeline in compared]
-    runs += [(pipeline, offset) for offset in CROPPED_PX for pipeline in dense]
+    runs = [(one, 0) for one in compared] + [(one, o) for o in CROPPED_PX for one in dense]
     tasks: dict[tuple[str, int], Task] = {
         (pipeline.title, offset): Task(
             f"{pipeline.title} on {folder.name}" + (f", offset {offset:+d} px" if offset else ""),
@@ -90,9 +89,8 @@ def _scene_part(context: BenchmarkContext, compared: Sequence[Pipeline], folder:
         if not found:
             return []
         scene = load_calibrated_pair(folder)
-        truths = context.try_run(
-            f"the ground truth of {folder.name}", partial(ground_truths, folder)
-        )
+        name = f"the ground truth of {folder.name}"
+        truths = context.try_run(name, partial(ground_truths, folder))
         named = (truths or {AS_IT_IS: None}).items()
         whole = {title: points for (title, offset), points in found.items() if not offset}
         tables = [_table(scene, compared, whole, name, truth) for name, truth in named]
@@ -100,11 +98,11 @@ def _scene_part(context: BenchmarkContext, compared: Sequence[Pipeline], folder:
             # Of the truth that belongs to the photographs.
             *_, truth = truths.values()
             title = f"{tables[-1].title}: pixels whose counterpart lies outside the right image"
-            titles = [pipeline.title for pipeline in dense]
-            tables.append(outside_table(scene.name, title, truth, found, titles))
-        figure = context.try_run(
-            f"Figure 8 of {folder.name}", partial(_figure, scene, compared, whole)
-        )
+            tables.append(
+                outside_table(scene.name, title, truth, found, [one.title for one in dense])
+            )
+        name = f"Figure 8 of {folder.name}"
+        figure = context.try_run(name, partial(_figure, scene, compared, whole))
         return [*tables, *([figure] if figure is not None else [])]
 
     return Part(tasks, summarize)

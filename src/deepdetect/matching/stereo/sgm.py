@@ -61,7 +61,8 @@ class SGMOptions:
         min_p2_to_p1: `p2` never falls below this many times `p1`.
         outside_cost: of a place outside the right image, of which nothing is known: 0 is that of
             the pair's matches (their median), 1 that of a wrong place. Between them a surface that
-            leaves the image is carried on by its neighbours, and takes no wrong place inside.
+            leaves the image is carried on by its neighbours, and takes no wrong place inside. With
+            less, more of what is seen at the border is lost where views are noisy.
 
     Raises:
         OptionError: a value is out of its range.
