@@ -73,8 +73,8 @@ def ways(
         f"every ({len(every):,})": lambda: ours(left, right, every),
         "edges": lambda: ours(left, right, every, AT_EDGES),
         "dense": lambda: ours(left, right, every, DENSE),
-        "SGBM": lambda: sgbm_disparity(left, right, count, 0),
-        "SGBM, framed": lambda: sgbm_disparity(left, right, count, count),
+        "SGBM": lambda: sgbm_disparity(left, right, count),
+        "SGBM, framed": lambda: sgbm_disparity(left, right, count, (count, 0)),
     }
 
 

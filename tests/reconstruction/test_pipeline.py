@@ -79,6 +79,33 @@ def test_every_pixel_is_as_complete_and_true_as_opencv(cones: Any, detector: Dee
     assert complete.keypoints == cones.left.shape[0] * cones.left.shape[1]
 
 
+@pytest.mark.parametrize("offset", [-40, 60])
+def test_with_an_offset_no_depth_is_invented(offset: int, cones: Any) -> None:
+    """The views are cropped on opposite sides; the depths stay those of the whole pair."""
+    kept = cones.left.shape[1] - abs(offset)
+    starts = max(-offset, 0), max(offset, 0)
+    left, right = (
+        view[:, start : start + kept]
+        for view, start in zip((cones.left, cones.right), starts, strict=True)
+    )
+    cameras = [Camera((kept, 375), 500, (224.5 - start, 187)) for start in starts]
+    found = reconstruct(
+        left, right, AllPixels(), calibration=Calibration(*cameras), rectified=True, density=1
+    )
+    truth = cones.disparity[:, starts[0] : starts[0] + kept]
+    column, row = found.pixels.astype(int).T
+    true = truth[row, column]
+    known = np.isfinite(true)
+    right_one = np.abs(500 / found.points[:, 2] - true) <= 1
+    assert right_one[known].mean() > 0.93
+    assert right_one[known & found.matched].mean() > 0.96
+    place = column - true - offset
+    outside = known & ((place < -0.5) | (place > kept - 0.5))
+    assert outside.sum() > 1_000
+    assert right_one[outside].mean() > 0.8
+    assert found.matched[outside].mean() < 0.1
+
+
 def test_disparities_are_below_the_pixel_without_terraces(found: Any) -> None:
     tenths, _ = np.histogram(found.disparity % 1, 10, (0, 1))
     assert tenths.max() < 1.5 * tenths.min()

@@ -33,8 +33,9 @@ class Reconstruction:
         pixels: (N, 2) float32 positions of the points in the left image.
         disparity: (N,) float32 in pixels for rectified pairs, else None: the match of the left
             (x, y) is the right (x - disparity, y).
-        matched: (N,) bool: seen in both images; False for points in filled occlusions (only when
-            every pixel of a rectified pair is asked for).
+        matched: (N,) bool: seen in both images; False for points filled in from the surface beside
+            them: hidden from the right camera, outside its image, or on the edge of what hides
+            (only when every pixel of a rectified pair is asked for).
         unit: "mm" when the baseline is known, else "baseline": the distance of the cameras is 1,
             and the true scale is not known.
         size: (width, height) of the left image.

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 
 from deepdetect.evaluation.metrics.stereo import (
     DISPARITY_TOLERANCES_PX,
+    counterpart_outside,
     disparity_accuracy,
+    outside_accuracy,
     score_errors,
     stereo_score,
 )
@@ -97,3 +99,22 @@ def test_known_answers() -> None:
 def test_no_match_is_no_error() -> None:
     assert score_errors(np.zeros(0)).precision == 0
     assert score_errors(np.array([np.nan])).precision == 0
+
+
+def test_outside_are_the_pixels_the_right_image_does_not_hold() -> None:
+    column = np.arange(30)
+    for shift in (-4.0, 0.0, 0.4, 6.6):
+        truth = np.full((2, 30), shift)
+        truth[1, 0] = np.nan
+        place = np.rint(column - shift)
+        expected = np.tile((place < 0) | (place > 29), (2, 1))
+        expected[1, 0] = False
+        np.testing.assert_array_equal(counterpart_outside(truth), expected)
+        count = int(expected.sum())
+        pixels = np.column_stack([part.ravel() for part in np.indices((2, 30))[::-1]])
+        found = outside_accuracy(pixels, np.full(60, shift + 1), truth)
+        assert (found.outside, found.given, found.correct) == (count, count, count)
+        assert outside_accuracy(pixels, np.full(60, shift + 1.1), truth).correct == 0
+        none = outside_accuracy(np.empty((0, 2)), np.empty(0), truth)
+        assert (none.outside, none.given) == (count, 0)
+        assert np.isnan(none.accuracy)

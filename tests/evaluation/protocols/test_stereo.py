@@ -73,7 +73,9 @@ def section(
     cache = StageCache(tmp_path_factory.mktemp("cache"))
     context = BenchmarkContext(data, cache)
     (plan,) = plan_middlebury(context, options)
-    assert len(plan) == 2 * len(pipelines(options))
+    compared = pipelines(options)
+    dense = sum(pipeline.every_pixel for pipeline in compared)
+    assert len(plan) == 2 * (len(compared) + 2 * dense)
     found = plan.run(context, no_bar)
     made = cache.made
     assert plan.run(context, no_bar).tables == found.tables
@@ -106,6 +108,21 @@ def test_ours_is_exact_and_the_baselines_are_there(section: Section) -> None:
     assert found["SIFT, low settings"]["points"] > found["SIFT"]["points"]
     published = found["the paper's pipeline, weights dense"]
     assert published["points, in the paper"] == 49_979
+
+
+@pytest.mark.slow
+def test_what_the_right_image_cannot_show_is_counted_with_offsets(section: Section) -> None:
+    keys = [table.key for table in section.tables]
+    assert "middlebury_outside_cones" in keys
+    assert "middlebury_outside_nothing-known" not in keys
+    (table,) = [table for table in section.tables if table.key == "middlebury_outside_cones"]
+    assert [row[1] for row in table.rows] == [0, 0, -40, -40, 40, 40]
+    titles = [column.title for column in table.columns]
+    for row in table.rows:
+        cells = dict(zip(titles, row, strict=True))
+        assert 0 < cells["with a point"] <= cells["pixels outside"]
+        assert 0 < cells["of these within 1 px"] <= 1
+        assert cells["1 - bad-1 of all"] > 0.8
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from deepdetect.matching.stereo.consistency import (
     fill_occlusions,
     filter_speckles,
     near_discontinuity,
+    on_occluding_edge,
 )
 
 
@@ -75,3 +76,22 @@ def test_rows_without_anything_known() -> None:
     whole, between = fill_occlusions(np.full((3, 8), np.nan, np.float32), nothing)
     assert (whole == 0).all()
     assert not between.any()
+
+
+def test_the_edge_of_what_hides_is_its_outermost_pixels() -> None:
+    disparity = np.zeros((30, 40), np.float32)
+    disparity[10:20, 10:20] = 5
+    known = np.ones(disparity.shape, bool)
+    for distance in (1, 2):
+        expected = disparity > 0
+        expected[10 + distance : 20 - distance, 10 + distance : 20 - distance] = False
+        np.testing.assert_array_equal(on_occluding_edge(disparity, known, distance), expected)
+
+
+def test_what_is_not_known_is_no_edge() -> None:
+    disparity = np.full((3, 12), 5, np.float32)
+    known = np.ones(disparity.shape, bool)
+    known[:, 4:7] = False
+    disparity[:, 7:] = 2
+    found = on_occluding_edge(disparity, known, 1)
+    np.testing.assert_array_equal(np.flatnonzero(found[1]), [3])  # the farther one fills the gap

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -225,6 +226,7 @@ def test_the_result_does_not_depend_on_threads(
     for other in found[1:]:
         np.testing.assert_array_equal(found[0].indices, other.indices)
         np.testing.assert_array_equal(found[0].disparity, other.disparity)
+        np.testing.assert_array_equal(found[0].matched, other.matched)
 
 
 def test_a_part_of_cones_against_the_truth(shared: Path, every_pixel) -> None:
@@ -237,6 +239,81 @@ def test_a_part_of_cones_against_the_truth(shared: Path, every_pixel) -> None:
         known = np.isfinite(errors)
         assert np.mean(errors[known] <= 1) > share
         assert np.sum(errors[known] <= 1) > complete * np.isfinite(truth).sum()
+
+
+OFFSETS = (-60, -12, 0, 25, 60)
+
+
+def outside(truth: np.ndarray) -> np.ndarray:
+    """Return the pixels whose counterpart the right image does not hold."""
+    place = np.arange(truth.shape[1]) - truth
+    return (place < -0.5) | (place > truth.shape[1] - 0.5)
+
+
+@pytest.mark.parametrize("offset", OFFSETS)
+@pytest.mark.parametrize("options", [DisparityOptions(), DENSE], ids=["strict", "dense"])
+def test_what_the_right_image_does_not_hold_is_not_matched(
+    offset: int, options: DisparityOptions, rectified_pair
+) -> None:
+    """Out of sight at the left border, at the right one, or at both."""
+    for slope in (0.0, 0.12):
+        truth = offset + slope * (COLUMN - 80)
+        found = disparity_map(*rectified_pair(truth), options)
+        hidden = outside(truth)
+        assert (found.matched & hidden).sum() <= 0.02 * hidden.sum()
+        given = hidden & np.isfinite(found.disparity)
+        assert (np.abs(found.disparity - truth)[given] <= 1).sum() >= 0.97 * given.sum()
+        assert given.any() == (options.fill_occlusions and hidden.any())
+        seen = ~hidden & np.isfinite(found.disparity)
+        assert seen.sum() > 0.75 * (~hidden).sum()
+        assert (np.abs(found.disparity - truth)[seen] <= 1).mean() > 0.995
+
+
+def test_matched_places_lie_in_the_right_image(rectified_pair) -> None:
+    for surface in (9.4, -9.4, 0.4):
+        found = disparity_map(*rectified_pair(np.full(SHAPE, surface)), DENSE)
+        place = (np.arange(SHAPE[1]) - found.disparity)[found.matched]
+        assert (place >= -0.5).all()
+        assert (place <= SHAPE[1] - 0.5).all()
+
+
+def test_a_surface_of_its_own_out_of_sight_is_not_invented(rectified_pair) -> None:
+    """Where another surface begins out of sight nobody knows: no point there is matched."""
+    truth = np.where(COLUMN < 12, 22.0, 30.0)
+    found = disparity_map(*rectified_pair(truth), DENSE)
+    assert not found.matched[:, :29].any()
+    assert np.nanmax(np.abs(found.disparity[:, :29] - 30)) <= 1
+
+
+@pytest.mark.parametrize("name", ["cones", "teddy"])
+@pytest.mark.parametrize("offset", [-80, 0, 80])
+def test_no_depth_is_invented_on_photographs(name: str, offset: int, shared: Path) -> None:
+    """Cropped on opposite sides, a pair has an offset of its disparity."""
+    pair = load_middlebury(shared / "data" / "middlebury" / name)
+    kept = pair.left.shape[1] - abs(offset)
+    first, second = max(-offset, 0), max(offset, 0)
+    left, right = pair.left[:, first : first + kept], pair.right[:, second : second + kept]
+    truth = pair.disparity[:, first : first + kept] + offset
+    found = disparity_map(left, right, DENSE)
+    hidden = outside(truth)
+    errors = np.abs(found.disparity - truth)
+    known = np.isfinite(errors)
+    assert (errors[hidden & known] <= 1).mean() > 0.5
+    assert known[hidden].mean() > 0.1
+    assert (found.matched & hidden).sum() < 0.02 * hidden.sum()
+    assert (errors[known] <= 1).mean() > 0.9
+    assert (errors[known & found.matched] <= 1).mean() > 0.95
+
+
+def test_the_edge_of_what_hides_has_no_match(two_surfaces) -> None:
+    left, right, truth = two_surfaces
+    plain = disparity_map(left, right, replace(DENSE, occluding_edge_px=0))
+    found = disparity_map(left, right, DENSE)
+    assert found.matched.sum() < 0.99 * plain.matched.sum()
+    assert not (found.matched & ~plain.matched).any()
+    assert np.isfinite(found.disparity).sum() > 0.995 * np.isfinite(plain.disparity).sum()
+    shares = [np.mean(np.abs(one.disparity - truth)[one.matched] <= 1) for one in (plain, found)]
+    assert shares[1] > shares[0]
 
 
 def test_what_is_wrong_is_said(photo: np.ndarray, one_line) -> None:
@@ -272,6 +349,8 @@ def test_what_is_wrong_is_said(photo: np.ndarray, one_line) -> None:
         {"discontinuity_margin_px": -1},
         {"discontinuity_margin_px": 101},
         {"max_speckle_area_px": -1},
+        {"occluding_edge_px": -1},
+        {"min_support_px": 1},
     ],
 )
 def test_options_out_of_range_are_refused(values: dict, one_line) -> None:

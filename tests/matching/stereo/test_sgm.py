@@ -167,9 +167,65 @@ def test_larger_penalties_give_smoother_surfaces(motorcycle) -> None:
         {"p2": 1e4},
         {"p2_half_gradient_levels": 0},
         {"min_p2_to_p1": 0.5},
+        {"outside_cost": -0.1},
+        {"outside_cost": 1.1},
     ],
 )
 def test_penalties_out_of_range_are_refused(values: dict, one_line) -> None:
     with pytest.raises(OptionError) as error:
         SGMOptions(**values)
     one_line(error.value)
+
+
+def test_matches_of_noisy_views_are_more_distant(motorcycle) -> None:
+    left, right, truth = motorcycle
+    generator = np.random.default_rng(0)
+    row, column = np.nonzero(np.isfinite(truth) & (np.arange(truth.shape[1]) - truth >= 0))
+    before = 0.0
+    for noise in (0, 4, 12):
+        words = [
+            census(np.clip(view + generator.normal(0, noise, view.shape), 0, 255).astype(np.uint8))
+            for view in (left, right)
+        ]
+        found = module._match_distance(*words, DisparityRange(0, 63))
+        cost = matching_cost(*words, 0, 64) / module.COST_PER_BIT
+        true = cost[row, column, np.rint(truth[row, column]).astype(int)]
+        # The matches that are found are the clearer half of the true ones.
+        assert np.quantile(true, 0.1) < found < np.quantile(true, 0.6)
+        assert found > before + 2
+        before = found
+
+
+def test_without_a_match_the_distance_is_that_of_chance() -> None:
+    words = np.zeros((20, 40), np.uint64)
+    nowhere = module._match_distance(words, words, DisparityRange(40, 50))
+    assert nowhere == module.WRONG_PLACE_BITS
+
+
+def test_what_is_out_of_sight_takes_no_place_inside(rectified_pair) -> None:
+    """The surface that leaves the right image carries its disparity on."""
+    shape = (60, 160)
+    column = np.arange(shape[1])
+    for surface in (14.0, -14.0, 30.0):
+        left, right = rectified_pair(np.full(shape, surface))
+        found = semi_global_matching(left, right, DisparityRange(-40, 40))
+        outside = (column - surface < 0) | (column - surface > shape[1] - 1)
+        assert not found.consistent[:, outside].any()
+        assert (np.abs(found.disparity - surface)[:, outside] <= 1).mean() > 0.95
+        assert found.consistent[:, ~outside].mean() > 0.99
+        place = column - found.disparity
+        leaves = (place < 0) | (place > shape[1] - 1)
+        assert (found.uniqueness_ratio[leaves & ~found.consistent] == 1).mean() > 0.99
+
+
+def test_a_place_outside_that_costs_as_much_as_a_wrong_one_is_hardly_taken(motorcycle) -> None:
+    left, right, truth = motorcycle
+    outside = np.arange(truth.shape[1]) - truth < -0.5
+    wrong = [
+        semi_global_matching(
+            left, right, DisparityRange(0, 63), SGMOptions(outside_cost=cost)
+        ).consistent[outside].mean()
+        for cost in (1, SGMOptions().outside_cost)
+    ]  # fmt: skip
+    assert wrong[1] < 0.06
+    assert wrong[1] < wrong[0] / 2

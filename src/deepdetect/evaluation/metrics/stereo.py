@@ -119,3 +119,63 @@ def disparity_accuracy(
         epe_px=float(near.mean()) if len(near) else np.nan,
         completeness=float(complete.sum() / knowable) if knowable else np.nan,
     )
+
+
+@dataclass(frozen=True)
+class OutsideAccuracy:
+    """Points at pixels whose counterpart lies outside the right image.
+
+    Attributes:
+        outside: number of such pixels, by the true disparity.
+        given: how many of them have a point.
+        correct: those of the given at most 1 px off.
+    """
+
+    outside: int
+    given: int
+    correct: int
+
+    @property
+    def accuracy(self) -> float:
+        """Fraction of the given that are correct; NaN without any."""
+        return self.correct / self.given if self.given else np.nan
+
+
+def counterpart_outside(disparity: np.ndarray) -> np.ndarray:
+    """Find the pixels whose counterpart lies outside the right image.
+
+    Args:
+        disparity: (H, W) true disparity of the left image, NaN where it is unknown.
+
+    Returns:
+        (H, W) bool, False where it is unknown.
+
+    Example:
+        >>> counterpart_outside(np.array([[1.0, 1.4, 1.0, np.nan, -1.0]])).tolist()
+        [[True, False, False, False, True]]
+    """
+    width = disparity.shape[1]
+    place = np.arange(width) - disparity
+    return (place < -0.5) | (place > width - 0.5)
+
+
+def outside_accuracy(
+    pixels: np.ndarray, disparity: np.ndarray, truth: np.ndarray
+) -> OutsideAccuracy:
+    """Evaluate points at pixels whose counterpart lies outside the right image.
+
+    Args:
+        pixels: (N, 2) whole pixels of the left image, each once.
+        disparity: (N,) in pixels.
+        truth: (H, W) true disparity of the left image, NaN where it is unknown.
+
+    Example:
+        >>> truth = np.array([[3.0, 3.0, 3.0, 3.0]])
+        >>> outside_accuracy([[0, 0], [1, 0], [3, 0]], np.array([3.5, 9, 3]), truth)
+        OutsideAccuracy(outside=3, given=2, correct=1)
+    """
+    columns, rows = np.rint(np.asarray(pixels, np.float64).reshape(-1, 2)).astype(np.int64).T
+    outside = counterpart_outside(truth)
+    there = outside[rows, columns]
+    errors = np.abs(np.asarray(disparity, np.float64) - truth[rows, columns])[there]
+    return OutsideAccuracy(int(outside.sum()), len(errors), int((errors <= TOLERANCE_PX).sum()))

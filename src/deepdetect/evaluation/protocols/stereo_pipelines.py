@@ -69,6 +69,7 @@ class Pipeline:
         rounds: how often it is run for its time.
         drawn: its title in Figure 8; empty: not drawn.
         paper: the points in the paper by scene.
+        every_pixel: it is asked for a point at every pixel, hidden ones too.
     """
 
     title: str
@@ -77,6 +78,7 @@ class Pipeline:
     rounds: int = ROUNDS
     drawn: str = ""
     paper: Mapping[str, float] = field(default_factory=dict)
+    every_pixel: bool = False
 
 
 @dataclass(frozen=True)
@@ -136,12 +138,14 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
     ):
         if name in options.classical:
             found.append(_paper(self_described(name, title), drawn, FIGURE_8[title]))
-    found.append(Pipeline("OpenCV's SGBM", sgbm))
+    found.append(Pipeline("OpenCV's SGBM", sgbm, every_pixel=True))
     detector = next(iter(detectors.values()))
     version = file_digest(detector.weights)[:16]
     found.append(Pipeline("baseline: as many random pixels as ours", _random(detector), version, 1))
     found.append(Pipeline("baseline: all pixels", _ours(AllPixels())))
-    found.append(Pipeline("all pixels, --density 1", _ours(AllPixels(), density=1)))
+    found.append(
+        Pipeline("all pixels, --density 1", _ours(AllPixels(), density=1), every_pixel=True)
+    )
     return found
 
 
@@ -262,15 +266,18 @@ def essential_inliers(
 def sgbm(scene: CalibratedStereoPair) -> StereoPoints:
     """Run OpenCV's semi-global matching on every pixel.
 
-    With the range that ours finds, made a multiple of 16. Both views are extended on the left by
-    that range, so that it gives values at the left margin, too.
+    With the range that ours finds, from 0 or below, made a multiple of 16. Both views are extended
+    by what it reaches beyond them, so that it gives values at the margins, too.
     """
     with StageProfiler() as profiler:
         gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
         search = find_disparity_range(*gray)
-        largest = 64 if search is None else search.max_disparity
-        count = max(16, -(-(largest + 1) // 16) * 16)
-        disparity = sgbm_disparity(scene.left, scene.right, count, count)
+        smallest, largest = (
+            (0, 64) if search is None else (min(search.min_disparity, 0), search.max_disparity)
+        )
+        count = max(16, -(-(largest - smallest + 1) // 16) * 16)
+        borders = max(smallest + count, 0), -smallest
+        disparity = sgbm_disparity(scene.left, scene.right, count, borders, smallest)
         rows, columns = np.nonzero(np.isfinite(disparity))
         profiler.record("matching")
     pixels = np.column_stack([columns, rows]).astype(np.float32)
@@ -278,20 +285,25 @@ def sgbm(scene: CalibratedStereoPair) -> StereoPoints:
 
 
 def sgbm_disparity(
-    left: np.ndarray, right: np.ndarray, num_disparities: int, border_px: int
+    left: np.ndarray,
+    right: np.ndarray,
+    num_disparities: int,
+    borders_px: tuple[int, int] = (0, 0),
+    min_disparity: int = 0,
 ) -> np.ndarray:
     """Run OpenCV's semi-global matching: block 5, three ways, uniqueness 10, speckle filter.
 
     Args:
         left, right: (H, W, 3) uint8 RGB.
-        num_disparities: disparities that are tried, from 0; a multiple of 16.
-        border_px: columns by which both views are extended on the left.
+        num_disparities: disparities that are tried; a multiple of 16.
+        borders_px: columns by which both views are extended on the left and on the right.
+        min_disparity: the first disparity.
 
     Returns:
         (H, W) float32 in pixels, NaN where it gives none.
     """
     matcher = cv2.StereoSGBM_create(
-        minDisparity=0,
+        minDisparity=min_disparity,
         numDisparities=num_disparities,
         blockSize=5,
         P1=8 * 3 * 25,
@@ -303,12 +315,13 @@ def sgbm_disparity(
     )
     views = [
         cv2.copyMakeBorder(
-            cv2.cvtColor(image, cv2.COLOR_RGB2BGR), 0, 0, border_px, 0, cv2.BORDER_REPLICATE
+            cv2.cvtColor(image, cv2.COLOR_RGB2BGR), 0, 0, *borders_px, cv2.BORDER_REPLICATE
         )
         for image in (left, right)
     ]
-    disparity = matcher.compute(*views)[:, border_px:].astype(np.float32) / 16
-    return np.where(disparity >= 0, disparity, np.nan)
+    inside = slice(borders_px[0], borders_px[0] + left.shape[1])
+    disparity = matcher.compute(*views)[:, inside].astype(np.float32) / 16
+    return np.where(disparity >= min_disparity, disparity, np.nan)
 
 
 @lru_cache(maxsize=1)

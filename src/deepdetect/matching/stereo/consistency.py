@@ -80,6 +80,39 @@ def near_discontinuity(
     return cv2.dilate(near, np.ones((side, side), np.uint8)) > 0
 
 
+def on_occluding_edge(
+    disparity: np.ndarray,
+    known: np.ndarray,
+    distance_px: int,
+    max_difference_px: float = MAX_DIFFERENCE_PX,
+) -> np.ndarray:
+    """Find the outermost pixels of surfaces in front of others.
+
+    The windows of the match give the nearer disparity also to what lies just beside it, so these
+    are the least sure of all. Where nothing is known, the farther of both sides is assumed to
+    continue.
+
+    Args:
+        disparity: (H, W) float32 in pixels.
+        known: (H, W) bool.
+        distance_px: along rows, columns or both.
+        max_difference_px: of neighbouring disparities on one surface.
+
+    Returns:
+        (H, W) bool, a part of the known pixels.
+
+    Example:
+        >>> disparity = np.zeros((5, 9), np.float32)
+        >>> disparity[:, 4:] = 3
+        >>> on_occluding_edge(disparity, disparity >= 0, 1)[0].astype(int)
+        array([0, 0, 0, 0, 1, 0, 0, 0, 0])
+    """
+    filled = fill_occlusions(disparity, known)[0]
+    side = 2 * distance_px + 1
+    farthest = cv2.erode(filled, np.ones((side, side), np.uint8))
+    return known & (filled - farthest > max_difference_px)
+
+
 def fill_occlusions(
     disparity: np.ndarray, known: np.ndarray, slack_px: float = 8
 ) -> tuple[np.ndarray, np.ndarray]:

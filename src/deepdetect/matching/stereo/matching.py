@@ -18,7 +18,9 @@ from .consistency import (
     fill_occlusions,
     filter_speckles,
     near_discontinuity,
+    on_occluding_edge,
 )
+from .continuation import continue_surfaces
 from .refinement import DisparityRefinementOptions, refine_disparity
 from .sgm import DisparityRange, SGMOptions, is_textured, semi_global_matching
 
@@ -71,12 +73,20 @@ class DisparityOptions:
         discontinuity_margin_px: pixels this near to a disparity discontinuity are left out: the
             windows that are compared extend so far, and give what lies beside a near object its
             disparity. Objects up to twice as wide vanish. 0 keeps them.
-        fill_occlusions: give what the right image does not show, between two surfaces, the
-            disparity of the farther one. Such pixels have no match: `DisparityMap.matched`.
+        fill_occlusions: give what the right image does not show the disparity of the surface
+            beside it: between two surfaces that of the farther one; where the counterpart lies
+            outside the right image that of the first surface in sight, continued along a line as
+            far as this predicts the surface itself, unless the surfaces above and below suggest
+            another. Such pixels have no match: `DisparityMap.matched`.
+        occluding_edge_px: so many of the outermost pixels of a nearer surface, and of the columns
+            at both ends of the right image, have no match, but are filled as what is hidden there,
+            or keep their disparity where that is not known: the windows give them the nearer
+            disparity too often. 0 takes them as matched.
         max_speckle_area_px: patches of one surface up to this size are left out.
         max_difference_px: of neighbouring disparities on one surface.
         occlusion_slack_px: by which an occlusion may be wider than the step of disparity that
             causes it.
+        min_support_px: fewest pixels that a line is fitted to, to continue a surface.
         sgm: penalties of semi-global matching.
         refinement: to sub-pixel accuracy.
         range_search: used without a `disparity_range`.
@@ -89,9 +99,11 @@ class DisparityOptions:
     uniqueness_ratio: float = 1.05
     discontinuity_margin_px: int = 4
     fill_occlusions: bool = False
+    occluding_edge_px: int = 0
     max_speckle_area_px: int = 100
     max_difference_px: float = MAX_DIFFERENCE_PX
     occlusion_slack_px: float = 8
+    min_support_px: int = 5
     sgm: SGMOptions = field(default_factory=SGMOptions)
     refinement: DisparityRefinementOptions = field(default_factory=DisparityRefinementOptions)
     range_search: RangeSearchOptions = field(default_factory=RangeSearchOptions)
@@ -104,12 +116,19 @@ class DisparityOptions:
         check_ranges(
             self,
             not_negative=("max_speckle_area_px", "max_difference_px", "occlusion_slack_px"),
-            between={"uniqueness_ratio": (1, math.inf), "discontinuity_margin_px": (0, 100)},
+            between={
+                "uniqueness_ratio": (1, math.inf),
+                "discontinuity_margin_px": (0, 100),
+                "occluding_edge_px": (0, 100),
+                "min_support_px": (2, math.inf),
+            },
         )
 
 
-DENSE = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True)
-"""As many pixels as possible: those near discontinuities too, and occluded ones filled."""
+DENSE = DisparityOptions(
+    uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True, occluding_edge_px=1
+)
+"""As many pixels as possible: those near discontinuities too, and what is hidden is filled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +139,8 @@ class RectifiedMatches:
         indices: (K,) int64 of the keypoints that have a disparity, rising.
         disparity: (K,) float32 in pixels: the match of the left (x, y) is the right
             (x - disparity, y).
-        matched: (K,) bool: seen in both views; False for those in filled occlusions.
+        matched: (K,) bool: seen in both views; False where the disparity is filled in from the
+            surface beside: hidden in the right view, outside of it, or on the edge of what hides.
     """
 
     indices: np.ndarray
@@ -138,8 +158,9 @@ class DisparityMap:
     Attributes:
         disparity: (H, W) float32 in pixels: the match of the left (x, y) is the right
             (x - disparity, y). NaN where there is none that can be trusted.
-        matched: (H, W) bool: seen in both views; False in filled occlusions and where the
-            disparity is NaN.
+        matched: (H, W) bool: seen in both views, so that (x - disparity, y) lies in the right one;
+            False where the disparity is NaN or filled in from the surface beside: hidden in the
+            right view, outside of it, or on the edge of what hides.
         disparity_range: the disparities that were tried; None where the views agree on nothing.
     """
 
@@ -239,17 +260,40 @@ def compute_disparity(
     disparity = refine_disparity(
         left, right, found.disparity, known, options.refinement, options.max_difference_px
     )
-    matched = known
+    known &= _leads_inside(disparity)
+    sure = known
+    if options.occluding_edge_px:
+        sure = _leads_inside(disparity, options.occluding_edge_px) & ~on_occluding_edge(
+            disparity, known, options.occluding_edge_px, options.max_difference_px
+        )
+        sure &= known
+    kept = known
     if options.discontinuity_margin_px:
-        matched = known & ~near_discontinuity(
+        kept = known & ~near_discontinuity(
             disparity, known, options.discontinuity_margin_px, options.max_difference_px
         )
-    kept = matched
+    matched = kept & sure
     if options.fill_occlusions:
-        filled, occluded = fill_occlusions(disparity, known, options.occlusion_slack_px)
-        disparity = np.where(known, disparity, filled)
-        kept = matched | (occluded & ~known)
+        behind, occluded = fill_occlusions(disparity, sure, options.occlusion_slack_px)
+        beyond = continue_surfaces(
+            disparity,
+            sure,
+            found.disparity,
+            options.min_support_px,
+            options.max_difference_px,
+        )
+        occluded &= ~sure
+        continued = ~known & np.isfinite(beyond)
+        disparity = np.where(occluded, behind, np.where(continued, beyond, disparity))
+        kept = kept | (occluded & ~known) | continued
     return DisparityMap(np.where(kept, disparity, np.float32(np.nan)), matched, disparities)
+
+
+def _leads_inside(disparity: np.ndarray, margin_px: int = 0) -> np.ndarray:
+    """Return where disparities lead to a column of the right image, less a margin; (H, W) bool."""
+    width = disparity.shape[1]
+    place = np.arange(width, dtype=np.float32) - disparity
+    return (place >= margin_px - 0.5) & (place <= width - 0.5 - margin_px)
 
 
 def find_disparity_range(

@@ -25,6 +25,9 @@ CENSUS_RADIUS_Y = 3
 
 CENSUS_BITS = (2 * CENSUS_RADIUS_X + 1) * (2 * CENSUS_RADIUS_Y + 1) - 1
 
+WRONG_PLACE_BITS = CENSUS_BITS // 2
+"""Distance of a wrong place on average: half of the comparisons differ."""
+
 COST_PER_BIT = 9 / 4
 """Costs are sums over 3 x 3 pixels, divided by four to fit a byte."""
 
@@ -36,6 +39,9 @@ LANES = 16
 
 VOLUME_BYTES = 400_000_000
 """Larger cost volumes are processed in bands of rows, one after the other."""
+
+SAMPLED_ROW_STEP = 48
+"""One row of so many says how distant matches are."""
 
 BAND_OVERLAP_PX = 32
 """Rows above and below a band from which paths enter it."""
@@ -53,6 +59,10 @@ class SGMOptions:
         p2: penalty of a larger change, where the grey level does not change; in the same unit.
         p2_half_gradient_levels: change of the grey level that halves `p2`.
         min_p2_to_p1: `p2` never falls below this many times `p1`.
+        outside_cost: of a place outside the right image, of which nothing is known: 0 is that of
+            the pair's matches (their median), 1 that of a wrong place. Between them a surface that
+            leaves the image is carried on by its neighbours, and takes no wrong place inside. With
+            less, more of what is seen at the border is lost where views are noisy.
 
     Raises:
         OptionError: a value is out of its range.
@@ -62,6 +72,7 @@ class SGMOptions:
     p2: float = 100
     p2_half_gradient_levels: float = 8
     min_p2_to_p1: float = 1.25
+    outside_cost: float = 0.6
 
     def __post_init__(self) -> None:
         if not 0 <= self.p1 <= self.p2:
@@ -69,7 +80,7 @@ class SGMOptions:
         check_ranges(
             self,
             positive=("p2_half_gradient_levels",),
-            between={"min_p2_to_p1": (1, math.inf)},
+            between={"min_p2_to_p1": (1, math.inf), "outside_cost": (0, 1)},
         )
         if max(self.p2, self.min_p2_to_p1 * self.p1) > MAX_PENALTY:
             raise OptionError(
@@ -114,10 +125,11 @@ class SGMResult:
     """Raw disparities of the left view.
 
     Attributes:
-        disparity: (H, W) float32 in pixels.
-        consistent: (H, W) bool: both views agree on it within a pixel.
+        disparity: (H, W) float32 in pixels; it may lead outside the right image, where it is only
+            that of the surface around.
+        consistent: (H, W) bool: it leads inside, and both views agree on it within a pixel.
         uniqueness_ratio: (H, W) float32: the least cost of a place elsewhere on the row over the
-            cost of this one, at least 1.
+            cost of this one, at least 1; 1 where it leads outside.
     """
 
     disparity: np.ndarray
@@ -150,6 +162,8 @@ def semi_global_matching(
     height, width = left.shape
     count = -(-disparities.count // LANES) * LANES
     censuses = census(left), census(right)
+    match = _match_distance(*censuses, disparities)
+    outside = round(match + options.outside_cost * (WRONG_PLACE_BITS - match))
     found = SGMResult(
         disparity=np.zeros((height, width), np.float32),
         consistent=np.zeros((height, width), bool),
@@ -169,6 +183,7 @@ def semi_global_matching(
             disparities.min_disparity,
             count,
             options,
+            outside,
         )
         inside = total[top - first : bottom - first]
         _select(inside, disparities, slice(top, bottom), found)
@@ -194,7 +209,11 @@ def census(gray: np.ndarray) -> np.ndarray:
 
 
 def matching_cost(
-    left: np.ndarray, right: np.ndarray, min_disparity: int, count: int
+    left: np.ndarray,
+    right: np.ndarray,
+    min_disparity: int,
+    count: int,
+    outside: int = WRONG_PLACE_BITS,
 ) -> np.ndarray:
     """Compute the cost of each disparity of each pixel.
 
@@ -202,10 +221,10 @@ def matching_cost(
         left, right: (H, W) uint64 census of both views.
         min_disparity: the first disparity.
         count: number of disparities, D.
+        outside: distance in bits of a place outside the right view.
 
     Returns:
-        (H, W, D) uint8, a quarter of the sum of the distances over 3 x 3 pixels. A place outside
-        the right view is as distant as a wrong place is on average.
+        (H, W, D) uint8, a quarter of the sum of the distances over 3 x 3 pixels.
 
     Example:
         >>> words = np.zeros((8, 30), np.uint64)
@@ -218,8 +237,9 @@ def matching_cost(
     cost = np.empty((*left.shape, count), np.uint8)
     # Mirrored, growing disparities lie at growing addresses.
     mirrored = np.ascontiguousarray(right[:, ::-1])
-    outside = np.uint8(CENSUS_BITS // 2)
-    parallel_for(len(left), kernel.cost_rows, left, mirrored, min_disparity, outside, cost)
+    parallel_for(
+        len(left), kernel.cost_rows, left, mirrored, min_disparity, np.uint8(outside), cost
+    )
     return cost
 
 
@@ -238,6 +258,30 @@ def is_textured(gray: np.ndarray) -> np.ndarray:
     return cv2.dilate(gray, window) > cv2.erode(gray, window)
 
 
+def _match_distance(left: np.ndarray, right: np.ndarray, disparities: DisparityRange) -> float:
+    """Return the median distance in bits of a pair's matches, from the censuses of some rows.
+
+    Matches are what both views find nearest without any path. Noise makes them more distant.
+    """
+    from . import sgm_kernel as kernel
+
+    height, width = left.shape
+    centres = np.arange(min(SAMPLED_ROW_STEP // 2, height // 2), height, SAMPLED_ROW_STEP)
+    # Costs are sums over three rows. Places outside are the most distant.
+    rows = np.clip(centres[:, None] + [-1, 0, 1], 0, height - 1).ravel()
+    tried = disparities.min_disparity, disparities.count
+    cost = matching_cost(left[rows], right[rows], *tried, CENSUS_BITS)[1::3]
+    disparity, ratio = np.empty((2, len(centres), width), np.float32)
+    agreed = np.empty(ratio.shape, bool)
+    parallel_for(
+        len(cost), kernel.best_of_rows, cost.astype(np.uint16), *tried, disparity, agreed, ratio
+    )
+    distances = cost.min(axis=2)[agreed & (ratio > 1)] / COST_PER_BIT
+    return (
+        min(float(np.median(distances)), WRONG_PLACE_BITS) if len(distances) else WRONG_PLACE_BITS
+    )
+
+
 def _aggregate(
     gray: np.ndarray,
     left: np.ndarray,
@@ -245,12 +289,13 @@ def _aggregate(
     min_disparity: int,
     count: int,
     options: SGMOptions,
+    outside: int = WRONG_PLACE_BITS,
 ) -> np.ndarray:
     """Return the (H, W, D) uint16 costs of a pair's censuses, summed over the eight paths."""
     from . import sgm_kernel as kernel
 
     height, width = gray.shape
-    cost = matching_cost(left, right, min_disparity, count)
+    cost = matching_cost(left, right, min_disparity, count, outside)
     total = np.zeros(cost.shape, np.uint16)
     p1 = np.uint16(options.p1 * COST_PER_BIT)
     p2 = options.p2 / (1 + np.arange(256) / options.p2_half_gradient_levels)

@@ -189,8 +189,10 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
         count: disparities that may be chosen, the first of the volume.
         disparity: (H, W) float32, written, with what a parabola through the least cost and its
             two neighbours adds.
-        consistent: (H, W) bool, written: the right pixel's best disparity is the same within one.
-        uniqueness_ratio: (H, W) float32, written: the least cost elsewhere over the least cost.
+        consistent: (H, W) bool, written: the disparity leads to a pixel of the right image whose
+            best disparity is the same within one.
+        uniqueness_ratio: (H, W) float32, written: of those, the least cost elsewhere inside the
+            right image over the least cost; 1 where the disparity leads outside.
     """
     width = total.shape[1]
     best = np.empty(width, np.int64)
@@ -199,31 +201,39 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
         keys[:] = np.uint32(0xFFFFFFFF)
         for x in range(width):
             sums = total[y, x]
-            # Only places inside the right image: 0 <= x - min_disparity - d < width.
-            low = max(0, x - min_disparity - width + 1)
-            high = min(count, x - min_disparity + 1)
-            consistent[y, x] = low < high
-            if low >= high:
-                continue
-            least = np.uint16(65535)
+            # Places inside the right image: 0 <= x - min_disparity - d < width.
+            low = min(max(0, x - min_disparity - width + 1), count)
+            high = max(min(count, x - min_disparity + 1), low)
+            inside = np.uint16(65535)
             for d in range(low, high):
+                inside = min(inside, sums[d])
+            least = inside
+            for d in range(low):
                 least = min(least, sums[d])
-            at = low
+            for d in range(high, count):
+                least = min(least, sums[d])
+            # Where both are as good, the place that can be seen.
+            seen = low < high and inside == least
+            at = low if seen else 0
             while sums[at] != least:
                 at += 1
-            other = np.uint16(65535)
-            for d in range(low, at - 1):
-                other = min(other, sums[d])
-            for d in range(at + 2, high):
-                other = min(other, sums[d])
             best[x] = at
-            uniqueness_ratio[y, x] = np.float32(other) / np.float32(max(least, np.uint16(1)))
+            consistent[y, x] = seen
+            uniqueness_ratio[y, x] = np.float32(1)
             fraction = np.float32(0)
-            if low < at < high - 1:
-                before, here, after = float(sums[at - 1]), float(least), float(sums[at + 1])
-                bend = before + after - 2 * here
-                if bend > 0:
-                    fraction = np.float32(0.5 * (before - after) / bend)
+            if seen:
+                other = np.uint16(65535)
+                for d in range(low, at - 1):
+                    other = min(other, sums[d])
+                for d in range(at + 2, high):
+                    other = min(other, sums[d])
+                ratio = np.float32(other) / np.float32(max(least, np.uint16(1)))
+                uniqueness_ratio[y, x] = ratio
+                if low < at < high - 1:
+                    before, here, after = float(sums[at - 1]), float(least), float(sums[at + 1])
+                    bend = before + after - 2 * here
+                    if bend > 0:
+                        fraction = np.float32(0.5 * (before - after) / bend)
             disparity[y, x] = np.float32(at + min_disparity) + fraction
             for d in range(low, high):
                 key = (np.uint32(sums[d]) << np.uint32(16)) | np.uint32(d)
