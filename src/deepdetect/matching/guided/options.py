@@ -238,7 +238,12 @@ class RectifiedMatchingOptions:
             others do so by `margin_px` at most.
         correlation_window_px: side of the window in which both images are compared after matching,
             odd.
+        correlation_sigma_px: of the blur before that.
         min_correlation: a match whose windows correlate less is left out.
+        false_positive_rate: so many of the pixels may be matched by chance; matches whose windows
+            correlate too little for that are left out. It is measured on rows that show something
+            else.
+        null_fraction: of the rows, which are matched with others for that.
         max_refits: the fundamental matrix is estimated again from tracked corners at most this
             often,
         max_row_error_px: where half of them leave their rows by more than this.
@@ -263,7 +268,10 @@ class RectifiedMatchingOptions:
     margin_fraction: float = 0.25
     min_fraction_of_one_sign: float = 0.8
     correlation_window_px: int = 9
+    correlation_sigma_px: float = 1.0
     min_correlation: float = 0.3
+    false_positive_rate: float = 0.01
+    null_fraction: float = 0.25
     max_refits: int = 1
     max_row_error_px: float = 0.1
     refit_corners: int = 2000
@@ -279,9 +287,13 @@ class RectifiedMatchingOptions:
             positive=(
                 *("max_volume", "margin_px", "max_row_error_px", "refit_corners"),
                 *("max_round_trip_px", "max_track_px", "refit_threshold_px"),
+                "correlation_sigma_px",
             ),
             not_negative=("max_refits", "margin_fraction"),
-            fractions=("min_correlation", "min_fraction_of_one_sign"),
+            fractions=(
+                *("min_correlation", "min_fraction_of_one_sign"),
+                *("false_positive_rate", "null_fraction"),
+            ),
             odd=("correlation_window_px", "refit_window_px"),
             between={"tail_fraction": (0, 0.5), "min_tracks": (8, math.inf)},
         )

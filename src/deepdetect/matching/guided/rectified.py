@@ -22,7 +22,12 @@ from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, recti
 from ...geometry.homography_refinement import equalise
 from ...geometry.rescaling import downscale, scaled_fundamental, scaled_points
 from ...geometry.zncc import gaussian_blur, local_zncc
-from ..stereo.matching import DisparityMap, compute_disparity, find_disparity_range
+from ..stereo.matching import (
+    DisparityMap,
+    DisparityOptions,
+    compute_disparity,
+    find_disparity_range,
+)
 from .options import RectifiedMatchingOptions
 
 Range = tuple[int, int]
@@ -167,31 +172,76 @@ def _rectify(
     low, high = max(low, -widest), min(high, widest)
     if low >= high:
         return None
-    found = compute_disparity(
-        first, second, replace(options.disparity, disparity_range=(low, high))
+    chosen = replace(options.disparity, disparity_range=(low, high))
+    found, correlation = _match_rows(first, second, valid0, valid1, chosen, options)
+    bound = max(
+        options.min_correlation,
+        _chance_correlation(first, second, valid0, valid1, chosen, options),
     )
-    disparity = found.disparity
-    row, column = np.indices(disparity.shape, dtype=np.float32)
-    there = np.where(np.isfinite(disparity), column - disparity, -1).astype(np.float32)
-    aligned = cv2.remap(second, there, row, cv2.INTER_LINEAR)
-    shown = cv2.remap(valid1.astype(np.uint8), there, row, cv2.INTER_NEAREST) > 0
-    kept = found.matched & valid0 & shown
-    correlation = local_zncc(
-        gaussian_blur(first, 1),
-        gaussian_blur(aligned, 1),
-        np.ones(kept.shape, bool),
-        options.correlation_window_px,
-    )
-    kept &= ~(correlation < options.min_correlation)
-    disparity = np.where(kept, disparity, np.float32(np.nan))
+    kept = found.matched & (correlation >= bound)
     return RectifiedView(
         frame,
         scale,
         first,
         second,
-        DisparityMap(disparity, kept, found.disparity_range),
-        np.where(kept, np.nan_to_num(correlation), np.float32(np.nan)),
+        DisparityMap(
+            np.where(kept, found.disparity, np.float32(np.nan)), kept, found.disparity_range
+        ),
+        np.where(kept, correlation, np.float32(np.nan)),
     )
+
+
+def _match_rows(
+    first: np.ndarray,
+    second: np.ndarray,
+    valid0: np.ndarray,
+    valid1: np.ndarray,
+    disparity_options: DisparityOptions,
+    options: RectifiedMatchingOptions,
+) -> tuple[DisparityMap, np.ndarray]:
+    """Return the disparities where both views show something, and the correlation after them."""
+    found = compute_disparity(first, second, disparity_options)
+    row, column = np.indices(first.shape, dtype=np.float32)
+    known = found.matched & np.isfinite(found.disparity)
+    there = np.where(known, column - found.disparity, -1).astype(np.float32)
+    aligned = cv2.remap(second, there, row, cv2.INTER_LINEAR)
+    shown = cv2.remap(valid1.astype(np.uint8), there, row, cv2.INTER_NEAREST) > 0
+    known &= valid0 & shown
+    correlation = local_zncc(
+        gaussian_blur(first, options.correlation_sigma_px),
+        gaussian_blur(aligned, options.correlation_sigma_px),
+        np.ones(first.shape, bool),
+        options.correlation_window_px,
+    )
+    matched = DisparityMap(found.disparity, known, found.disparity_range)
+    return matched, np.where(known, np.nan_to_num(correlation), np.float32(-1))
+
+
+def _chance_correlation(
+    first: np.ndarray,
+    second: np.ndarray,
+    valid0: np.ndarray,
+    valid1: np.ndarray,
+    disparity_options: DisparityOptions,
+    options: RectifiedMatchingOptions,
+) -> float:
+    """Return the correlation below which too many matches are found by chance.
+
+    Some rows are matched with rows of the second view that show something else: what is found there
+    is found by chance, the best of as many disparities as everywhere.
+    """
+    height = len(first)
+    count = max(1, round(height * options.null_fraction))
+    start = (height - count) // 2
+    rows = np.arange(start, start + count)
+    others = (rows + height // 2) % height
+    valid = valid0[rows], valid1[others]
+    found, correlation = _match_rows(
+        first[rows], second[others], *valid, disparity_options, options
+    )
+    by_chance = np.sort(correlation[found.matched])[::-1]
+    allowed = int(options.false_positive_rate * np.count_nonzero(valid[0]))
+    return float(by_chance[allowed]) if len(by_chance) > allowed else -1.0
 
 
 def _range_of_matches(
