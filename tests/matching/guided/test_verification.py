@@ -292,20 +292,6 @@ def test_it_changes_little_which_points_are_described(photo: np.ndarray) -> None
 
 # Null pairs
 
-AT_EDGES_TOO = VerificationOptions(enough_null_pairs=10**9)
-
-
-def test_null_pairs_at_edges_are_left_out_where_there_are_enough(
-    gray: np.ndarray, points: np.ndarray
-) -> None:
-    every = sample_null_pairs(points, gray, everywhere(gray), AT_EDGES_TOO)
-    fewer = sample_null_pairs(points, gray, everywhere(gray))
-    for whole, inner in zip(every, fewer, strict=True):
-        assert inner.interior.all()
-        np.testing.assert_array_equal(inner.rows, whole.rows[whole.interior])
-    few = sample_null_pairs(points[::50], gray, everywhere(gray))
-    assert not all(null.interior.all() for null in few)
-
 
 @pytest.fixture
 def gray(photo: np.ndarray) -> np.ndarray:
@@ -320,7 +306,7 @@ def points(gray: np.ndarray) -> np.ndarray:
 def test_under_a_point_of_the_shifted_image_lies_its_null_partner(
     gray: np.ndarray, points: np.ndarray
 ) -> None:
-    chosen = sample_null_pairs(points, gray, everywhere(gray), AT_EDGES_TOO)
+    chosen = sample_null_pairs(points, gray, everywhere(gray))
     assert len(chosen) == len(OPTIONS.null_shifts)
     for null in chosen:
         np.testing.assert_array_equal(np.sort(null.rows), np.arange(len(points)))
@@ -337,7 +323,7 @@ def test_under_a_point_of_the_shifted_image_lies_its_null_partner(
 def test_interior_descriptors_are_those_of_the_image_that_is_not_shifted(
     gray: np.ndarray, points: np.ndarray, size: float
 ) -> None:
-    for null in sample_null_pairs(points, gray, everywhere(gray), AT_EDGES_TOO):
+    for null in sample_null_pairs(points, gray, everywhere(gray)):
         assert 0.1 < null.interior.mean() < 0.9
         moved = dense_sift(null.shifted, points[null.rows], size)
         unmoved = dense_sift(gray, null.places, size)
@@ -348,7 +334,7 @@ def test_interior_descriptors_are_those_of_the_image_that_is_not_shifted(
 def test_null_partners_are_valid(gray: np.ndarray, points: np.ndarray) -> None:
     seen = everywhere(gray)
     seen[:, 200:] = False
-    for null in sample_null_pairs(points, gray, seen, AT_EDGES_TOO):
+    for null in sample_null_pairs(points, gray, seen):
         assert 0.3 < len(null.rows) / len(points) < 0.9
         assert null.places[:, 0].max() < 200
 

@@ -93,8 +93,6 @@ class VerificationOptions:
         min_support: fraction of the points in the window that must pass.
         null_shifts: shifts between the patches of a null pair, in shares of width and height.
         null_block_px: side of the blocks of the image that null pairs are taken from.
-        enough_null_pairs: of one shift; with so many those whose descriptors reach over an edge of
-            the image, which are described for each shift anew, are left out.
         max_null_blocks: at most this many blocks for each shift, chosen at random: all of them up
             to a megapixel.
 
@@ -110,7 +108,6 @@ class VerificationOptions:
     min_support: float = 0.5
     null_shifts: tuple[tuple[float, float], ...] = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
     null_block_px: int = 64
-    enough_null_pairs: int = 1000
     max_null_blocks: int = 256
 
     def __post_init__(self) -> None:
@@ -118,7 +115,7 @@ class VerificationOptions:
             self,
             positive=(
                 *("keypoint_sizes_px", "lattice_px", "smoothing_sigma_px", "window_px"),
-                *("null_block_px", "enough_null_pairs", "max_null_blocks"),
+                *("null_block_px", "max_null_blocks"),
             ),
             fractions=("false_positive_rate", "min_support", "null_shifts"),
         )

@@ -148,11 +148,8 @@ def sample_null_pairs(
             (np.minimum(xy, size - 1 - xy) >= DESCRIPTOR_REACH).all(axis=1)
             for xy in (points[rows], places)
         ]
-        interior = inner[0] & inner[1]
-        if np.count_nonzero(interior) >= options.enough_null_pairs:
-            rows, places, interior = rows[interior], places[interior], interior[interior]
         shifted = np.roll(warped, shift[::-1], (0, 1))
-        result.append(NullPairs(rows, places, interior, shifted))
+        result.append(NullPairs(rows, places, inner[0] & inner[1], shifted))
     return result
 
 
@@ -190,8 +187,6 @@ def _distances(
             x, y = null.places[null.interior].T
             inner, outer = null.rows[null.interior], null.rows[~null.interior]
             values[null.interior] += correlation_distance(first, inner, second, index[y, x], mean)
-            if not len(outer):
-                continue
             others = to_root_sift(dense_sift(null.shifted, points[outer], size), overwrite=True)
             rows = np.arange(len(outer))
             values[~null.interior] += correlation_distance(first, outer, others, rows, mean)
