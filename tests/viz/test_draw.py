@@ -56,6 +56,16 @@ def test_match_lines_join_the_right_pixels() -> None:
     assert not picture[20:30].any()
 
 
+def test_the_lower_image_is_enlarged_with_its_matches() -> None:
+    """A white pixel of either image lies under its end of the line, and nothing is left black."""
+    first, second = np.full((60, 40, 3), 90, np.uint8), np.full((30, 50, 3), 90, np.uint8)
+    picture = draw_matches(first, second, np.array([[10, 20]]), np.array([[30, 10]]), [True])
+    assert picture.shape == (60, 40 + 100, 3)
+    assert tuple(picture[20, 10]) == GREEN
+    assert tuple(picture[20, 40 + 60]) == GREEN  # (30, 10) is at (60.5, 20.5) in twice the size
+    assert picture.any(axis=2).all()
+
+
 def test_pictures_are_saved_as_they_are(tmp_path: Path) -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8)
     save_picture(rgb, tmp_path / "deep" / "p.png")

@@ -106,6 +106,8 @@ def draw_matches(
 ) -> np.ndarray:
     """Draw the two images side by side, with lines between a sample of the matches.
 
+    The lower image is enlarged to the height of the other.
+
     Args:
         rgb0, rgb1: the images, (H, W, 3) uint8 RGB.
         points0, points1: (M, 2) matched positions.
@@ -114,21 +116,33 @@ def draw_matches(
             have the proportions of all matches.
 
     Returns:
-        (H, W0 + W1, 3) uint8 RGB, H that of the taller image.
+        (H, W, 3) uint8 RGB, H that of the taller image, W that of both at this height.
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
-    canvas = np.zeros((height, rgb0.shape[1] + rgb1.shape[1], 3), np.uint8)
-    canvas[: rgb0.shape[0], : rgb0.shape[1]] = cv2.convertScaleAbs(rgb0, alpha=0.7)
-    canvas[: rgb1.shape[0], rgb0.shape[1] :] = cv2.convertScaleAbs(rgb1, alpha=0.7)
+    shown = [_of_height(rgb, height) for rgb in (rgb0, rgb1)]
+    canvas = cv2.convertScaleAbs(np.concatenate(shown, axis=1), alpha=0.7)
+    points0, points1 = (
+        (np.asarray(points, np.float64) + 0.5) * (view.shape[1] / rgb.shape[1], height / len(rgb))
+        - 0.5
+        for points, view, rgb in zip((points0, points1), shown, (rgb0, rgb1), strict=True)
+    )
     chosen = np.random.default_rng(0).permutation(len(points0))[:lines]
     for k in sorted(chosen, key=lambda k: bool(good[k])):  # the good ones on top
         start = tuple(int(v) for v in np.rint(points0[k]))
-        end = tuple(int(v) for v in np.rint(points1[k] + [rgb0.shape[1], 0]))
+        end = tuple(int(v) for v in np.rint(points1[k] + [shown[0].shape[1], 0]))
         colour = GREEN if good[k] else RED
         cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
         cv2.circle(canvas, start, 2, colour, -1, cv2.LINE_AA)
         cv2.circle(canvas, end, 2, colour, -1, cv2.LINE_AA)
     return canvas
+
+
+def _of_height(rgb: np.ndarray, height: int) -> np.ndarray:
+    """Enlarge an image to a height."""
+    if len(rgb) == height:
+        return rgb
+    width = max(1, round(rgb.shape[1] * height / len(rgb)))
+    return cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def draw_masks(rgb: np.ndarray, masks: Mapping[str, np.ndarray], title: str) -> np.ndarray:
