@@ -31,7 +31,7 @@ class MatchingOptions:
     """How two images are matched.
 
     Those of `UNGUIDED_ONLY` (descriptor, keypoint_size, angle, matcher, ratio) apply only to
-    matches by descriptors alone: with `guided=False`, or where no geometry can be trusted.
+    matches by descriptors alone, with `guided=False`.
 
     Attributes:
         heatmap: how the network sees the images; None leaves the detector's own way.
