@@ -32,6 +32,33 @@ class Guide:
     simulated_views: int
 
 
+@dataclass(frozen=True, eq=False)
+class GuidedMatches:
+    """Matches of keypoints of the first image.
+
+    Attributes:
+        rows0: (M,) int64 keypoints of the first image, rising, each once.
+        points1: (M, 2) float64 positions in the second image: keypoints of it where a homography
+            guided, sub-pixel positions where the pair was rectified.
+        scores: (M,) float32 in [0, 1], higher is better.
+    """
+
+    rows0: np.ndarray
+    points1: np.ndarray
+    scores: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.rows0)
+
+    def unique(self) -> GuidedMatches:
+        """Keep the best match of those that end on the same pixel of the second image."""
+        pixels = np.rint(self.points1).astype(np.int64)
+        best_first = np.lexsort((self.rows0, -self.scores))
+        _, first = np.unique(pixels[best_first], axis=0, return_index=True)
+        kept = np.sort(best_first[first])
+        return GuidedMatches(self.rows0[kept], self.points1[kept], self.scores[kept])
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Matches:
     """Matched keypoints of two images.

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from deepdetect.datasets.middlebury import load_middlebury
+from deepdetect.features.matches import GuidedMatches
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.initial_geometry import find_initial_geometry
 from deepdetect.matching.guided.options import RectifiedMatchingOptions
-from deepdetect.matching.guided.rectified import RectifiedPairMatches, match_by_rectification
+from deepdetect.matching.guided.rectified import match_by_rectification
 
 TURNED = cv2.getRotationMatrix2D((225, 190), 30, 1.0)
 
@@ -26,13 +27,14 @@ def cones(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def match(
     gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray, **changes: object
-) -> RectifiedPairMatches | None:
+) -> GuidedMatches | None:
     first = find_initial_geometry(gray0, gray1, "fundamental")
     assert first.matrix is not None
     options = RectifiedMatchingOptions(**changes)  # type: ignore[arg-type]
-    return match_by_rectification(
+    found = match_by_rectification(
         gray0, gray1, xy0, first.points0, first.points1, first.matrix, options
     )
+    return None if found is None else found[1]
 
 
 def every_second(gray: np.ndarray) -> np.ndarray:
@@ -40,7 +42,7 @@ def every_second(gray: np.ndarray) -> np.ndarray:
     return np.column_stack([x.ravel(), y.ravel()]).astype(np.float32)
 
 
-def within(found: RectifiedPairMatches, xy0: np.ndarray, cones, move: np.ndarray) -> float:
+def within(found: GuidedMatches, xy0: np.ndarray, cones, move: np.ndarray) -> float:
     """Return the share of the matches with a true place that are within a pixel of it."""
     x, y = xy0[found.rows0].astype(int).T
     disparity = cones[2][y, x]
@@ -97,7 +99,8 @@ def test_a_geometry_that_is_off_is_estimated_again(cones) -> None:
             RectifiedMatchingOptions(max_refits=rounds),
         )
         assert found is not None
-        rows.append(np.abs(found.points1[:, 1] - xy0[found.rows0, 1]).mean())
+        matches = found[1]
+        rows.append(np.abs(matches.points1[:, 1] - xy0[matches.rows0, 1]).mean())
     assert rows[0] > 0.4
     assert rows[1] < 0.3 * rows[0]
 

@@ -7,12 +7,12 @@ similar, moves like its neighbours and lies among other matches (`epipolar`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from ...features.matchers import DescriptorMatches
-from ...features.matches import Guide
+from ...features.matches import Guide, GuidedMatches
 from ...geometry import GeometryOptions, estimate_geometry
 from .epipolar import match_along_epipolar_lines
 from .homography import (
@@ -30,33 +30,6 @@ from .initial_geometry import (
 from .options import GuidedOptions
 from .prewarp import estimate_affinity, prewarp
 from .rectified import match_by_rectification
-
-
-@dataclass(frozen=True, eq=False)
-class GuidedMatches:
-    """Matches of keypoints of the first image.
-
-    Attributes:
-        rows0: (M,) int64 keypoints of the first image, rising, each once.
-        points1: (M, 2) float64 positions in the second image: keypoints of it where a homography
-            guided, sub-pixel positions where the pair was rectified.
-        scores: (M,) float32 in [0, 1], higher is better.
-    """
-
-    rows0: np.ndarray
-    points1: np.ndarray
-    scores: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.rows0)
-
-    def unique(self) -> GuidedMatches:
-        """Keep the best match of those that end on the same pixel of the second image."""
-        pixels = np.rint(self.points1).astype(np.int64)
-        best_first = np.lexsort((self.rows0, -self.scores))
-        _, first = np.unique(pixels[best_first], axis=0, return_index=True)
-        kept = np.sort(best_first[first])
-        return GuidedMatches(self.rows0[kept], self.points1[kept], self.scores[kept])
 
 
 def guided_matches(
@@ -153,7 +126,7 @@ def _match_scene_with_depth(
         seed,
     )
     if found is not None:
-        return found.matrix, GuidedMatches(found.rows0, found.points1, found.scores)
+        return found
     matrix, searched = _search_epipolar_lines(pair, first, options, seed)
     return matrix, _at_keypoints(pair, searched)
 

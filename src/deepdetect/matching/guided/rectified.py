@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from ...features.matches import GuidedMatches
 from ...geometry import GeometryOptions, estimate_geometry
 from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
 from ...geometry.homography_refinement import equalise
@@ -53,26 +54,6 @@ class RectifiedView:
     correlation: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class RectifiedPairMatches:
-    """Matches of keypoints of the first image.
-
-    Attributes:
-        matrix: (3, 3) the fundamental matrix that rectified the pair.
-        rows0: (M,) int64 of the keypoints that have a match.
-        points1: (M, 2) float64 its position in the second image.
-        scores: (M,) float32 in [0, 1], the correlation of both places.
-    """
-
-    matrix: np.ndarray
-    rows0: np.ndarray
-    points1: np.ndarray
-    scores: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.rows0)
-
-
 def match_by_rectification(
     gray0: np.ndarray,
     gray1: np.ndarray,
@@ -82,7 +63,7 @@ def match_by_rectification(
     fundamental: np.ndarray,
     options: RectifiedMatchingOptions = RectifiedMatchingOptions(),
     seed: int = 0,
-) -> RectifiedPairMatches | None:
+) -> tuple[np.ndarray, GuidedMatches] | None:
     """Match keypoints of the first image by rectifying the pair.
 
     Args:
@@ -94,7 +75,8 @@ def match_by_rectification(
         seed: of the random samples of further estimates.
 
     Returns:
-        The matches; None where the pair cannot be rectified.
+        The fundamental matrix that rectified the pair, and the matches; None where it cannot be
+        rectified.
     """
     view = _rectify(gray0, gray1, points0, points1, fundamental, options)
     for _ in range(options.max_refits):
@@ -121,7 +103,7 @@ def match_by_rectification(
     rows, places, scores = _sample(view, xy0)
     height, width = gray1.shape
     inside = ((places > -0.5) & (places < (width - 0.5, height - 0.5))).all(axis=1)
-    return RectifiedPairMatches(fundamental, rows[inside], places[inside], scores[inside])
+    return fundamental, GuidedMatches(rows[inside], places[inside], scores[inside])
 
 
 def _matched(view: RectifiedView) -> int:
