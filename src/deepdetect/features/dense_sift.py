@@ -26,19 +26,23 @@ BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's size (3 times its radius)."""
 
 
-def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarray:
+def dense_sift(
+    gray: np.ndarray, xy: np.ndarray, size: float = 3.0, step_px: int = 1
+) -> np.ndarray:
     """Compute upright SIFT descriptors; they equal OpenCV's at angle 0.
 
     Args:
         gray: (H, W) uint8 luma.
         xy: (N, 2) positions on whole pixels within the image.
         size: diameter of the keypoints in pixels, in [2, 8].
+        step_px: the positions lie on every so many-th row and column, which saves time.
 
     Returns:
         (N, 128) uint8: four rows of four columns of eight orientations.
 
     Raises:
-        OptionError: a position is not on a pixel of the image, or the size is out of its range.
+        OptionError: a position is not on a pixel of the image, or the size is out of its range, or
+            the positions are not so many rows or columns apart.
 
     Example:
         >>> gray = np.random.default_rng(0).integers(0, 256, (40, 40)).astype(np.uint8)
@@ -51,22 +55,23 @@ def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0) -> np.ndarra
         )
     if not on_pixels(xy, gray.shape):
         raise OptionError("dense SIFT needs keypoints on whole pixels within the image")
-    from .descriptor_kernels import TILE_HEIGHT, TILE_WIDTH, describe_tiles
+    from .descriptor_kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 
-    magnitude, orientation = _gradient(gray)
-    taps = _taps(size)
-    spans = np.array([[np.flatnonzero(row)[0], np.flatnonzero(row)[-1] + 1] for row in taps])
-    columns, rows = (np.ascontiguousarray(part, np.int32) for part in np.asarray(xy).T)
-    across, down = -(-gray.shape[1] // TILE_WIDTH), -(-gray.shape[0] // TILE_HEIGHT)
-    tile = rows // TILE_HEIGHT * across + columns // TILE_WIDTH
-    order = np.argsort(tile, kind="stable")
-    starts = np.searchsorted(tile[order], np.arange(across * down + 1))
-    out = np.empty((len(xy), 128), np.uint8)
-    keypoints = columns, rows, order, starts, across
-    parallel_for(
-        across * down, describe_tiles, magnitude, orientation, *keypoints, taps, spans, out
-    )
-    return out
+    if not len(xy):
+        return np.empty((0, 128), np.uint8)
+    pixels = np.asarray(xy).astype(np.int64)
+    origin = pixels.min(axis=0)
+    if ((pixels - origin) % step_px).any():
+        raise OptionError(f"the keypoints do not lie on every {step_px}th row and column")
+    column, row = ((pixels - origin) // step_px).T
+    rows_of = np.full((row.max() + 1, column.max() + 1), -1, np.int32)
+    rows_of[row, column] = np.arange(len(pixels))
+    out = np.empty((len(pixels), 128), np.uint8)
+    tiles = -(-len(rows_of) // max(1, TILE_HEIGHT // step_px)) * -(-rows_of.shape[1] // TILE_COLUMNS)
+    arguments = (*_gradient(gray), rows_of, origin, step_px, *_taps(size))
+    parallel_for(tiles, describe_tiles, *arguments, out)
+    described = rows_of[row, column]
+    return out if (described == np.arange(len(out))).all() else out[described]
 
 
 def _gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,11 +85,24 @@ def _gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return magnitude, degrees * np.float32(8 / 360)
 
 
-def _taps(size: float) -> np.ndarray:
-    """Return the weights of the pixels around a keypoint for its four spatial bins, (4, T)."""
+def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of the pixels around a keypoint, and where they are not 0.
+
+    Returns:
+        (4, T) float32 weights for the four spatial bins, and (4, 3) int64 spans, as of
+        `describe_tiles`.
+    """
+    from .descriptor_kernels import TAPS_AT_ONCE
+
     width = BIN_WIDTH * size
     reach = int(np.ceil(2.5 * width)) - 1  # bins overlap: half of one beyond four
     offsets = np.arange(-reach, reach + 1) / width
     bins = np.arange(4)[:, None] - 1.5
     bilinear = np.maximum(0, 1 - np.abs(offsets - bins))
-    return (bilinear * np.exp(-(offsets**2) / 8)).astype(np.float32)
+    weights = (bilinear * np.exp(-(offsets**2) / 8)).astype(np.float32)
+    spans = []
+    for row in weights:
+        first, last = np.flatnonzero(row)[[0, -1]]
+        groups = -(-(last + 1 - first) // TAPS_AT_ONCE)
+        spans.append([first, first + groups * TAPS_AT_ONCE, len(offsets)])
+    return np.pad(weights, ((0, 0), (0, TAPS_AT_ONCE))), np.array(spans)

@@ -2,7 +2,9 @@
 
 Dense SIFT works in tiles, so that intermediate results stay in the processor's cache: for each
 pixel of a tile eight soft orientations, summed along its row into the descriptor's four columns,
-then along the column into its four rows, at the keypoints only.
+then along the column into its four rows. The innermost loops run over all keypoints in a row of the
+tile and their orientations, which lie side by side in memory, so that the processor handles many of
+them at once.
 """
 
 from __future__ import annotations
@@ -11,107 +13,140 @@ import numpy as np
 
 from .._shared.kernels import compiled
 
-TILE_HEIGHT = 48
-TILE_WIDTH = 64
+TILE_COLUMNS = 32
+"""Columns of the lattice in a tile."""
+
+NUMBERS_OF_BIN = 8 * TILE_COLUMNS
+"""Eight orientations of each column of a tile, for one of four bins."""
+
+TILE_HEIGHT = 96
+"""Of a tile in pixels."""
+
+TAPS_AT_ONCE = 4
+"""Spans of taps are multiples of this."""
 
 MIN_SQUARED_NORMS = 1e-3
 """Of the product of the squared norms: below it a descriptor is the mean."""
 
 
 @compiled(nogil=True, fastmath=True)
-def describe_tiles(  # type: ignore[no-untyped-def]
-    first,
-    last,
-    magnitude,
-    orientation,
-    columns,
-    rows,
-    order,
-    starts,
-    tiles_across,
-    taps,
-    spans,
-    out,
-):
+def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, taps, spans, out):  # type: ignore[no-untyped-def]
     """Describe the keypoints of the tiles from `first` to before `last`.
 
     Args:
         first, last: numbers of the tiles, row by row.
         magnitude, orientation: (H, W) float32 gradient; orientation in units of 45 degrees.
-        columns, rows: (N,) int32 keypoints.
-        order: (N,) keypoints sorted by tile; `starts[k]` is where those of tile k begin.
-        tiles_across: tiles in a row of them.
-        taps: (4, T) float32 weights of the T pixels around a keypoint for each of four bins.
-        spans: (4, 2) first tap and end of the taps of each bin that are not 0.
+        rows_of: (h, w) int32 row of `out` for each point of the lattice, -1 where there is no
+            keypoint.
+        origin: (x, y) pixel of the lattice's first point.
+        step: of the lattice, in pixels.
+        taps: (4, T) float32 weights of the T pixels around a keypoint for each of four bins, T odd,
+            and zeros.
+        spans: (4, 3) first tap and end of the taps of each bin that are not 0, the end rounded up
+            to whole groups of `TAPS_AT_ONCE`; T.
         out: (N, 128) uint8, written.
     """
     height, width = magnitude.shape
-    reach = taps.shape[1] // 2
-    soft = np.zeros((TILE_WIDTH + 2 * reach, 8), np.float32)
-    summed = np.zeros((TILE_HEIGHT + 2 * reach, TILE_WIDTH, 32), np.float32)
-    histogram = np.zeros((4, 32), np.float32)
-    line = np.zeros(8, np.float32)
-    needed = np.zeros(TILE_WIDTH, np.bool_)
+    reach = spans[0, 2] // 2
+    tile_rows = max(1, TILE_HEIGHT // step)
+    across = (rows_of.shape[1] + TILE_COLUMNS - 1) // TILE_COLUMNS
+    depth = TILE_COLUMNS + (taps.shape[1] + step - 1) // step
+    soft = np.zeros((step, depth * 8), np.float32)
+    height_of_tile = (tile_rows - 1) * step + taps.shape[1]
+    summed = np.zeros((height_of_tile, 4 * NUMBERS_OF_BIN), np.float32)
+    histogram = np.zeros((4, 4 * NUMBERS_OF_BIN), np.float32)
     for tile in range(first, last):
-        if starts[tile] == starts[tile + 1]:
+        top, left = tile // across * tile_rows, tile % across * TILE_COLUMNS
+        bottom = min(top + tile_rows, rows_of.shape[0])
+        right = min(left + TILE_COLUMNS, rows_of.shape[1])
+        while top < bottom and (rows_of[top, left:right] < 0).all():
+            top += 1
+        while top < bottom and (rows_of[bottom - 1, left:right] < 0).all():
+            bottom -= 1
+        if top == bottom:
             continue
-        top = (tile // tiles_across) * TILE_HEIGHT
-        left = (tile % tiles_across) * TILE_WIDTH
-        needed[:] = False
-        lowest, highest = TILE_HEIGHT, -1
-        for k in order[starts[tile] : starts[tile + 1]]:
-            needed[columns[k] - left] = True
-            lowest, highest = min(lowest, rows[k] - top), max(highest, rows[k] - top)
-        for j in range(lowest, highest + 2 * reach + 1):
-            y = top + j - reach
+        x0, y0 = origin[0] + left * step - reach, origin[1] + top * step - reach
+        for j in range((bottom - top - 1) * step + 2 * reach + 1):
+            y = y0 + j
             if y < 1 or y >= height - 1:
                 summed[j] = 0
                 continue
             soft[:] = 0
-            for i in range(max(0, reach + 1 - left), min(len(soft), width - 1 + reach - left)):
-                turn = orientation[y, left + i - reach]
-                whole = int(turn)
-                part = turn - np.float32(whole)
-                weight = magnitude[y, left + i - reach]
-                soft[i, whole & 7] = weight * (np.float32(1) - part)
-                soft[i, (whole + 1) & 7] = weight * part
-            for i in range(TILE_WIDTH):
-                if not needed[i]:
-                    continue
-                for b in range(4):
-                    line[:] = 0
-                    for t in range(spans[b, 0], spans[b, 1]):
-                        for o in range(8):
-                            line[o] += taps[b, t] * soft[i + t, o]
-                    for o in range(8):
-                        summed[j, i, 8 * b + o] = line[o]
-        for k in order[starts[tile] : starts[tile + 1]]:
-            j, i = rows[k] - top, columns[k] - left
-            for b in range(4):
-                histogram[b] = 0
-                for t in range(spans[b, 0], spans[b, 1]):
-                    for o in range(32):
-                        histogram[b, o] += taps[b, t] * summed[j + t, i, o]
-            _normalise(histogram, out[k])
+            for phase in range(step):
+                for k in range(depth):
+                    x = x0 + phase + k * step
+                    if x < 1 or x >= width - 1:
+                        continue
+                    turn = orientation[y, x]
+                    whole = int(turn)
+                    part = turn - np.float32(whole)
+                    soft[phase, 8 * k + (whole & 7)] = magnitude[y, x] * (np.float32(1) - part)
+                    soft[phase, 8 * k + ((whole + 1) & 7)] = magnitude[y, x] * part
+            _sum_along_row(soft, taps, spans, step, summed[j])
+        for row in range(top, bottom):
+            if (rows_of[row, left:right] < 0).all():
+                continue
+            _sum_along_column(summed[(row - top) * step :], taps, spans, histogram)
+            for i in range(right - left):
+                if rows_of[row, left + i] >= 0:
+                    _normalise(histogram, i * 8, out[rows_of[row, left + i]])
 
 
 @compiled(nogil=True, fastmath=True, inline="always")
-def _normalise(histogram, out):  # type: ignore[no-untyped-def]
+def _sum_along_row(soft, taps, spans, step, out):  # type: ignore[no-untyped-def]
+    out[:] = 0
+    for b in range(4):
+        of_bin = out[b * NUMBERS_OF_BIN : (b + 1) * NUMBERS_OF_BIN]
+        for t in range(spans[b, 0], spans[b, 1], TAPS_AT_ONCE):
+            weights = taps[b, t], taps[b, t + 1], taps[b, t + 2], taps[b, t + 3]
+            _add(
+                of_bin,
+                weights,
+                soft[t % step, t // step * 8 :],
+                soft[(t + 1) % step, (t + 1) // step * 8 :],
+                soft[(t + 2) % step, (t + 2) // step * 8 :],
+                soft[(t + 3) % step, (t + 3) // step * 8 :],
+            )
+
+
+@compiled(nogil=True, fastmath=True, inline="always")
+def _sum_along_column(summed, taps, spans, out):  # type: ignore[no-untyped-def]
+    out[:] = 0
+    for b in range(4):
+        for t in range(spans[b, 0], spans[b, 1], TAPS_AT_ONCE):
+            weights = taps[b, t], taps[b, t + 1], taps[b, t + 2], taps[b, t + 3]
+            _add(out[b], weights, summed[t], summed[t + 1], summed[t + 2], summed[t + 3])
+
+
+@compiled(nogil=True, fastmath=True)
+def _add(out, weights, a, b, c, d):  # type: ignore[no-untyped-def]
+    """Add four weighted arrays to one."""
+    for i in range(len(out)):
+        out[i] += weights[0] * a[i] + weights[1] * b[i] + weights[2] * c[i] + weights[3] * d[i]
+
+
+@compiled(nogil=True, fastmath=True, inline="always")
+def _normalise(histogram, place, out):  # type: ignore[no-untyped-def]
     """Clip at a fifth of the norm, scale to 512 and round, as Lowe and OpenCV do."""
     total = np.float32(0)
     for b in range(4):
-        for o in range(32):
-            total += histogram[b, o] * histogram[b, o]
+        for c in range(place, 4 * NUMBERS_OF_BIN, NUMBERS_OF_BIN):
+            for o in range(8):
+                total += histogram[b, c + o] * histogram[b, c + o]
     most = np.sqrt(total) * np.float32(0.2)
     total = np.float32(0)
     for b in range(4):
-        for o in range(32):
-            histogram[b, o] = min(histogram[b, o], most)
-            total += histogram[b, o] * histogram[b, o]
+        for c in range(place, 4 * NUMBERS_OF_BIN, NUMBERS_OF_BIN):
+            for o in range(8):
+                value = min(histogram[b, c + o], most)
+                total += value * value
     scale = np.float32(512) / max(np.sqrt(total), np.float32(1.1920929e-07))
     for b in range(4):
-        for o in range(32):
-            out[32 * b + o] = np.uint8(min(np.float32(255), np.rint(histogram[b, o] * scale)))
+        for c in range(4):
+            for o in range(8):
+                value = min(histogram[b, c * NUMBERS_OF_BIN + place + o], most)
+                value = np.rint(value * scale)
+                out[32 * b + 8 * c + o] = np.uint8(min(np.float32(255), value))
 
 
 @compiled(nogil=True)

@@ -137,19 +137,27 @@ def sample_null_pairs(
         One entry for each shift.
     """
     size = np.array(warped.shape[::-1])
+    # Shifts by whole steps, also around the edge: most partners lie on the lattice, too, where a
+    # descriptor is one for all shifts.
+    step = options.lattice_px
+    period = np.maximum(size // step, 1) * step
+    rows_and_columns = [np.arange(length) for length in warped.shape]
     result = []
     blocks = _sample_blocks(points, options, seed)
     for rows, fraction in zip(blocks, options.null_shifts, strict=True):
-        shift = np.rint(np.array(fraction) * size).astype(np.int64)
-        places = (points[rows] - shift) % size
+        shift = np.rint(np.array(fraction) * period / step).astype(np.int64) * step
+        places = (points[rows] - shift) % period
         known = valid[places[:, 1], places[:, 0]]
         rows, places = rows[known], places[known]
         inner = [
-            (np.minimum(xy, size - 1 - xy) >= DESCRIPTOR_REACH).all(axis=1)
-            for xy in (points[rows], places)
+            (np.minimum(xy, end - 1 - xy) >= DESCRIPTOR_REACH).all(axis=1)
+            for xy, end in ((points[rows], size), (places, period))
         ]
-        shifted = np.roll(warped, shift[::-1], (0, 1))
-        result.append(NullPairs(rows, places, inner[0] & inner[1], shifted))
+        y, x = (
+            (line - by) % end
+            for line, by, end in zip(rows_and_columns, shift[::-1], period[::-1], strict=True)
+        )
+        result.append(NullPairs(rows, places, inner[0] & inner[1], warped[np.ix_(y, x)]))
     return result
 
 
