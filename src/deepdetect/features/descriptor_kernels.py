@@ -16,9 +16,6 @@ from .._shared.kernels import compiled
 TILE_COLUMNS = 32
 """Columns of the lattice in a tile."""
 
-NUMBERS_OF_BIN = 8 * TILE_COLUMNS
-"""Eight orientations of each column of a tile, for one of four bins."""
-
 TILE_HEIGHT = 96
 """Of a tile in pixels."""
 
@@ -50,11 +47,11 @@ def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, t
     reach = spans[0, 2] // 2
     tile_rows = max(1, TILE_HEIGHT // step)
     across = (rows_of.shape[1] + TILE_COLUMNS - 1) // TILE_COLUMNS
-    depth = TILE_COLUMNS + (taps.shape[1] + step - 1) // step
-    soft = np.zeros((step, depth * 8), np.float32)
+    more_columns = (taps.shape[1] + step - 1) // step
+    soft = np.zeros((step, 8 * (TILE_COLUMNS + more_columns)), np.float32)
     height_of_tile = (tile_rows - 1) * step + taps.shape[1]
-    summed = np.zeros((height_of_tile, 4 * NUMBERS_OF_BIN), np.float32)
-    histogram = np.zeros((4, 4 * NUMBERS_OF_BIN), np.float32)
+    summed = np.zeros((height_of_tile, 32 * TILE_COLUMNS), np.float32)
+    histogram = np.zeros((4, 32 * TILE_COLUMNS), np.float32)
     for tile in range(first, last):
         top, left = tile // across * tile_rows, tile % across * TILE_COLUMNS
         bottom = min(top + tile_rows, rows_of.shape[0])
@@ -65,6 +62,11 @@ def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, t
             bottom -= 1
         if top == bottom:
             continue
+        while (rows_of[top:bottom, left] < 0).all():
+            left += 1
+        while (rows_of[top:bottom, right - 1] < 0).all():
+            right -= 1
+        numbers = 8 * (right - left)  # of one bin: eight orientations of each column
         x0, y0 = origin[0] + left * step - reach, origin[1] + top * step - reach
         for j in range((bottom - top - 1) * step + 2 * reach + 1):
             y = y0 + j
@@ -73,7 +75,7 @@ def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, t
                 continue
             soft[:] = 0
             for phase in range(step):
-                for k in range(depth):
+                for k in range(right - left + more_columns):
                     x = x0 + phase + k * step
                     if x < 1 or x >= width - 1:
                         continue
@@ -82,21 +84,21 @@ def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, t
                     part = turn - np.float32(whole)
                     soft[phase, 8 * k + (whole & 7)] = magnitude[y, x] * (np.float32(1) - part)
                     soft[phase, 8 * k + ((whole + 1) & 7)] = magnitude[y, x] * part
-            _sum_along_row(soft, taps, spans, step, summed[j])
+            _sum_along_row(soft, taps, spans, step, summed[j], numbers)
         for row in range(top, bottom):
             if (rows_of[row, left:right] < 0).all():
                 continue
-            _sum_along_column(summed[(row - top) * step :], taps, spans, histogram)
+            _sum_along_column(summed[(row - top) * step :], taps, spans, histogram, 4 * numbers)
             for i in range(right - left):
                 if rows_of[row, left + i] >= 0:
-                    _normalise(histogram, i * 8, out[rows_of[row, left + i]])
+                    _normalise(histogram[:, 8 * i :], numbers, out[rows_of[row, left + i]])
 
 
 @compiled(nogil=True, fastmath=True, inline="always")
-def _sum_along_row(soft, taps, spans, step, out):  # type: ignore[no-untyped-def]
+def _sum_along_row(soft, taps, spans, step, out, numbers):  # type: ignore[no-untyped-def]
     out[:] = 0
     for b in range(4):
-        of_bin = out[b * NUMBERS_OF_BIN : (b + 1) * NUMBERS_OF_BIN]
+        of_bin = out[b * numbers : (b + 1) * numbers]
         for t in range(spans[b, 0], spans[b, 1], TAPS_AT_ONCE):
             weights = taps[b, t], taps[b, t + 1], taps[b, t + 2], taps[b, t + 3]
             _add(
@@ -110,12 +112,14 @@ def _sum_along_row(soft, taps, spans, step, out):  # type: ignore[no-untyped-def
 
 
 @compiled(nogil=True, fastmath=True, inline="always")
-def _sum_along_column(summed, taps, spans, out):  # type: ignore[no-untyped-def]
+def _sum_along_column(summed, taps, spans, out, numbers):  # type: ignore[no-untyped-def]
     out[:] = 0
     for b in range(4):
         for t in range(spans[b, 0], spans[b, 1], TAPS_AT_ONCE):
             weights = taps[b, t], taps[b, t + 1], taps[b, t + 2], taps[b, t + 3]
-            _add(out[b], weights, summed[t], summed[t + 1], summed[t + 2], summed[t + 3])
+            _add(
+                out[b, :numbers], weights, summed[t], summed[t + 1], summed[t + 2], summed[t + 3]
+            )
 
 
 @compiled(nogil=True, fastmath=True)
@@ -126,17 +130,17 @@ def _add(out, weights, a, b, c, d):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True, fastmath=True, inline="always")
-def _normalise(histogram, place, out):  # type: ignore[no-untyped-def]
+def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
     """Clip at a fifth of the norm, scale to 512 and round, as Lowe and OpenCV do."""
     total = np.float32(0)
     for b in range(4):
-        for c in range(place, 4 * NUMBERS_OF_BIN, NUMBERS_OF_BIN):
+        for c in range(0, 4 * numbers, numbers):
             for o in range(8):
                 total += histogram[b, c + o] * histogram[b, c + o]
     most = np.sqrt(total) * np.float32(0.2)
     total = np.float32(0)
     for b in range(4):
-        for c in range(place, 4 * NUMBERS_OF_BIN, NUMBERS_OF_BIN):
+        for c in range(0, 4 * numbers, numbers):
             for o in range(8):
                 value = min(histogram[b, c + o], most)
                 total += value * value
@@ -144,7 +148,7 @@ def _normalise(histogram, place, out):  # type: ignore[no-untyped-def]
     for b in range(4):
         for c in range(4):
             for o in range(8):
-                value = min(histogram[b, c * NUMBERS_OF_BIN + place + o], most)
+                value = min(histogram[b, c * numbers + o], most)
                 value = np.rint(value * scale)
                 out[32 * b + 8 * c + o] = np.uint8(min(np.float32(255), value))
 

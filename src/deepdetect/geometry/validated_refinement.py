@@ -35,6 +35,9 @@ from .zncc import (
     warp_to_reference,
 )
 
+STEP_PX = WINDOW_PX // 3
+"""Between the windows in which images are compared."""
+
 Fit = Callable[[np.ndarray], "np.ndarray | None"]
 """From the (H, W) bool mask of the pixels that may be used to a correction, (3, 3)."""
 
@@ -140,7 +143,8 @@ def refine_homography_validated(
 
     def correlation(warped: np.ndarray, valid_mask: np.ndarray) -> np.ndarray:
         second = gaussian_blur(warped, options.blur_sigma_px)
-        return local_zncc(first, second, erode_mask(valid_mask, options.blur_sigma_px))
+        known = erode_mask(valid_mask, options.blur_sigma_px)
+        return local_zncc(first, second, known, step_px=STEP_PX)
 
     def gain(fit: Fit) -> float:
         """Return on how many more windows a fit is better than worse, as a fraction of them.
@@ -151,7 +155,11 @@ def refine_homography_validated(
         views = [warp_to_reference(gray1, current @ one, size) for one in fits if one is not None]
         if len(views) < options.parts:
             return -math.inf
-        after = correlation(*(np.choose(part, view) for view in zip(*views, strict=True)))
+        mixed, valid_mask = views[0]
+        for one, (warped, valid) in enumerate(views[1:], start=1):
+            np.copyto(mixed, warped, where=part == one)
+            np.copyto(valid_mask, valid, where=part == one)
+        after = correlation(mixed, valid_mask)
         known = inner & np.isfinite(before) & np.isfinite(after)
         if not known.any():
             return -math.inf
@@ -266,8 +274,8 @@ def _parts(
     """Divide an image into squares, in turn of each part.
 
     Returns:
-        Which part each pixel belongs to, (H, W) int64, and whether its blurred window lies within
-        its square, (H, W) bool.
+        Which part each pixel belongs to, (H, W) int64, and whether the blurred windows of
+        `local_zncc` lie within their squares, (H // STEP_PX, W // STEP_PX) bool.
     """
     margin = WINDOW_PX // 2 + int(np.ceil(3 * options.blur_sigma_px))
     side = max(max(size) / options.squares, 4 * margin)
@@ -275,4 +283,5 @@ def _parts(
     along = column // side + row // side * (options.parts // 2 + options.parts % 2)
     part = (along % options.parts).astype(np.int64)
     near = [np.minimum(line % side, side - line % side) for line in (row, column)]
-    return part, np.minimum(*near) > margin
+    inner = np.minimum(*near)[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX] > margin
+    return part, inner[: size[1] // STEP_PX, : size[0] // STEP_PX]

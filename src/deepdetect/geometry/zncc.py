@@ -5,6 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from .._shared.errors import OptionError
+
 WINDOW_PX = 15
 """Side of the square windows."""
 
@@ -34,7 +36,11 @@ def warp_to_reference(
 
 
 def local_zncc(
-    first: np.ndarray, second: np.ndarray, valid_mask: np.ndarray, window_px: int = WINDOW_PX
+    first: np.ndarray,
+    second: np.ndarray,
+    valid_mask: np.ndarray,
+    window_px: int = WINDOW_PX,
+    step_px: int = 1,
 ) -> np.ndarray:
     """Compute the zero-mean normalised cross-correlation of the windows around each pixel.
 
@@ -42,28 +48,50 @@ def local_zncc(
         first, second: (H, W) images in the same frame, any dtype.
         valid_mask: (H, W) bool; windows must lie within it.
         window_px: side of the square windows in pixels, odd.
+        step_px: between the centres of the windows; the side is an odd multiple of it. The image is
+            divided into squares of this side from the first pixel on, and the windows are centred
+            on them.
 
     Returns:
-        (H, W) float32 in [-1, 1], NaN where a window is not valid or is flat.
+        (H // step_px, W // step_px) float32 in [-1, 1], NaN where a window is not valid or is flat.
+
+    Raises:
+        OptionError: the side of the windows is no odd multiple of the step.
 
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (32, 32)).astype(np.uint8)
         >>> valid = np.ones((32, 32), bool)
         >>> float(np.nanmedian(local_zncc(image, 255 - image, valid)).round(3))
         -1.0
+        >>> local_zncc(image, image, valid, step_px=5).shape
+        (6, 6)
     """
-    a, b = first.astype(np.float64), second.astype(np.float64)
+    side, rest = divmod(window_px, step_px)
+    if rest or side % 2 == 0:
+        raise OptionError(f"{window_px} is no odd multiple of {step_px}: choose another window_px")
+    shape = (first.shape[0] // step_px, first.shape[1] // step_px)
+    if 0 in shape:
+        return np.full(shape, np.nan, np.float32)
+    a, b, mask = (
+        values[: shape[0] * step_px, : shape[1] * step_px] for values in (first, second, valid_mask)
+    )
+    a, b = a.astype(np.float64), b.astype(np.float64)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return cv2.boxFilter(values, cv2.CV_64F, (window_px, window_px))
+        if step_px > 1:
+            values = cv2.resize(values, shape[::-1], interpolation=cv2.INTER_AREA)
+        return cv2.boxFilter(values, cv2.CV_64F, (side, side))
 
     mean_a, mean_b = mean(a), mean(b)
     variance_a = mean(a * a) - mean_a**2
     variance_b = mean(b * b) - mean_b**2
-    inside = _erode(valid_mask, window_px)
+    whole = mask.astype(np.float32)
+    if step_px > 1:
+        whole = cv2.resize(whole, shape[::-1], interpolation=cv2.INTER_AREA)
+    inside = _erode(whole > 1 - 0.5 / step_px**2, side)
     known = inside & (variance_a > MIN_VARIANCE) & (variance_b > MIN_VARIANCE)
     covariance = mean(a * b) - mean_a * mean_b
-    result = np.full(first.shape, np.nan, np.float32)
+    result = np.full(shape, np.nan, np.float32)
     scale = np.sqrt(variance_a[known] * variance_b[known])
     result[known] = np.clip(covariance[known] / scale, -1, 1)
     return result

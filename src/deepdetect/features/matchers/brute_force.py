@@ -10,6 +10,9 @@ from ..._shared.errors import OptionError
 BLOCK_SIZE = 32_000_000
 """Numbers of four bytes that exact search holds at a time, to bound the memory (about 128 MB)."""
 
+MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
+"""Length of descriptors of bytes up to which single precision computes distances exactly."""
+
 HAMMING_QUERIES = 20_000
 """At a time: OpenCV keeps an object for each of their neighbours."""
 
@@ -26,15 +29,18 @@ def exact_neighbours(
     """
     rows = np.empty((len(queries), count), np.int32)
     distances = np.empty((len(queries), count), np.float32)
-    # Double precision: the expansion below loses digits where distances are small.
+    # The expansion below loses digits where distances are small: double precision, but for bytes,
+    # whose sums are whole numbers that single precision holds.
+    whole = queries.dtype == base.dtype == np.uint8 and queries.shape[1] <= MAX_EXACT_BYTES
+    precision = np.float32 if whole else np.float64
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
-    wide = base.astype(np.float64)
+    wide = base.astype(precision)
     squared_norms = np.einsum("ij,ij->i", wide, wide)
     step = max(1, BLOCK_SIZE // (2 * max(len(base), 2 * count * base.shape[1])))
     for start in range(0, len(queries), step):
         block = queries[start : start + step]
         # |q - b|^2 without the constant |q|^2.
-        partial = block.astype(np.float64) @ wide.T
+        partial = block.astype(precision) @ wide.T
         partial *= -2
         partial += squared_norms
         found = np.empty((len(block), count), np.intp)

@@ -8,8 +8,8 @@ What unrelated patches look like is measured on the pair itself, by null pairs: 
 shifted by a third of its size and more, and what then lies under a point is unrelated to it, but of
 the same kind of scene and light. A point passes when its descriptors, averaged with those of its
 neighbours, are more similar than all but `false_positive_rate` of the null pairs, and when most
-points around it pass, too. Only points on a lattice are described: neighbours have nearly the same
-descriptors.
+points around it pass, too. Only places on a lattice are described, those nearest to the points:
+neighbours have nearly the same descriptors.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ class NullPairs:
         rows: (N,) the points that have a partner.
         places: (N, 2) where it is in the second image.
         interior: (N,) bool: no descriptor sees an edge: it is the same with and without the shift.
+            Of the others the first image's edge cuts both descriptors.
         shifted: (H, W) uint8, the second image shifted cyclically.
     """
 
@@ -95,7 +96,8 @@ def dissimilarity(
     if not len(known):
         return result
     here, shape = pixels[known], gray0.shape
-    described = here[_on_lattice(here, shape, options.lattice_px)]
+    described = _lattice_near(here, shape, options.lattice_px)
+    described = described[valid[described[:, 1], described[:, 0]]]
     null_pairs = sample_null_pairs(described, warped, valid, options, seed)
     distances, null_distances = _distances(gray0, warped, described, null_pairs, options)
     sigma = options.smoothing_sigma_px
@@ -147,17 +149,18 @@ def sample_null_pairs(
     for rows, fraction in zip(blocks, options.null_shifts, strict=True):
         shift = np.rint(np.array(fraction) * period / step).astype(np.int64) * step
         places = (points[rows] - shift) % period
-        known = valid[places[:, 1], places[:, 0]]
-        rows, places = rows[known], places[known]
-        inner = [
+        inner, whole = (
             (np.minimum(xy, end - 1 - xy) >= DESCRIPTOR_REACH).all(axis=1)
             for xy, end in ((points[rows], size), (places, period))
-        ]
+        )
+        # Where only the partner is at an edge: a seam in the shifted image, which no warped has.
+        kept = valid[places[:, 1], places[:, 0]] & (whole | ~inner)
+        rows, places, interior = rows[kept], places[kept], inner[kept]
         y, x = (
             (line - by) % end
             for line, by, end in zip(rows_and_columns, shift[::-1], period[::-1], strict=True)
         )
-        result.append(NullPairs(rows, places, inner[0] & inner[1], warped[np.ix_(y, x)]))
+        result.append(NullPairs(rows, places, interior, warped[np.ix_(y, x)]))
     return result
 
 
@@ -180,38 +183,35 @@ def _distances(
     """Return 1 - correlation of the points and of the null pairs, summed over the sizes."""
     # Each place of the second image is described once, however often it is part of a null pair.
     used = [points, *(null.places[null.interior] for null in null_pairs)]
+    step = options.lattice_px
     places, index = index_map(np.concatenate(used), warped.shape)
     own = index[points[:, 1], points[:, 0]]
     distances = np.zeros(len(points), np.float32)
     null_distances = [np.zeros(len(null.rows), np.float32) for null in null_pairs]
     for size in options.keypoint_sizes_px:
-        first = to_root_sift(dense_sift(gray0, points, size), overwrite=True)
+        first = to_root_sift(dense_sift(gray0, points, size, step), overwrite=True)
         total = first.sum(axis=0, dtype=np.int64)  # exact: the order of the points does not matter
         enough = len(first) >= MIN_POINTS_OF_MEAN
         mean = (total / len(first) if enough else 0 * total).astype(np.float32)
-        second = to_root_sift(dense_sift(warped, places, size), overwrite=True)
+        second = to_root_sift(dense_sift(warped, places, size, step), overwrite=True)
         distances += correlation_distance(first, np.arange(len(first)), second, own, mean)
         for values, null in zip(null_distances, null_pairs, strict=True):
             x, y = null.places[null.interior].T
             inner, outer = null.rows[null.interior], null.rows[~null.interior]
             values[null.interior] += correlation_distance(first, inner, second, index[y, x], mean)
-            others = to_root_sift(dense_sift(null.shifted, points[outer], size), overwrite=True)
+            others = to_root_sift(dense_sift(null.shifted, points[outer], size, step), overwrite=True)
             rows = np.arange(len(outer))
             values[~null.interior] += correlation_distance(first, outer, others, rows, mean)
     return distances, null_distances
 
 
-def _on_lattice(pixels: np.ndarray, shape: Sequence[int], step_px: int) -> np.ndarray:
-    """Return the rows of the points on every `step_px`-th row and column, and those far from them.
-
-    Far: with none of these in the window that reaches one step in each direction.
-    """
-    chosen = (pixels % step_px == step_px // 2).all(axis=1)
-    image = np.zeros(tuple(shape[:2]), np.uint8)
-    image[pixels[:, 1], pixels[:, 0]] = chosen
-    side = 2 * step_px + 1
-    near = cv2.dilate(image, np.ones((side, side), np.uint8))[pixels[:, 1], pixels[:, 0]] > 0
-    return np.flatnonzero(chosen | ~near)
+def _lattice_near(pixels: np.ndarray, shape: Sequence[int], step_px: int) -> np.ndarray:
+    """Return the pixels in every `step_px`-th row and column that are nearest to some points."""
+    last = (np.array(shape[1::-1]) - 1 - step_px // 2) // step_px
+    index = np.clip(pixels // step_px, 0, np.maximum(last, 0))
+    used = np.zeros(index.max(axis=0) + 1, bool)
+    used[index[:, 0], index[:, 1]] = True
+    return np.minimum(np.argwhere(used) * step_px + step_px // 2, np.array(shape[1::-1]) - 1)
 
 
 def _sample_blocks(pixels: np.ndarray, options: VerificationOptions, seed: int) -> list[np.ndarray]:
