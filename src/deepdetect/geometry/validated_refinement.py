@@ -48,7 +48,8 @@ class ValidatedRefinementOptions:
 
     Attributes:
         windows_px: sides of the tracked windows, odd, one for each round of tracking and fitting.
-        max_corners: tracked in each round.
+        max_corners: tracked in each round; in the first one, which starts the furthest off, half as
+            many.
         min_tracks: that a homography is fitted to.
         pyramid_levels: above the image; each doubles how far a track can move. After the first
             round one is enough.
@@ -70,7 +71,7 @@ class ValidatedRefinementOptions:
         OptionError: a value is out of its range.
     """
 
-    windows_px: tuple[int, ...] = (31, 21)
+    windows_px: tuple[int, ...] = (31, 15)
     max_corners: int = 3000
     min_tracks: int = 15
     pyramid_levels: int = 3
@@ -104,7 +105,7 @@ class ValidatedRefinementOptions:
         """Return the options of `track_corners` for one of the windows."""
         first = window_px == self.windows_px[0]
         return RefinementOptions(
-            max_corners=max(self.max_corners, self.min_tracks),
+            max_corners=max(self.max_corners // 2 if first else self.max_corners, self.min_tracks),
             min_tracks=self.min_tracks,
             pyramid_levels=self.pyramid_levels if first else min(1, self.pyramid_levels),
             tracking_iterations=self.tracking_iterations,

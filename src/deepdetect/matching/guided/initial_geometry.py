@@ -8,6 +8,7 @@ part.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,7 +107,10 @@ def initial_matches(
     view0, scale0 = downscale(gray0, options.max_side_px)
     view1, scale1 = downscale(gray1, options.max_side_px)
     if features is None:
-        features = detect_sift(view0, options.sift), detect_sift(view1, options.sift)
+        with ThreadPoolExecutor(2) as pool:  # OpenCV's SIFT leaves a second processor idle
+            of_first = pool.submit(detect_sift, view0, options.sift)
+            of_second = detect_sift(view1, options.sift)
+            features = of_first.result(), of_second
     matched = _match(features[0], features[1], options)
     return InitialMatches((view0, view1), (scale0, scale1), features, matched)
 
@@ -142,7 +146,11 @@ def find_initial_geometry(
     longest = max(*gray0.shape, *gray1.shape)
     first_side = min(options.first_side_px, options.max_side_px)
     if initial is None and longest > first_side and model != "fundamental":
-        small = replace(options, max_side_px=first_side)
+        few = replace(
+            options.sift,
+            max_keypoints=min(options.first_max_keypoints, options.sift.max_keypoints),
+        )
+        small = replace(options, max_side_px=first_side, sift=few)
         look = initial_matches(gray0, gray1, options=small)
         found = estimate_initial_geometry(look, model, seed, small, simulate_views=False)
         if _is_clearly_a_plane(found, options):
@@ -246,11 +254,14 @@ def estimate_initial_geometry(
 
 
 def _is_clearly_a_plane(found: InitialGeometry, options: InitialGeometryOptions) -> bool:
-    """Whether most matches agree with a homography, and no others on an epipole."""
+    """Whether most matches agree with a homography, and not many others on an epipole."""
     needed = max(options.min_first_inliers, options.min_first_fraction * found.num_matches)
     if found.model != "homography" or len(found.points0) < needed:
         return False
-    return found.parallax is None or not found.parallax.is_seen(options.model_selection)
+    parallax = found.parallax
+    if parallax is None or not parallax.is_seen(options.model_selection):
+        return True
+    return parallax.agreeing <= options.max_first_parallax * parallax.on_plane
 
 
 def _nothing(num_matches: int) -> InitialGeometry:

@@ -27,8 +27,11 @@ class InitialGeometryOptions:
     Attributes:
         first_side_px: longer sides are scaled down to this for a first look, which decides where
             the pair is clearly a plane.
+        first_max_keypoints: of each image in the first look.
         min_first_inliers, min_first_fraction: number and fraction of the matches of the first look
             that agree with a homography, for it to decide.
+        max_first_parallax: with more matches than this that agree on an epipole off the plane,
+            relative to those on it, the first look does not decide.
         max_side_px: longer sides are scaled down to this: the initial geometry need not be fine.
         simulated_side_px: the same where views are simulated.
         sift: the keypoints of each image; each simulated view gets half as many.
@@ -48,8 +51,10 @@ class InitialGeometryOptions:
     """
 
     first_side_px: int = 640
+    first_max_keypoints: int = 2000
     min_first_inliers: int = 50
     min_first_fraction: float = 0.5
+    max_first_parallax: float = 0.1
     max_side_px: int = 1200
     simulated_side_px: int = 320
     sift: SiftOptions = field(default_factory=SiftOptions)
@@ -68,9 +73,9 @@ class InitialGeometryOptions:
             positive=(
                 *("first_side_px", "max_side_px", "simulated_side_px", "min_first_inliers"),
                 *("min_separation_px", "tilts", "rotation_step_deg"),
-                *("homography_threshold_px", "fundamental_threshold_px"),
+                *("homography_threshold_px", "fundamental_threshold_px", "first_max_keypoints"),
             ),
-            fractions=("ratio", "min_first_fraction"),
+            fractions=("ratio", "min_first_fraction", "max_first_parallax"),
             between={"max_log10_nfa": (-math.inf, 0)},
         )
 
