@@ -26,9 +26,7 @@ BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's size (3 times its radius)."""
 
 
-def dense_sift(
-    gray: np.ndarray, xy: np.ndarray, size: float = 3.0, step_px: int = 1
-) -> np.ndarray:
+def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0, step_px: int = 1) -> np.ndarray:
     """Compute upright SIFT descriptors; they equal OpenCV's at angle 0.
 
     Args:
@@ -67,7 +65,9 @@ def dense_sift(
     rows_of = np.full((row.max() + 1, column.max() + 1), -1, np.int32)
     rows_of[row, column] = np.arange(len(pixels))
     out = np.empty((len(pixels), 128), np.uint8)
-    tiles = -(-len(rows_of) // max(1, TILE_HEIGHT // step_px)) * -(-rows_of.shape[1] // TILE_COLUMNS)
+    tiles = -(-len(rows_of) // max(1, TILE_HEIGHT // step_px)) * -(
+        -rows_of.shape[1] // TILE_COLUMNS
+    )
     arguments = (*_gradient(gray), rows_of, origin, step_px, *_taps(size))
     parallel_for(tiles, describe_tiles, *arguments, out)
     described = rows_of[row, column]

@@ -117,9 +117,7 @@ def _sum_along_column(summed, taps, spans, out, numbers):  # type: ignore[no-unt
     for b in range(4):
         for t in range(spans[b, 0], spans[b, 1], TAPS_AT_ONCE):
             weights = taps[b, t], taps[b, t + 1], taps[b, t + 2], taps[b, t + 3]
-            _add(
-                out[b, :numbers], weights, summed[t], summed[t + 1], summed[t + 2], summed[t + 3]
-            )
+            _add(out[b, :numbers], weights, summed[t], summed[t + 1], summed[t + 2], summed[t + 3])
 
 
 @compiled(nogil=True, fastmath=True)

@@ -20,6 +20,7 @@ import numpy as np
 
 from .._shared.options import check_ranges
 from .homography_refinement import (
+    IrlsOptions,
     RefinementOptions,
     equalise,
     fit_homography_irls,
@@ -56,7 +57,7 @@ class ValidatedRefinementOptions:
         tracking_iterations: of each track and level, at most.
         tracking_step_px: a track that moves by less than this has arrived.
         max_round_trip_px: a track counts when it ends this near to its start, forth and back.
-        inlier_threshold_px: of MAGSAC.
+        cauchy_scale_px: a track with this residual has half the weight of an exact one.
         alignment_side_px: longer side of the copies on which all pixels are aligned, where the
             images are larger.
         alignment_sigma_px: of the blur of these copies.
@@ -78,7 +79,7 @@ class ValidatedRefinementOptions:
     tracking_iterations: int = 15
     tracking_step_px: float = 0.02
     max_round_trip_px: float = 0.3
-    inlier_threshold_px: float = 0.5
+    cauchy_scale_px: float = 1.0
     alignment_side_px: int = 480
     alignment_sigma_px: float = 1.0
     alignment_iterations: int = 15
@@ -92,7 +93,7 @@ class ValidatedRefinementOptions:
             self,
             positive=(
                 *("max_corners", "squares", "blur_sigma_px", "alignment_sigma_px"),
-                *("max_round_trip_px", "inlier_threshold_px"),
+                *("max_round_trip_px", "cauchy_scale_px"),
                 *("tracking_iterations", "tracking_step_px"),
                 *("alignment_side_px", "alignment_iterations"),
             ),
@@ -170,9 +171,8 @@ def refine_homography_validated(
     warped, valid_mask = warp_to_reference(gray1, current, size)
     before = correlation(warped, valid_mask)
     for step in _steps(gray0, options):
-        candidates = [(gain(fit), fit) for fit in step(warped, valid_mask)]
-        best, fit = max(candidates, key=lambda one: one[0], default=(-math.inf, None))
-        correction = fit(valid_mask) if fit is not None and best > options.min_gain else None
+        fit = step(warped, valid_mask)
+        correction = fit(valid_mask) if fit and gain(fit) > options.min_gain else None
         if correction is None:
             continue
         current = current @ correction
@@ -181,66 +181,55 @@ def refine_homography_validated(
     return current / current[2, 2]
 
 
-Step = Callable[[np.ndarray, np.ndarray], Iterator[Fit]]
+Step = Callable[[np.ndarray, np.ndarray], "Fit | None"]
+"""From the warped second image and its (H, W) bool mask of valid pixels to a way to fit."""
 
 
 def _steps(gray0: np.ndarray, options: ValidatedRefinementOptions) -> Iterator[Step]:
     equalised = equalise(gray0)
     for window_px in options.windows_px:
-        yield partial(_fits_to_corners, equalised, window_px=window_px, options=options)
-    yield partial(_fits_to_pixels, gray0, options=options)
+        yield partial(_fit_to_corners, equalised, window_px=window_px, options=options)
+    yield partial(_fit_to_pixels, gray0, options=options)
 
 
-def _fits_to_corners(
+def _fit_to_corners(
     equalised: np.ndarray,
     warped: np.ndarray,
     valid_mask: np.ndarray,
     *,
     window_px: int,
     options: ValidatedRefinementOptions,
-) -> Iterator[Fit]:
-    """Track corners, and yield two fits to them.
+) -> Fit | None:
+    """Track corners, and return the fit to those in a part of the image.
 
-    The consensus of most tracks, and least squares with weights, which is right on most of an image
-    that no single homography fits: a lens that bends lines, a wall that is not quite flat.
+    Least squares with weights: right on most of an image that no single homography fits (a lens
+    that bends lines, a wall that is not quite flat), where a consensus is another one each time.
     """
     tracking = options.tracking(window_px)
     tracks = track_corners(equalised, equalise(warped), valid_mask, window_px, tracking)
     if tracks is None:
-        return
+        return None
     start, end = tracks
     x, y = np.rint(start).astype(np.int64).T
-
-    def consensus(used: np.ndarray) -> np.ndarray | None:
-        chosen = used[y, x]
-        if np.count_nonzero(chosen) < options.min_tracks:
-            return None
-        found = cv2.findHomography(
-            start[chosen],
-            end[chosen],
-            cv2.USAC_MAGSAC,
-            options.inlier_threshold_px,
-            maxIters=2000,
-            confidence=0.999,
-        )[0]
-        return None if found is None else found.astype(np.float64)
+    weighted = IrlsOptions(cauchy_scale_px=options.cauchy_scale_px)
 
     def least_squares(used: np.ndarray) -> np.ndarray | None:
         chosen = used[y, x]
-        return fit_homography_irls(start[chosen], end[chosen])
+        if np.count_nonzero(chosen) < options.min_tracks:
+            return None
+        return fit_homography_irls(start[chosen], end[chosen], weighted)
 
-    yield consensus
-    yield least_squares
+    return least_squares
 
 
-def _fits_to_pixels(
+def _fit_to_pixels(
     gray0: np.ndarray,
     warped: np.ndarray,
     valid_mask: np.ndarray,
     *,
     options: ValidatedRefinementOptions,
-) -> Iterator[Fit]:
-    """Yield the alignment of all pixels (ECC), which has the least noise."""
+) -> Fit:
+    """Return the alignment of all pixels (ECC), which has the least noise."""
     side = options.alignment_side_px
     (first, scale), (second, _) = downscale(gray0, side), downscale(warped, side)
     shape = first.shape[::-1]
@@ -266,7 +255,7 @@ def _fits_to_pixels(
             return None
         return scaled_homography(found.astype(np.float64), 1 / scale, 1 / scale)
 
-    yield align
+    return align
 
 
 def _parts(

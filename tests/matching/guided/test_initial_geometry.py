@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -228,7 +229,19 @@ def test_two_images_of_different_things_have_no_geometry(
 ) -> None:
     found = initial_geometry(picture(first, (200, 150)), picture(second, (200, 150)))
     assert_nothing(found)
-    assert found.num_views > 20  # all were tried
+    assert found.num_views == 10  # and nothing hints at more
+
+
+def test_stronger_tilts_are_tried_where_something_hints_at_a_geometry(
+    picture: Callable[..., np.ndarray],
+) -> None:
+    image = picture("camera", (200, 150))
+    never = InitialGeometryOptions(max_log10_nfa=-1e9)
+    for options, tried in ((never, 30), (replace(never, max_hint_log10_nfa=-1e9), 10)):
+        initial = initial_matches(image, image, options=options)
+        found = estimate_initial_geometry(initial, options=options)
+        assert found.matrix is None
+        assert found.num_views == tried
 
 
 def test_noise_has_no_geometry() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -32,7 +34,7 @@ def exact_neighbours(
     # The expansion below loses digits where distances are small: double precision, but for bytes,
     # whose sums are whole numbers that single precision holds.
     whole = queries.dtype == base.dtype == np.uint8 and queries.shape[1] <= MAX_EXACT_BYTES
-    precision = np.float32 if whole else np.float64
+    precision: type[np.floating[Any]] = np.float32 if whole else np.float64
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
     wide = base.astype(precision)
     squared_norms = np.einsum("ij,ij->i", wide, wide)

@@ -8,10 +8,12 @@ way round. Small tilts come first, and the search ends as soon as a geometry can
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
 
+from ..._shared.parallel import processor_count
 from ...features.keypoints import Keypoints
 from ...features.sift_detector import SiftOptions, detect_sift
 
@@ -29,20 +31,25 @@ def simulated_views(
     Yields:
         The described keypoints of each view, at their positions in the image itself.
     """
-    directions = round(180 * tilt / rotation_step_deg)
-    for rotation in np.linspace(0, 180, directions, endpoint=False):
-        view, to_view = simulate_view(gray, tilt, float(rotation))
+
+    def see(rotation_deg: float) -> Keypoints:
+        view, to_view = simulate_view(gray, tilt, rotation_deg)
         found = detect_sift(view, sift)
         back = cv2.invertAffineTransform(to_view)
         xy = found.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
         inside = ((xy > 0) & (xy < np.array(gray.shape[::-1]) - 1)).all(1)
         assert found.descriptors is not None
-        yield Keypoints(
+        return Keypoints(
             xy[inside],
             found.scores[inside],
             (gray.shape[1], gray.shape[0]),
             descriptors=found.descriptors[inside],
         )
+
+    directions = round(180 * tilt / rotation_step_deg)
+    rotations = np.linspace(0, 180, directions, endpoint=False).tolist()
+    with ThreadPoolExecutor(processor_count()) as pool:
+        yield from pool.map(see, rotations)
 
 
 def simulate_view(

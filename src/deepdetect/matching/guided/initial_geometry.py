@@ -146,11 +146,7 @@ def find_initial_geometry(
     longest = max(*gray0.shape, *gray1.shape)
     first_side = min(options.first_side_px, options.max_side_px)
     if initial is None and longest > first_side and model != "fundamental":
-        few = replace(
-            options.sift,
-            max_keypoints=min(options.first_max_keypoints, options.sift.max_keypoints),
-        )
-        small = replace(options, max_side_px=first_side, sift=few)
+        small = _scaled_down(options, first_side, options.first_max_keypoints)
         look = initial_matches(gray0, gray1, options=small)
         found = estimate_initial_geometry(look, model, seed, small, simulate_views=False)
         if _is_clearly_a_plane(found, options):
@@ -162,7 +158,7 @@ def find_initial_geometry(
         return found
     simulated_side = min(options.simulated_side_px, options.max_side_px)
     if longest > simulated_side:
-        options = replace(options, max_side_px=simulated_side)
+        options = _scaled_down(options, simulated_side, options.simulated_max_keypoints)
         initial = initial_matches(gray0, gray1, options=options)
     return estimate_initial_geometry(initial, model, seed, options)
 
@@ -248,9 +244,17 @@ def estimate_initial_geometry(
             best = replace(found, num_views=num_views)
         if best.log10_nfa < options.max_log10_nfa:
             return _upscale(best, *initial.scales)
-        if not simulate_views:
+        if not simulate_views or (num_views and best.log10_nfa > options.max_hint_log10_nfa):
             break
     return replace(_nothing(best.num_matches), log10_nfa=best.log10_nfa, num_views=num_views)
+
+
+def _scaled_down(
+    options: InitialGeometryOptions, max_side_px: int, max_keypoints: int
+) -> InitialGeometryOptions:
+    """Return the options of a look at small images, with few keypoints."""
+    sift = replace(options.sift, max_keypoints=min(max_keypoints, options.sift.max_keypoints))
+    return replace(options, max_side_px=max_side_px, sift=sift)
 
 
 def _is_clearly_a_plane(found: InitialGeometry, options: InitialGeometryOptions) -> bool:

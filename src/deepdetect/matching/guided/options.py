@@ -33,8 +33,9 @@ class InitialGeometryOptions:
         max_first_parallax: with more matches than this that agree on an epipole off the plane,
             relative to those on it, the first look does not decide.
         max_side_px: longer sides are scaled down to this: the initial geometry need not be fine.
-        simulated_side_px: the same where views are simulated.
-        sift: the keypoints of each image; each simulated view gets half as many.
+        sift: the keypoints of each image.
+        simulated_side_px, simulated_max_keypoints: side and keypoints of images of which views are
+            simulated; each view gets half as many keypoints.
         ratio: of the ratio test.
         min_separation_px: matches that begin or end nearer together than this count as one.
         homography_threshold_px, fundamental_threshold_px: matches within this agree with a model,
@@ -43,6 +44,9 @@ class InitialGeometryOptions:
             below this.
         model_selection: when the matches alone show that a scene has depth.
         tilts: of the simulated views: how many times shorter one direction is seen.
+        max_hint_log10_nfa: views of a larger tilt are simulated only where the best geometry so far
+            has a logarithm of its number of false alarms below this: where it may be more than
+            chance.
         rotation_step_deg: between the directions of the views for a tilt of 1; the step is
             inversely proportional to the tilt.
 
@@ -57,6 +61,7 @@ class InitialGeometryOptions:
     max_first_parallax: float = 0.1
     max_side_px: int = 1200
     simulated_side_px: int = 320
+    simulated_max_keypoints: int = 1000
     sift: SiftOptions = field(default_factory=SiftOptions)
     ratio: float = 0.85
     min_separation_px: float = 2.0
@@ -65,6 +70,7 @@ class InitialGeometryOptions:
     max_log10_nfa: float = MAX_LOG10_NFA
     model_selection: ModelSelectionOptions = field(default_factory=ModelSelectionOptions)
     tilts: tuple[float, ...] = (2.0, 4.0)
+    max_hint_log10_nfa: float = 0.0
     rotation_step_deg: float = 72.0
 
     def __post_init__(self) -> None:
@@ -74,6 +80,7 @@ class InitialGeometryOptions:
                 *("first_side_px", "max_side_px", "simulated_side_px", "min_first_inliers"),
                 *("min_separation_px", "tilts", "rotation_step_deg"),
                 *("homography_threshold_px", "fundamental_threshold_px", "first_max_keypoints"),
+                "simulated_max_keypoints",
             ),
             fractions=("ratio", "min_first_fraction", "max_first_parallax"),
             between={"max_log10_nfa": (-math.inf, 0)},
@@ -109,7 +116,7 @@ class VerificationOptions:
     lattice_px: int = 3
     false_positive_rate: float = 0.01
     smoothing_sigma_px: float = 2.5
-    window_px: int = 81
+    window_px: int = 101
     min_support: float = 0.5
     null_shifts: tuple[tuple[float, float], ...] = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
     null_block_px: int = 64
@@ -136,8 +143,9 @@ class HomographyMatchingOptions:
             scaled down to the other for the refinement.
         refinement: how it is refined.
         max_distance_px: from where the homography takes a keypoint to its partner.
-        min_verified_fraction: of the pairs it proposes, this fraction must have the same patches on
-            both sides: with fewer, little of the scene lies on the plane.
+        min_verified_fraction: of the keypoints that the second image shows under the homography,
+            this fraction must have the same patches there: with fewer, little of the scene lies on
+            the plane.
         min_verified_fraction_of_depth: the same where matches off the plane agree on an epipole.
         min_parallax_fraction: as many must agree, relative to those on the plane.
 

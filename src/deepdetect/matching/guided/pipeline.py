@@ -96,7 +96,7 @@ def _match_plane(
     assert first.matrix is not None
     plane = options.homography_matching
     matrix = refine_guiding_homography(pair.gray0, pair.gray1, first.matrix, plane)
-    matches, proposed = match_by_homography(pair, matrix, plane, options.verification, seed)
+    matches, verified = match_by_homography(pair, matrix, plane, options.verification, seed)
     found = _at_keypoints(pair, matches)
     parallax = first.parallax
     if parallax is None:  # a homography was asked for
@@ -106,7 +106,7 @@ def _match_plane(
     least = plane.min_verified_fraction
     if seen and agree:
         least = max(least, plane.min_verified_fraction_of_depth)
-    return matrix, found if len(found) >= least * proposed else None
+    return matrix, found if verified >= least else None
 
 
 def _match_scene_with_depth(

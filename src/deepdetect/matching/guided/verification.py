@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from ...features.dense_sift import dense_sift
@@ -199,7 +198,9 @@ def _distances(
             x, y = null.places[null.interior].T
             inner, outer = null.rows[null.interior], null.rows[~null.interior]
             values[null.interior] += correlation_distance(first, inner, second, index[y, x], mean)
-            others = to_root_sift(dense_sift(null.shifted, points[outer], size, step), overwrite=True)
+            others = to_root_sift(
+                dense_sift(null.shifted, points[outer], size, step), overwrite=True
+            )
             rows = np.arange(len(outer))
             values[~null.interior] += correlation_distance(first, outer, others, rows, mean)
     return distances, null_distances
