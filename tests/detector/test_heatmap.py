@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
+from deepdetect.detector import heatmap
 from deepdetect.detector.heatmap import HeatmapOptions, compute_heatmap, compute_heatmap_and_logits
 
 RGB = np.random.default_rng(11).integers(0, 256, (61, 90, 3), dtype=np.uint8)
@@ -101,6 +102,29 @@ def test_a_squashed_map_stays_in_range(side: int) -> None:
     assert heatmap.max() == 1
 
 
+@pytest.mark.parametrize(("pixels", "seen"), [(48 * 64, (48, 64)), (12 * 16, (16, 16))])
+def test_auto_is_native_up_to_a_number_of_pixels(
+    pixels: int, seen: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(heatmap, "MAX_AUTO_PIXELS", pixels)
+    rgb = np.zeros((48, 64, 3), np.uint8)
+    rgb[:, 32:] = 200
+    shapes = []
+
+    def network(planes: np.ndarray) -> np.ndarray:
+        shapes.append(planes.shape[2:])
+        return respond(planes)
+
+    found = compute_heatmap(rgb, network, HeatmapOptions("auto"))
+    assert shapes == [seen]
+    assert found.shape == (48, 64)
+    assert found[24, 60] > found[24, 4]
+    if pixels == rgb[:, :, 0].size:
+        np.testing.assert_array_equal(
+            found, compute_heatmap(rgb, respond, HeatmapOptions("native"))
+        )
+
+
 @pytest.mark.parametrize("resolution", ["native", 40])
 def test_bgr_is_the_swapped_image(resolution: str | int) -> None:
     swapped = np.ascontiguousarray(RGB[:, :, ::-1])
@@ -157,6 +181,6 @@ def test_wrong_options(options: dict[str, object], words: str) -> None:
     assert words in str(caught.value)
 
 
-@pytest.mark.parametrize("resolution", ["native", 16, 480, np.int64(640)])
+@pytest.mark.parametrize("resolution", ["auto", "native", 16, 480, np.int64(640)])
 def test_right_resolutions(resolution: str | int) -> None:
     assert HeatmapOptions(resolution).resolution == resolution

@@ -23,17 +23,18 @@ PATH = click.Path(path_type=Path)
 
 
 class Resolution(click.ParamType):  # type: ignore[type-arg]  # generic in new versions only
-    """The word "native", or a number of pixels."""
+    """The word "auto" or "native", or a number of pixels."""
 
-    name = "native|PIXELS"
+    name = "auto|native|PIXELS"
 
     def convert(self, value: Any, param: Any, context: Any) -> str | int:
-        if value == "native" or isinstance(value, int):
+        if value in ("auto", "native") or isinstance(value, int):
             return value
         try:
             return int(value)
         except ValueError:
-            self.fail(f"{value!r} is neither 'native' nor a number of pixels", param, context)
+            message = f"{value!r} is neither 'auto' nor 'native' nor a number of pixels"
+            self.fail(message, param, context)
 
 
 DETECTOR = FieldOptions(

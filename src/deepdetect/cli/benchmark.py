@@ -103,7 +103,7 @@ def benchmark(
     from ..evaluation.runner import run_benchmarks
     from ..matching.options import get_preset
 
-    if values["resolution"] not in (None, "native"):
+    if values["resolution"] not in (None, "auto", "native"):
         raise OptionError(
             "the protocols fix the resolution (480x480 and native): leave out --resolution"
         )

@@ -32,8 +32,9 @@ class DeepDetect:
     Args:
         weights: "default" or "dense", the weights inside the package; or an ONNX file, or
             a safetensors file where torch is installed.
-        resolution: "native" (the image as it is, padded), or a number of pixels: the
-            image is squashed to a square of that side, as the paper does with 480.
+        resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
+            that), "native" (always as it is), or a number of pixels: the image is squashed to a
+            square of that side, as the paper does with 480.
         backend: "auto" (OpenVINO when it is installed, else ONNX Runtime; torch for
             safetensors), "onnxruntime", "openvino" or "torch".
         providers: ONNX Runtime's execution providers by name, as "CUDAExecutionProvider", the
@@ -66,7 +67,7 @@ class DeepDetect:
         self,
         weights: str | Path = "default",
         *,
-        resolution: Literal["native"] | int = "native",
+        resolution: Literal["auto", "native"] | int = "auto",
         backend: str = "auto",
         providers: tuple[str, ...] = (),
         threads: int | None = None,

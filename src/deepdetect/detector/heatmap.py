@@ -14,14 +14,20 @@ from .backends import Network
 STRIDE = 8
 """The network halves an image three times, so its sides must be multiples of 8."""
 
+MAX_AUTO_PIXELS = 2_000_000
+"""Of an image that the resolution "auto" takes as it is."""
+
 
 @dataclass(frozen=True)
 class HeatmapOptions:
     """How an image is shown to the network.
 
     Attributes:
-        resolution: "native" takes the image as it is; a number of pixels squashes it to
-            a square of that side and the map back, as the paper does with 480.
+        resolution: "native" takes the image as it is. "auto" does so up to two megapixels, and
+            scales larger images down to that and the map back: their finest pixels show blur and
+            noise more than structure, and the network needs seconds and gigabytes for them. A
+            number of pixels squashes the image to a square of that side and the map back, as the
+            paper does with 480.
         channels: order of the colours that the network sees. "bgr" is what the paper's
             published code feeds, though the weights were trained on RGB.
 
@@ -29,20 +35,21 @@ class HeatmapOptions:
         OptionError: a value is unknown or out of its range.
     """
 
-    resolution: Literal["native"] | int = "native"
+    resolution: Literal["auto", "native"] | int = "auto"
     channels: Literal["rgb", "bgr"] = "rgb"
 
     def __post_init__(self) -> None:
         if isinstance(self.resolution, str):
-            if self.resolution != "native":
-                raise unknown_name("resolution", self.resolution, ["native", "a number of pixels"])
+            if self.resolution not in ("auto", "native"):
+                known = ["auto", "native", "a number of pixels"]
+                raise unknown_name("resolution", self.resolution, known)
         elif (
             not isinstance(self.resolution, (int, np.integer))
             or self.resolution < 16
             or self.resolution % STRIDE
         ):
             raise OptionError(
-                f"the resolution must be 'native' or a multiple of {STRIDE} from 16 on, "
+                f"the resolution must be 'auto', 'native' or a multiple of {STRIDE} from 16 on, "
                 f"not {self.resolution}"
             )
         if self.channels not in ("rgb", "bgr"):
@@ -79,12 +86,19 @@ def compute_heatmap_and_logits(
     if (rgb == rgb[0, 0]).all():
         return np.zeros((height, width), np.float32), np.full((height, width), -np.inf, np.float32)
     shown = rgb if options.channels == "rgb" else rgb[:, :, ::-1]
-    if options.resolution == "native":
+    whole = height * width <= MAX_AUTO_PIXELS
+    if options.resolution == "native" or (options.resolution == "auto" and whole):
         logits = np.ascontiguousarray(_run(network, _pad(shown))[:height, :width])
         return _sigmoid(logits), logits
-    side = int(options.resolution)
-    squashed = cv2.resize(np.ascontiguousarray(shown), (side, side), interpolation=cv2.INTER_CUBIC)
-    logits = _run(network, squashed)
+    shown = np.ascontiguousarray(shown)
+    if options.resolution == "auto":
+        scale = (MAX_AUTO_PIXELS / (height * width)) ** 0.5
+        size = [max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (width, height)]
+        small = cv2.resize(shown, size, interpolation=cv2.INTER_AREA)
+    else:
+        side = int(options.resolution)
+        small = cv2.resize(shown, (side, side), interpolation=cv2.INTER_CUBIC)
+    logits = _run(network, small)
     heatmap, enlarged = (
         cv2.resize(map_, (width, height), interpolation=cv2.INTER_CUBIC)
         for map_ in (_sigmoid(logits), logits)

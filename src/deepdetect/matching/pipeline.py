@@ -48,7 +48,7 @@ def match_images(
     nms_radius: int | None = None,
     subpixel: bool | None = None,
     ignore: np.ndarray | None = None,
-    resolution: Literal["native"] | int | None = None,
+    resolution: Literal["auto", "native"] | int | None = None,
     channels: Literal["rgb", "bgr"] | None = None,
     descriptor: str | None = None,
     keypoint_size: float | None = None,

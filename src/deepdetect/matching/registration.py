@@ -73,7 +73,7 @@ def register(
     nms_radius: int | None = None,
     subpixel: bool | None = None,
     ignore: np.ndarray | None = None,
-    resolution: Literal["native"] | int | None = None,
+    resolution: Literal["auto", "native"] | int | None = None,
     channels: Literal["rgb", "bgr"] | None = None,
     mutual: bool | None = None,
     seed: int | None = None,

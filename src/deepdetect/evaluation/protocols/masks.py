@@ -161,7 +161,7 @@ def score_at_scale(
         ('normal', 1.0)
     """
     check_scales([scale])
-    native = detector.configured(HeatmapOptions())
+    native = detector.configured(HeatmapOptions("native"))
     found: dict[str, list[tuple[MaskScore, float, float]]] = {}
     for image in images:
         rgb = _scaled(load_image(image), scale)
