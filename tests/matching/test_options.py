@@ -235,7 +235,10 @@ def test_presets_cannot_be_changed_in_place(name: str) -> None:
             lambda: MatchingOptions(guide="fundamental", geometry=GeometryOptions("homography")),
             "the guide fundamental contradicts the model homography",
         ),
-        (lambda: InitialGeometryOptions(ratio=1.2), "`ratio` must lie in [0, 1], not 1.2"),
+        (
+            lambda: InitialGeometryOptions(max_ratios=(0.8, 1.2)),
+            "`max_ratios` must lie in [0, 1], not 1.2",
+        ),
         (lambda: VerificationOptions(keypoint_sizes_px=()), "`keypoint_sizes_px` must be above 0"),
         (lambda: VerificationOptions(false_positive_rate=-0.1), "`false_positive_rate` must lie"),
         (

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -66,12 +67,14 @@ class InitialMatches:
         scales: of the views, at most 1.
         features: SIFT keypoints of the views, with their descriptors.
         matched: (M, 2) positions in both views.
+        ratios: (M,) of the ratio test.
     """
 
     views: tuple[np.ndarray, np.ndarray]
     scales: tuple[float, float]
     features: tuple[Keypoints, Keypoints]
     matched: Points
+    ratios: np.ndarray
 
     @property
     def points0(self) -> np.ndarray:
@@ -111,8 +114,8 @@ def initial_matches(
             of_first = pool.submit(detect_sift, view0, options.sift)
             of_second = detect_sift(view1, options.sift)
             features = of_first.result(), of_second
-    matched = _match(features[0], features[1], options)
-    return InitialMatches((view0, view1), (scale0, scale1), features, matched)
+    points0, points1, ratios = _match(features[0], features[1], options)
+    return InitialMatches((view0, view1), (scale0, scale1), features, (points0, points1), ratios)
 
 
 def find_initial_geometry(
@@ -203,7 +206,8 @@ def geometry_of_seeds(
     scales = [min(1.0, options.max_side_px / max(size)) for size in sizes]
     size = (round(sizes[1][0] * scales[1]), round(sizes[1][1] * scales[1]))
     scaled = (scaled_points(points0, scales[0]), scaled_points(points1, scales[1]))
-    found = _estimate(_separate(*scaled, options.min_separation_px), model, seed, size, options)
+    points = _separate(*scaled, min_separation_px=options.min_separation_px)
+    found = _estimate((points[0], points[1]), model, seed, size, options)
     if found.log10_nfa < options.max_log10_nfa:
         return _upscale(found, scales[0], scales[1])
     return replace(_nothing(found.num_matches), log10_nfa=found.log10_nfa)
@@ -236,14 +240,16 @@ def estimate_initial_geometry(
         raise unknown_name("model", model, ("auto", *MODELS))
     best = _nothing(0)
     num_views = 0
-    for points, views in _more_and_more_matches(initial, options):
+    for points, ratios, views in _more_and_more_matches(initial, options):
         num_views += views
         size = (initial.views[1].shape[1], initial.views[1].shape[0])
-        found = _estimate(points, model, seed, size, options)
-        if found.log10_nfa < best.log10_nfa:
-            best = replace(found, num_views=num_views)
-        if best.log10_nfa < options.max_log10_nfa:
-            return _upscale(best, *initial.scales)
+        for ratio in options.max_ratios:
+            chosen = points[0][ratios < ratio], points[1][ratios < ratio]
+            found = _estimate(chosen, model, seed, size, options)
+            if found.log10_nfa < best.log10_nfa:
+                best = replace(found, num_views=num_views)
+            if best.log10_nfa < options.max_log10_nfa:
+                return _upscale(best, *initial.scales)
         if not simulate_views or (num_views and best.log10_nfa > options.max_hint_log10_nfa):
             break
     return replace(_nothing(best.num_matches), log10_nfa=best.log10_nfa, num_views=num_views)
@@ -275,10 +281,10 @@ def _nothing(num_matches: int) -> InitialGeometry:
 
 def _more_and_more_matches(
     initial: InitialMatches, options: InitialGeometryOptions
-) -> Iterator[tuple[Points, int]]:
-    """Yield matched positions and the number of views simulated for them, up to strong tilts."""
-    points0, points1 = initial.matched
-    yield (points0, points1), 0
+) -> Iterator[tuple[Points, np.ndarray, int]]:
+    """Yield matched positions, ratios and the number of simulated views, up to strong tilts."""
+    (points0, points1), ratios = initial.matched, initial.ratios
+    yield (points0, points1), ratios, 0
     of_view = replace(options.sift, max_keypoints=options.sift.max_keypoints // 2)
     for tilt in options.tilts:
         views = 0
@@ -289,33 +295,41 @@ def _more_and_more_matches(
                 found = _match(seen, other, options)
                 points0 = np.concatenate([points0, found[side]])
                 points1 = np.concatenate([points1, found[1 - side]])
+                ratios = np.concatenate([ratios, found[2]])
                 views += 1
-        points0, points1 = _separate(points0, points1, options.min_separation_px)
-        yield (points0, points1), views
+        separate = partial(_separate, min_separation_px=options.min_separation_px)
+        points0, points1, ratios = separate(points0, points1, ratios)
+        yield (points0, points1), ratios, views
 
 
-def _match(first: Keypoints, second: Keypoints, options: InitialGeometryOptions) -> Points:
+def _match(
+    first: Keypoints, second: Keypoints, options: InitialGeometryOptions
+) -> tuple[np.ndarray, ...]:
+    """Return matched positions in both images, and the ratios of the ratio test."""
     assert first.descriptors is not None
     assert second.descriptors is not None
     found = match_descriptors(
         first.descriptors,
         second.descriptors,
         get_matcher("exact"),
-        ratio=options.ratio,
+        ratio=max(options.max_ratios),
         mutual=True,
     )
     points0, points1 = first.xy[found.rows0], second.xy[found.rows1]
-    return _separate(points0, points1, options.min_separation_px)
+    return _separate(points0, points1, found.ratios, min_separation_px=options.min_separation_px)
 
 
-def _separate(points0: np.ndarray, points1: np.ndarray, min_separation_px: float) -> Points:
-    """Keep each place once in each image: one corner in many views is no further evidence."""
+def _separate(*matches: np.ndarray, min_separation_px: float) -> tuple[np.ndarray, ...]:
+    """Keep each place once in each image: one corner in many views is no further evidence.
+
+    The first two arrays are the positions in both images; others are kept like them.
+    """
     for side in (0, 1):
-        places = np.rint((points0, points1)[side] / min_separation_px)
+        places = np.rint(matches[side] / min_separation_px)
         _, kept = np.unique(places, axis=0, return_index=True)
         kept.sort()
-        points0, points1 = points0[kept], points1[kept]
-    return points0, points1
+        matches = tuple(values[kept] for values in matches)
+    return matches
 
 
 def _estimate(

@@ -36,7 +36,8 @@ class InitialGeometryOptions:
         sift: the keypoints of each image.
         simulated_side_px, simulated_max_keypoints: side and keypoints of images of which views are
             simulated; each view gets half as many keypoints.
-        ratio: of the ratio test.
+        max_ratios: of the ratio test, in the order in which they are tried: fewer matches with fewer
+            wrong ones among them may show what more do not.
         min_separation_px: matches that begin or end nearer together than this count as one.
         homography_threshold_px, fundamental_threshold_px: matches within this agree with a model,
             in pixels of the scaled images.
@@ -63,7 +64,7 @@ class InitialGeometryOptions:
     simulated_side_px: int = 320
     simulated_max_keypoints: int = 1000
     sift: SiftOptions = field(default_factory=SiftOptions)
-    ratio: float = 0.85
+    max_ratios: tuple[float, ...] = (0.85, 0.8)
     min_separation_px: float = 2.0
     homography_threshold_px: float = 3.0
     fundamental_threshold_px: float = 1.5
@@ -82,7 +83,7 @@ class InitialGeometryOptions:
                 *("homography_threshold_px", "fundamental_threshold_px", "first_max_keypoints"),
                 "simulated_max_keypoints",
             ),
-            fractions=("ratio", "min_first_fraction", "max_first_parallax"),
+            fractions=("max_ratios", "min_first_fraction", "max_first_parallax"),
             between={"max_log10_nfa": (-math.inf, 0)},
         )
 
