@@ -16,9 +16,8 @@ from deepdetect import (
 from deepdetect._shared.options import option_names, replace_options
 from deepdetect.matching.guided import GuidedOptions
 from deepdetect.matching.guided.options import (
-    EpipolarMatchingOptions,
     InitialGeometryOptions,
-    PrewarpOptions,
+    RectifiedMatchingOptions,
     VerificationOptions,
 )
 from deepdetect.matching.options import PRESETS, get_preset
@@ -237,15 +236,18 @@ def test_presets_cannot_be_changed_in_place(name: str) -> None:
         ),
         (
             lambda: InitialGeometryOptions(max_ratios=(0.8, 1.2)),
-            "`max_ratios` must lie in [0, 1], not 1.2",
+            "`max_ratios` must lie in [0, 1], not (0.8, 1.2)",
         ),
         (lambda: VerificationOptions(keypoint_sizes_px=()), "`keypoint_sizes_px` must be above 0"),
         (lambda: VerificationOptions(false_positive_rate=-0.1), "`false_positive_rate` must lie"),
         (
-            lambda: EpipolarMatchingOptions(max_cycle_error_px=0),
-            "`max_cycle_error_px` must be above",
+            lambda: RectifiedMatchingOptions(max_round_trip_px=0),
+            "`max_round_trip_px` must be above",
         ),
-        (lambda: PrewarpOptions(max_anisotropy=float("nan")), "`max_anisotropy` must be above 0"),
+        (
+            lambda: RectifiedMatchingOptions(max_row_error_px=float("nan")),
+            "`max_row_error_px` must be above 0",
+        ),
         (lambda: GuidedOptions(min_matched_fraction=2), "`min_matched_fraction` must lie"),
     ],
 )

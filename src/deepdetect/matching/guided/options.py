@@ -1,9 +1,8 @@
 """Every tuned number of guided matching, with its unit.
 
 The bounds of the verification and the sizes of its windows were chosen on nine pairs of Oxford,
-with parts of their second images covered; those along epipolar lines on Middlebury's cones, teddy
-and art, as they are and rotated (docs/matching.md); what tells a plane from depth, on all of
-Oxford and Middlebury, Strecha's fountain and a KITTI clip.
+with parts of their second images covered; what tells a plane from depth, and the values of matching
+by rectification, on all of Oxford and Middlebury, Strecha's fountain and a KITTI clip.
 """
 
 from __future__ import annotations
@@ -36,8 +35,8 @@ class InitialGeometryOptions:
         sift: the keypoints of each image.
         simulated_side_px, simulated_max_keypoints: side and keypoints of images of which views are
             simulated; each view gets half as many keypoints.
-        max_ratios: of the ratio test, in the order in which they are tried: fewer matches with fewer
-            wrong ones among them may show what more do not.
+        max_ratios: of the ratio test, in the order in which they are tried: fewer matches, with
+            fewer wrong ones among them, may show what more do not.
         min_separation_px: matches that begin or end nearer together than this count as one.
         homography_threshold_px, fundamental_threshold_px: matches within this agree with a model,
             in pixels of the scaled images.
@@ -175,66 +174,6 @@ class HomographyMatchingOptions:
 
 
 @dataclass(frozen=True)
-class EpipolarMatchingOptions:
-    """How keypoints are matched along epipolar lines.
-
-    Attributes:
-        keypoint_size_px: diameter of the keypoints of the descriptors: small, as depth jumps
-            within a large one.
-        max_epipolar_distance_px: from the epipolar line to a partner.
-        max_cycle_error_px: from a keypoint to the best partner of its best partner. Dense
-            keypoints have equally good neighbours, so it need not be 0.
-        false_positive_rate: fraction of random pairs whose descriptors are similar enough to pass.
-        null_pairs: number of random pairs that this is measured on.
-        motion_window_px: side of the window in which matches must move consistently, odd.
-        max_motion_difference_px: by which the motions of neighbours may differ, in x and in y.
-        min_motion_support: fraction of the matches in the window that must move so.
-        density_window_px: side of the window around a match in which keypoints must be matched,
-            odd.
-        min_match_density: fraction of the keypoints in the window that must be matched.
-        min_relative_density: of the median of these shares, where that is less: scattered
-            keypoints are matched less often.
-        max_refits: the fundamental matrix is estimated again from the dense matches at most this
-            often,
-        min_refit_gain: as long as each new one gives this fraction of further matches.
-        refit_threshold_px: inlier threshold of these estimates.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    keypoint_size_px: float = 2.0
-    max_epipolar_distance_px: float = 1.5
-    max_cycle_error_px: float = 1.0
-    false_positive_rate: float = 0.02
-    null_pairs: int = 20_000
-    motion_window_px: int = 15
-    max_motion_difference_px: float = 1.5
-    min_motion_support: float = 0.8
-    density_window_px: int = 31
-    min_match_density: float = 0.35
-    min_relative_density: float = 0.5
-    max_refits: int = 2
-    min_refit_gain: float = 0.01
-    refit_threshold_px: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=(
-                *("keypoint_size_px", "max_epipolar_distance_px", "max_cycle_error_px"),
-                *("null_pairs", "motion_window_px", "max_motion_difference_px"),
-                *("density_window_px", "refit_threshold_px"),
-            ),
-            not_negative=("max_refits",),
-            fractions=(
-                *("false_positive_rate", "min_motion_support", "min_match_density"),
-                *("min_relative_density", "min_refit_gain"),
-            ),
-        )
-
-
-@dataclass(frozen=True)
 class RectifiedMatchingOptions:
     """How a pair is rectified by a fundamental matrix and its rows are matched.
 
@@ -262,7 +201,8 @@ class RectifiedMatchingOptions:
         refit_window_px: side of the windows in which they are tracked, odd.
         max_round_trip_px: a track counts when it ends this near to its start, forth and back.
         max_track_px: a track that moves further than this from its match is wrong.
-        min_tracks: that a matrix is estimated from.
+        min_tracks: that a matrix is estimated from; where fewer corners can be tracked to where
+            they are matched, no match counts.
         refit_threshold_px: inlier threshold of the estimate.
 
     Raises:
@@ -311,35 +251,6 @@ class RectifiedMatchingOptions:
 
 
 @dataclass(frozen=True)
-class PrewarpOptions:
-    """When and how a second image is warped by an affinity before it is matched.
-
-    Attributes:
-        min_deviation: an affinity matters when it moves a point by more than this fraction of its
-            distance from another. The floor shears rectified pairs by less (0.13 on art), and so
-            small a rotation costs fewer matches than the warp; 12 degrees cost most of them.
-        max_anisotropy: an affinity that stretches one direction by more than this factor, relative
-            to the other or in all, is not trusted.
-        frame_margin: fraction of the sides of the first image by which the warped image may extend
-            beyond it: parallax moves points there. It bounds the memory.
-        max_distance_px: a pixel of the warped image stands for a keypoint nearer than this, in
-            pixels of the second image.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    min_deviation: float = 0.15
-    max_anisotropy: float = 6.0
-    frame_margin: float = 0.25
-    max_distance_px: float = 1.0
-
-    def __post_init__(self) -> None:
-        names = "min_deviation", "max_anisotropy", "frame_margin", "max_distance_px"
-        check_ranges(self, positive=names)
-
-
-@dataclass(frozen=True)
 class GuidedOptions:
     """All tuned numbers of guided matching.
 
@@ -347,8 +258,6 @@ class GuidedOptions:
         initial_geometry: the geometry that guides at first.
         homography_matching: planes and rotating cameras.
         rectified_matching: scenes with depth.
-        epipolar_matching: scenes with depth that cannot be rectified.
-        prewarp: second images that are rotated, zoomed or sheared, of scenes with depth.
         verification: when two patches count as the same.
         min_matched_fraction: with a smaller fraction of the keypoints of a scene with depth
             matched, only the sparse matches that agree with its geometry are taken.
@@ -363,8 +272,6 @@ class GuidedOptions:
         default_factory=HomographyMatchingOptions
     )
     rectified_matching: RectifiedMatchingOptions = field(default_factory=RectifiedMatchingOptions)
-    epipolar_matching: EpipolarMatchingOptions = field(default_factory=EpipolarMatchingOptions)
-    prewarp: PrewarpOptions = field(default_factory=PrewarpOptions)
     verification: VerificationOptions = field(default_factory=VerificationOptions)
     min_matched_fraction: float = 0.02
     min_matches: int = 8

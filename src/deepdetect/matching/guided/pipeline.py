@@ -1,8 +1,7 @@
 """Guided matching: an initial geometry, refined, then all keypoints where it predicts them.
 
 Geometry only proposes. A pair is kept when its patches are the same once the geometry is taken out
-(`verification`); when it is the best on its row in both images (`rectified`); or when it is
-similar, moves like its neighbours and lies among other matches (`epipolar`).
+(`verification`), or when it is the best on its row in both images (`rectified`).
 """
 
 from __future__ import annotations
@@ -13,8 +12,6 @@ import numpy as np
 
 from ...features.matchers import DescriptorMatches
 from ...features.matches import Guide, GuidedMatches
-from ...geometry import GeometryOptions, estimate_geometry
-from .epipolar import match_along_epipolar_lines
 from .homography import (
     ImagePair,
     match_by_homography,
@@ -28,7 +25,6 @@ from .initial_geometry import (
     geometry_of_seeds,
 )
 from .options import GuidedOptions
-from .prewarp import estimate_affinity, prewarp
 from .rectified import match_by_rectification
 
 
@@ -80,10 +76,6 @@ def guided_matches(
         return _no_guide(first), None
     if found is None:
         matrix, found = _match_scene_with_depth(pair, first, options, seed)
-        if len(found) < enough:
-            # Too little around them is alike; the sparse matches are distinct, and agree.
-            assert first.matrix is not None
-            matrix, found = first.matrix, _sparse_matches(pair, first)
     if len(found) < options.min_matches:
         return _no_guide(first), None
     return _guide(first, matrix), found
@@ -112,9 +104,11 @@ def _match_plane(
 def _match_scene_with_depth(
     pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
 ) -> tuple[np.ndarray, GuidedMatches]:
-    """Match by rectification; along epipolar lines where the pair cannot be rectified."""
+    """Match by rectification; where that finds too little, return the sparse matches that agree.
+
+    Then too little around them is alike, but they themselves are distinct, and agree.
+    """
     assert first.matrix is not None
-    rectified = options.rectified_matching
     found = match_by_rectification(
         pair.gray0,
         pair.gray1,
@@ -122,13 +116,13 @@ def _match_scene_with_depth(
         first.points0,
         first.points1,
         first.matrix,
-        rectified,
+        options.rectified_matching,
         seed,
     )
-    if found is not None:
-        return found
-    matrix, searched = _search_epipolar_lines(pair, first, options, seed)
-    return matrix, _at_keypoints(pair, searched)
+    enough = options.min_matched_fraction * min(len(pair.xy0), len(pair.xy1))
+    if found is None or len(found[1]) < enough:
+        return first.matrix, _sparse_matches(pair, first)
+    return found
 
 
 def _sparse_matches(pair: ImagePair, first: InitialGeometry) -> GuidedMatches:
@@ -142,39 +136,6 @@ def _sparse_matches(pair: ImagePair, first: InitialGeometry) -> GuidedMatches:
     )
     order = np.unique(found.rows0, return_index=True)[1]
     return GuidedMatches(found.rows0[order], found.points1[order], found.scores[order])
-
-
-def _search_epipolar_lines(
-    pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
-) -> tuple[np.ndarray, DescriptorMatches]:
-    """Match along epipolar lines; estimate them again while that gives more matches.
-
-    The second image is aligned with the first where it is not already.
-    """
-    epipolar = options.epipolar_matching
-    affinity = estimate_affinity(first.points0, first.points1, options.prewarp)
-    aligned = None if affinity is None else prewarp(pair, affinity, options.prewarp)
-
-    def match(fundamental: np.ndarray) -> DescriptorMatches:
-        if aligned is None:
-            return match_along_epipolar_lines(pair, fundamental, epipolar, seed)
-        warped = aligned.fundamental(fundamental)
-        return aligned.original(match_along_epipolar_lines(aligned.pair, warped, epipolar, seed))
-
-    assert first.matrix is not None
-    best, found = first.matrix, match(first.matrix)
-    refit = GeometryOptions(
-        model="fundamental", inlier_threshold=epipolar.refit_threshold_px, seed=seed
-    )
-    for _ in range(epipolar.max_refits):
-        matrix = estimate_geometry(pair.xy0[found.rows0], pair.xy1[found.rows1], refit).matrix
-        if matrix is None:
-            break
-        again = match(matrix)
-        if len(again) <= len(found) * (1 + epipolar.min_refit_gain):
-            break
-        best, found = matrix, again
-    return best, found
 
 
 def _at_keypoints(pair: ImagePair, found: DescriptorMatches) -> GuidedMatches:

@@ -76,13 +76,11 @@ def match_by_rectification(
 
     Returns:
         The fundamental matrix that rectified the pair, and the matches; None where it cannot be
-        rectified.
+        rectified, or too few corners can be tracked from one image to where they are matched.
     """
     view = _rectify(gray0, gray1, points0, points1, fundamental, options)
+    tracks = None if view is None else _track(view, options)
     for _ in range(options.max_refits):
-        if view is None:
-            return None
-        tracks = _track(view, options)
         if tracks is None or np.median(np.abs(tracks[2])) < options.max_row_error_px:
             break
         refit = GeometryOptions(
@@ -95,10 +93,10 @@ def match_by_rectification(
         again = _rectify(
             gray0, gray1, tracks[0][inliers], tracks[1][inliers], found.matrix, options
         )
-        if again is None or _matched(again) < _matched(view):
+        if view is None or again is None or _matched(again) < _matched(view):
             break
-        view, fundamental = again, found.matrix
-    if view is None:
+        view, fundamental, tracks = again, found.matrix, _track(again, options)
+    if view is None or tracks is None:
         return None
     rows, places, scores = _sample(view, xy0)
     height, width = gray1.shape
