@@ -114,10 +114,12 @@ def estimate_relative_pose(
     )
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    geometry = estimate_geometry(points0, points1, essential)
+    every = -(-len(points0) // options.max_matches) if refine and len(points0) else 1
+    geometry = estimate_geometry(points0[::every], points1[::every], essential)
     if geometry.matrix is None or not geometry.inliers.any():
         return None
-    kept = geometry.inliers
+    kept = np.zeros(len(points0), bool)
+    kept[::every] = geometry.inliers
     inliers = points0[kept], points1[kept]
     pose = _best_of_four(geometry.matrix, *inliers, calibration, options.max_matches)
     for _ in range(options.max_refits if refine else 0):
@@ -132,7 +134,9 @@ def estimate_relative_pose(
     kept = errors < inlier_threshold
     if not kept.any():
         return None
-    ratio = _cheirality_ratio(points0[kept], points1[kept], calibration, *pose)
+    sample = np.flatnonzero(kept)
+    sample = sample[:: -(-len(sample) // options.max_matches)]
+    ratio = _cheirality_ratio(points0[sample], points1[sample], calibration, *pose)
     return RelativePose(*pose, inliers=kept, errors=errors, cheirality_ratio=ratio)
 
 

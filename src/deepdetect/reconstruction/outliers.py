@@ -27,6 +27,9 @@ from ..geometry.windows import window_sums
 FLANN_INDEX_KDTREE_SINGLE = 4
 """FLANN's number of the kd-tree that is exact in few dimensions."""
 
+QUERIES = 200_000
+"""Points whose neighbours are looked up at a time, to bound the memory."""
+
 
 @dataclass(frozen=True)
 class PointFilterOptions:
@@ -153,9 +156,13 @@ def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
     centred = np.ascontiguousarray(points - points.mean(0), np.float32)
     count = min(neighbors + 1, len(points))
     tree = cv2.flann_Index(centred, {"algorithm": FLANN_INDEX_KDTREE_SINGLE, "leaf_max_size": 10})
-    _, squares = tree.knnSearch(centred, count, params={"checks": -1})
-    # The nearest is the point itself, or one in the same place.
-    return np.sqrt(squares[:, 1:].astype(np.float64)).mean(1)
+    means = np.empty(len(centred))
+    for start in range(0, len(centred), QUERIES):
+        some = centred[start : start + QUERIES]
+        _, squares = tree.knnSearch(some, count, params={"checks": -1})
+        # The nearest is the point itself, or one in the same place.
+        means[start : start + QUERIES] = np.sqrt(squares[:, 1:].astype(np.float64)).mean(1)
+    return means
 
 
 def disparity_space(

@@ -14,6 +14,7 @@ by 14 degrees (84 %) 62 / 79 % (parabola 31 / 59 %; before 9 / 29 %).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -36,6 +37,8 @@ class SubpixelOptions:
         min_correlation: of both patches at the end; a match below it has not converged.
         convergence_px: a smaller step ends the alignment.
         coarse_convergence_px: the same in the first alignment, which only serves the second.
+        min_pixels_of_lattice: with more matches than this only those in every second row and column
+            are aligned before.
         affinity_window_px: side of the window whose matches give a patch its affinity.
         affinity_regularization: matches spread over the window that the similarity of all counts
             for beside those in it: few, or those on one line, give no affinity of their own.
@@ -52,6 +55,7 @@ class SubpixelOptions:
     min_correlation: float = 0.8
     convergence_px: float = 0.01
     coarse_convergence_px: float = 0.05
+    min_pixels_of_lattice: int = 1_000_000
     affinity_window_px: int = 15
     affinity_regularization: float = 20.0
     max_similarity_samples: int = 5000
@@ -64,11 +68,18 @@ class SubpixelOptions:
                 *("coarse_convergence_px", "affinity_window_px", "affinity_regularization"),
                 "max_similarity_samples",
             ),
+            not_negative=("min_pixels_of_lattice",),
             between={"patch_radius_px": (1, 31), "min_correlation": (-1, 1)},
         )
 
 
 DEFAULTS = SubpixelOptions()
+
+MATCHES_OF_BAND = 500_000
+"""At a time, to bound the memory."""
+
+COARSE_STEP_PX = 2
+"""Between the rows and columns of the matches that are aligned before the others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,13 +149,43 @@ def refine_matches(
         return RefinedMatches(start, known, np.zeros(0, np.float32))
     images = gray0.astype(np.float32), gray1.astype(np.float32)
     overall = similarity(pixels0, start, options.max_similarity_samples)
-    affinities = np.broadcast_to(overall, (len(pixels0), 2, 2))
+    result = RefinedMatches(start.copy(), np.zeros(len(start), bool), np.zeros(len(start), "f4"))
+    step = COARSE_STEP_PX if len(pixels0) > options.min_pixels_of_lattice else 1
+    # In bands of rows, for which the memory is small; neighbours beyond their edges are seen, too.
+    rows = pixels0[:, 1]
+    edges = np.quantile(rows, np.linspace(0, 1, -(-len(rows) // MATCHES_OF_BAND) + 1))
+    edges[-1] += 1
+    for top, bottom in pairwise(np.ceil(edges).astype(np.int64).tolist()):
+        reach = options.affinity_window_px // 2
+        near = np.flatnonzero((rows >= top - reach) & (rows < bottom + reach))
+        own = (rows[near] >= top) & (rows[near] < bottom)
+        found = _refine_band(images, pixels0[near], start[near], own, overall, step, options)
+        result.points1[near[own]] = found.points1
+        result.converged[near[own]] = found.converged
+        result.correlation[near[own]] = found.correlation
+    return result
+
+
+def _refine_band(
+    images: tuple[np.ndarray, np.ndarray],
+    pixels0: np.ndarray,
+    start: np.ndarray,
+    own: np.ndarray,
+    overall: np.ndarray,
+    step_px: int,
+    options: SubpixelOptions,
+) -> RefinedMatches:
+    """Refine those of the matches, (N,) bool, that a band of the image owns."""
+    # How patches are deformed can be seen on some of them, where they are many.
+    some = np.flatnonzero((pixels0 % step_px == 0).all(axis=1))
+    affinities = np.broadcast_to(overall, (len(some), 2, 2))
     coarse = options.coarse_convergence_px
-    found = _align(images, pixels0, start, affinities, options, coarse)
-    affinities = local_affinities(
-        pixels0, found.points1, found.converged, gray0.shape, overall, options
-    )
-    return _align(images, pixels0, found.points1, affinities, options, options.convergence_px)
+    found = _align(images, pixels0[some], start[some], affinities, options, coarse)
+    start, converged = start.copy(), np.zeros(len(start), bool)
+    start[some], converged[some] = found.points1, found.converged
+    shape = images[0].shape
+    affinities = local_affinities(pixels0, start, converged, shape, overall, options)[own]
+    return _align(images, pixels0[own], start[own], affinities, options, options.convergence_px)
 
 
 def similarity(
