@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect import OptionError
+from deepdetect.reconstruction import outliers
 from deepdetect.reconstruction.outliers import (
     PointFilterOptions,
     disparity_space,
@@ -47,6 +48,13 @@ def test_distances_are_those_of_scipy_on_a_surface() -> None:
     np.testing.assert_allclose(
         mean_neighbor_distances(space, 16), expected[:, 1:].mean(1), rtol=1e-3
     )
+
+
+def test_many_points_are_looked_up_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(0).random((1000, 3))
+    whole = mean_neighbor_distances(points, 8)
+    monkeypatch.setattr(outliers, "QUERIES", 300)
+    np.testing.assert_array_equal(mean_neighbor_distances(points, 8), whole)
 
 
 def test_points_astray_are_found_near_and_far_in_disparity_space_only() -> None:

@@ -120,6 +120,30 @@ def test_the_number_of_threads_does_not_matter(
     np.testing.assert_array_equal(many.converged, one.converged)
 
 
+def test_bands_of_rows_do_not_matter(
+    gray: np.ndarray, pixels: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    second = moved(gray, 0.4, -0.3)
+    whole = refine_matches(gray, second, pixels, pixels.astype(float))
+    monkeypatch.setattr(subpixel, "MATCHES_OF_BAND", len(pixels) // 5)
+    banded = refine_matches(gray, second, pixels, pixels.astype(float))
+    np.testing.assert_array_equal(banded.converged, whole.converged)
+    np.testing.assert_allclose(banded.points1, whole.points1, atol=1e-3)
+    assert whole.converged.mean() > 0.5
+
+
+def test_of_very_many_matches_some_tell_how_patches_are_deformed(
+    gray: np.ndarray, pixels: np.ndarray
+) -> None:
+    second = moved(gray, 0.4, -0.3)
+    start = pixels.astype(float)
+    every = refine_matches(gray, second, pixels, start)
+    some = refine_matches(gray, second, pixels, start, SubpixelOptions(min_pixels_of_lattice=0))
+    both = every.converged & some.converged
+    assert both.mean() > 0.9 * every.converged.mean()
+    assert np.median(np.abs(some.points1 - every.points1)[both]) < 0.01
+
+
 def test_no_matches_and_few(gray: np.ndarray) -> None:
     assert len(refine_matches(gray, gray, *np.empty((2, 0, 2))).points1) == 0
     for count in (1, 2, 3):

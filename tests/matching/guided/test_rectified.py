@@ -105,6 +105,13 @@ def test_a_geometry_that_is_off_is_estimated_again(cones) -> None:
     assert rows[1] < 0.3 * rows[0]
 
 
+def test_without_tracked_corners_no_match_counts(cones) -> None:
+    gray0, gray1, _ = cones
+    xy = every_second(gray0)
+    assert match(gray0, gray1, xy) is not None
+    assert match(gray0, gray1, xy, min_tracks=1_000_000) is None
+
+
 def test_too_few_sparse_matches_give_no_frame(cones) -> None:
     left, right, _ = cones
     few = np.zeros((5, 2))
