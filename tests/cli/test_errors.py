@@ -189,11 +189,11 @@ def test_a_full_disk_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.Mon
     save_keypoints(keypoints, path)
     before = path.read_bytes()
 
-    def write_half(file: BinaryIO, **arrays: np.ndarray) -> None:
+    def write_half(file: BinaryIO, array: np.ndarray, **options: object) -> None:
         file.write(b"half")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(np, "savez_compressed", write_half)
+    monkeypatch.setattr(np.lib.format, "write_array", write_half)
     with pytest.raises(DeepDetectError, match="No space left"):
         save_keypoints(keypoints, path)
     assert path.read_bytes() == before

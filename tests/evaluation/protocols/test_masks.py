@@ -30,7 +30,7 @@ class Labels:
         self.sizes: list[tuple[int, int]] = []
 
     def configured(self, options: HeatmapOptions) -> Labels:
-        assert options == HeatmapOptions(), "native resolution"
+        assert options == HeatmapOptions("native")
         return self
 
     def heatmap(self, rgb: np.ndarray) -> np.ndarray:

@@ -83,7 +83,10 @@ class InitialGeometryOptions:
                 "simulated_max_keypoints",
             ),
             fractions=("max_ratios", "min_first_fraction", "max_first_parallax"),
-            between={"max_log10_nfa": (-math.inf, 0)},
+            between={
+                "max_log10_nfa": (-math.inf, 0),
+                "max_hint_log10_nfa": (-math.inf, math.inf),
+            },
         )
 
     def threshold_px(self, model: str) -> float:
