@@ -45,22 +45,27 @@ def match_by_homography(
 
     Returns:
         The matches, their ratios the `dissimilarity` of their patches, under 1; and the fraction
-        with the same patches of all keypoints of the first image that the second one shows under
-        the homography, whether there is a keypoint or not. Each keypoint of the first image is
-        matched once at most, those of the second image perhaps more often.
+        with the same patches of the pairs that the homography proposes, or, where keypoints are
+        few, of all keypoints of the first image that the second one shows under it. Each keypoint
+        of the first image is matched once at most, those of the second image perhaps more often.
     """
     gray0, gray1 = pair.gray0, pair.gray1
     places = transform_points(pair.xy0, homography)
     rows1, distances = nearest_keypoint(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
     with np.errstate(invalid="ignore"):
         shown = (places > -0.5) & (places < np.array(gray1.shape[::-1]) - 0.5)
+    near = distances < options.max_distance_px
     rows0 = np.flatnonzero(shown.all(axis=1))
+    proposed = np.flatnonzero(near)
+    # Where keypoints are few it is chance which of them have another there: all are judged.
+    if len(proposed) >= options.min_proposed_fraction * len(rows0):
+        rows0 = proposed
     if not len(rows0):
         return DescriptorMatches(rows0, rows0, np.empty(0, np.float32)), 0.0
     warped, valid = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
     ratios = dissimilarity(gray0, warped, valid, pair.xy0[rows0], verification, seed)
     same = ratios < 1
-    kept = same & (distances[rows0] < options.max_distance_px)
+    kept = same & near[rows0]
     matched = rows0[kept]
     return DescriptorMatches(matched, rows1[matched], ratios[kept]), float(same.mean())
 

@@ -146,9 +146,10 @@ class HomographyMatchingOptions:
             scaled down to the other for the refinement.
         refinement: how it is refined.
         max_distance_px: from where the homography takes a keypoint to its partner.
-        min_verified_fraction: of the keypoints that the second image shows under the homography,
-            this fraction must have the same patches there: with fewer, little of the scene lies on
-            the plane.
+        min_proposed_fraction: where fewer of the keypoints that the second image shows under the
+            homography have a partner there, keypoints are few, and all of them are verified.
+        min_verified_fraction: this fraction of what is verified must be the same patches: with
+            less, little of the scene lies on the plane.
         min_verified_fraction_of_depth: the same where matches off the plane agree on an epipole.
         min_parallax_fraction: as many must agree, relative to those on the plane.
 
@@ -160,6 +161,7 @@ class HomographyMatchingOptions:
     max_scale_ratio: float = 1.5
     refinement: ValidatedRefinementOptions = field(default_factory=ValidatedRefinementOptions)
     max_distance_px: float = 1.0
+    min_proposed_fraction: float = 0.25
     min_verified_fraction: float = 0.5
     min_verified_fraction_of_depth: float = 0.6
     min_parallax_fraction: float = 0.1
@@ -171,7 +173,7 @@ class HomographyMatchingOptions:
             between={"max_scale_ratio": (1, math.inf)},
             fractions=(
                 *("min_verified_fraction", "min_verified_fraction_of_depth"),
-                "min_parallax_fraction",
+                *("min_parallax_fraction", "min_proposed_fraction"),
             ),
         )
 
