@@ -80,7 +80,7 @@ def test_a_turn_is_followed(gray: np.ndarray, pixels: np.ndarray) -> None:
 def test_real_matches_come_nearer_to_the_truth(
     turned: Any, turned_matches: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    points0, points1 = turned_matches
+    points0, points1 = turned_matches[0], np.rint(turned_matches[1])
     true = turned.match(points0)
     known = np.isfinite(true).all(1)
     found = refine_matches(*turned.grays, points0, points1)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ from deepdetect.matching.guided import verification
 from deepdetect.matching.guided.options import VerificationOptions
 from deepdetect.matching.guided.verification import (
     DESCRIPTOR_REACH,
+    NullPairs,
     dissimilarity,
     index_map,
     sample_null_pairs,
@@ -200,15 +203,18 @@ def test_what_is_known_of_the_unmoved_image_is_not_described_again_and_the_same(
     gray = cv2.resize(luma(photo), (300, 240))
     pixels, second = edges(gray), seen_again(np.roll(gray, 40, 1))
     second[:, :200] = seen_again(gray)[:, :200]
-    found = {}
-    for edge in (
-        verification.DESCRIPTOR_REACH,
-        10_000,
-        0,
-    ):  # beyond the image: all moved images are described
-        monkeypatch.setattr(verification, "DESCRIPTOR_REACH", edge)
-        found[edge] = dissimilarity(gray, second, everywhere(gray), pixels)
-    real, plain, none = found.values()
+    found = [dissimilarity(gray, second, everywhere(gray), pixels)]
+    for interior in (False, True):
+
+        def sample(*arguments: Any, interior: bool = interior) -> list[NullPairs]:
+            return [
+                replace(null, interior=np.full(len(null.rows), interior))
+                for null in sample_null_pairs(*arguments)
+            ]
+
+        monkeypatch.setattr(verification, "sample_null_pairs", sample)
+        found.append(dissimilarity(gray, second, everywhere(gray), pixels))
+    real, plain, none = found  # as it is; all described in moved images; none
     assert 0.3 < (plain < 1).mean() < 0.95
     np.testing.assert_array_equal(np.isinf(real), np.isinf(plain))
     some = np.isfinite(plain)
