@@ -14,20 +14,25 @@ import numpy as np
 MAX_LOG10_NFA = -6.0
 """A geometry is accepted below this decimal logarithm of its number of false alarms."""
 
-MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7}
+MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 """Matches that determine a model."""
 
 
 def log10_nfa(
-    errors: np.ndarray, model: str, inlier_threshold: float, image_size: tuple[int, int]
+    errors: np.ndarray,
+    model: str,
+    inlier_threshold: float,
+    image_size: tuple[int, int],
+    models_per_sample: int = 1,
 ) -> float:
     """Return the decimal logarithm of the number of false alarms.
 
     Args:
         errors: (M,) distances of all matches from the model, in pixels of the second image.
-        model: "homography" or "fundamental".
+        model: "homography", "fundamental" or "essential".
         inlier_threshold: in pixels; matches nearer than this are the inliers.
         image_size: (width, height) of the second image.
+        models_per_sample: that were tried for each minimal sample.
 
     Returns:
         Below 0 for what chance does not explain; infinite when there are too few inliers.
@@ -48,7 +53,8 @@ def log10_nfa(
         chance = pi * inlier_threshold**2 / (width * height)
     else:  # a band along a line through the image
         chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
-    tests = log(count - sample) + log_binomial(count, inliers) + log_binomial(inliers, sample)
+    tests = log(models_per_sample * (count - sample))
+    tests += log_binomial(count, inliers) + log_binomial(inliers, sample)
     return (tests + (inliers - sample) * log(min(chance, 1.0))) / log(10)
 
 

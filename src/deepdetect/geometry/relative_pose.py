@@ -10,7 +10,7 @@ import numpy as np
 from .._shared.options import check_ranges
 from .camera import Calibration
 from .estimation import GeometryOptions, estimate_geometry
-from .residuals import epipolar_errors
+from .residuals import epipolar_errors, signed_epipolar_errors
 from .triangulation import fundamental_matrix, triangulate
 
 
@@ -121,7 +121,7 @@ def estimate_relative_pose(
     kept = np.zeros(len(points0), bool)
     kept[::every] = geometry.inliers
     inliers = points0[kept], points1[kept]
-    pose = _best_of_four(geometry.matrix, *inliers, calibration, options.max_matches)
+    pose = best_of_four(geometry.matrix, *inliers, calibration, options.max_matches)
     for _ in range(options.max_refits if refine else 0):
         inliers = points0[kept], points1[kept]
         pose = refine_pose(*inliers, calibration, *pose, scale_px=inlier_threshold, options=options)
@@ -167,7 +167,7 @@ def refine_pose(
     points0, points1 = points0[::every], points1[::every]
 
     def residuals(pose: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        return _signed_errors(points0, points1, fundamental_matrix(calibration, *pose))
+        return signed_epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
 
     def cost(values: np.ndarray) -> float:
         return float(np.log1p((values / (scale_px / 2)) ** 2).sum())
@@ -177,13 +177,13 @@ def refine_pose(
     best = cost(here)
     for _ in range(options.max_iterations):
         step = options.derivative_step
-        varied = (residuals(_moved(pose, axis)) for axis in np.eye(5) * step)
+        varied = (residuals(moved_pose(pose, axis)) for axis in np.eye(5) * step)
         slopes = np.column_stack([(there - here) / step for there in varied])
         weights = 1 / (1 + (here / (scale_px / 2)) ** 2)
         normal = slopes.T @ (slopes * weights[:, None])
         change = -np.linalg.lstsq(normal, slopes.T @ (weights * here), rcond=None)[0]
         while np.abs(change).max() > options.min_change:
-            there = _moved(pose, change)
+            there = moved_pose(pose, change)
             values = residuals(there)
             if cost(values) < best:
                 break
@@ -194,10 +194,13 @@ def refine_pose(
     return pose
 
 
-def _moved(
+def moved_pose(
     pose: tuple[np.ndarray, np.ndarray], change: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate the rotation by three small angles, and the translation by two across itself."""
+    """Return a pose near another: a change of 5 angles in radians.
+
+    Three rotate the rotation, two move the translation, of length 1, across itself.
+    """
     rotation, translation = pose
     small = cv2.Rodrigues(np.asarray(change[:3], np.float64))[0]
     least = np.eye(3)[np.abs(translation).argmin()]
@@ -207,22 +210,24 @@ def _moved(
     return small @ rotation, moved / np.linalg.norm(moved)
 
 
-def _signed_errors(points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray) -> np.ndarray:
-    lines1 = points0 @ fundamental[:, :2].T + fundamental[:, 2]
-    lines0 = points1 @ fundamental[:2, :2] + fundamental[2, :2]
-    algebraic = (points1 * lines1[:, :2]).sum(1) + lines1[:, 2]
-    gradient = (lines1[:, :2] ** 2).sum(1) + (lines0**2).sum(1)
-    return algebraic / np.sqrt(np.maximum(gradient, 1e-300))
-
-
-def _best_of_four(
+def best_of_four(
     essential: np.ndarray,
     points0: np.ndarray,
     points1: np.ndarray,
     calibration: Calibration,
     max_matches: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of an essential matrix with most points in front of both cameras."""
+    """Return the pose of an essential matrix with most points in front of both cameras.
+
+    Args:
+        essential: (3, 3), in normalised coordinates.
+        points0, points1: (M, 2) matched positions in pixels.
+        calibration: of both cameras.
+        max_matches: at most so many are looked at, sampled evenly.
+
+    Returns:
+        (3, 3) rotation and (3,) translation of length 1.
+    """
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
     every = -(-len(points0) // max_matches)
     points0, points1 = points0[::every], points1[::every]

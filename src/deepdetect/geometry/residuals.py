@@ -46,13 +46,22 @@ def epipolar_errors(
     Returns:
         (N,) float64.
     """
-    first = np.column_stack([np.asarray(points0, np.float64), np.ones(len(points0))])
-    second = np.column_stack([np.asarray(points1, np.float64), np.ones(len(points1))])
-    lines1 = first @ fundamental.T
-    lines0 = second @ fundamental
-    algebraic = np.einsum("ij,ij->i", second, lines1)
-    gradient = (lines1[:, :2] ** 2).sum(1) + (lines0[:, :2] ** 2).sum(1)
-    return np.abs(algebraic) / np.sqrt(np.maximum(gradient, 1e-300))
+    return np.abs(signed_epipolar_errors(points0, points1, fundamental))
+
+
+def signed_epipolar_errors(
+    points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
+) -> np.ndarray:
+    """Return the Sampson distances with a sign that says on which side a match lies.
+
+    Arguments and result as of `epipolar_errors`.
+    """
+    points0, points1 = np.asarray(points0, np.float64), np.asarray(points1, np.float64)
+    lines1 = points0 @ fundamental[:, :2].T + fundamental[:, 2]
+    lines0 = points1 @ fundamental[:2, :2] + fundamental[2, :2]
+    algebraic = (points1 * lines1[:, :2]).sum(1) + lines1[:, 2]
+    gradient = (lines1[:, :2] ** 2).sum(1) + (lines0**2).sum(1)
+    return algebraic / np.sqrt(np.maximum(gradient, 1e-300))
 
 
 def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:

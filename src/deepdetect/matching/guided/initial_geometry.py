@@ -23,12 +23,19 @@ from ...geometry.acontrario import log10_nfa
 from ...geometry.model_selection import Parallax, measure_parallax
 from ...geometry.rescaling import downscale, scaled_fundamental, scaled_homography, scaled_points
 from ...geometry.residuals import epipolar_errors, transfer_errors
+from ...geometry.semi_calibrated import (
+    SemiCalibratedOptions,
+    estimate_semi_calibrated,
+    refine_fundamental,
+)
+from .along_lines import match_along_lines
 from .asift import simulated_views
 from .options import InitialGeometryOptions
 
 MODELS = ("homography", "fundamental")
 
 Points = tuple[np.ndarray, np.ndarray]
+Size = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,10 +211,14 @@ def geometry_of_seeds(
     if not (np.isfinite(points0).all() and np.isfinite(points1).all()):
         raise OptionError("seeds must be finite positions: leave out those that are not")
     scales = [min(1.0, options.max_side_px / max(size)) for size in sizes]
-    size = (round(sizes[1][0] * scales[1]), round(sizes[1][1] * scales[1]))
+    width, height = (
+        [round(size[axis] * scale) for size, scale in zip(sizes, scales, strict=True)]
+        for axis in (0, 1)
+    )
+    views = (width[0], height[0]), (width[1], height[1])
     scaled = (scaled_points(points0, scales[0]), scaled_points(points1, scales[1]))
     points = _separate(*scaled, min_separation_px=options.min_separation_px)
-    found = _estimate((points[0], points[1]), model, seed, size, options)
+    found = _estimate((points[0], points[1]), model, seed, views, options)
     if found.log10_nfa < options.max_log10_nfa:
         return _upscale(found, scales[0], scales[1])
     return replace(_nothing(found.num_matches), log10_nfa=found.log10_nfa)
@@ -242,13 +253,15 @@ def estimate_initial_geometry(
     num_views = 0
     for points, ratios, views in _more_and_more_matches(initial, options):
         num_views += views
-        size = (initial.views[1].shape[1], initial.views[1].shape[0])
+        height, width = zip(*(view.shape for view in initial.views), strict=True)
+        sizes = (width[0], height[0]), (width[1], height[1])
         for ratio in options.max_ratios:
             chosen = points[0][ratios < ratio], points[1][ratios < ratio]
-            found = _estimate(chosen, model, seed, size, options)
+            found = _estimate(chosen, model, seed, sizes, options)
             if found.log10_nfa < best.log10_nfa:
                 best = replace(found, num_views=num_views)
             if best.log10_nfa < options.max_log10_nfa:
+                best = _with_further_matches(best, initial, sizes, options)
                 return _upscale(best, *initial.scales)
         if not simulate_views or (num_views and best.log10_nfa > options.max_hint_log10_nfa):
             break
@@ -258,9 +271,9 @@ def estimate_initial_geometry(
 def _scaled_down(
     options: InitialGeometryOptions, max_side_px: int, max_keypoints: int
 ) -> InitialGeometryOptions:
-    """Return the options of a look at small images, with few keypoints."""
+    """Return the options of a quick look at small images, with few keypoints."""
     sift = replace(options.sift, max_keypoints=min(max_keypoints, options.sift.max_keypoints))
-    return replace(options, max_side_px=max_side_px, sift=sift)
+    return replace(options, max_side_px=max_side_px, sift=sift, semi_calibrated=None)
 
 
 def _is_clearly_a_plane(found: InitialGeometry, options: InitialGeometryOptions) -> bool:
@@ -333,45 +346,93 @@ def _separate(*matches: np.ndarray, min_separation_px: float) -> tuple[np.ndarra
 
 
 def _estimate(
-    points: Points, model: str, seed: int, size: tuple[int, int], options: InitialGeometryOptions
+    points: Points, model: str, seed: int, sizes: tuple[Size, Size], options: InitialGeometryOptions
 ) -> InitialGeometry:
     """Estimate the models that are asked for and return the one that fits."""
-    points0, points1 = points
-    found: dict[str, InitialGeometry] = {}
-    for name in MODELS if model == "auto" else (model,):
-        threshold = options.threshold_px(name)
-        chosen = GeometryOptions(model=name, inlier_threshold=threshold, seed=seed)
-        geometry = estimate_geometry(points0, points1, chosen)
-        if geometry.matrix is None:
-            continue
-        errors_of = transfer_errors if name == "homography" else epipolar_errors
-        errors = errors_of(points0, points1, geometry.matrix)
-        found[name] = InitialGeometry(
-            name,
-            geometry.matrix,
-            points0[geometry.inliers],
-            points1[geometry.inliers],
-            len(points0),
-            log10_nfa(errors, name, threshold, size),
-            0,
-        )
-    trusted = {name: one for name, one in found.items() if one.log10_nfa < options.max_log10_nfa}
-    if model == "auto" and "homography" in trusted:
-        return _plane_or_depth(points, trusted, seed, options)
-    candidates = (trusted or found).values()
-    return min(candidates, key=lambda one: one.log10_nfa, default=_nothing(len(points0)))
+    nothing = _nothing(len(points[0]))
+    plane, depth = (
+        _fit(points, name, seed, sizes[1], options) if model in ("auto", name) else nothing
+        for name in MODELS
+    )
+    if plane.log10_nfa < options.max_log10_nfa:
+        assert plane.matrix is not None
+        if model == "homography":
+            return plane
+        parallax = measure_parallax(*points, plane.matrix, options.model_selection, seed)
+        plane = replace(plane, parallax=parallax)
+        if not parallax.is_depth(options.model_selection):
+            if not depth.log10_nfa < options.max_log10_nfa:
+                depth = _fit_semi_calibrated(points, seed, sizes, options)
+            trusted = depth if depth.log10_nfa < options.max_log10_nfa else None
+            return replace(plane, alternative=trusted)
+    if model != "homography":
+        known = _fit_semi_calibrated(points, seed, sizes, options)
+        depth = min(depth, known, key=lambda one: one.log10_nfa)
+        if depth.log10_nfa < options.max_log10_nfa:
+            return depth
+    return min(plane, depth, key=lambda one: one.log10_nfa)
 
 
-def _plane_or_depth(
-    points: Points, trusted: dict[str, InitialGeometry], seed: int, options: InitialGeometryOptions
+def _fit(
+    points: Points, model: str, seed: int, size: Size, options: InitialGeometryOptions
 ) -> InitialGeometry:
-    """Return the fundamental matrix where the matches alone show depth, else the homography."""
-    plane, depth = trusted["homography"], trusted.get("fundamental")
-    assert plane.matrix is not None
-    parallax = measure_parallax(*points, plane.matrix, options.model_selection, seed)
-    if depth is not None and parallax.is_depth(options.model_selection):
-        return depth
-    return replace(plane, parallax=parallax, alternative=depth)
+    """Estimate one model, trusted or not."""
+    threshold = options.threshold_px(model)
+    chosen = GeometryOptions(model=model, inlier_threshold=threshold, seed=seed)
+    geometry = estimate_geometry(*points, chosen)
+    if geometry.matrix is None:
+        return _nothing(len(points[0]))
+    errors_of = transfer_errors if model == "homography" else epipolar_errors
+    alarms = log10_nfa(errors_of(*points, geometry.matrix), model, threshold, size)
+    return _found(model, geometry.matrix, points, geometry.inliers, alarms)
+
+
+def _fit_semi_calibrated(
+    points: Points, seed: int, sizes: tuple[Size, Size], options: InitialGeometryOptions
+) -> InitialGeometry:
+    """Estimate a fundamental matrix with what is known of most cameras, trusted or not."""
+    if options.semi_calibrated is None:
+        return _nothing(len(points[0]))
+    threshold = options.fundamental_threshold_px
+    found = estimate_semi_calibrated(*points, sizes, threshold, seed, options.semi_calibrated)
+    if found is None:
+        return _nothing(len(points[0]))
+    return _found("fundamental", found.matrix, points, found.inliers, found.log10_nfa)
+
+
+def _found(
+    model: str, matrix: np.ndarray, points: Points, inliers: np.ndarray, alarms: float
+) -> InitialGeometry:
+    points0, points1 = points[0][inliers], points[1][inliers]
+    return InitialGeometry(model, matrix, points0, points1, len(inliers), alarms, 0)
+
+
+def _with_further_matches(
+    found: InitialGeometry,
+    initial: InitialMatches,
+    sizes: tuple[Size, Size],
+    options: InitialGeometryOptions,
+) -> InitialGeometry:
+    """Search along the lines of a fundamental matrix that few matches agree with, and refit it."""
+    if found.alternative is not None:
+        alternative = _with_further_matches(found.alternative, initial, sizes, options)
+        found = replace(found, alternative=alternative)
+    if found.model != "fundamental" or len(found.points0) >= options.max_matches_to_search:
+        return found
+    assert found.matrix is not None
+    further = match_along_lines(*initial.features, found.matrix, options.line_search)
+    points0, points1 = _separate(
+        np.concatenate([found.points0, further[0]]),
+        np.concatenate([found.points1, further[1]]),
+        min_separation_px=options.min_separation_px,
+    )
+    known = options.semi_calibrated or SemiCalibratedOptions()
+    sigmas = np.full(len(points0), known.match_sigma_px)
+    matrix = refine_fundamental(points0, points1, found.matrix, sizes, sigmas, known)
+    inliers = epipolar_errors(points0, points1, matrix) < options.fundamental_threshold_px
+    if np.count_nonzero(inliers) <= len(found.points0):
+        return found
+    return replace(found, matrix=matrix, points0=points0[inliers], points1=points1[inliers])
 
 
 def _upscale(found: InitialGeometry, scale0: float, scale1: float) -> InitialGeometry:

@@ -15,8 +15,10 @@ from ...features.sift_detector import SiftOptions
 from ...geometry.acontrario import MAX_LOG10_NFA
 from ...geometry.epipolar_rectification import RectificationFrameOptions
 from ...geometry.model_selection import ModelSelectionOptions
+from ...geometry.semi_calibrated import SemiCalibratedOptions
 from ...geometry.validated_refinement import ValidatedRefinementOptions
 from ..stereo.matching import DisparityOptions
+from .along_lines import LineSearchOptions
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,10 @@ class InitialGeometryOptions:
             in pixels of the scaled images.
         max_log10_nfa: a geometry is trusted when the logarithm of its number of false alarms is
             below this.
+        semi_calibrated: what a fundamental matrix may assume of both cameras, where no plane
+            guides; None: nothing, as for small copies, where it would take as long as the rest.
+        line_search: when keypoints match, once a fundamental matrix is known.
+        max_matches_to_search: with fewer that agree with it, it looks for more.
         model_selection: when the matches alone show that a scene has depth.
         tilts: of the simulated views: how many times shorter one direction is seen.
         max_hint_log10_nfa: views of a larger tilt are simulated only where the best geometry so far
@@ -68,6 +74,9 @@ class InitialGeometryOptions:
     homography_threshold_px: float = 3.0
     fundamental_threshold_px: float = 1.5
     max_log10_nfa: float = MAX_LOG10_NFA
+    semi_calibrated: SemiCalibratedOptions | None = field(default_factory=SemiCalibratedOptions)
+    line_search: LineSearchOptions = field(default_factory=LineSearchOptions)
+    max_matches_to_search: int = 200
     model_selection: ModelSelectionOptions = field(default_factory=ModelSelectionOptions)
     tilts: tuple[float, ...] = (2.0, 4.0)
     max_hint_log10_nfa: float = 0.0
@@ -82,6 +91,7 @@ class InitialGeometryOptions:
                 *("homography_threshold_px", "fundamental_threshold_px", "first_max_keypoints"),
                 "simulated_max_keypoints",
             ),
+            not_negative=("max_matches_to_search",),
             fractions=("max_ratios", "min_first_fraction", "max_first_parallax"),
             between={
                 "max_log10_nfa": (-math.inf, 0),
@@ -199,16 +209,18 @@ class RectifiedMatchingOptions:
             correlate too little for that are left out. It is measured on rows that show something
             else.
         null_fraction: of the rows, which are matched with others for that.
-        max_refits: the fundamental matrix is estimated again from tracked corners at most this
-            often,
-        max_row_error_px: where half of them leave their rows by more than this.
+        max_refits: the images are rectified again, by a matrix fitted to tracked corners, at most
+            this often,
+        max_row_error_px, row_quantile: where this fraction of them has its rows nearer than this to
+            the lines of the new matrix, the old rows are good enough.
+        semi_calibrated: what the fit may assume of both cameras.
+        min_sigma_px: a track or a sparse match is never counted as more exact than this.
         refit_corners: that are tracked.
         refit_window_px: side of the windows in which they are tracked, odd.
         max_round_trip_px: a track counts when it ends this near to its start, forth and back.
         max_track_px: a track that moves further than this from its match is wrong.
         min_tracks: that a matrix is estimated from; where fewer corners can be tracked to where
             they are matched, no match counts.
-        refit_threshold_px: inlier threshold of the estimate.
 
     Raises:
         OptionError: a value is out of its range.
@@ -229,26 +241,27 @@ class RectifiedMatchingOptions:
     false_positive_rate: float = 0.01
     null_fraction: float = 0.25
     max_refits: int = 1
-    max_row_error_px: float = 0.1
+    max_row_error_px: float = 0.5
+    row_quantile: float = 0.9
+    semi_calibrated: SemiCalibratedOptions = field(default_factory=SemiCalibratedOptions)
+    min_sigma_px: float = 0.1
     refit_corners: int = 2000
     refit_window_px: int = 15
     max_round_trip_px: float = 0.3
     max_track_px: float = 4.0
     min_tracks: int = 50
-    refit_threshold_px: float = 0.5
 
     def __post_init__(self) -> None:
         check_ranges(
             self,
             positive=(
                 *("max_volume", "margin_px", "max_row_error_px", "refit_corners"),
-                *("max_round_trip_px", "max_track_px", "refit_threshold_px"),
-                "correlation_sigma_px",
+                *("max_round_trip_px", "max_track_px", "correlation_sigma_px", "min_sigma_px"),
             ),
             not_negative=("max_refits", "margin_fraction"),
             fractions=(
                 *("min_correlation", "min_fraction_of_one_sign"),
-                *("false_positive_rate", "null_fraction"),
+                *("false_positive_rate", "null_fraction", "row_quantile"),
             ),
             odd=("correlation_window_px", "refit_window_px"),
             between={"tail_fraction": (0, 0.5), "min_tracks": (8, math.inf)},

@@ -117,7 +117,6 @@ def _match_scene_with_depth(
         first.points1,
         first.matrix,
         options.rectified_matching,
-        seed,
     )
     enough = options.min_matched_fraction * min(len(pair.xy0), len(pair.xy1))
     if found is None or len(found[1]) < enough:

@@ -6,8 +6,8 @@ Both images are warped into a frame in which matches lie on the same row
 positions, not keypoints of the second image.
 
 A fundamental matrix from few matches may miss by some pixels where none of them was. So corners are
-tracked in both directions around their matches: where they leave their rows, the matrix is
-estimated again from them, and the images are rectified again.
+tracked in both directions around their matches, and the matrix is fitted to them: matches are moved
+to its lines, and where these are far from the rows, the images are rectified again.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ import cv2
 import numpy as np
 
 from ...features.matches import GuidedMatches
-from ...geometry import GeometryOptions, estimate_geometry
 from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
 from ...geometry.homography_refinement import equalise
 from ...geometry.rescaling import downscale, scaled_fundamental, scaled_points
+from ...geometry.residuals import epipolar_errors
+from ...geometry.semi_calibrated import refine_fundamental
 from ...geometry.zncc import gaussian_blur, local_zncc
 from ..stereo.matching import (
     DisparityMap,
@@ -54,6 +55,20 @@ class RectifiedView:
     correlation: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Corners that were tracked around their matches.
+
+    Attributes:
+        positions: (N, 2) in both images at their own size.
+        on_rows: the same, moved in the frame to the rows of the first: where row matching may
+            look for them.
+    """
+
+    positions: tuple[np.ndarray, np.ndarray]
+    on_rows: tuple[np.ndarray, np.ndarray]
+
+
 def match_by_rectification(
     gray0: np.ndarray,
     gray1: np.ndarray,
@@ -62,7 +77,6 @@ def match_by_rectification(
     points1: np.ndarray,
     fundamental: np.ndarray,
     options: RectifiedMatchingOptions = RectifiedMatchingOptions(),
-    seed: int = 0,
 ) -> tuple[np.ndarray, GuidedMatches] | None:
     """Match keypoints of the first image by rectifying the pair.
 
@@ -72,36 +86,65 @@ def match_by_rectification(
         points0, points1: (K, 2) sparse matches that fit the fundamental matrix.
         fundamental: (3, 3) with x1^T F x0 = 0.
         options: how.
-        seed: of the random samples of further estimates.
 
     Returns:
-        The fundamental matrix that rectified the pair, and the matches; None where it cannot be
-        rectified, or too few corners can be tracked from one image to where they are matched.
+        The refined fundamental matrix and the matches, which fit it exactly; None where the pair
+        cannot be rectified, or too few corners can be tracked from one image to where they are matched.
     """
-    view = _rectify(gray0, gray1, points0, points1, fundamental, options)
+    sizes = (gray0.shape[::-1], gray1.shape[::-1])
+    sparse = points0, points1
+    view = _rectify(gray0, gray1, *sparse, fundamental, options)
     tracks = None if view is None else _track(view, options)
-    for _ in range(options.max_refits):
-        if tracks is None or np.median(np.abs(tracks[2])) < options.max_row_error_px:
-            break
-        refit = GeometryOptions(
-            model="fundamental", inlier_threshold=options.refit_threshold_px, seed=seed
-        )
-        found = estimate_geometry(tracks[0], tracks[1], refit)
-        if found.matrix is None:
-            break
-        inliers = found.inliers
-        again = _rectify(
-            gray0, gray1, tracks[0][inliers], tracks[1][inliers], found.matrix, options
-        )
-        if view is None or again is None or _matched(again) < _matched(view):
-            break
-        view, fundamental, tracks = again, found.matrix, _track(again, options)
     if view is None or tracks is None:
         return None
+    fundamental = _refine(fundamental, sparse, tracks, sizes, options)
+    for _ in range(options.max_refits):
+        error = np.quantile(epipolar_errors(*tracks.on_rows, fundamental), options.row_quantile)
+        if error < options.max_row_error_px:
+            break
+        again = _rectify(gray0, gray1, *tracks.positions, fundamental, options)
+        if again is None or _matched(again) < _matched(view):
+            break
+        found = _track(again, options)
+        if found is None:
+            break
+        view, tracks = again, found
+        fundamental = _refine(fundamental, sparse, tracks, sizes, options)
     rows, places, scores = _sample(view, xy0)
+    places = _moved_to_lines(xy0[rows], places, fundamental)
     height, width = gray1.shape
     inside = ((places > -0.5) & (places < (width - 0.5, height - 0.5))).all(axis=1)
     return fundamental, GuidedMatches(rows[inside], places[inside], scores[inside])
+
+
+def _refine(
+    fundamental: np.ndarray,
+    sparse: tuple[np.ndarray, np.ndarray],
+    tracks: Tracks,
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+    options: RectifiedMatchingOptions,
+) -> np.ndarray:
+    """Fit the fundamental matrix to tracks and sparse matches, as exact as each of them are."""
+    sigmas = []
+    for points0, points1 in (sparse, tracks.positions):
+        errors = epipolar_errors(points0, points1, fundamental)
+        sigma = max(1.4826 * float(np.median(errors)), options.min_sigma_px)
+        sigmas.append(np.full(len(points0), sigma))
+    points0, points1 = (np.concatenate([sparse[side], tracks.positions[side]]) for side in (0, 1))
+    return refine_fundamental(
+        points0, points1, fundamental, sizes, np.concatenate(sigmas), options.semi_calibrated
+    )
+
+
+def _moved_to_lines(
+    points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
+) -> np.ndarray:
+    """Move the second positions of matches to the nearest points of their epipolar lines."""
+    lines = np.column_stack([points0, np.ones(len(points0))]) @ fundamental.T
+    normal = lines[:, :2]
+    distance = (normal * points1).sum(axis=1) + lines[:, 2]
+    squared = np.maximum((normal**2).sum(axis=1), 1e-300)
+    return np.asarray(points1 - normal * (distance / squared)[:, None])
 
 
 def _matched(view: RectifiedView) -> int:
@@ -247,15 +290,8 @@ def _range_of_matches(
     return int(np.floor(smallest)), int(np.ceil(largest))
 
 
-def _track(
-    view: RectifiedView, options: RectifiedMatchingOptions
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Track corners around their matches.
-
-    Returns:
-        (N, 2) positions in both images at their own size, and (N,) by how many pixels of the frame
-        each has left its row; None with fewer than `min_tracks`.
-    """
+def _track(view: RectifiedView, options: RectifiedMatchingOptions) -> Tracks | None:
+    """Track corners around their matches; None with fewer than `min_tracks`."""
     first, second = equalise(view.first), equalise(view.second)
     mask = view.disparities.matched.astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(first, options.refit_corners, 0.001, 5, mask=mask)
@@ -283,9 +319,12 @@ def _track(
     good &= np.abs(there - expected).max(axis=1) < options.max_track_px
     if np.count_nonzero(good) < options.min_tracks:
         return None
-    places = view.frame.from_frame(start[good], 0), view.frame.from_frame(there[good], 1)
-    own = [scaled_points(points, 1 / view.scale) for points in places]
-    return own[0], own[1], (there - start)[good, 1]
+    on_rows = np.column_stack([there[good, 0], start[good, 1]])
+    first_places, second_places, row_places = (
+        scaled_points(view.frame.from_frame(points, side), 1 / view.scale)
+        for points, side in ((start[good], 0), (there[good], 1), (on_rows, 1))
+    )
+    return Tracks((first_places, second_places), (first_places, row_places))
 
 
 def _sample(view: RectifiedView, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

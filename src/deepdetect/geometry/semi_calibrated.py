@@ -1,0 +1,362 @@
+"""The fundamental matrix of two cameras of which something is known: those of most photographs.
+
+Pixels are square, the principal point lies near the middle of the image, and both images were taken
+with about the same focal length. Five matches then give a relative pose for each focal length that
+is tried, where a fundamental matrix needs seven: the share of samples without a wrong match is far
+larger, and so few matches leave fewer degrees of freedom to chance. Which focal length is nearest
+is decided by how many matches agree; then pose and cameras are fitted to them together.
+
+Nister, "An efficient solution to the five-point relative pose problem", 2004; for an unknown focal
+length see Kukelova, Bujnak and Pajdla, "Polynomial eigenvalue solutions to minimal problems in
+computer vision", 2012.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from .._shared.options import check_ranges
+from .acontrario import log10_nfa
+from .camera import Calibration, Camera
+from .relative_pose import best_of_four, moved_pose
+from .residuals import epipolar_errors, signed_epipolar_errors
+from .triangulation import fundamental_matrix
+
+Size = tuple[int, int]
+
+MODELS_PER_SAMPLE = 10
+"""Five matches give up to ten essential matrices."""
+
+START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
+"""In units of the longer side: from which a fit begins, that of the nearest essential matrix."""
+
+MIN_MATCHES = 6
+"""One more than give an essential matrix."""
+
+
+@dataclass(frozen=True)
+class SemiCalibratedOptions:
+    """What is assumed of both cameras.
+
+    Attributes:
+        focal_lengths: that are tried, in units of the longer side of the image: as good as all from
+            a wide angle of 90 degrees to a telephoto lens of 28.
+        confidence: desired probability that a model is the best one.
+        iterations: maximum number for each focal length.
+        focal_spread: standard deviation of the focal length from one longer side, as a factor's
+            natural logarithm.
+        focal_difference: the same of one camera's focal length from the other's.
+        principal_point_spread: standard deviation of the principal point from the middle of the
+            image, in units of the longer side.
+        match_sigma_px: standard deviation of right matches from their epipolar lines.
+        max_fits: how often pose and cameras are fitted to the matches that agree with them.
+        max_iterations: of each fit (Levenberg-Marquardt).
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    focal_lengths: tuple[float, ...] = (0.7, 1.4)
+    confidence: float = 0.9999
+    iterations: int = 5000
+    focal_spread: float = 0.7
+    focal_difference: float = 0.03
+    principal_point_spread: float = 0.03
+    match_sigma_px: float = 0.5
+    max_fits: int = 4
+    max_iterations: int = 20
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=(
+                *("focal_lengths", "iterations", "focal_spread", "focal_difference"),
+                *("principal_point_spread", "match_sigma_px"),
+            ),
+            not_negative=("max_fits", "max_iterations"),
+            between={"confidence": (0, 1)},
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SemiCalibratedGeometry:
+    """A relative pose with the cameras that fit it.
+
+    Attributes:
+        matrix: (3, 3) fundamental matrix, x1^T F x0 = 0.
+        inliers: (M,) bool, the matches that agree with it.
+        log10_nfa: decimal logarithm of its number of false alarms, of all that were tried.
+        focal_lengths: of both cameras, in units of the longer side of their images. They are sure
+            only where the motion shows them.
+    """
+
+    matrix: np.ndarray
+    inliers: np.ndarray
+    log10_nfa: float
+    focal_lengths: tuple[float, float]
+
+
+def estimate_semi_calibrated(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    sizes: tuple[Size, Size],
+    inlier_threshold: float = 1.5,
+    seed: int = 0,
+    options: SemiCalibratedOptions = SemiCalibratedOptions(),
+) -> SemiCalibratedGeometry | None:
+    """Estimate a fundamental matrix from matches, many of which may be wrong.
+
+    Args:
+        points0, points1: (M, 2) matched positions, centre of the first pixel (0, 0).
+        sizes: (width, height) of both images.
+        inlier_threshold: Sampson distance in pixels.
+        seed: of the random samples.
+        options: what is assumed of the cameras.
+
+    Returns:
+        The geometry; None with too few matches, or where nothing could be estimated.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> points = rng.uniform((-4, -3, 8), (4, 3, 16), (60, 3))
+        >>> camera = Camera((640, 480), 500.0)
+        >>> first, second = camera.project(points), camera.project(points - [1, 0, 0.5])
+        >>> second[:30] = rng.uniform(0, 480, (30, 2))
+        >>> found = estimate_semi_calibrated(first, second, ((640, 480), (640, 480)))
+        >>> bool(found.inliers[30:].all()), bool(found.log10_nfa < -30)
+        (True, True)
+    """
+    points0 = np.asarray(points0, np.float64).reshape(-1, 2)
+    points1 = np.asarray(points1, np.float64).reshape(-1, 2)
+    if len(points0) < MIN_MATCHES:
+        return None
+    # OpenCV draws the same samples every time; another order of the matches draws others.
+    order = np.random.default_rng(seed).permutation(len(points0))
+    best: SemiCalibratedGeometry | None = None
+    essential = None
+    for focal in options.focal_lengths:
+        cameras = _Cameras.guess(sizes, focal)
+        matrix = _fit_essential(points0[order], points1[order], cameras, inlier_threshold, options)
+        if matrix is None:
+            continue
+        found = _judge(
+            _fundamental(matrix, cameras), cameras, points0, points1, inlier_threshold, options
+        )
+        if best is None or found.log10_nfa < best.log10_nfa:
+            best, essential = found, matrix
+    if best is None or essential is None or np.count_nonzero(best.inliers) < MIN_MATCHES:
+        return best
+    cameras = _Cameras.guess(sizes, best.focal_lengths[0])
+    pose = best_of_four(
+        essential, points0[best.inliers], points1[best.inliers], cameras.calibration, len(points0)
+    )
+    here = _View(pose, cameras)
+    for _ in range(options.max_fits):
+        inliers = points0[best.inliers], points1[best.inliers]
+        here = _fit(here, *inliers, np.full(len(inliers[0]), options.match_sigma_px), options)
+        found = _judge(here.fundamental, here.cameras, points0, points1, inlier_threshold, options)
+        if found.log10_nfa >= best.log10_nfa:
+            break
+        best = found
+    return best
+
+
+def refine_fundamental(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    fundamental: np.ndarray,
+    sizes: tuple[Size, Size],
+    match_sigmas_px: np.ndarray,
+    options: SemiCalibratedOptions = SemiCalibratedOptions(),
+) -> np.ndarray:
+    """Fit a fundamental matrix to matches that are mostly right, and to what cameras usually are.
+
+    Where the matches say little, as about the focal length or at the borders, the usual decides.
+
+    Args:
+        points0, points1: (M, 2) matched positions, M at least 6.
+        fundamental: (3, 3) with x1^T F x0 = 0, to begin with.
+        sizes: (width, height) of both images.
+        match_sigmas_px: (M,) standard deviations of the matches from their epipolar lines.
+        options: what is assumed of the cameras; `match_sigma_px` has no effect.
+
+    Returns:
+        (3, 3) fundamental matrix of norm 1; the given one with too few matches.
+    """
+    if len(points0) < MIN_MATCHES:
+        return fundamental
+    cameras, essential = _nearest_cameras(fundamental, sizes)
+    pose = best_of_four(essential, points0, points1, cameras.calibration, len(points0))
+    start = _View(pose, cameras)
+    matrix = _fit(start, points0, points1, match_sigmas_px, options).fundamental
+    return np.asarray(matrix / np.linalg.norm(matrix))
+
+
+def _nearest_cameras(
+    fundamental: np.ndarray, sizes: tuple[Size, Size]
+) -> tuple[_Cameras, np.ndarray]:
+    """Return the cameras of one focal length under which the matrix is most nearly essential."""
+    tried = []
+    for focal in START_FOCAL_LENGTHS:
+        cameras = _Cameras.guess(sizes, focal)
+        calibration = cameras.calibration
+        essential = calibration.camera1.matrix.T @ fundamental @ calibration.camera0.matrix
+        largest, middle, _ = np.linalg.svd(essential, compute_uv=False)
+        tried.append((middle / largest, cameras, essential))
+    _, cameras, essential = max(tried, key=lambda one: one[0])
+    return cameras, essential
+
+
+@dataclass(frozen=True, eq=False)
+class _Cameras:
+    """Both cameras: (2,) natural logarithms of focal lengths, (2, 2) offsets of principal points.
+
+    Both in units of the longer side of each image.
+    """
+
+    sizes: tuple[Size, Size]
+    log_focal: np.ndarray
+    offsets: np.ndarray
+
+    @classmethod
+    def guess(cls, sizes: tuple[Size, Size], focal: float) -> _Cameras:
+        return cls(sizes, np.full(2, math.log(focal)), np.zeros((2, 2)))
+
+    @property
+    def calibration(self) -> Calibration:
+        cameras = []
+        for size, log_focal, offset in zip(self.sizes, self.log_focal, self.offsets, strict=True):
+            side = max(size)
+            centre = (np.array(size) - 1) / 2 + offset * side
+            cameras.append(Camera(size, math.exp(log_focal) * side, tuple(centre)))
+        return Calibration(cameras[0], cameras[1])
+
+    def moved(self, change: np.ndarray) -> _Cameras:
+        """Return cameras near these: a change of 6 parameters."""
+        offsets = self.offsets + change[2:].reshape(2, 2)
+        return _Cameras(self.sizes, self.log_focal + change[:2], offsets)
+
+    def deviations(self, options: SemiCalibratedOptions) -> np.ndarray:
+        """Return by how many standard deviations they are unusual, (6,)."""
+        mean, difference = self.log_focal.mean(), self.log_focal[0] - self.log_focal[1]
+        of_focal = [mean / options.focal_spread, difference / options.focal_difference]
+        return np.append(of_focal, self.offsets / options.principal_point_spread)
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A pose and both cameras: 11 parameters."""
+
+    pose: tuple[np.ndarray, np.ndarray]
+    cameras: _Cameras
+
+    @property
+    def fundamental(self) -> np.ndarray:
+        return fundamental_matrix(self.cameras.calibration, *self.pose)
+
+    def moved(self, change: np.ndarray) -> _View:
+        return _View(moved_pose(self.pose, change[:5]), self.cameras.moved(change[5:]))
+
+
+def _fit_essential(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    cameras: _Cameras,
+    inlier_threshold: float,
+    options: SemiCalibratedOptions,
+) -> np.ndarray | None:
+    """Return an essential matrix by MAGSAC."""
+    calibration = cameras.calibration
+    # Of one camera for both images, in pixels: in normalised coordinates OpenCV 5 is less accurate.
+    focal = (calibration.camera0.focal_px[0] + calibration.camera1.focal_px[0]) / 2
+    first, second = (
+        np.ascontiguousarray(camera.rays(points)[:, :2] * focal)
+        for camera, points in ((calibration.camera0, points0), (calibration.camera1, points1))
+    )
+    try:
+        matrix, _ = cv2.findEssentialMat(
+            first,
+            second,
+            np.diag([focal, focal, 1.0]),
+            method=cv2.USAC_MAGSAC,
+            prob=options.confidence,
+            threshold=inlier_threshold,
+            maxIters=options.iterations,
+        )
+    except cv2.error:  # degenerate input, as all points in one place
+        return None
+    if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        return None
+    return np.asarray(matrix)
+
+
+def _fundamental(essential: np.ndarray, cameras: _Cameras) -> np.ndarray:
+    calibration = cameras.calibration
+    inverse0 = np.linalg.inv(calibration.camera0.matrix)
+    inverse1 = np.linalg.inv(calibration.camera1.matrix)
+    matrix = inverse1.T @ essential @ inverse0
+    return np.asarray(matrix / np.linalg.norm(matrix))
+
+
+def _judge(
+    fundamental: np.ndarray,
+    cameras: _Cameras,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    inlier_threshold: float,
+    options: SemiCalibratedOptions,
+) -> SemiCalibratedGeometry:
+    """Count the matches that agree, and how likely that is by chance."""
+    errors = epipolar_errors(points0, points1, fundamental)
+    tried = MODELS_PER_SAMPLE * len(options.focal_lengths)
+    alarms = log10_nfa(errors, "essential", inlier_threshold, cameras.sizes[1], tried)
+    focal = np.exp(cameras.log_focal)
+    return SemiCalibratedGeometry(
+        fundamental, errors < inlier_threshold, alarms, (float(focal[0]), float(focal[1]))
+    )
+
+
+def _fit(
+    view: _View,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    sigmas: np.ndarray,
+    options: SemiCalibratedOptions,
+) -> _View:
+    """Fit pose and cameras to matches, with a Cauchy loss, and to what is usual (MAP estimate)."""
+
+    def residuals(view: _View) -> np.ndarray:
+        errors = signed_epipolar_errors(points0, points1, view.fundamental)
+        return np.append(errors / sigmas, view.cameras.deviations(options))
+
+    def cost(values: np.ndarray) -> float:
+        matches, usual = values[: len(points0)], values[len(points0) :]
+        return float(2 * np.log1p((matches / 2) ** 2).sum() + (usual**2).sum() / 2)
+
+    step, damping = 1e-6, 1e-3
+    here = residuals(view)
+    best = cost(here)
+    for _ in range(options.max_iterations):
+        varied = (residuals(view.moved(axis)) for axis in np.eye(11) * step)
+        slopes = np.column_stack([(there - here) / step for there in varied])
+        weights = np.ones(len(here))
+        weights[: len(points0)] = 1 / (1 + (here[: len(points0)] / 2) ** 2)
+        normal, gradient = slopes.T @ (slopes * weights[:, None]), slopes.T @ (weights * here)
+        before = best
+        while damping < 1e6:
+            damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
+            change = -np.linalg.solve(damped, gradient)
+            moved = view.moved(change)
+            there = residuals(moved)
+            if cost(there) < best:
+                view, here, best = moved, there, cost(there)
+                damping /= 5
+                break
+            damping *= 5
+        if before - best < 1e-4:
+            break
+    return view

@@ -1,0 +1,126 @@
+"""Sparse matches along known epipolar lines.
+
+A ratio test over the whole image rejects what is repeated anywhere. Once a fundamental matrix is
+known, a partner can only lie near a line; what is elsewhere tells how alike wrong partners are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..._shared.options import check_ranges
+from ...features.keypoints import Keypoints
+
+BLOCK = 500
+"""Keypoints of the first image that are compared at once."""
+
+
+@dataclass(frozen=True)
+class LineSearchOptions:
+    """When two keypoints match, given the epipolar lines.
+
+    Attributes:
+        max_distance_px: of each from the other's line.
+        ratio_elsewhere: to be as different as this from the most similar keypoint far from the
+            line, which is wrong for sure: the ratio of both distances, at most.
+        ratio_near: the same for the second-best near the line.
+        min_separation_px: keypoints nearer than this to the best show the same, and are no
+            second-best.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    max_distance_px: float = 3.0
+    ratio_elsewhere: float = 0.95
+    ratio_near: float = 0.85
+    min_separation_px: float = 5.0
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("max_distance_px",),
+            not_negative=("min_separation_px",),
+            fractions=("ratio_elsewhere", "ratio_near"),
+        )
+
+
+def match_along_lines(
+    first: Keypoints,
+    second: Keypoints,
+    fundamental: np.ndarray,
+    options: LineSearchOptions = LineSearchOptions(),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Match keypoints near each other's epipolar lines, mutually.
+
+    Args:
+        first, second: keypoints with descriptors.
+        fundamental: (3, 3) with x1^T F x0 = 0.
+        options: when two keypoints match.
+
+    Returns:
+        (M, 2) float64 positions in both images.
+
+    Example:
+        >>> rows = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # lines are the rows
+        >>> xy = np.array([[5.0, 5.0], [50.0, 50.0]])
+        >>> keypoints = Keypoints(xy, [1, 1], (99, 99), descriptors=np.eye(2, 128))
+        >>> match_along_lines(keypoints, keypoints, rows)[1].tolist()
+        [[5.0, 5.0], [50.0, 50.0]]
+    """
+    points0, points1 = first.xy.astype(np.float64), second.xy.astype(np.float64)
+    nowhere = np.empty((0, 2))
+    if not len(points0) or not len(points1):
+        return nowhere, nowhere
+    assert first.descriptors is not None
+    assert second.descriptors is not None
+    described0 = first.descriptors.astype(np.float32)
+    described1 = second.descriptors.astype(np.float32)
+    squares1 = (described1**2).sum(axis=1)
+    lines1 = _lines(points0, fundamental)
+    lines0 = _lines(points1, fundamental.T)
+    ones0, ones1 = (
+        np.column_stack([points, np.ones(len(points))]).astype(np.float32)
+        for points in (points0, points1)
+    )
+    count = len(points0)
+    best = np.full(count, np.inf, np.float32)
+    partner = np.zeros(count, np.int64)
+    second_best, elsewhere0 = best.copy(), best.copy()
+    elsewhere1 = np.full(len(points1), np.inf, np.float32)
+    best1, partner1 = elsewhere1.copy(), np.zeros(len(points1), np.int64)
+    for start in range(0, count, BLOCK):
+        rows = slice(start, min(start + BLOCK, count))
+        products = described0[rows] @ described1.T
+        squares0 = (described0[rows] ** 2).sum(axis=1)[:, None]
+        distance = np.sqrt(np.maximum(squares0 + squares1 - 2 * products, 0))
+        near = np.abs(lines1[rows] @ ones1.T) < options.max_distance_px
+        near &= np.abs(ones0[rows] @ lines0.T) < options.max_distance_px
+        inside, outside = np.where(near, distance, np.inf), np.where(near, np.inf, distance)
+        elsewhere0[rows] = outside.min(axis=1)
+        elsewhere1 = np.minimum(elsewhere1, outside.min(axis=0))
+        nearest = inside.argmin(axis=0)
+        value = inside[nearest, np.arange(len(points1))]
+        better = value < best1
+        best1[better], partner1[better] = value[better], nearest[better] + start
+        own = inside.argmin(axis=1)
+        best[rows], partner[rows] = inside[np.arange(len(own)), own], own
+        there = points1[own]
+        apart = (
+            np.hypot(points1[:, 0] - there[:, :1], points1[:, 1] - there[:, 1:])
+            >= options.min_separation_px
+        )
+        second_best[rows] = np.where(apart, inside, np.inf).min(axis=1)
+    kept = np.isfinite(best) & (partner1[partner] == np.arange(count))
+    kept &= best < options.ratio_elsewhere * np.minimum(elsewhere0, elsewhere1[partner])
+    kept &= best < options.ratio_near * second_best
+    return points0[kept], points1[partner[kept]]
+
+
+def _lines(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Return the epipolar lines of points, (N, 3) float32, so that a product is a distance."""
+    lines = np.column_stack([points, np.ones(len(points))]) @ matrix.T
+    length = np.hypot(lines[:, 0], lines[:, 1])
+    return (lines / np.maximum(length, 1e-300)[:, None]).astype(np.float32)
