@@ -50,8 +50,7 @@ class InitialGeometry:
         log10_nfa: decimal logarithm of its number of false alarms.
         num_views: simulated views that it took.
         parallax: of a homography that was chosen, not asked for: what it leaves.
-        alternative: the fundamental matrix, where both can be trusted and the homography was
-            chosen: the images decide.
+        initial: the sparse matches of the larger images, where they have been made.
     """
 
     model: str
@@ -62,7 +61,7 @@ class InitialGeometry:
     log10_nfa: float
     num_views: int
     parallax: Parallax | None = None
-    alternative: InitialGeometry | None = None
+    initial: InitialMatches | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +164,7 @@ def find_initial_geometry(
         initial = initial_matches(gray0, gray1, options=options)
     found = estimate_initial_geometry(initial, model, seed, options, simulate_views=False)
     if found.matrix is not None:
-        return found
+        return replace(found, initial=initial)
     simulated_side = min(options.simulated_side_px, options.max_side_px)
     if longest > simulated_side:
         options = _scaled_down(options, simulated_side, options.simulated_max_keypoints)
@@ -349,11 +348,9 @@ def _estimate(
     points: Points, model: str, seed: int, sizes: tuple[Size, Size], options: InitialGeometryOptions
 ) -> InitialGeometry:
     """Estimate the models that are asked for and return the one that fits."""
-    nothing = _nothing(len(points[0]))
-    plane, depth = (
-        _fit(points, name, seed, sizes[1], options) if model in ("auto", name) else nothing
-        for name in MODELS
-    )
+    plane = depth = _nothing(len(points[0]))
+    if model != "fundamental":
+        plane = _fit(points, "homography", seed, sizes[1], options)
     if plane.log10_nfa < options.max_log10_nfa:
         assert plane.matrix is not None
         if model == "homography":
@@ -361,11 +358,9 @@ def _estimate(
         parallax = measure_parallax(*points, plane.matrix, options.model_selection, seed)
         plane = replace(plane, parallax=parallax)
         if not parallax.is_depth(options.model_selection):
-            if not depth.log10_nfa < options.max_log10_nfa:
-                depth = _fit_semi_calibrated(points, seed, sizes, options)
-            trusted = depth if depth.log10_nfa < options.max_log10_nfa else None
-            return replace(plane, alternative=trusted)
+            return plane
     if model != "homography":
+        depth = _fit(points, "fundamental", seed, sizes[1], options)
         known = _fit_semi_calibrated(points, seed, sizes, options)
         depth = min(depth, known, key=lambda one: one.log10_nfa)
         if depth.log10_nfa < options.max_log10_nfa:
@@ -414,9 +409,6 @@ def _with_further_matches(
     options: InitialGeometryOptions,
 ) -> InitialGeometry:
     """Search along the lines of a fundamental matrix that few matches agree with, and refit it."""
-    if found.alternative is not None:
-        alternative = _with_further_matches(found.alternative, initial, sizes, options)
-        found = replace(found, alternative=alternative)
     if found.model != "fundamental" or len(found.points0) >= options.max_matches_to_search:
         return found
     assert found.matrix is not None
@@ -437,9 +429,6 @@ def _with_further_matches(
 
 def _upscale(found: InitialGeometry, scale0: float, scale1: float) -> InitialGeometry:
     """Return a geometry of scaled images as one of the images themselves."""
-    if found.alternative is not None:
-        alternative = _upscale(found.alternative, scale0, scale1)
-        found = replace(found, alternative=alternative)
     assert found.matrix is not None
     convert = scaled_homography if found.model == "homography" else scaled_fundamental
     return replace(

@@ -56,11 +56,7 @@ def guided_matches(
     Raises:
         OptionError: the model is unknown, or the seeds are no matches.
     """
-    if seeds is None:
-        first = find_initial_geometry(gray0, gray1, model, seed, options.initial_geometry, initial)
-    else:
-        sizes = gray0.shape[::-1], gray1.shape[::-1]
-        first = geometry_of_seeds(seeds, sizes, model, seed, options.initial_geometry)
+    first = _initial_geometry(gray0, gray1, model, seed, initial, seeds, options)
     if first.matrix is None:
         return _guide(first, None), None
     pair = ImagePair(gray0, gray1, xy0, xy1)
@@ -68,9 +64,11 @@ def guided_matches(
     if first.model == "homography":
         matrix, found = _match_plane(pair, first, options, seed)
         if found is None:
-            if first.alternative is None:
+            views, known = first.num_views, initial or first.initial
+            first = _initial_geometry(gray0, gray1, "fundamental", seed, known, seeds, options)
+            first = replace(first, num_views=first.num_views + views)
+            if first.matrix is None:
                 return _no_guide(first), None
-            first = replace(first.alternative, num_views=first.num_views)
     enough = options.min_matched_fraction * min(len(xy0), len(xy1))
     if found is not None and len(found) < enough:
         return _no_guide(first), None
@@ -79,6 +77,22 @@ def guided_matches(
     if len(found) < options.min_matches:
         return _no_guide(first), None
     return _guide(first, matrix), found
+
+
+def _initial_geometry(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    model: str,
+    seed: int,
+    initial: InitialMatches | None,
+    seeds: tuple[np.ndarray, np.ndarray] | None,
+    options: GuidedOptions,
+) -> InitialGeometry:
+    """Return the initial geometry, from seeds where there are some."""
+    if seeds is None:
+        return find_initial_geometry(gray0, gray1, model, seed, options.initial_geometry, initial)
+    sizes = gray0.shape[::-1], gray1.shape[::-1]
+    return geometry_of_seeds(seeds, sizes, model, seed, options.initial_geometry)
 
 
 def _match_plane(

@@ -89,7 +89,8 @@ def match_by_rectification(
 
     Returns:
         The refined fundamental matrix and the matches, which fit it exactly; None where the pair
-        cannot be rectified, or too few corners can be tracked from one image to where they are matched.
+        cannot be rectified, or too few corners can be tracked from one image to where they are
+        matched.
     """
     sizes = (gray0.shape[::-1], gray1.shape[::-1])
     sparse = points0, points1
