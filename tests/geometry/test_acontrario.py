@@ -110,7 +110,13 @@ def test_in_an_image_of_a_few_pixels_everything_is_near(kind: str) -> None:
     assert np.isfinite(log10_nfa(errors(30, 30), kind, 3, (1, 1)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+def test_more_models_for_each_sample_are_less_trusted() -> None:
+    """Each of them may be right by chance."""
+    one, ten = (log10_nfa(errors(20, 60), "essential", 3, SIZE, tried) for tried in (1, 10))
+    assert ten == pytest.approx(one + 1)
+
+
+@pytest.mark.parametrize("kind", ["homography", "fundamental"])
 def test_random_matches_are_not_trusted(kind: str) -> None:
     """The best model of random matches, as it is searched for in earnest."""
     threshold = {"homography": 3.0, "fundamental": 1.5}[kind]

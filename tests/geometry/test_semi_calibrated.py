@@ -1,0 +1,167 @@
+"""Fundamental matrices of partly known cameras, from few and mostly wrong matches."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect.geometry import GeometryOptions, epipolar_errors, estimate_geometry
+from deepdetect.geometry.acontrario import MAX_LOG10_NFA, log10_nfa
+from deepdetect.geometry.camera import Calibration, Camera
+from deepdetect.geometry.semi_calibrated import (
+    SemiCalibratedOptions,
+    estimate_semi_calibrated,
+    refine_fundamental,
+)
+from deepdetect.geometry.triangulation import fundamental_matrix
+
+SIZE = (1200, 800)
+SIZES = (SIZE, SIZE)
+SIDEWAYS = np.array([-1.0, 0.1, 0.2])
+FORWARD = np.array([0.1, 0.0, -1.0])
+
+
+def matches(
+    count: int,
+    wrong: int,
+    focal: float = 0.9,
+    motion: np.ndarray = SIDEWAYS,
+    noise: float = 0.4,
+    seed: int = 0,
+    sizes: tuple[tuple[int, int], tuple[int, int]] = SIZES,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return right matches of a scene 5 to 20 baselines deep, wrong ones, and the true matrix."""
+    generator = np.random.default_rng(seed)
+    cameras = [Camera(size, focal * max(size)) for size in sizes]
+    turn = cv2.Rodrigues(np.radians([3.0, 8.0, -5.0]))[0]
+    pixels = generator.uniform((0, 0), sizes[0], (8 * count, 2))
+    points = cameras[0].rays(pixels) * generator.uniform(5, 20, (len(pixels), 1))
+    there = cameras[1].project(points @ turn.T + motion)
+    shown = ((there > 0) & (there < sizes[1])).all(axis=1)
+    first, second = pixels[shown][:count], there[shown][:count]
+    assert len(first) == count
+    first = first + generator.normal(0, noise, first.shape)
+    second = second + generator.normal(0, noise, second.shape)
+    first = np.concatenate([first, generator.uniform((0, 0), sizes[0], (wrong, 2))])
+    second = np.concatenate([second, generator.uniform((0, 0), sizes[1], (wrong, 2))])
+    return first, second, fundamental_matrix(Calibration(*cameras), turn, motion)
+
+
+@pytest.mark.parametrize("motion", [SIDEWAYS, FORWARD], ids=["sideways", "forward"])
+@pytest.mark.parametrize("focal", [0.55, 0.9, 1.8])
+def test_three_of_ten_right_matches_are_enough(focal: float, motion: np.ndarray) -> None:
+    first, second, true = matches(30, 70, focal, motion)
+    found = estimate_semi_calibrated(first, second, SIZES)
+    assert found is not None
+    assert found.log10_nfa < MAX_LOG10_NFA
+    assert found.inliers[:30].mean() > 0.6
+    assert found.inliers[30:].mean() < 0.15
+    unseen = matches(300, 0, focal, motion, noise=0, seed=1)
+    assert np.median(epipolar_errors(*unseen[:2], true)) < 1e-6
+    assert np.median(epipolar_errors(*unseen[:2], found.matrix)) < 2
+
+
+def test_seven_points_alone_find_nothing_there() -> None:
+    """What it is for: where a fundamental matrix without assumptions is lost."""
+    trusted = {"seven points": 0, "five points": 0}
+    for seed in range(5):
+        first, second, _ = matches(22, 68, seed=seed)
+        options = GeometryOptions(model="fundamental", inlier_threshold=1.5, seed=seed)
+        plain = estimate_geometry(first, second, options).matrix
+        if plain is not None:
+            alarms = log10_nfa(epipolar_errors(first, second, plain), "fundamental", 1.5, SIZE)
+            trusted["seven points"] += alarms < MAX_LOG10_NFA
+        found = estimate_semi_calibrated(first, second, SIZES, seed=seed)
+        assert found is not None
+        right = found.inliers[:22].mean() > 0.8
+        trusted["five points"] += right and found.log10_nfa < MAX_LOG10_NFA
+    assert trusted["five points"] >= 4
+    assert trusted["seven points"] <= 1
+
+
+@pytest.mark.parametrize("count", [20, 60, 200])
+def test_random_matches_are_never_trusted(count: int) -> None:
+    for seed in range(5):
+        first, second, _ = matches(6, count, seed=seed)
+        found = estimate_semi_calibrated(first[6:], second[6:], SIZES, seed=seed)
+        assert found is not None
+        assert found.log10_nfa > 0
+
+
+def test_images_of_different_sizes() -> None:
+    sizes = ((1200, 800), (500, 640))
+    first, second, _ = matches(40, 40, sizes=sizes)
+    found = estimate_semi_calibrated(first, second, sizes)
+    assert found is not None
+    assert found.inliers[:40].mean() > 0.9
+
+
+def test_a_large_turn_shows_the_focal_length() -> None:
+    first, second, _ = matches(400, 100, focal=1.2, noise=0.1)
+    found = estimate_semi_calibrated(first, second, SIZES)
+    assert found is not None
+    assert found.focal_lengths == pytest.approx((1.2, 1.2), rel=0.05)
+
+
+@pytest.mark.parametrize("count", [0, 5])
+def test_too_few_matches_give_nothing(count: int) -> None:
+    first, second, true = matches(8, 0)
+    assert estimate_semi_calibrated(first[:count], second[:count], SIZES) is None
+    kept = refine_fundamental(first[:count], second[:count], true, SIZES, np.ones(count))
+    np.testing.assert_array_equal(kept, true)
+
+
+def test_matches_in_one_place_are_no_evidence() -> None:
+    nowhere = np.zeros((30, 2))
+    found = estimate_semi_calibrated(nowhere, nowhere, SIZES)
+    assert found is None or np.isfinite(found.matrix).all()
+
+
+def test_is_the_same_for_the_same_seed() -> None:
+    first, second, _ = matches(30, 60)
+    found, again = (estimate_semi_calibrated(first, second, SIZES, seed=3) for _ in range(2))
+    assert found is not None
+    assert again is not None
+    np.testing.assert_array_equal(found.matrix, again.matrix)
+
+
+@pytest.mark.parametrize("motion", [SIDEWAYS, FORWARD], ids=["sideways", "forward"])
+def test_a_refined_matrix_is_nearer_to_the_truth(motion: np.ndarray) -> None:
+    """Than one of seven points from the same matches, in the median of some scenes."""
+    plain, refined = [], []
+    for seed in range(7):
+        first, second, _ = matches(80, 0, motion=motion, noise=0.5, seed=seed)
+        unseen = matches(300, 0, motion=motion, noise=0, seed=100 + seed)[:2]
+        options = GeometryOptions(model="fundamental", inlier_threshold=2, seed=seed)
+        start = estimate_geometry(first, second, options).matrix
+        better = refine_fundamental(first, second, start, SIZES, np.full(80, 0.5))
+        plain.append(np.quantile(epipolar_errors(*unseen, start), 0.9))
+        refined.append(np.quantile(epipolar_errors(*unseen, better), 0.9))
+    assert np.median(refined) < 0.8 * np.median(plain)
+
+
+def test_wrong_matches_hardly_move_a_refined_matrix() -> None:
+    first, second, true = matches(200, 20)
+    unseen = matches(300, 0, noise=0, seed=9)[:2]
+    refined = refine_fundamental(first, second, true, SIZES, np.full(220, 0.5))
+    assert np.quantile(epipolar_errors(*unseen, refined), 0.9) < 0.5
+
+
+def test_exact_matches_of_an_unusual_camera_outweigh_what_is_usual() -> None:
+    """A principal point off the middle, as of a cut-out: matches decide where there are many."""
+    cameras = [Camera(SIZE, 1500, (700, 300)), Camera(SIZE, 1500, (700, 300))]
+    turn = cv2.Rodrigues(np.radians([2.0, 15.0, 5.0]))[0]
+    generator = np.random.default_rng(0)
+    pixels = generator.uniform((0, 0), SIZE, (1000, 2))
+    points = cameras[0].rays(pixels) * generator.uniform(3, 12, (1000, 1))
+    there = cameras[1].project(points @ turn.T + SIDEWAYS)
+    start = fundamental_matrix(Calibration(Camera(SIZE, 1500), Camera(SIZE, 1500)), turn, SIDEWAYS)
+    assert np.median(epipolar_errors(pixels, there, start)) > 1
+    refined = refine_fundamental(pixels, there, start, SIZES, np.full(1000, 0.1))
+    assert np.quantile(epipolar_errors(pixels, there, refined), 0.95) < 0.1
+
+
+def test_options_say_what_is_wrong_with_them() -> None:
+    with pytest.raises(ValueError, match="focal_lengths"):
+        SemiCalibratedOptions(focal_lengths=(0.7, -1))

@@ -1,0 +1,93 @@
+"""Sparse matches along epipolar lines, against a search in plain loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.matching.guided.along_lines import LineSearchOptions, match_along_lines
+
+ROWS = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+"""Of a rectified pair: epipolar lines are the rows."""
+
+SIZE = (400, 300)
+
+
+def keypoints(xy: np.ndarray, descriptors: np.ndarray) -> Keypoints:
+    return Keypoints(xy, np.ones(len(xy)), SIZE, descriptors=descriptors.astype(np.uint8))
+
+
+def random_pair(count: int, seed: int = 0) -> tuple[Keypoints, Keypoints]:
+    """Return keypoints that moved along their rows, with a little noise, and others."""
+    generator = np.random.default_rng(seed)
+    xy = generator.uniform((0, 0), SIZE, (count, 2))
+    described = generator.integers(0, 256, (count, 128))
+    moved = xy + np.column_stack([generator.uniform(-40, 40, count), generator.normal(0, 1, count)])
+    noisy = np.clip(described + generator.normal(0, 30, described.shape), 0, 255)
+    others = generator.random(count) < 0.3
+    noisy[others] = generator.integers(0, 256, (others.sum(), 128))
+    order = generator.permutation(count)
+    return keypoints(xy, described), keypoints(moved[order], noisy[order])
+
+
+def by_loops(first: Keypoints, second: Keypoints, options: LineSearchOptions) -> list[tuple]:
+    """Search as the documentation says it, one keypoint at a time; lines are the rows."""
+    a, b = first.descriptors.astype(float), second.descriptors.astype(float)
+    distance = np.linalg.norm(a[:, None] - b[None], axis=2)
+    near = np.abs(first.xy[:, None, 1] - second.xy[None, :, 1]) < options.max_distance_px
+    inside, outside = np.where(near, distance, np.inf), np.where(near, np.inf, distance)
+    found = []
+    for row in range(len(a)):
+        best = int(inside[row].argmin())
+        if not near[row, best] or inside[:, best].argmin() != row:
+            continue
+        apart = np.linalg.norm(second.xy - second.xy[best], axis=1) >= options.min_separation_px
+        rivals = [outside[row].min(), outside[:, best].min()]
+        passes = inside[row, best] < options.ratio_elsewhere * min(rivals)
+        second_best = inside[row][apart].min(initial=np.inf)
+        if passes and inside[row, best] < options.ratio_near * second_best:
+            found.append((*first.xy[row], *second.xy[best]))
+    return found
+
+
+@pytest.mark.parametrize("count", [60, 700])
+@pytest.mark.parametrize("ratio", [0.6, 0.95])
+def test_finds_what_plain_loops_find(count: int, ratio: float) -> None:
+    first, second = random_pair(count)
+    options = LineSearchOptions(ratio_elsewhere=ratio)
+    found = match_along_lines(first, second, ROWS, options)
+    expected = by_loops(first, second, options)
+    assert len(expected) > 20
+    np.testing.assert_allclose(np.column_stack(found), expected, atol=1e-6)
+
+
+def test_a_pattern_that_repeats_elsewhere_is_matched_on_its_line() -> None:
+    """The same descriptor on every row: the best and the second-best are equally far."""
+    descriptor = np.random.default_rng(0).integers(0, 256, 128)
+    xy = np.array([[50.0, y] for y in range(10, 290, 40)])
+    noise = np.random.default_rng(1).integers(-4, 5, (2, len(xy), 128))
+    first = keypoints(xy, np.clip(descriptor + noise[0], 0, 255))
+    second = keypoints(xy + [30, 0.5], np.clip(descriptor + noise[1], 0, 255))
+    strict = LineSearchOptions(ratio_elsewhere=0.5)
+    assert len(match_along_lines(first, second, ROWS, strict)[0]) == 0
+    lenient = LineSearchOptions(ratio_elsewhere=1)
+    points0, points1 = match_along_lines(first, second, ROWS, lenient)
+    np.testing.assert_allclose(points1 - points0, np.tile([30, 0.5], (len(points0), 1)))
+
+
+def test_what_is_off_the_line_is_no_partner() -> None:
+    described = np.random.default_rng(0).integers(0, 256, (2, 128))
+    first = keypoints(np.array([[50.0, 50.0], [90.0, 200.0]]), described)
+    second = keypoints(np.array([[60.0, 54.0], [70.0, 202.0]]), described)
+    points0, points1 = match_along_lines(first, second, ROWS)
+    assert points0.tolist() == [[90, 200]]
+    assert points1.tolist() == [[70, 202]]
+
+
+def test_without_keypoints_there_are_no_matches() -> None:
+    first, _ = random_pair(10)
+    none = keypoints(np.empty((0, 2)), np.empty((0, 128)))
+    for pair in ((first, none), (none, first), (none, none)):
+        points0, points1 = match_along_lines(*pair, ROWS)
+        assert points0.shape == points1.shape == (0, 2)
