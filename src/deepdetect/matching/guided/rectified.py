@@ -42,8 +42,9 @@ class RectifiedView:
         frame: the frame, of the images at `scale`.
         scale: of both images, at most 1.
         first, second: (H, W) uint8, the warped images.
-        disparities: of every pixel of the first.
-        correlation: (H, W) float32 local ZNCC of both after the disparity, NaN without one.
+        disparities: of every pixel of the first, those that geometry may rely on.
+        kept: (H, W) float32 disparities of the matches that are kept, perhaps more; else NaN.
+        correlation: (H, W) float32 local ZNCC of both after the disparity, where one is kept.
     """
 
     frame: RectifiedFrame
@@ -51,6 +52,7 @@ class RectifiedView:
     first: np.ndarray
     second: np.ndarray
     disparities: DisparityMap
+    kept: np.ndarray
     correlation: np.ndarray
 
 
@@ -80,9 +82,11 @@ def match_by_rectification(
     """
     view = _rectify(gray0, gray1, points0, points1, fundamental, options)
     tracks = None if view is None else _track(view, options)
+    settled = True
     for _ in range(options.max_refits):
         if tracks is None or np.median(np.abs(tracks[2])) < options.max_row_error_px:
             break
+        settled = False
         refit = GeometryOptions(
             model="fundamental", inlier_threshold=options.refit_threshold_px, seed=seed
         )
@@ -96,9 +100,12 @@ def match_by_rectification(
         if view is None or again is None or _matched(again) < _matched(view):
             break
         view, fundamental, tracks = again, found.matrix, _track(again, options)
+        settled = True
     if view is None or tracks is None:
         return None
-    rows, places, scores = _sample(view, xy0)
+    # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
+    disparity = view.kept if settled else view.disparities.disparity
+    rows, places, scores = _sample(view, disparity, xy0)
     height, width = gray1.shape
     inside = ((places > -0.5) & (places < (width - 0.5, height - 0.5))).all(axis=1)
     return fundamental, GuidedMatches(rows[inside], places[inside], scores[inside])
@@ -154,20 +161,20 @@ def _rectify(
         return None
     chosen = replace(options.disparity, disparity_range=(low, high))
     found, correlation = _match_rows(first, second, valid0, valid1, chosen, options)
-    bound = max(
-        options.min_correlation,
-        _chance_correlation(first, second, valid0, valid1, chosen, options),
+    chance = _match_by_chance(first, second, valid0, valid1, chosen, options)
+    bounds = _correlation_bounds(
+        correlation[found.matched], *chance, int(np.count_nonzero(valid0)), options
     )
-    kept = found.matched & (correlation >= bound)
+    relied, kept = (found.matched & (correlation >= bound) for bound in bounds)
+    nan = np.float32(np.nan)
     return RectifiedView(
         frame,
         scale,
         first,
         second,
-        DisparityMap(
-            np.where(kept, found.disparity, np.float32(np.nan)), kept, found.disparity_range
-        ),
-        np.where(kept, correlation, np.float32(np.nan)),
+        DisparityMap(np.where(relied, found.disparity, nan), relied, found.disparity_range),
+        np.where(kept, found.disparity, nan),
+        np.where(kept, correlation, nan),
     )
 
 
@@ -197,15 +204,15 @@ def _match_rows(
     return matched, np.where(known, np.nan_to_num(correlation), np.float32(-1))
 
 
-def _chance_correlation(
+def _match_by_chance(
     first: np.ndarray,
     second: np.ndarray,
     valid0: np.ndarray,
     valid1: np.ndarray,
     disparity_options: DisparityOptions,
     options: RectifiedMatchingOptions,
-) -> float:
-    """Return the correlation below which too many matches are found by chance.
+) -> tuple[np.ndarray, int]:
+    """Return the correlations of matches by chance, and for how many pixels they were sought.
 
     Some rows are matched with rows of the second view that show something else: what is found there
     is found by chance, the best of as many disparities as everywhere.
@@ -219,9 +226,35 @@ def _chance_correlation(
     found, correlation = _match_rows(
         first[rows], second[others], *valid, disparity_options, options
     )
-    by_chance = np.sort(correlation[found.matched])[::-1]
-    allowed = int(options.false_positive_rate * np.count_nonzero(valid[0]))
-    return float(by_chance[allowed]) if len(by_chance) > allowed else -1.0
+    return correlation[found.matched], int(np.count_nonzero(valid[0]))
+
+
+def _correlation_bounds(
+    correlations: np.ndarray,
+    by_chance: np.ndarray,
+    chance_pixels: int,
+    pixels: int,
+    options: RectifiedMatchingOptions,
+) -> tuple[float, float]:
+    """Return the least correlation of a match that geometry relies on, and of one that is kept.
+
+    Args:
+        correlations: of the matches.
+        by_chance: of matches by chance.
+        chance_pixels, pixels: for how many pixels these and the matches were sought.
+        options: how many may be found by chance.
+    """
+    null = np.sort(by_chance)[::-1]
+    allowed = int(options.false_positive_rate * chance_pixels)
+    high = max(options.min_correlation, float(null[allowed]) if len(null) > allowed else -1.0)
+    # Where nearly nothing is found by chance and nearly all else is, low correlation is no reason
+    # to doubt: smooth surfaces are matched by what surrounds them.
+    ordered = np.sort(correlations)
+    bounds = np.append(-1.0, null[::-1])
+    matches = len(ordered) - np.searchsorted(ordered, bounds)
+    wrong = (len(null) - np.searchsorted(null[::-1], bounds)) * pixels / max(chance_pixels, 1)
+    few = bounds[(wrong <= options.false_discovery_rate * matches) & (chance_pixels > 0)]
+    return high, min(high, float(few.min())) if len(few) else high
 
 
 def _range_of_matches(
@@ -288,9 +321,10 @@ def _track(
     return own[0], own[1], (there - start)[good, 1]
 
 
-def _sample(view: RectifiedView, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows of the keypoints that have a match, its places and its scores."""
-    disparity = view.disparities.disparity
+def _sample(
+    view: RectifiedView, disparity: np.ndarray, xy0: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows of the keypoints that have a disparity, their places and scores."""
     height, width = disparity.shape
     places = view.frame.to_frame(scaled_points(xy0, view.scale), 0)
     nearest = np.rint(np.where(np.isfinite(places), places, -1)).astype(np.int64)
