@@ -20,7 +20,7 @@ Arrays = Mapping[str, np.ndarray]
 STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "keypoints": (1, ()),
     "matches": (1, ("keypoints",)),
-    "guided": (3, ("keypoints",)),
+    "guided": (4, ("keypoints",)),
     "stereo": (1, ()),
     "repeatability_paper": (1, ("keypoints",)),
     "repeatability_mutual_nn": (1, ("keypoints",)),

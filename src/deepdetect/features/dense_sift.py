@@ -26,7 +26,13 @@ BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's size (3 times its radius)."""
 
 
-def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0, step_px: int = 1) -> np.ndarray:
+def dense_sift(
+    gray: np.ndarray,
+    xy: np.ndarray,
+    size: float = 3.0,
+    step_px: int = 1,
+    gradient: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
     """Compute upright SIFT descriptors; they equal OpenCV's at angle 0.
 
     Args:
@@ -34,6 +40,7 @@ def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0, step_px: int
         xy: (N, 2) positions on whole pixels within the image.
         size: diameter of the keypoints in pixels, in [2, 8].
         step_px: the positions lie on every so many-th row and column, which saves time.
+        gradient: of the image, where `sift_gradient` has computed it already.
 
     Returns:
         (N, 128) uint8: four rows of four columns of eight orientations.
@@ -68,14 +75,23 @@ def dense_sift(gray: np.ndarray, xy: np.ndarray, size: float = 3.0, step_px: int
     tiles = -(-len(rows_of) // max(1, TILE_HEIGHT // step_px)) * -(
         -rows_of.shape[1] // TILE_COLUMNS
     )
-    arguments = (*_gradient(gray), rows_of, origin, step_px, *_taps(size))
+    gradient = sift_gradient(gray) if gradient is None else gradient
+    arguments = (*gradient, rows_of, origin, step_px, *_taps(size))
     parallel_for(tiles, describe_tiles, *arguments, out)
     described = rows_of[row, column]
     return out if (described == np.arange(len(out))).all() else out[described]
 
 
-def _gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gradient's magnitude, 0 on the border, and orientation in units of 45 degrees."""
+def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the gradient of an image that `dense_sift` describes.
+
+    Args:
+        gray: (H, W) uint8 luma.
+
+    Returns:
+        Its magnitude, 0 on the border, and its orientation in units of 45 degrees, both (H, W)
+        float32.
+    """
     blur = float(np.sqrt(SIGMA_PX**2 - CAMERA_SIGMA_PX**2))
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), blur)
     across, up = np.zeros_like(smooth), np.zeros_like(smooth)

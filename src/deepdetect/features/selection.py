@@ -121,6 +121,9 @@ def select_keypoints(
         pixels = pixels[_suppress(pixels, ranks[pixels], heatmap.shape, options.suppression_radius)]
     count = _wanted_count(options, heatmap.size)
     if count is not None and len(pixels) > count:
+        scores = ranks[pixels]
+        # Only the best are sorted, and those that tie with the last of them.
+        pixels = pixels[scores >= np.partition(scores, len(scores) - count)[len(scores) - count]]
         pixels = pixels[np.sort(_ranked(pixels, ranks[pixels], heatmap.shape)[:count])]
     row, column = np.divmod(pixels, width)
     xy = np.stack([column, row], 1).astype(np.float32)
@@ -172,12 +175,31 @@ def _suppress(
 ) -> np.ndarray:
     """Return which pixels rank highest in the window around them.
 
-    Pixels are compared by rank, which has no ties: one pixel of a plateau is kept.
+    Of equal scores the one that comes first in `bayer_order` ranks higher: one pixel of a plateau
+    is kept.
     """
-    rank = np.zeros(shape, np.float32 if len(pixels) < 2**24 else np.float64)
-    rank.ravel()[pixels[_ranked(pixels, scores, shape)]] = np.arange(len(pixels), 0, -1)
+    kind = np.float32 if scores.dtype == np.float32 else np.float64
+    image = np.full(shape, -np.inf, kind)
+    image.ravel()[pixels] = np.maximum(scores, np.finfo(kind).min)
     window = np.ones((2 * radius + 1,) * 2, np.uint8)  # a box is dilated in linear time
-    return (cv2.dilate(rank, window) == rank).ravel()[pixels]  # beyond the border is -infinity
+    highest = cv2.dilate(image, window) == image  # beyond the border is -infinity
+    kept = highest.ravel()[pixels]
+    rows = np.flatnonzero(kept)
+    row, column = np.divmod(pixels[rows], shape[1])
+    padded = np.pad(image, radius, constant_values=-np.inf)
+    own = image[row, column]
+    for y, x in np.ndindex(window.shape):
+        down, across = y - radius, x - radius
+        tied = np.flatnonzero(padded[row + y, column + x] == own)
+        if not len(tied) or (down, across) == (0, 0):
+            continue
+        here = np.column_stack([column[tied], row[tied]])
+        first, second = (
+            bayer_order(xy, (shape[1], shape[0])) for xy in (here, here + (across, down))
+        )
+        before = second <= first if (down, across) < (0, 0) else second < first
+        kept[rows[tied[before]]] = False
+    return kept
 
 
 def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarray:

@@ -170,12 +170,15 @@ def refine_homography_validated(
     current = np.asarray(homography, np.float64)
     warped, valid_mask = warp_to_reference(gray1, current, size)
     before = correlation(warped, valid_mask)
-    for step in _steps(gray0, options):
+    steps = list(_steps(gray0, options))
+    for step in steps:
         fit = step(warped, valid_mask)
         correction = fit(valid_mask) if fit and gain(fit) > options.min_gain else None
         if correction is None:
             continue
         current = current @ correction
+        if step is steps[-1]:  # nothing is compared with it any more
+            break
         warped, valid_mask = warp_to_reference(gray1, current, size)
         before = correlation(warped, valid_mask)
     return current / current[2, 2]

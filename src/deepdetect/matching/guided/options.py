@@ -204,10 +204,13 @@ class RectifiedMatchingOptions:
         correlation_window_px: side of the window in which both images are compared after matching,
             odd.
         correlation_sigma_px: of the blur before that.
-        min_correlation: a match whose windows correlate less is left out.
+        min_correlation: a match whose windows correlate less is left out, unless
+            `false_discovery_rate` allows it.
         false_positive_rate: so many of the pixels may be matched by chance; matches whose windows
             correlate too little for that are left out. It is measured on rows that show something
             else.
+        false_discovery_rate: while no more than this fraction of the matches is found by chance,
+            the two bounds above hold only for the matches that geometry relies on.
         null_fraction: of the rows, which are matched with others for that.
         max_refits: the images are rectified again, by a matrix fitted to tracked corners, at most
             this often,
@@ -239,6 +242,7 @@ class RectifiedMatchingOptions:
     correlation_sigma_px: float = 1.0
     min_correlation: float = 0.3
     false_positive_rate: float = 0.01
+    false_discovery_rate: float = 0.01
     null_fraction: float = 0.25
     max_refits: int = 1
     max_row_error_px: float = 0.5
@@ -261,7 +265,8 @@ class RectifiedMatchingOptions:
             not_negative=("max_refits", "margin_fraction"),
             fractions=(
                 *("min_correlation", "min_fraction_of_one_sign"),
-                *("false_positive_rate", "null_fraction", "row_quantile"),
+                *("false_positive_rate", "false_discovery_rate", "null_fraction"),
+                "row_quantile",
             ),
             odd=("correlation_window_px", "refit_window_px"),
             between={"tail_fraction": (0, 0.5), "min_tracks": (8, math.inf)},

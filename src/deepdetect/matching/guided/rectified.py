@@ -43,8 +43,9 @@ class RectifiedView:
         frame: the frame, of the images at `scale`.
         scale: of both images, at most 1.
         first, second: (H, W) uint8, the warped images.
-        disparities: of every pixel of the first.
-        correlation: (H, W) float32 local ZNCC of both after the disparity, NaN without one.
+        disparities: of every pixel of the first, those that geometry may rely on.
+        kept: (H, W) float32 disparities of the matches that are kept, perhaps more; else NaN.
+        correlation: (H, W) float32 local ZNCC of both after the disparity, where one is kept.
     """
 
     frame: RectifiedFrame
@@ -52,6 +53,7 @@ class RectifiedView:
     first: np.ndarray
     second: np.ndarray
     disparities: DisparityMap
+    kept: np.ndarray
     correlation: np.ndarray
 
 
@@ -99,19 +101,19 @@ def match_by_rectification(
     if view is None or tracks is None:
         return None
     fundamental = _refine(fundamental, sparse, tracks, sizes, options)
+    settled = _are_near(tracks, fundamental, options)
     for _ in range(options.max_refits):
-        error = np.quantile(epipolar_errors(*tracks.on_rows, fundamental), options.row_quantile)
-        if error < options.max_row_error_px:
+        if settled:
             break
         again = _rectify(gray0, gray1, *tracks.positions, fundamental, options)
-        if again is None or _matched(again) < _matched(view):
+        found = None if again is None else _track(again, options)
+        if again is None or found is None or _matched(again) < _matched(view):
             break
-        found = _track(again, options)
-        if found is None:
-            break
-        view, tracks = again, found
+        view, tracks, settled = again, found, True
         fundamental = _refine(fundamental, sparse, tracks, sizes, options)
-    rows, places, scores = _sample(view, xy0)
+    # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
+    disparity = view.kept if settled else view.disparities.disparity
+    rows, places, scores = _sample(view, disparity, xy0)
     places = _moved_to_lines(xy0[rows], places, fundamental)
     height, width = gray1.shape
     inside = ((places > -0.5) & (places < (width - 0.5, height - 0.5))).all(axis=1)
@@ -135,6 +137,12 @@ def _refine(
     return refine_fundamental(
         points0, points1, fundamental, sizes, np.concatenate(sigmas), options.semi_calibrated
     )
+
+
+def _are_near(tracks: Tracks, fundamental: np.ndarray, options: RectifiedMatchingOptions) -> bool:
+    """Whether the rows that were matched are near the lines of a matrix."""
+    errors = epipolar_errors(*tracks.on_rows, fundamental)
+    return float(np.quantile(errors, options.row_quantile)) < options.max_row_error_px
 
 
 def _moved_to_lines(
@@ -198,20 +206,20 @@ def _rectify(
         return None
     chosen = replace(options.disparity, disparity_range=(low, high))
     found, correlation = _match_rows(first, second, valid0, valid1, chosen, options)
-    bound = max(
-        options.min_correlation,
-        _chance_correlation(first, second, valid0, valid1, chosen, options),
+    chance = _match_by_chance(first, second, valid0, valid1, chosen, options)
+    bounds = _correlation_bounds(
+        correlation[found.matched], *chance, int(np.count_nonzero(valid0)), options
     )
-    kept = found.matched & (correlation >= bound)
+    relied, kept = (found.matched & (correlation >= bound) for bound in bounds)
+    nan = np.float32(np.nan)
     return RectifiedView(
         frame,
         scale,
         first,
         second,
-        DisparityMap(
-            np.where(kept, found.disparity, np.float32(np.nan)), kept, found.disparity_range
-        ),
-        np.where(kept, correlation, np.float32(np.nan)),
+        DisparityMap(np.where(relied, found.disparity, nan), relied, found.disparity_range),
+        np.where(kept, found.disparity, nan),
+        np.where(kept, correlation, nan),
     )
 
 
@@ -241,15 +249,15 @@ def _match_rows(
     return matched, np.where(known, np.nan_to_num(correlation), np.float32(-1))
 
 
-def _chance_correlation(
+def _match_by_chance(
     first: np.ndarray,
     second: np.ndarray,
     valid0: np.ndarray,
     valid1: np.ndarray,
     disparity_options: DisparityOptions,
     options: RectifiedMatchingOptions,
-) -> float:
-    """Return the correlation below which too many matches are found by chance.
+) -> tuple[np.ndarray, int]:
+    """Return the correlations of matches by chance, and for how many pixels they were sought.
 
     Some rows are matched with rows of the second view that show something else: what is found there
     is found by chance, the best of as many disparities as everywhere.
@@ -263,9 +271,35 @@ def _chance_correlation(
     found, correlation = _match_rows(
         first[rows], second[others], *valid, disparity_options, options
     )
-    by_chance = np.sort(correlation[found.matched])[::-1]
-    allowed = int(options.false_positive_rate * np.count_nonzero(valid[0]))
-    return float(by_chance[allowed]) if len(by_chance) > allowed else -1.0
+    return correlation[found.matched], int(np.count_nonzero(valid[0]))
+
+
+def _correlation_bounds(
+    correlations: np.ndarray,
+    by_chance: np.ndarray,
+    chance_pixels: int,
+    pixels: int,
+    options: RectifiedMatchingOptions,
+) -> tuple[float, float]:
+    """Return the least correlation of a match that geometry relies on, and of one that is kept.
+
+    Args:
+        correlations: of the matches.
+        by_chance: of matches by chance.
+        chance_pixels, pixels: for how many pixels these and the matches were sought.
+        options: how many may be found by chance.
+    """
+    null = np.sort(by_chance)[::-1]
+    allowed = int(options.false_positive_rate * chance_pixels)
+    high = max(options.min_correlation, float(null[allowed]) if len(null) > allowed else -1.0)
+    # Where nearly nothing is found by chance and nearly all else is, low correlation is no reason
+    # to doubt: smooth surfaces are matched by what surrounds them.
+    ordered = np.sort(correlations)
+    bounds = np.append(-1.0, null[::-1])
+    matches = len(ordered) - np.searchsorted(ordered, bounds)
+    wrong = (len(null) - np.searchsorted(null[::-1], bounds)) * pixels / max(chance_pixels, 1)
+    few = bounds[(wrong <= options.false_discovery_rate * matches) & (chance_pixels > 0)]
+    return high, min(high, float(few.min())) if len(few) else high
 
 
 def _range_of_matches(
@@ -328,9 +362,10 @@ def _track(view: RectifiedView, options: RectifiedMatchingOptions) -> Tracks | N
     return Tracks((first_places, second_places), (first_places, row_places))
 
 
-def _sample(view: RectifiedView, xy0: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows of the keypoints that have a match, its places and its scores."""
-    disparity = view.disparities.disparity
+def _sample(
+    view: RectifiedView, disparity: np.ndarray, xy0: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rows of the keypoints that have a disparity, their places and scores."""
     height, width = disparity.shape
     places = view.frame.to_frame(scaled_points(xy0, view.scale), 0)
     nearest = np.rint(np.where(np.isfinite(places), places, -1)).astype(np.int64)

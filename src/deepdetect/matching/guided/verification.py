@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...features.dense_sift import dense_sift
+from ...features.dense_sift import dense_sift, sift_gradient
 from ...features.sift import correlation_distance, to_root_sift
 from ...geometry.windows import gaussian_means, window_sums
 from .options import VerificationOptions
@@ -187,20 +187,23 @@ def _distances(
     own = index[points[:, 1], points[:, 0]]
     distances = np.zeros(len(points), np.float32)
     null_distances = [np.zeros(len(null.rows), np.float32) for null in null_pairs]
+    gradients = [sift_gradient(gray) for gray in (gray0, warped)]
+    shifted = [sift_gradient(null.shifted) for null in null_pairs]
     for size in options.keypoint_sizes_px:
-        first = to_root_sift(dense_sift(gray0, points, size, step), overwrite=True)
+        described = dense_sift(gray0, points, size, step, gradients[0])
+        first = to_root_sift(described, overwrite=True)
         total = first.sum(axis=0, dtype=np.int64)  # exact: the order of the points does not matter
         enough = len(first) >= MIN_POINTS_OF_MEAN
         mean = (total / len(first) if enough else 0 * total).astype(np.float32)
-        second = to_root_sift(dense_sift(warped, places, size, step), overwrite=True)
+        described = dense_sift(warped, places, size, step, gradients[1])
+        second = to_root_sift(described, overwrite=True)
         distances += correlation_distance(first, np.arange(len(first)), second, own, mean)
-        for values, null in zip(null_distances, null_pairs, strict=True):
+        for values, null, gradient in zip(null_distances, null_pairs, shifted, strict=True):
             x, y = null.places[null.interior].T
             inner, outer = null.rows[null.interior], null.rows[~null.interior]
             values[null.interior] += correlation_distance(first, inner, second, index[y, x], mean)
-            others = to_root_sift(
-                dense_sift(null.shifted, points[outer], size, step), overwrite=True
-            )
+            described = dense_sift(null.shifted, points[outer], size, step, gradient)
+            others = to_root_sift(described, overwrite=True)
             rows = np.arange(len(outer))
             values[~null.interior] += correlation_distance(first, outer, others, rows, mean)
     return distances, null_distances
