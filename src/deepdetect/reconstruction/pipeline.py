@@ -303,6 +303,7 @@ def _reconstruct_general(pair: _Pair) -> Reconstruction:
         options.point_filter,
         options.seed,
         timer,
+        refined=found.subpixel,
     )
     pixels = found.points0[made.indices]
     columns, rows = np.rint(pixels).astype(np.int64).T

@@ -101,7 +101,7 @@ def match_by_rectification(
     rows, places, scores = _sample(view, xy0)
     height, width = gray1.shape
     inside = ((places > -0.5) & (places < (width - 0.5, height - 0.5))).all(axis=1)
-    return fundamental, GuidedMatches(rows[inside], places[inside], scores[inside])
+    return fundamental, GuidedMatches(rows[inside], places[inside], scores[inside], subpixel=True)
 
 
 def _matched(view: RectifiedView) -> int:
