@@ -63,7 +63,7 @@ class RectificationOptions:
     first_side_px: int = 480
     first_max_keypoints: int = 1000
     min_first_inliers: int = 50
-    max_first_row_error_px: float = 0.5
+    max_first_row_error_px: float = 0.6
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -264,7 +264,7 @@ def detect_rectification(
                 model="homography", inlier_threshold=options.max_transfer_error_px, seed=seed
             ),
         )
-        if is_planar(plane.inliers, epipolar.inliers, options.min_planar_ratio):
+        if is_planar(first, second, plane, epipolar, options.min_planar_ratio, seed):
             reason = "one homography explains all the matches: all move nearly the same"
     on_rows_count, by_fundamental, by_other_rows = counts
     return Rectification(
