@@ -2,14 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from deepdetect import GeometryOptions, estimate_geometry
 from deepdetect.geometry.model_selection import (
     ModelSelectionOptions,
     measure_parallax,
-    select_model,
 )
 
 CAMERA = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], float)
@@ -39,20 +36,6 @@ def test_auto_of_too_few_matches_is_nothing() -> None:
     found = estimate_geometry(np.zeros((2, 2)), np.zeros((2, 2)), GeometryOptions(model="auto"))
     assert found.matrix is None
     assert not found.inliers.any()
-
-
-@given(st.lists(st.booleans(), min_size=1, max_size=60))
-def test_what_a_plane_explains_has_no_depth(explained: list[bool]) -> None:
-    inliers = np.array(explained)
-    assert select_model(inliers, inliers) == "homography"
-    assert select_model(np.ones_like(inliers), inliers) == "homography"
-
-
-def test_depth_needs_a_share_of_the_rest_and_of_all() -> None:
-    index = np.arange(1000)
-    assert select_model(index < 800, index < 950) == "fundamental"
-    assert select_model(index < 800, index < 880) == "homography"  # less than half of the rest
-    assert select_model(index < 950, index < 1000) == "homography"  # next to nothing of all
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])

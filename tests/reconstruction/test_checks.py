@@ -16,6 +16,7 @@ from deepdetect import DeepDetect, match_images
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
+from deepdetect.geometry import Geometry, GeometryOptions, estimate_geometry
 from deepdetect.geometry.camera import Calibration, Camera, calibration_from_focal
 from deepdetect.geometry.relative_pose import RelativePose, estimate_relative_pose
 from deepdetect.io.image import load_image, luma
@@ -291,6 +292,25 @@ def test_what_stands_in_front_of_a_plane() -> None:
         by_fundamental[100 + explained :] = False
         assert has_foreground(off_plane, by_fundamental) == expected
     assert not has_foreground(off_plane[:104], np.ones(104, bool))  # under 5 %
-    by_homography = off_plane < 2
-    assert is_planar(by_homography[:105], np.ones(105, bool))
-    assert not is_planar(np.arange(100) < 70, np.ones(100, bool))
+
+
+@pytest.mark.parametrize("wrong", [0, 300])
+def test_a_plane_is_one_also_among_wrong_matches_and_depth_is_none(wrong: int) -> None:
+    """Of 300 matches on a plane up to 100 move further along their rows."""
+    generator = np.random.default_rng(0)
+    points0 = generator.uniform(0, 500, (300 + wrong, 2))
+    noise = generator.normal(0, 0.3, points0.shape)
+    for nearer, expected in ((0, True), (15, True), (70, False), (100, False)):
+        points1 = points0 + 5 + noise
+        points1[:nearer, 0] += np.linspace(8, 40, nearer)
+        points1[300:] = np.random.default_rng(1).uniform(0, 500, (wrong, 2))
+        plane, epipolar = (
+            estimate_geometry(
+                points0, points1, GeometryOptions(model=model, inlier_threshold=threshold)
+            )
+            for model, threshold in (("homography", 2), ("fundamental", 1.5))
+        )
+        planar = is_planar(points0, points1, plane, epipolar, min_ratio=0.5)
+        assert planar is expected
+    nothing = Geometry("homography", None, np.zeros(len(points0), bool))
+    assert not is_planar(points0, points1, nothing, epipolar)

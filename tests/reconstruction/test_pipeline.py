@@ -176,7 +176,8 @@ def test_a_post_before_a_wall_is_not_left_out(
     pair = facade(0.07)
     given: list[np.ndarray] = []
 
-    def stop(points0: np.ndarray, points1: np.ndarray, *rest: Any) -> None:
+    def stop(points0: np.ndarray, points1: np.ndarray, *rest: Any, refined: bool) -> None:
+        assert refined  # they come from rectified rows
         given.extend([points0, points1])
         raise ReconstructionError("seen enough")
 

@@ -8,10 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
+from deepdetect.datasets import load_stereo_pair
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.io.image import load_image, luma
-from deepdetect.reconstruction.rectification import detect_rectification
+from deepdetect.matching.guided import initial_matches
+from deepdetect.reconstruction.rectification import (
+    RectificationOptions,
+    detect_rectification,
+    find_rectification,
+)
 
 SCENES = [
     *("art", "cones", "teddy"),
@@ -155,3 +161,114 @@ def test_the_figures_are_those_of_the_pair() -> None:
     assert found.disparities == pytest.approx((12, 30, 48), abs=0.7)
     assert found.line_angle < 0.1
     assert found.vertical_offset == 0
+
+
+@pytest.fixture(scope="module")
+def motorcycle() -> tuple[np.ndarray, np.ndarray]:
+    pytest.importorskip("skimage.data", reason="needs scikit-image for the Motorcycle pair")
+    pair = load_stereo_pair("motorcycle")
+    return luma(pair.left), luma(pair.right)
+
+
+def enlarged(pair: tuple[np.ndarray, np.ndarray], factor: float) -> list[np.ndarray]:
+    zoom = {"fx": factor, "fy": factor, "interpolation": cv2.INTER_CUBIC}
+    return [cv2.resize(view, None, **zoom) for view in pair]
+
+
+def moved(image: np.ndarray, matrix: Any) -> np.ndarray:
+    size = image.shape[::-1]
+    options = {"flags": cv2.INTER_CUBIC, "borderMode": cv2.BORDER_REFLECT}
+    return cv2.warpAffine(image, np.array(matrix, np.float64), size, **options)
+
+
+def test_small_copies_of_large_images_decide_alone(motorcycle: Any) -> None:
+    left, right = enlarged(motorcycle, 2)
+    found, initial = find_rectification(left, right)
+    assert found.rectified
+    assert not found.swapped
+    assert initial is None
+    size = left.shape[::-1]
+    fine = initial_matches(left, right)
+    expected = detect_rectification(fine.points0, fine.points1, size, size)
+    for own, other in zip(found.disparities[::2], expected.disparities[::2], strict=True):
+        assert own == pytest.approx(other, rel=0.1)
+    assert found.vertical_offset == pytest.approx(expected.vertical_offset, abs=0.3)
+    exchanged, initial = find_rectification(right, left)
+    assert exchanged.rectified
+    assert exchanged.swapped
+    assert initial is None
+    with_offset, _ = find_rectification(right, left, offset_px=500)
+    assert with_offset.rectified
+    assert not with_offset.swapped
+
+
+def test_small_copies_reject_views_that_are_clearly_turned(motorcycle: Any) -> None:
+    left, right = enlarged(motorcycle, 2)
+    turn = cv2.getRotationMatrix2D((left.shape[1] / 2, left.shape[0] / 2), 3, 1)
+    found, initial = find_rectification(left, moved(right, turn))
+    assert not found.rectified
+    assert "same row" in found.reason
+    assert initial is None
+
+
+@pytest.mark.parametrize("shift", [-2, 1, 2, 3])
+def test_rows_off_by_less_than_small_copies_show_are_seen_on_larger_ones(
+    shift: float, motorcycle: Any
+) -> None:
+    """Three pixels are less than one of the copies."""
+    left, right = enlarged(motorcycle, 3)
+    found, initial = find_rectification(left, moved(right, [[1, 0, 0], [0, 1, shift]]))
+    assert not found.rectified
+    assert initial is not None
+    assert len(initial.points0) > 500
+
+
+def test_rows_bent_by_a_lens_are_not_taken_for_level(motorcycle: Any) -> None:
+    """By some pixels at the border; a plane through the shifts is level."""
+    left, right = enlarged(motorcycle, 2)
+    height, width = left.shape
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    bent = cv2.remap(right, x, y + 6 * (2 * x / width - 1) ** 2 - 2, cv2.INTER_CUBIC)
+    found, initial = find_rectification(left, bent)
+    assert not found.rectified
+    assert initial is not None
+
+
+def test_where_small_copies_show_no_depth_larger_ones_decide(motorcycle: Any) -> None:
+    left, _ = enlarged(motorcycle, 2)
+    noise = np.random.default_rng(0).normal(0, 3, left.shape)
+    same, initial = find_rectification(left, np.clip(left + noise, 0, 255).astype(np.uint8))
+    assert not same.rectified
+    assert initial is not None
+    unrelated = np.random.default_rng(0).integers(0, 256, left.shape).astype(np.uint8)
+    found, initial = find_rectification(left, unrelated)
+    assert not found.rectified
+    assert initial is not None
+
+
+def test_small_images_and_images_of_two_sizes_are_looked_at_once(motorcycle: Any) -> None:
+    left, right = motorcycle
+    own = RectificationOptions(first_side_px=741)
+    found, initial = find_rectification(left, right, options=own)
+    assert found.rectified
+    assert initial is not None
+    found, initial = find_rectification(left, right[:, :-4])
+    assert "differ in size" in found.reason
+    assert found.matches == 0
+    assert initial is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["art", "cones", "teddy", "cloth", "dolls", "moebius", "rocks"])
+def test_small_copies_decide_as_larger_ones_do(shared: Path, name: str) -> None:
+    folder = shared / "data" / "middlebury" / name
+    pair = [luma(load_image(folder / f"{side}.png")) for side in ("left", "right")]
+    left, right = pair if max(pair[0].shape) > 1000 else enlarged(tuple(pair), 3)
+    found, initial = find_rectification(left, right)
+    assert found.rectified
+    assert not found.swapped
+    assert initial is None
+    assert find_rectification(right, left)[0].swapped
+    for shift in (-2, 1.5, 3):
+        other = moved(right, [[1, 0, 0], [0, 1, shift]])
+        assert not find_rectification(left, other)[0].rectified

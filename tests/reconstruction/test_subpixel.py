@@ -14,6 +14,7 @@ from deepdetect.reconstruction.subpixel import (
     local_affinities,
     refine_matches,
     similarity,
+    spread_corners,
 )
 
 
@@ -142,6 +143,20 @@ def test_of_very_many_matches_some_tell_how_patches_are_deformed(
     both = every.converged & some.converged
     assert both.mean() > 0.9 * every.converged.mean()
     assert np.median(np.abs(some.points1 - every.points1)[both]) < 0.01
+
+
+def test_corners_come_from_all_parts_of_the_image_each_once(
+    gray: np.ndarray, pixels: np.ndarray
+) -> None:
+    rows = spread_corners(gray, pixels, 60)
+    assert (np.diff(rows) > 0).all()
+    assert 40 <= len(rows) <= 80
+    quarter = (pixels[rows] > np.median(pixels, axis=0)) @ [1, 2]
+    assert np.bincount(quarter, minlength=4).min() > 5
+    strength = cv2.cornerMinEigenVal(gray, 7)[pixels[:, 1], pixels[:, 0]]
+    assert np.median(strength[rows]) > 2 * np.median(strength)
+    assert len(spread_corners(gray, pixels, 10**9)) == len(pixels)
+    assert len(spread_corners(gray, np.empty((0, 2)), 60)) == 0
 
 
 def test_no_matches_and_few(gray: np.ndarray) -> None:

@@ -40,6 +40,42 @@ def test_pose_and_depth_are_true(turned: Any, turned_matches: Any, found: Any) -
     assert found.pose.cheirality_ratio > 0.99
 
 
+@pytest.fixture(scope="module")
+def as_they_are(turned: Any, turned_matches: Any) -> TwoViewReconstruction:
+    return reconstruct_two_view(*turned_matches, turned.calibration, turned.grays, refined=True)
+
+
+def test_matches_of_rectified_rows_are_taken_as_they_are(
+    turned: Any, turned_matches: Any, found: Any, as_they_are: Any
+) -> None:
+    points0, points1 = turned_matches
+    np.testing.assert_array_equal(as_they_are.points1, points1[as_they_are.indices])
+    assert "not refined" not in as_they_are.dropped
+    assert len(as_they_are) + sum(as_they_are.dropped.values()) == len(points0)
+    assert len(as_they_are) > 1.1 * len(found)
+    shares = []
+    for made in (found, as_they_are):
+        off = np.linalg.norm(made.points1 - turned.match(points0[made.indices]), axis=1)
+        shares.append((off[np.isfinite(off)] < 0.25).mean())
+    assert shares[1] > shares[0] + 0.05
+    depth = [depth_errors(turned, made, points0) for made in (found, as_they_are)]
+    assert np.count_nonzero(depth[1] < 0.02) > 1.1 * np.count_nonzero(depth[0] < 0.02)
+    assert (depth[1] < 0.02).mean() > (depth[0] < 0.02).mean() - 0.01
+
+
+def test_their_pose_is_that_of_corners_refined_alone(
+    turned: Any, turned_matches: Any, as_they_are: Any
+) -> None:
+    """Across their epipolar lines they say what rectified the pair, and are exact about it."""
+    assert turned.rotation_error(as_they_are.pose.rotation) < 0.05
+    assert turned.direction_error(as_they_are.pose.translation) < 0.5
+    assert 1000 < len(as_they_are.pose_indices) < 10_000 < len(as_they_are)
+    assert len(as_they_are.pose.errors) == len(as_they_are.pose_indices)
+    unrefined = reconstruct_two_view(*turned_matches, turned.calibration)
+    errors = [turned.rotation_error(made.pose.rotation) for made in (as_they_are, unrefined)]
+    assert errors[0] < 0.5 * errors[1]
+
+
 def test_whole_pixels_give_a_worse_model(turned: Any, turned_matches: Any, found: Any) -> None:
     coarse = reconstruct_two_view(*turned_matches, turned.calibration)
     fine = depth_errors(turned, found, turned_matches[0])
@@ -135,7 +171,11 @@ def test_what_is_wrong_is_said(turned: Any, turned_matches: Any, level: Any, one
             None,
             point_filter=PointFilterOptions(min_parallax_px=1e4),
         )
-    for options in ({"max_epipolar_distance_px": 0}, {"max_reprojection_error_px": -1}):
+    for options in (
+        {"max_epipolar_distance_px": 0},
+        {"max_reprojection_error_px": -1},
+        {"pose_cells": 0},
+    ):
         with pytest.raises(OptionError):
             TwoViewOptions(**options)
 

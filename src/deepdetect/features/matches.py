@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,11 +41,13 @@ class GuidedMatches:
         points1: (M, 2) float64 positions in the second image: keypoints of it where a homography
             guided, sub-pixel positions where the pair was rectified.
         scores: (M,) float32 in [0, 1], higher is better.
+        subpixel: whether the positions in the second image are sub-pixel.
     """
 
     rows0: np.ndarray
     points1: np.ndarray
     scores: np.ndarray
+    subpixel: bool = False
 
     def __len__(self) -> int:
         return len(self.rows0)
@@ -56,7 +58,9 @@ class GuidedMatches:
         best_first = np.lexsort((self.rows0, -self.scores))
         _, first = np.unique(pixels[best_first], axis=0, return_index=True)
         kept = np.sort(best_first[first])
-        return GuidedMatches(self.rows0[kept], self.points1[kept], self.scores[kept])
+        return replace(
+            self, rows0=self.rows0[kept], points1=self.points1[kept], scores=self.scores[kept]
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,7 +71,7 @@ class Matches:
         points0, points1: (M, 2) float32 positions in the first and in the second
             image, matched row by row; centre of the first pixel (0, 0). Those of the first image
             are keypoints of it; those of the second are, too, except where a fundamental matrix
-            guided: then they are sub-pixel positions.
+            guided.
         scores: (M,) float32 in [0, 1], higher is better. Guided by a homography, 1 - the
             dissimilarity of the two patches (0: only just more similar than unrelated patches); by
             a fundamental matrix, their correlation; else 1 - Lowe's ratio.
@@ -80,6 +84,8 @@ class Matches:
         keypoints0, keypoints1: all keypoints of the two images.
         seconds: time of each stage, both images together.
         guide: the geometry that guided the matching; None when guided matching was not asked for.
+        subpixel: whether the matching itself found sub-pixel positions in the second image, by
+            rectification: they need no refinement.
 
     Example:
         >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
@@ -97,6 +103,7 @@ class Matches:
     keypoints1: Keypoints
     seconds: dict[str, float] = field(default_factory=dict)
     guide: Guide | None = None
+    subpixel: bool = False
 
     def __post_init__(self) -> None:
         counts = [len(self.points0), len(self.points1), len(self.scores), len(self.inliers)]

@@ -174,28 +174,3 @@ def _log10_nfa(count: int, agreeing: int, chance: float) -> float:
         return math.inf
     tests = math.log(count - 2) + log_binomial(count, agreeing) + log_binomial(agreeing, 2)
     return (tests + (agreeing - 2) * math.log(min(chance, 1.0))) / math.log(10)
-
-
-def select_model(
-    homography_inliers: np.ndarray,
-    fundamental_inliers: np.ndarray,
-    min_fraction_of_rest: float = 0.5,
-    min_fraction_of_all: float = 0.1,
-) -> str:
-    """Return the model of a scene by its inliers alone: "homography" (no depth) or "fundamental".
-
-    Of the matches that the homography leaves, the fundamental matrix must explain the first
-    fraction, and these must be the second fraction of all that it explains.
-
-    Example:
-        >>> plane = np.arange(100) < 60
-        >>> select_model(plane, plane), select_model(plane, np.arange(100) < 95)
-        ('homography', 'fundamental')
-    """
-    gained = np.count_nonzero(fundamental_inliers & ~homography_inliers)
-    needed = max(
-        min_fraction_of_rest * np.count_nonzero(~homography_inliers),
-        min_fraction_of_all * np.count_nonzero(fundamental_inliers),
-        1,
-    )
-    return "fundamental" if gained >= needed else "homography"

@@ -72,10 +72,10 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         matches: the matches.
         path: ending in .npz (arrays named as the attributes of `Matches`: `points0` and `points1`
             (M, 2) float32, `scores` (M,) float32, `inliers` (M,) bool, `model` a string, `matrix`
-            (3, 3), or (0, 0) without one; `guided` bool; `keypoints0` (N, 2) float32,
-            `keypoint_scores0` (N,) float32 and `image_size0` (width, height), and the same of the
-            second image; and of a `Guide` its attributes, as `guide_model`) or .csv (columns x0,
-            y0, x1, y1, score, inlier).
+            (3, 3), or (0, 0) without one; `guided` and `subpixel` bool; `keypoints0` (N, 2)
+            float32, `keypoint_scores0` (N,) float32 and `image_size0` (width, height), and the same
+            of the second image; and of a `Guide` its attributes, as `guide_model`) or .csv (columns
+            x0, y0, x1, y1, score, inlier).
 
     Raises:
         OptionError: the file's ending is another.
@@ -87,7 +87,7 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         return
     arrays = {name: getattr(matches, name) for name in ("points0", "points1", "scores", "inliers")}
     arrays |= {"model": matches.model, "matrix": _or_empty(matches.matrix)}
-    arrays["guided"] = matches.guided
+    arrays |= {"guided": matches.guided, "subpixel": matches.subpixel}
     for side, keypoints in enumerate((matches.keypoints0, matches.keypoints1)):
         arrays[f"keypoints{side}"] = keypoints.xy
         arrays[f"keypoint_scores{side}"] = keypoints.scores
@@ -136,6 +136,7 @@ def load_matches(path: str | Path) -> Matches:
             keypoints[0],
             keypoints[1],
             guide=guide,
+            subpixel=bool(arrays["subpixel"]),
         )
 
 

@@ -155,7 +155,7 @@ def match_images(
     with timer.stage("keypoints"):
         keypoints = [find_keypoints(detector, image, chosen.selection) for image in rgb]
     grays = luma(rgb[0]), luma(rgb[1])
-    found_guide = None
+    found_guide, guided_pair = None, None
     if chosen.guided:
         with timer.stage("guided matching"):
             found_guide, guided_pair = guided_matches(
@@ -187,6 +187,7 @@ def match_images(
         keypoints[1],
         timer.seconds,
         found_guide,
+        guided_pair is not None and guided_pair.subpixel,
     )
 
 

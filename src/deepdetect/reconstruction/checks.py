@@ -15,10 +15,16 @@ import numpy as np
 from .._shared.errors import ReconstructionError
 from .._shared.options import check_ranges
 from ..features.selection import grid_subsample
-from ..geometry import GeometryOptions, epipolar_errors, estimate_geometry, transfer_errors
+from ..geometry import (
+    Geometry,
+    GeometryOptions,
+    epipolar_errors,
+    estimate_geometry,
+    transfer_errors,
+)
 from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
 from ..geometry.camera import Calibration, Camera
-from ..geometry.model_selection import select_model
+from ..geometry.model_selection import ModelSelectionOptions, measure_parallax
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
 
 
@@ -254,7 +260,7 @@ def check_matches(
             "nothing moves between the images: they show the same view, depth needs two "
             "photographs from two places"
         )
-    planar = is_planar(plane.inliers, epipolar.inliers, options.min_planar_ratio)
+    planar = is_planar(first, second, plane, epipolar, options.min_planar_ratio, seed)
     if planar and not has_foreground(off_plane, epipolar.inliers, options.foreground):
         explained = first[plane.inliers], second[plane.inliers]
         raise ReconstructionError(_no_depth(*explained, calibration, options))
@@ -345,13 +351,39 @@ def check_focal(
 
 
 def is_planar(
-    by_homography: np.ndarray,
-    by_fundamental: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    plane: Geometry,
+    epipolar: Geometry,
     min_ratio: float = CheckOptions.min_planar_ratio,
+    seed: int = 0,
+    max_parallax: float = ModelSelectionOptions.min_fraction_of_plane,
 ) -> bool:
-    """Return whether a homography explains all that can be explained, though many may be wrong."""
-    explained = np.count_nonzero(by_homography) >= min_ratio * np.count_nonzero(by_fundamental)
-    return bool(explained and select_model(by_homography, by_fundamental) == "homography")
+    """Return whether a homography explains all that can be explained, though many may be wrong.
+
+    Args:
+        points0, points1: (M, 2) matches, some of them wrong.
+        plane, epipolar: the homography and the fundamental matrix that were estimated from them.
+        min_ratio: matches of the homography per match of the fundamental matrix, of a plane.
+        seed: of the search for an epipole among the others.
+        max_parallax: as many of the others may agree on an epipole, relative to the matches on the
+            plane: a repeated pattern, or a thing that moved, gives a few.
+
+    Example:
+        >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
+        >>> models = [
+        ...     estimate_geometry(points, points + 5, GeometryOptions(model=model))
+        ...     for model in ("homography", "fundamental")
+        ... ]
+        >>> is_planar(points, points + 5, *models)
+        True
+    """
+    explained = np.count_nonzero(plane.inliers) >= min_ratio * np.count_nonzero(epipolar.inliers)
+    if plane.matrix is None or not explained:
+        return False
+    parallax = measure_parallax(points0, points1, plane.matrix, seed=seed)
+    # Not `is_depth`, which needs a share of all matches off the plane, wrong ones among them.
+    return not parallax.is_seen() or parallax.agreeing < max_parallax * parallax.on_plane
 
 
 def has_foreground(

@@ -21,13 +21,13 @@ from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
 from ..io.exif import calibration_from_exif
 from ..io.image import load_image, luma
-from ..matching.guided import InitialMatches, initial_matches
+from ..matching.guided import InitialMatches
 from ..matching.options import get_preset
 from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .checks import check_images
 from .outliers import PointFilterOptions, sor_inliers_on_grid
-from .rectification import Rectification, RectificationOptions, detect_rectification
+from .rectification import Rectification, RectificationOptions, find_rectification
 from .rectified_checks import (
     RectifiedCheckOptions,
     check_cameras,
@@ -170,14 +170,8 @@ def reconstruct(
     is_rectified = chosen.rectified
     if is_rectified is None:
         with timer.stage("rectified or not"):
-            initial = initial_matches(*grays)
-            rectification = detect_rectification(
-                initial.points0,
-                initial.points1,
-                *sizes,
-                offset_px=known.disparity_offset_px,
-                seed=chosen.seed,
-                options=chosen.rectification,
+            rectification, initial = find_rectification(
+                *grays, known.disparity_offset_px, chosen.seed, chosen.rectification
             )
         is_rectified = rectification.rectified
         if rectification.swapped:
@@ -309,6 +303,7 @@ def _reconstruct_general(pair: _Pair) -> Reconstruction:
         options.point_filter,
         options.seed,
         timer,
+        refined=found.subpixel,
     )
     pixels = found.points0[made.indices]
     columns, rows = np.rint(pixels).astype(np.int64).T

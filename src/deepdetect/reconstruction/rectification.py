@@ -3,11 +3,14 @@
 The rows are a model without any parameter. A pair is rectified when they explain about as many
 matches as the best models with parameters do: a robust fundamental matrix, and rows that are
 shifted, tilted and scaled. What fraction of all matches that is does not matter: many may be wrong.
+
+Of large images small copies are looked at first. They decide where the answer is the same whatever
+they are too coarse to show; else larger copies do.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,6 +18,8 @@ from .._shared.options import check_ranges
 from ..features.selection import grid_subsample
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
+from ..matching.guided import InitialMatches, initial_matches
+from ..matching.guided.options import InitialGeometryOptions
 from .checks import StaticOptions, is_planar, is_static
 
 
@@ -34,6 +39,13 @@ class RectificationOptions:
         grid_size_px: cells of the left image of this size give one match each.
         iterations: samples of three matches, for the rows that are shifted, tilted and scaled.
         static: when nothing moves.
+        first_side_px: longer sides are scaled down to this for a first look.
+        first_max_keypoints: of each image in the first look.
+        min_first_inliers: matches of the first look that a fundamental matrix explains, with fewer
+            of which it does not decide.
+        max_first_row_error_px: a pair is rectified after the first look only where its rows are off
+            by less than this at `min_inlier_ratio` of the matches. It is in pixels of the images
+            themselves: many matches show together what each is too coarse for.
 
     Raises:
         OptionError: a value is out of its range.
@@ -48,13 +60,20 @@ class RectificationOptions:
     grid_size_px: int = 8
     iterations: int = 500
     static: StaticOptions = field(default_factory=StaticOptions)
+    first_side_px: int = 480
+    first_max_keypoints: int = 1000
+    min_first_inliers: int = 50
+    max_first_row_error_px: float = 0.6
 
     def __post_init__(self) -> None:
         check_ranges(
             self,
-            positive=("max_row_distance_px", "max_transfer_error_px", "grid_size_px", "iterations"),
+            positive=(
+                *("max_row_distance_px", "max_transfer_error_px", "grid_size_px", "iterations"),
+                *("first_side_px", "first_max_keypoints", "min_first_inliers"),
+            ),
             not_negative=(
-                *("min_inlier_ratio", "min_planar_ratio"),
+                *("min_inlier_ratio", "min_planar_ratio", "max_first_row_error_px"),
                 *("min_disparity_spread_px", "min_planar_spread_px"),
             ),
         )
@@ -91,6 +110,97 @@ class Rectification:
     vertical_offset: float
     line_angle: float
     disparities: tuple[float, float, float]
+
+
+def find_rectification(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    offset_px: float = 0.0,
+    seed: int = 0,
+    options: RectificationOptions = RectificationOptions(),
+) -> tuple[Rectification, InitialMatches | None]:
+    """Decide whether a pair of images is rectified, by the least effort that it takes.
+
+    Args:
+        gray0, gray1: (H, W) uint8 luma.
+        offset_px: what is added to a disparity before it gives the depth (calibration).
+        seed: of the random samples.
+        options: the thresholds.
+
+    Returns:
+        The decision, and the sparse matches of larger copies where they were needed for it.
+
+    Example:
+        >>> import cv2
+        >>> noise = np.random.default_rng(0).integers(0, 256, (150, 200)).astype(np.uint8)
+        >>> x, y = np.meshgrid(np.arange(200, dtype=np.float32), np.arange(150, dtype=np.float32))
+        >>> moved = cv2.remap(noise, x + 4 + y / 5, y, cv2.INTER_LINEAR)
+        >>> find_rectification(noise, moved)[0].rectified
+        True
+    """
+    size0, size1 = gray0.shape[::-1], gray1.shape[::-1]
+    if size0 != size1:
+        nowhere = np.empty((0, 2))
+        return detect_rectification(nowhere, nowhere, size0, size1, offset_px, seed, options), None
+    if max(size0) > options.first_side_px:
+        found = _first_look(gray0, gray1, offset_px, seed, options)
+        if found is not None:
+            return found, None
+    initial = initial_matches(gray0, gray1)
+    points = initial.points0, initial.points1
+    return detect_rectification(*points, size0, size1, offset_px, seed, options), initial
+
+
+def _first_look(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    offset_px: float,
+    seed: int,
+    options: RectificationOptions,
+) -> Rectification | None:
+    """Decide from small copies of two images of one size; None where they leave it open."""
+    coarse = InitialGeometryOptions(max_side_px=options.first_side_px)
+    coarse = replace(coarse, sift=replace(coarse.sift, max_keypoints=options.first_max_keypoints))
+    initial = initial_matches(gray0, gray1, options=coarse)
+    scale, size = initial.scales[0], initial.views[0].shape[::-1]
+    # The thresholds are pixels of the copies: what they decide holds with a margin.
+    found = detect_rectification(*initial.matched, size, size, offset_px * scale, seed, options)
+    if found.by_fundamental < options.min_first_inliers:
+        return None
+    if found.rectified:
+        on_rows = abs(found.disparities[1] + offset_px * scale) > options.max_row_distance_px
+        limit = options.max_first_row_error_px * scale
+        decided = on_rows and _row_error(*initial.matched, seed, options) < limit
+    else:
+        best = max(found.by_fundamental, found.by_other_rows)
+        ratio = options.min_inlier_ratio
+        # By three standard deviations of a binomial distribution.
+        decided = found.on_rows < ratio * best - 3 * np.sqrt(best * ratio * abs(1 - ratio))
+    if not decided:
+        return None
+    low, median, high = (value / scale for value in found.disparities)
+    return replace(
+        found, vertical_offset=found.vertical_offset / scale, disparities=(low, median, high)
+    )
+
+
+def _row_error(
+    points0: np.ndarray, points1: np.ndarray, seed: int, options: RectificationOptions
+) -> float:
+    """Return by how much the rows of a pair that looks rectified are off at most of its matches.
+
+    Not by the distance of each match from its row, which is as coarse as the matches, but by what
+    all of them have in common: how that distance depends on the place (views that are turned, or
+    bent by a lens) and on the disparity (a camera that moved up or down as well).
+    """
+    indices = grid_subsample(points0, options.grid_size_px, seed)
+    first, second = points0[indices], points1[indices]
+    off, disparity = second[:, 1] - first[:, 1], first[:, 0] - second[:, 0]
+    near = np.abs(off) <= options.max_row_distance_px
+    x, y = ((first[near] - first[near].mean(axis=0)) / np.ptp(first[near], axis=0).max()).T
+    design = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y, disparity[near]])
+    predicted = design @ np.linalg.lstsq(design, off[near], rcond=None)[0]
+    return float(np.quantile(np.abs(predicted), min(options.min_inlier_ratio, 1)))
 
 
 def detect_rectification(
@@ -154,7 +264,7 @@ def detect_rectification(
                 model="homography", inlier_threshold=options.max_transfer_error_px, seed=seed
             ),
         )
-        if is_planar(plane.inliers, epipolar.inliers, options.min_planar_ratio):
+        if is_planar(first, second, plane, epipolar, options.min_planar_ratio, seed):
             reason = "one homography explains all the matches: all move nearly the same"
     on_rows_count, by_fundamental, by_other_rows = counts
     return Rectification(

@@ -82,6 +82,10 @@ COARSE_STEP_PX = 2
 """Between the rows and columns of the matches that are aligned before the others."""
 
 
+CORNER_WINDOW_PX = 7
+"""Side of the window whose gradients make a corner: about the patch that is aligned."""
+
+
 @dataclass(frozen=True, eq=False)
 class RefinedMatches:
     """Matches to sub-pixel accuracy.
@@ -186,6 +190,32 @@ def _refine_band(
     shape = images[0].shape
     affinities = local_affinities(pixels0, start, converged, shape, overall, options)[own]
     return _align(images, pixels0[own], start[own], affinities, options, options.convergence_px)
+
+
+def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
+    """Choose points that can be aligned well, from all parts of an image.
+
+    Args:
+        gray: (H, W) uint8 luma.
+        points: (N, 2) whole pixels of the image.
+        count: how many cells the image has; each gives its best corner (Shi and Tomasi, 1994).
+
+    Returns:
+        (M,) int64 rows of the points, rising.
+
+    Example:
+        >>> square = np.zeros((60, 60), np.uint8)
+        >>> square[20:40, 20:40] = 200
+        >>> spread_corners(square, np.array([[5, 5], [30, 20], [20, 20]]), 1).tolist()
+        [2]
+    """
+    column, row = np.asarray(points, np.int64).reshape(-1, 2).T
+    strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]
+    side = np.sqrt(gray.size / count)
+    across, down = (np.floor(values / side).astype(np.int64) for values in (column, row))
+    cell = down * (gray.shape[1] + 1) + across
+    order = np.lexsort((-strength, cell))
+    return np.sort(order[np.flatnonzero(np.diff(cell[order], prepend=-1))])
 
 
 def similarity(

@@ -1,6 +1,11 @@
 """Points from the matches of two calibrated images that need not be rectified.
 
 Sub-pixel matches -> relative pose -> triangulation -> checks -> points.
+
+Matches on whole pixels are all refined. Those of rectified rows are sub-pixel already, and more
+accurate along their epipolar lines than a small patch alone can say; but across them they are as
+the fundamental matrix that rectified the pair, and know no more of the pose. So the pose is that of
+a sample of corners, each refined by itself, and the points are those of the matches as they are.
 """
 
 from __future__ import annotations
@@ -12,12 +17,13 @@ import numpy as np
 from .._shared.errors import ReconstructionError
 from .._shared.options import check_ranges
 from .._shared.timing import StageTimer
+from ..geometry import epipolar_errors
 from ..geometry.camera import Calibration
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
-from ..geometry.triangulation import triangulate
+from ..geometry.triangulation import fundamental_matrix, triangulate
 from .checks import CheckOptions, check_focal, check_images, check_matches, check_pose
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
-from .subpixel import SubpixelOptions, refine_matches
+from .subpixel import SubpixelOptions, refine_matches, spread_corners
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,8 @@ class TwoViewOptions:
         max_epipolar_distance_px: within which a match agrees with the pose (Sampson's distance).
         max_reprojection_error_px: of a point that is kept (root mean square of both images).
         subpixel: how matches are refined, or None: they are taken as they are.
+        pose_cells: of matches that are sub-pixel already, the best corner of each of this many
+            cells is refined, for the pose.
         checks: thresholds of the checks.
 
     Raises:
@@ -37,10 +45,12 @@ class TwoViewOptions:
     max_epipolar_distance_px: float = 1.0
     max_reprojection_error_px: float = 0.5
     subpixel: SubpixelOptions | None = field(default_factory=SubpixelOptions)
+    pose_cells: int = 10_000
     checks: CheckOptions = field(default_factory=CheckOptions)
 
     def __post_init__(self) -> None:
-        check_ranges(self, positive=("max_epipolar_distance_px", "max_reprojection_error_px"))
+        limits = "max_epipolar_distance_px", "max_reprojection_error_px"
+        check_ranges(self, positive=(*limits, "pose_cells"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +61,10 @@ class TwoViewReconstruction:
         points: (N, 3) float32 in the frame of the left camera: x right, y down, z forward.
         unit: "mm" when the baseline is known, else "baseline": the distance of the cameras is 1.
         indices: (N,) int64, the match that each comes from, rising.
-        points1: (N, 2) float64 positions in the right image, refined.
+        points1: (N, 2) float64 positions in the right image that the points were made from.
         pose: of the right camera; its inliers and errors belong to `pose_indices`.
         pose_indices: (P,) int64, the matches that the pose was estimated from: those that were
-            refined.
+            refined; or all.
         reprojection_errors: (N,) float32 in pixels, root mean square of both images.
         triangulation_angles: (N,) float32 angle between both rays in degrees.
         dropped: how many matches each check removed, in order.
@@ -85,6 +95,7 @@ def reconstruct_two_view(
     point_filter: PointFilterOptions = PointFilterOptions(),
     seed: int = 0,
     timer: StageTimer | None = None,
+    refined: bool = False,
 ) -> TwoViewReconstruction:
     """Reconstruct the points of a pair.
 
@@ -97,6 +108,8 @@ def reconstruct_two_view(
         point_filter: which points are kept.
         seed: of all random choices.
         timer: of the stages; None: a new one.
+        refined: whether the positions in the right image are sub-pixel already
+            (`Matches.subpixel`): then some are refined for the pose only.
 
     Raises:
         ReconstructionError: the pair gives no depth (`checks` says why), the calibration is for
@@ -118,7 +131,8 @@ def reconstruct_two_view(
     timer = StageTimer() if timer is None else timer
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    indices = np.arange(len(points0))
+    indices = pose_indices = np.arange(len(points0))
+    pose_points1 = points1
     dropped: dict[str, int] = {}
     checks = options.checks
     if images is not None:
@@ -126,29 +140,37 @@ def reconstruct_two_view(
         check_images(*images, checks.copy)
         if options.subpixel is not None:
             with timer.stage("sub-pixel"):
-                refined = refine_matches(*images, points0, points1, options.subpixel)
-            indices = np.flatnonzero(refined.converged)
-            points1 = refined.points1
-            dropped["not refined"] = len(points0) - len(indices)
-    used = points0[indices], points1[indices]
+                if refined:
+                    pose_indices = spread_corners(images[0], points0, options.pose_cells)
+                start = points0[pose_indices], points1[pose_indices]
+                aligned = refine_matches(*images, *start, options.subpixel)
+            pose_indices = pose_indices[aligned.converged]
+            pose_points1 = aligned.points1[aligned.converged]
+            if not refined:
+                indices, points1 = pose_indices, aligned.points1
+                dropped["not refined"] = len(points0) - len(indices)
+    evident = points0[pose_indices], pose_points1
     with timer.stage("checks"):
-        evidence = check_matches(*used, calibration.camera1.size, calibration, seed, checks)
+        evidence = check_matches(*evident, calibration.camera1.size, calibration, seed, checks)
     with timer.stage("pose"):
         pose = check_pose(
-            estimate_relative_pose(*used, calibration, options.max_epipolar_distance_px, seed),
+            estimate_relative_pose(*evident, calibration, options.max_epipolar_distance_px, seed),
             evidence,
             calibration,
             checks,
         )
     with timer.stage("focal length"):
-        check_focal(*used, pose, evidence, calibration, seed, checks)
+        check_focal(*evident, pose, evidence, calibration, seed, checks)
     baseline = 1.0 if calibration.baseline_mm is None else calibration.baseline_mm
+    used = points0[indices], points1[indices]
     with timer.stage("triangulation"):
         found = triangulate(*used, calibration, pose.rotation, pose.translation * baseline)
+    fundamental = fundamental_matrix(calibration, pose.rotation, pose.translation)
+    near_line = epipolar_errors(*used, fundamental) < options.max_epipolar_distance_px
     focal = calibration.camera0.focal_px[0]
     kept = np.ones(len(indices), bool)
     for reason, passed in (
-        ("far from its epipolar line", pose.inliers),
+        ("far from its epipolar line", near_line),
         ("behind a camera", found.cheirality),
         ("reprojection error", found.reprojection_errors < options.max_reprojection_error_px),
         ("parallax", found.triangulation_angle * focal >= point_filter.min_parallax_px),
@@ -175,7 +197,7 @@ def reconstruct_two_view(
         indices=indices[kept],
         points1=points1[indices[kept]],
         pose=pose,
-        pose_indices=indices,
+        pose_indices=pose_indices,
         reprojection_errors=found.reprojection_errors[kept].astype(np.float32),
         triangulation_angles=np.degrees(found.triangulation_angle[kept]).astype(np.float32),
         dropped=dropped,

@@ -11,7 +11,6 @@ import pytest
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.geometry import epipolar_errors, transfer_errors, transform_points
 from deepdetect.geometry.acontrario import MAX_LOG10_NFA
-from deepdetect.geometry.model_selection import select_model
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided.initial_geometry import (
     InitialGeometry,
@@ -345,35 +344,6 @@ def test_few_matches_on_a_line_make_no_geometry() -> None:
     spots = sum(np.exp(-((column - x) ** 2 + (row - 30) ** 2) / 18) for x in (20, 55, 90, 140))
     gray = np.rint(40 + 180 * spots).astype(np.uint8)
     assert_nothing(initial_geometry(gray, gray))
-
-
-@pytest.mark.parametrize(
-    ("homography", "rest", "neither", "expected"),
-    [
-        (60, 0, 40, False),  # a plane: the fundamental matrix explains no more
-        (60, 19, 21, False),  # less than half of the rest
-        (60, 20, 20, True),
-        (60, 35, 5, True),
-        (950, 50, 0, False),  # all of the rest, but less than a tenth of all
-        (900, 100, 0, True),
-        (100, 0, 0, False),
-        (0, 30, 10, True),
-        (0, 0, 0, False),
-        (0, 0, 10, False),
-    ],
-)
-def test_a_scene_has_depth_by_what_the_homography_leaves(
-    homography: int, rest: int, neither: int, expected: bool
-) -> None:
-    by_homography = np.repeat([True, False, False], [homography, rest, neither])
-    by_fundamental = np.repeat([True, True, False], [homography, rest, neither])
-    assert (select_model(by_homography, by_fundamental) == "fundamental") is expected
-
-
-def test_matches_that_the_homography_alone_explains_are_no_depth() -> None:
-    by_homography = np.repeat([True, True, False], [50, 30, 20])
-    by_fundamental = np.repeat([True, False, False], [50, 30, 20])
-    assert select_model(by_homography, by_fundamental) == "homography"
 
 
 def test_features_that_are_there_are_taken(photo: np.ndarray) -> None:

@@ -63,6 +63,8 @@ def test_unguided_gives_fewer(photo: np.ndarray, second: np.ndarray) -> None:
     )
     assert unguided.guide is None
     assert not unguided.guided
+    assert not unguided.subpixel
+    assert not guided.subpixel  # keypoints of the second image
     assert guided.inliers.sum() > unguided.inliers.sum()
 
 
@@ -144,6 +146,8 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
         for guided in (True, False)
     )
     assert guided.guided
+    assert guided.subpixel
+    assert not unguided.subpixel
     assert guided.model == guided.guide.model == "fundamental"
     # The lines are estimated: near a corner they may be some rows off.
     assert (np.abs(guided.points0[:, 1] - guided.points1[:, 1]) <= 2).mean() > 0.98

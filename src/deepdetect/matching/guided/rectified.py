@@ -117,7 +117,7 @@ def match_by_rectification(
     places = _moved_to_lines(xy0[rows], places, fundamental)
     height, width = gray1.shape
     inside = ((places > -0.5) & (places < (width - 0.5, height - 0.5))).all(axis=1)
-    return fundamental, GuidedMatches(rows[inside], places[inside], scores[inside])
+    return fundamental, GuidedMatches(rows[inside], places[inside], scores[inside], subpixel=True)
 
 
 def _refine(
