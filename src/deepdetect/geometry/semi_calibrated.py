@@ -90,14 +90,11 @@ class SemiCalibratedGeometry:
         matrix: (3, 3) fundamental matrix, x1^T F x0 = 0.
         inliers: (M,) bool, the matches that agree with it.
         log10_nfa: decimal logarithm of its number of false alarms, of all that were tried.
-        focal_lengths: of both cameras, in units of the longer side of their images. They are sure
-            only where the motion shows them.
     """
 
     matrix: np.ndarray
     inliers: np.ndarray
     log10_nfa: float
-    focal_lengths: tuple[float, float]
 
 
 def estimate_semi_calibrated(
@@ -136,30 +133,27 @@ def estimate_semi_calibrated(
         return None
     # OpenCV draws the same samples every time; another order of the matches draws others.
     order = np.random.default_rng(seed).permutation(len(points0))
-    best: SemiCalibratedGeometry | None = None
-    essential = None
+    best = start = None
     for focal in options.focal_lengths:
         cameras = _Cameras.guess(sizes, focal)
         matrix = _fit_essential(points0[order], points1[order], cameras, inlier_threshold, options)
         if matrix is None:
             continue
         found = _judge(
-            _fundamental(matrix, cameras), cameras, points0, points1, inlier_threshold, options
+            _fundamental(matrix, cameras), sizes, points0, points1, inlier_threshold, options
         )
         if best is None or found.log10_nfa < best.log10_nfa:
-            best, essential = found, matrix
-    if best is None or essential is None or np.count_nonzero(best.inliers) < MIN_MATCHES:
+            best, start = found, (matrix, cameras)
+    if best is None or start is None or np.count_nonzero(best.inliers) < MIN_MATCHES:
         return best
-    cameras = _Cameras.guess(sizes, best.focal_lengths[0])
-    pose = best_of_four(
-        essential, points0[best.inliers], points1[best.inliers], cameras.calibration, len(points0)
-    )
-    here = _View(pose, cameras)
+    essential, cameras = start
+    inliers = points0[best.inliers], points1[best.inliers]
+    here = _View(best_of_four(essential, *inliers, cameras.calibration, len(order)), cameras)
     for _ in range(options.max_fits):
         inliers = points0[best.inliers], points1[best.inliers]
         here = _fit(here, *inliers, np.full(len(inliers[0]), options.match_sigma_px), options)
-        found = _judge(here.fundamental, here.cameras, points0, points1, inlier_threshold, options)
-        if found.log10_nfa >= best.log10_nfa:
+        found = _judge(here.fundamental, sizes, points0, points1, inlier_threshold, options)
+        if found.log10_nfa > best.log10_nfa:
             break
         best = found
     return best
@@ -304,7 +298,7 @@ def _fundamental(essential: np.ndarray, cameras: _Cameras) -> np.ndarray:
 
 def _judge(
     fundamental: np.ndarray,
-    cameras: _Cameras,
+    sizes: tuple[Size, Size],
     points0: np.ndarray,
     points1: np.ndarray,
     inlier_threshold: float,
@@ -313,11 +307,8 @@ def _judge(
     """Count the matches that agree, and how likely that is by chance."""
     errors = epipolar_errors(points0, points1, fundamental)
     tried = MODELS_PER_SAMPLE * len(options.focal_lengths)
-    alarms = log10_nfa(errors, "essential", inlier_threshold, cameras.sizes[1], tried)
-    focal = np.exp(cameras.log_focal)
-    return SemiCalibratedGeometry(
-        fundamental, errors < inlier_threshold, alarms, (float(focal[0]), float(focal[1]))
-    )
+    alarms = log10_nfa(errors, "essential", inlier_threshold, sizes[1], tried)
+    return SemiCalibratedGeometry(fundamental, errors < inlier_threshold, alarms)
 
 
 def _fit(
