@@ -10,7 +10,7 @@ import pytest
 
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.matches import GuidedMatches
-from deepdetect.geometry import transform_points
+from deepdetect.geometry import epipolar_errors, transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.initial_geometry import find_initial_geometry
 from deepdetect.matching.guided.options import RectifiedMatchingOptions
@@ -107,26 +107,39 @@ def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(cones) -> N
     assert within(found, xy0, cones, move) > 0.85
 
 
-def test_a_geometry_that_is_off_is_estimated_again(cones) -> None:
+def test_a_matrix_that_is_off_is_corrected(cones) -> None:
     """One that is turned by a third of a degree about the middle of the image."""
     left, right, _ = cones
     first = find_initial_geometry(left, right, "fundamental")
     turn = np.vstack([cv2.getRotationMatrix2D((225, 190), 0.3, 1), [0, 0, 1]])
     assert first.matrix is not None
     wrong = np.linalg.inv(turn).T @ first.matrix
-    turned = transform_points(first.points1, turn)
     xy0 = every_second(left)
-    rows = []
+    counts = []
     for rounds in (0, 1):
         found = match_by_rectification(
-            *(left, right, xy0, first.points0, turned, wrong),
+            *(left, right, xy0, first.points0, first.points1, wrong),
             RectifiedMatchingOptions(max_refits=rounds),
         )
         assert found is not None
-        matches = found[1]
-        rows.append(np.abs(matches.points1[:, 1] - xy0[matches.rows0, 1]).mean())
-    assert rows[0] > 0.4
-    assert rows[1] < 0.3 * rows[0]
+        matrix, matches = found
+        assert epipolar_errors(xy0[matches.rows0], matches.points1, matrix).max() < 1e-6
+        rows = np.abs(matches.points1[:, 1] - xy0[matches.rows0, 1])
+        assert np.quantile(rows, 0.9) < 0.25
+        counts.append(len(matches))
+    assert counts[1] > counts[0]
+
+
+def test_matches_that_the_sparse_ones_contradict_do_not_count(cones) -> None:
+    """Sparse matches that lie on the right lines, but at other places of them."""
+    left, right, _ = cones
+    first = find_initial_geometry(left, right, "fundamental")
+    assert first.matrix is not None
+    astray = first.points1.copy()
+    astray[::2, 0] -= 8
+    given = left, right, every_second(left), first.points0, astray, first.matrix
+    assert match_by_rectification(*given) is None
+    assert match_by_rectification(*given, RectifiedMatchingOptions(min_agreement=0.2)) is not None
 
 
 def test_without_tracked_corners_no_match_counts(cones) -> None:

@@ -216,6 +216,8 @@ class RectifiedMatchingOptions:
             this often,
         max_row_error_px, row_quantile: where this fraction of them has its rows nearer than this to
             the lines of the new matrix, the old rows are good enough.
+        max_range_excess: images that were scaled down are rectified again, too, where more was
+            searched than this times the range of what was found.
         semi_calibrated: what the fit may assume of both cameras.
         min_sigma_px: a track or a sparse match is never counted as more exact than this.
         refit_corners: that are tracked.
@@ -247,6 +249,7 @@ class RectifiedMatchingOptions:
     max_refits: int = 1
     max_row_error_px: float = 0.5
     row_quantile: float = 0.9
+    max_range_excess: float = 1.25
     semi_calibrated: SemiCalibratedOptions = field(default_factory=SemiCalibratedOptions)
     min_sigma_px: float = 0.1
     refit_corners: int = 2000
@@ -254,6 +257,7 @@ class RectifiedMatchingOptions:
     max_round_trip_px: float = 0.3
     max_track_px: float = 4.0
     min_tracks: int = 50
+    min_agreement: float = 0.75
 
     def __post_init__(self) -> None:
         check_ranges(
@@ -266,10 +270,14 @@ class RectifiedMatchingOptions:
             fractions=(
                 *("min_correlation", "min_fraction_of_one_sign"),
                 *("false_positive_rate", "false_discovery_rate", "null_fraction"),
-                "row_quantile",
+                *("row_quantile", "min_agreement"),
             ),
             odd=("correlation_window_px", "refit_window_px"),
-            between={"tail_fraction": (0, 0.5), "min_tracks": (8, math.inf)},
+            between={
+                "tail_fraction": (0, 0.5),
+                "min_tracks": (8, math.inf),
+                "max_range_excess": (1, math.inf),
+            },
         )
 
 

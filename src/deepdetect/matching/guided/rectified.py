@@ -7,7 +7,8 @@ positions, not keypoints of the second image.
 
 A fundamental matrix from few matches may miss by some pixels where none of them was. So corners are
 tracked in both directions around their matches, and the matrix is fitted to them: matches are moved
-to its lines, and where these are far from the rows, the images are rectified again.
+to its lines, and where these are far from the rows, or larger images can be searched in the range
+of what has been found, the images are rectified again.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ from ..stereo.matching import (
 from .options import RectifiedMatchingOptions
 
 Range = tuple[int, int]
+
+AGREEMENT_PX = 3.0
+"""By which the disparity of a right sparse match, found in images of another scale, may differ."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +95,8 @@ def match_by_rectification(
 
     Returns:
         The refined fundamental matrix and the matches, which fit it exactly; None where the pair
-        cannot be rectified, or too few corners can be tracked from one image to where they are
-        matched.
+        cannot be rectified, too few corners can be tracked from one image to where they are
+        matched, or the sparse matches contradict.
     """
     sizes = (gray0.shape[::-1], gray1.shape[::-1])
     sparse = points0, points1
@@ -101,7 +105,7 @@ def match_by_rectification(
     if view is None or tracks is None:
         return None
     fundamental = _refine(fundamental, sparse, tracks, sizes, options)
-    settled = _are_near(tracks, fundamental, options)
+    settled = _are_near(tracks, fundamental, options) and not _is_range_too_wide(view, options)
     for _ in range(options.max_refits):
         if settled:
             break
@@ -111,6 +115,8 @@ def match_by_rectification(
             break
         view, tracks, settled = again, found, True
         fundamental = _refine(fundamental, sparse, tracks, sizes, options)
+    if _agreement(view, sparse) < options.min_agreement:
+        return None
     # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
     disparity = view.kept if settled else view.disparities.disparity
     rows, places, scores = _sample(view, disparity, xy0)
@@ -139,10 +145,40 @@ def _refine(
     )
 
 
+def _agreement(view: RectifiedView, sparse: tuple[np.ndarray, np.ndarray]) -> float:
+    """Return the fraction of the sparse matches with a disparity that lie where it says.
+
+    They know nothing of each other: where most contradict, what looks alike on the rows is another
+    of many like things.
+    """
+    places = [
+        view.frame.to_frame(scaled_points(points, view.scale), side)
+        for side, points in enumerate(sparse)
+    ]
+    disparity = view.disparities.disparity
+    height, width = disparity.shape
+    nearest = np.rint(np.where(np.isfinite(places[0]), places[0], -1)).astype(np.int64)
+    inside = ((nearest >= 0) & (nearest < (width, height))).all(axis=1)
+    column, row = nearest[inside].T
+    errors = places[0][inside, 0] - places[1][inside, 0] - disparity[row, column]
+    errors = np.abs(errors[np.isfinite(errors)])
+    return float((errors < AGREEMENT_PX).mean()) if len(errors) else 0.0
+
+
 def _are_near(tracks: Tracks, fundamental: np.ndarray, options: RectifiedMatchingOptions) -> bool:
     """Whether the rows that were matched are near the lines of a matrix."""
     errors = epipolar_errors(*tracks.on_rows, fundamental)
     return float(np.quantile(errors, options.row_quantile)) < options.max_row_error_px
+
+
+def _is_range_too_wide(view: RectifiedView, options: RectifiedMatchingOptions) -> bool:
+    """Whether less had to be searched than was, so that larger images could have been matched."""
+    searched = view.disparities.disparity_range
+    if view.scale == 1 or searched is None:
+        return False
+    low, high = _with_margin(view.disparities.disparity[view.disparities.matched], options)
+    width = searched.max_disparity - searched.min_disparity
+    return width > options.max_range_excess * (high - low)
 
 
 def _moved_to_lines(
@@ -313,16 +349,21 @@ def _range_of_matches(
     disparity = disparity[np.isfinite(disparity)]
     if not len(disparity):
         return 0, 0
-    tail = options.tail_fraction
-    low, high = np.quantile(disparity, [tail, 1 - tail])
-    margin = options.margin_px + options.margin_fraction * (high - low)
-    smallest, largest = low - margin, high + margin
+    smallest, largest = _with_margin(disparity, options)
     if isinstance(frame, PolarFrame):
         if np.mean(disparity > 0) > options.min_fraction_of_one_sign:
             smallest = max(smallest, -options.margin_px)
         if np.mean(disparity < 0) > options.min_fraction_of_one_sign:
             largest = min(largest, options.margin_px)
     return int(np.floor(smallest)), int(np.ceil(largest))
+
+
+def _with_margin(disparity: np.ndarray, options: RectifiedMatchingOptions) -> tuple[float, float]:
+    """Return the range of most disparities, with a margin on both sides."""
+    tail = options.tail_fraction
+    low, high = np.quantile(disparity, [tail, 1 - tail])
+    margin = options.margin_px + options.margin_fraction * (high - low)
+    return float(low - margin), float(high + margin)
 
 
 def _track(view: RectifiedView, options: RectifiedMatchingOptions) -> Tracks | None:
