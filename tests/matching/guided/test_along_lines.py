@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from deepdetect.features.keypoints import Keypoints
-from deepdetect.matching.guided.along_lines import LineSearchOptions, match_along_lines
+from deepdetect.matching.guided.along_lines import (
+    LineSearchOptions,
+    log10_chance,
+    match_along_lines,
+)
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """Of a rectified pair: epipolar lines are the rows."""
@@ -91,3 +95,24 @@ def test_without_keypoints_there_are_no_matches() -> None:
     for pair in ((first, none), (none, first), (none, none)):
         points0, points1 = match_along_lines(*pair, ROWS)
         assert points0.shape == points1.shape == (0, 2)
+
+
+def test_right_lines_find_more_than_chance() -> None:
+    first, second = random_pair(300)
+    nothing = np.empty((0, 2))
+    assert log10_chance(first, second, ROWS, nothing) < -10
+    columns = np.array([[0, 0, 1.0], [0, 0, 0], [-1.0, 0, 0]])
+    assert log10_chance(first, second, columns, nothing) > -2
+
+
+def test_matches_that_a_geometry_came_from_are_no_evidence() -> None:
+    first, second = random_pair(300)
+    used = match_along_lines(first, second, ROWS)[0]
+    assert log10_chance(first, second, ROWS, used) == 0
+
+
+def test_unrelated_keypoints_are_explained_by_chance() -> None:
+    for seed in range(10):
+        first, _ = random_pair(300, seed)
+        _, second = random_pair(300, seed + 100)
+        assert log10_chance(first, second, ROWS, np.empty((0, 2))) > -3

@@ -6,9 +6,11 @@ known, a partner can only lie near a line; what is elsewhere tells how alike wro
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import pdtrc
 
 from ..._shared.options import check_ranges
 from ...features.keypoints import Keypoints
@@ -28,6 +30,8 @@ class LineSearchOptions:
         ratio_near: the same for the second-best near the line.
         min_separation_px: keypoints nearer than this to the best show the same, and are no
             second-best.
+        null_shifts: by how much lines are moved, right, left, down and up, to count what matches by
+            chance, in units of the longer side of the image.
 
     Raises:
         OptionError: a value is out of its range.
@@ -37,11 +41,12 @@ class LineSearchOptions:
     ratio_elsewhere: float = 0.95
     ratio_near: float = 0.85
     min_separation_px: float = 5.0
+    null_shifts: tuple[float, ...] = (0.05, 0.1)
 
     def __post_init__(self) -> None:
         check_ranges(
             self,
-            positive=("max_distance_px",),
+            positive=("max_distance_px", "null_shifts"),
             not_negative=("min_separation_px",),
             fractions=("ratio_elsewhere", "ratio_near"),
         )
@@ -117,6 +122,48 @@ def match_along_lines(
     kept &= best < options.ratio_elsewhere * np.minimum(elsewhere0, elsewhere1[partner])
     kept &= best < options.ratio_near * second_best
     return points0[kept], points1[partner[kept]]
+
+
+def log10_chance(
+    first: Keypoints,
+    second: Keypoints,
+    fundamental: np.ndarray,
+    used: np.ndarray,
+    options: LineSearchOptions = LineSearchOptions(),
+) -> float:
+    """Return how likely chance explains the matches along lines that a geometry did not come from.
+
+    Lines at wrong places, the same but moved, find matches by chance alone. As many as the right
+    lines find are unlikely among them (a Poisson distribution of the mean number, at least 1).
+
+    Args:
+        first, second: keypoints with descriptors.
+        fundamental: (3, 3) with x1^T F x0 = 0.
+        used: (K, 2) positions in the first image of the matches that it was estimated from, right
+            or wrong: they are no evidence.
+        options: when two keypoints match.
+
+    Returns:
+        The decimal logarithm of the probability, at most 0. It is independent of the number of
+        false alarms of the geometry.
+    """
+    known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}
+
+    def further(matrix: np.ndarray) -> int:
+        found = match_along_lines(first, second, matrix, options)[0].astype(np.float32)
+        return sum((float(x), float(y)) not in known for x, y in found)
+
+    side = max(second.image_size)
+    by_chance = []
+    for share in options.null_shifts:
+        for right, down in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            back = np.eye(3)
+            back[:2, 2] = -side * share * np.array([right, down])
+            by_chance.append(further(back.T @ fundamental))
+    expected = max(float(np.mean(by_chance)), 1.0)
+    count = further(fundamental)
+    probability = float(pdtrc(count - 1, expected)) if count else 1.0
+    return math.log10(max(probability, 1e-300))
 
 
 def _lines(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:

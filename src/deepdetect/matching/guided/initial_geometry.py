@@ -28,7 +28,7 @@ from ...geometry.semi_calibrated import (
     estimate_semi_calibrated,
     refine_fundamental,
 )
-from .along_lines import match_along_lines
+from .along_lines import log10_chance, match_along_lines
 from .asift import simulated_views
 from .options import InitialGeometryOptions
 
@@ -257,6 +257,7 @@ def estimate_initial_geometry(
         for ratio in options.max_ratios:
             chosen = points[0][ratios < ratio], points[1][ratios < ratio]
             found = _estimate(chosen, model, seed, sizes, options)
+            found = _with_further_evidence(found, chosen[0], initial, options)
             if found.log10_nfa < best.log10_nfa:
                 best = replace(found, num_views=num_views)
             if best.log10_nfa < options.max_log10_nfa:
@@ -400,6 +401,21 @@ def _found(
 ) -> InitialGeometry:
     points0, points1 = points[0][inliers], points[1][inliers]
     return InitialGeometry(model, matrix, points0, points1, len(inliers), alarms, 0)
+
+
+def _with_further_evidence(
+    found: InitialGeometry,
+    used: np.ndarray,
+    initial: InitialMatches,
+    options: InitialGeometryOptions,
+) -> InitialGeometry:
+    """Let keypoints that no match was made of decide where a fundamental matrix is in doubt."""
+    doubtful = options.max_log10_nfa <= found.log10_nfa < options.max_hint_log10_nfa
+    if found.model != "fundamental" or not doubtful:
+        return found
+    assert found.matrix is not None
+    chance = log10_chance(*initial.features, found.matrix, used, options.line_search)
+    return replace(found, log10_nfa=found.log10_nfa + chance)
 
 
 def _with_further_matches(

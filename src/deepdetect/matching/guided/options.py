@@ -50,9 +50,9 @@ class InitialGeometryOptions:
         max_matches_to_search: with fewer that agree with it, it looks for more.
         model_selection: when the matches alone show that a scene has depth.
         tilts: of the simulated views: how many times shorter one direction is seen.
-        max_hint_log10_nfa: views of a larger tilt are simulated only where the best geometry so far
-            has a logarithm of its number of false alarms below this: where it may be more than
-            chance.
+        max_hint_log10_nfa: where the logarithm of the number of false alarms of the best geometry
+            so far is below this, it may be more than chance: views of a larger tilt are simulated,
+            and further matches along epipolar lines are counted.
         rotation_step_deg: between the directions of the views for a tilt of 1; the step is
             inversely proportional to the tilt.
 
