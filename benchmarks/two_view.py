@@ -3,10 +3,11 @@
     python benchmarks/two_view.py
 
 The Motorcycle pair of Middlebury 2014 (in scikit-image's wheel), its views turned by known
-rotations, so that the pose and every depth are known. Beside the alignment that is used stand the
-whole pixels it begins with and the parabola it was chosen over; beside the error of the rotation,
-that without the refinement of the pose (degrees). The truth itself is off: by the matches the rows
-of the pair are up to 0.1 px apart.
+rotations, so that the pose and every depth are known. Matches from rectification are sub-pixel
+positions and are taken as they are, with corners among them refined for the pose; beside them stand
+the same, rounded to whole pixels, and those aligned again, as other matches are. Beside the error
+of the rotation, that without the refinement of the pose (degrees). The truth itself is off: by the
+matches the rows of the pair are up to 0.1 px apart.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from deepdetect.datasets import load_stereo_pair
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.relative_pose import estimate_relative_pose, rotation_angle
 from deepdetect.io.image import luma
-from deepdetect.reconstruction.subpixel import refine_matches, similarity
+from deepdetect.reconstruction.subpixel import refine_matches
 from deepdetect.reconstruction.two_view import TwoViewOptions, reconstruct_two_view
 
 FOCAL, CENTRE, OFFSET = 994.978, (311.193, 254.877), 31.086
@@ -31,36 +32,6 @@ TURNS = {
     "14 degrees": ((1, 2, -3), (4, -6, 8)),
 }
 """Rotations of the left and of the right camera, degrees about x, y and z."""
-
-
-def parabola(
-    grays: tuple[np.ndarray, ...], points0: np.ndarray, points1: np.ndarray, reach: int = 4
-) -> np.ndarray:
-    """Refine matches by parabolas through the correlation at the nearest whole pixels."""
-    first, second = (gray.astype(np.float32) for gray in grays)
-    turned = similarity(points0, points1).T
-    side = np.arange(-reach, reach + 1)
-    offsets = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
-
-    def patches(image: np.ndarray, centres: np.ndarray, around: np.ndarray) -> np.ndarray:
-        x, y = np.moveaxis((centres[:, None] + around).astype(np.float32), 2, 0)
-        border = cv2.BORDER_REPLICATE
-        values = cv2.remap(image, x.copy(), y.copy(), cv2.INTER_CUBIC, borderMode=border)
-        values -= values.mean(1, keepdims=True)
-        return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
-
-    result = np.asarray(points1, np.float64).copy()
-    for start in range(0, len(points0), 20_000):
-        part = slice(start, start + 20_000)
-        template = patches(first, np.asarray(points0[part], np.float64), offsets)
-        for axis, step in enumerate(np.eye(2)):
-            low, middle, high = (
-                (template * patches(second, points1[part] + k * step, offsets @ turned)).sum(1)
-                for k in (-1, 0, 1)
-            )
-            bend = np.minimum(low - 2 * middle + high, -1e-9)
-            result[part, axis] += np.clip((low - high) / (2 * bend), -1, 1)
-    return result
 
 
 def main() -> None:
@@ -99,17 +70,23 @@ def main() -> None:
         depth = ((left.rays(back) * (FOCAL / (disparity + OFFSET))[:, None]) @ turns[0].T)[:, 2]
         calibration = Calibration(left, right, source="the page")
         rotation, translation = turns[1] @ turns[0].T, -turns[1][:, 0]
-        refined = refine_matches(*grays, points0, found.points1)
+        whole = np.rint(found.points1)
+        aligned = refine_matches(*grays, points0, whole)
         everything = np.ones(len(points0), bool)
-        for label, points1, used in (
-            ("whole pixels", found.points1.astype(float), everything),
-            ("parabola", parabola(grays, points0, found.points1), refined.converged),
-            ("alignment", refined.points1, refined.converged),
+        for label, points1, used, subpixel in (
+            ("as matched", found.points1.astype(float), everything, True),
+            ("whole pixels", whole, everything, None),
+            ("whole pixels, aligned", aligned.points1, aligned.converged, False),
         ):
             rows = np.flatnonzero(used)
             error = np.linalg.norm(points1 - there, axis=1)[used & known]
             model = reconstruct_two_view(
-                points0[rows], points1[rows], calibration, None, TwoViewOptions(subpixel=None)
+                points0[rows],
+                (whole if subpixel is False else points1)[rows],
+                calibration,
+                grays,
+                TwoViewOptions() if subpixel is not None else TwoViewOptions(subpixel=None),
+                refined=bool(subpixel),
             )
             pose = model.pose
             off = np.abs(model.points[:, 2] / depth[rows[model.indices]] - 1)
