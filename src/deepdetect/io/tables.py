@@ -136,7 +136,7 @@ def load_matches(path: str | Path) -> Matches:
             keypoints[0],
             keypoints[1],
             guide=guide,
-            subpixel=bool(arrays["subpixel"]),
+            subpixel="subpixel" in arrays and bool(arrays["subpixel"]),
         )
 
 
