@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.geometry import epipolar_errors
+from deepdetect.geometry import epipolar_errors, triangulation
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.triangulation import (
     correct_matches,
@@ -141,3 +141,17 @@ def test_parallel_rays_and_no_matches_raise_nothing() -> None:
     assert not np.isfinite(found.points).all()
     assert found.triangulation_angle[0] == pytest.approx(0)
     assert triangulate(*np.empty((2, 0, 2)), both, np.eye(3), np.ones(3)).points.shape == (0, 3)
+
+
+def test_blocks_give_what_all_at_once_gives(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera((640, 480), 500.0)
+    calibration = Calibration(camera, camera)
+    pose = np.eye(3), np.array([-1.0, 0.1, 0])
+    points0 = np.random.default_rng(0).uniform(0, 480, (100, 2))
+    points1 = points0 - [[20, 3]]
+    whole = triangulate(points0, points1, calibration, *pose)
+    monkeypatch.setattr(triangulation, "BLOCK", 7)
+    parts = triangulate(points0, points1, calibration, *pose)
+    for name, values in vars(whole).items():
+        np.testing.assert_array_equal(getattr(parts, name), values)
+    assert len(triangulate([], [], calibration, *pose).points) == 0

@@ -14,6 +14,9 @@ import numpy as np
 
 from .camera import Calibration
 
+BLOCK = 100_000
+"""Matches that are triangulated at once: a score of arrays of millions would fill the memory."""
+
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
@@ -62,6 +65,27 @@ def triangulate(
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     rotation = np.asarray(rotation, np.float64)
     translation = np.asarray(translation, np.float64).reshape(3)
+    blocks = [
+        _triangulate_block(
+            points0[start : start + BLOCK],
+            points1[start : start + BLOCK],
+            calibration,
+            rotation,
+            translation,
+        )
+        for start in range(0, max(len(points0), 1), BLOCK)
+    ]
+    return Triangulation(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
+
+
+def _triangulate_block(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    calibration: Calibration,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Triangulate some matches: the fields of `Triangulation`."""
     fundamental = fundamental_matrix(calibration, rotation, translation)
     moved0, moved1 = correct_matches(points0, points1, fundamental)
     camera0, camera1 = calibration.camera0, calibration.camera1
@@ -78,7 +102,7 @@ def triangulate(
     cheirality = np.isfinite(depth) & (depth > 0) & (depth1 > 0)
     error = ((moved0 - points0) ** 2).sum(1) + ((moved1 - points1) ** 2).sum(1)
     angle = np.arctan2(np.sqrt(squares), np.einsum("ij,ij->i", rays1, rotated))
-    return Triangulation(points, cheirality, np.sqrt(error / 2), angle)
+    return points, cheirality, np.sqrt(error / 2), angle
 
 
 def fundamental_matrix(
