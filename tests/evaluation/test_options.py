@@ -9,7 +9,7 @@ import pytest
 from deepdetect import DeepDetect, OptionError
 from deepdetect.evaluation.baselines.method import with_common_descriptor
 from deepdetect.evaluation.baselines.opencv import CLASSICAL, STANDARD
-from deepdetect.evaluation.options import THRESHOLDS, BenchmarkOptions
+from deepdetect.evaluation.options import BASELINES, THRESHOLDS, BenchmarkOptions
 from deepdetect.io.image import load_image
 
 LOW = [name for name in CLASSICAL if name.endswith("-low")]
@@ -62,17 +62,18 @@ def test_the_rows_of_the_standard_protocol(options: BenchmarkOptions) -> None:
     found = names(options.standard_features())
     assert found == [
         *("sift-common", "orb-many-common", "brisk-common", "fast-common", "agast-common"),
-        *("harris-maxima-common", "shi-tomasi-eigenvalue-common", "sift-own", "orb-many-own"),
+        *("harris-maxima-common", "shi-tomasi-eigenvalue-common"),
+        *("hessian-common", "hessian-scales-common", "sift-own", "orb-many-own"),
         *("deepdetect-sparse", "deepdetect-native-common"),
         *("random-native-common", "all-pixels-common"),
     ]
 
 
 @pytest.mark.parametrize("rows", ["density_features", "matching_features", "standard_features"])
-@pytest.mark.parametrize("extra", ["fast-low", "sift", "harris"])
+@pytest.mark.parametrize("extra", ["fast-low", "sift", "harris", "hessian"])
 def test_no_method_is_a_row_twice(options: BenchmarkOptions, rows: str, extra: str) -> None:
     """Also when a classical one is asked for again by its name."""
-    more = dataclasses.replace(options, others=(CLASSICAL[extra], CLASSICAL[extra]))
+    more = dataclasses.replace(options, others=(BASELINES[extra], BASELINES[extra]))
     methods = getattr(more, rows)()
     assert len(set(names(methods))) == len(methods)
     titles = [method.title for method in methods]

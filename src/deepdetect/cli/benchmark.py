@@ -96,10 +96,9 @@ def benchmark(
     from .._shared.errors import OptionError
     from .._shared.registry import look_up
     from ..datasets.pair_selection import PairSelectionOptions
-    from ..evaluation.baselines.opencv import CLASSICAL
     from ..evaluation.baselines.plugin import find_feature
     from ..evaluation.benchmarks import BENCHMARKS
-    from ..evaluation.options import PROTOCOLS, BenchmarkOptions
+    from ..evaluation.options import BASELINES, PROTOCOLS, BenchmarkOptions
     from ..evaluation.runner import run_benchmarks
     from ..matching.options import get_preset
 
@@ -111,7 +110,7 @@ def benchmark(
     for each in names:
         look_up("benchmark", each, dict.fromkeys(NAMES))
     heatmap = get_preset(preset).heatmap
-    classical = tuple(CLASSICAL)
+    classical = tuple(BASELINES)
     if baselines is not None:
         listed = [word.strip() for word in baselines.split(",")]
         classical = tuple(word for word in listed if word not in ("", "none"))

@@ -12,6 +12,7 @@ from ..datasets.pair_selection import PairSelectionOptions
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
 from ..features.selection import SelectionOptions
+from .baselines.hessian import HESSIAN
 from .baselines.method import (
     COMMON_DESCRIPTOR,
     LocalFeature,
@@ -24,6 +25,9 @@ from .baselines.random import all_pixels_feature, random_feature
 PROTOCOLS = ("paper", "standard", "guided")
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 PAPER_RESOLUTION_PX = 480
+
+BASELINES: dict[str, LocalFeature] = {**CLASSICAL, **HESSIAN}
+"""The classical baselines by name: the paper's, and those of the standard protocol only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +50,7 @@ class BenchmarkOptions:
 
     detector: DeepDetect
     protocols: tuple[str, ...] = PROTOCOLS
-    classical: tuple[str, ...] = tuple(CLASSICAL)
+    classical: tuple[str, ...] = tuple(BASELINES)
     others: tuple[LocalFeature, ...] = ()
     channels: Literal["rgb", "bgr"] = "rgb"
     geometry_weights: tuple[str | Path, ...] = ("dense",)
@@ -67,8 +71,8 @@ class BenchmarkOptions:
                 "file"
             )
         for name in self.classical:
-            if name not in CLASSICAL:
-                raise unknown_name("classical baseline", name, CLASSICAL)
+            if name not in BASELINES:
+                raise unknown_name("classical baseline", name, BASELINES)
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
         """Return DeepDetect as the paper runs it: images squashed to 480x480, SIFT of size 3."""
@@ -91,7 +95,7 @@ class BenchmarkOptions:
 
     def density_features(self) -> tuple[LocalFeature, ...]:
         """Return the rows of Table I and of the repeatability, chance baselines last."""
-        classical = [CLASSICAL[name] for name in self.classical]
+        classical = [CLASSICAL[name] for name in self.classical if name in CLASSICAL]
         own = [self.deepdetect_480(threshold) for threshold in THRESHOLDS]
         return without_repeats((*classical, *self.others, *own, *self.chance_baselines()))
 
@@ -104,10 +108,11 @@ class BenchmarkOptions:
 
     def standard_features(self) -> tuple[LocalFeature, ...]:
         """Return the rows of the standard protocol: default settings, ours sparse, chance."""
-        chosen = [name for name in STANDARD if name in self.classical]
-        classical = [with_common_descriptor(STANDARD[name]) for name in chosen]
-        others = [feature for feature in self.others if feature.name not in CLASSICAL]
-        systems = {f.name: f for f in self.others if f.name in CLASSICAL}
+        ranked = {**STANDARD, **HESSIAN}
+        chosen = [name for name in ranked if name in self.classical]
+        classical = [with_common_descriptor(ranked[name]) for name in chosen]
+        others = [feature for feature in self.others if feature.name not in BASELINES]
+        systems = {f.name: f for f in self.others if f.name in BASELINES}
         systems |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
         own = deepdetect_feature(
             self._native(),

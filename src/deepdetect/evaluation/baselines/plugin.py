@@ -19,6 +19,7 @@ import numpy as np
 
 from ..._shared.errors import OptionError
 from ..._shared.registry import look_up
+from .hessian import HESSIAN
 from .method import LocalFeature, external_feature
 from .onnx import onnx_feature
 from .opencv import CLASSICAL
@@ -40,7 +41,7 @@ def find_feature(word: str) -> LocalFeature:
     if ":" in word:
         return plugin_feature(word)
     try:
-        return look_up("method", word, CLASSICAL)
+        return look_up("method", word, {**CLASSICAL, **HESSIAN})
     except OptionError as error:
         raise OptionError(f"{error}; or give an ONNX file, or package.module:function") from None
 

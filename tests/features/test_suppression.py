@@ -1,0 +1,24 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deepdetect.features.suppression import suppress_neighbors
+
+
+@pytest.mark.parametrize("radius", [0.7, 2.0, 5.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_as_a_search_among_all_kept_ones(radius: float, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    xy = generator.uniform(-3, 30, (300, 2)).astype(np.float32)
+    scores = generator.integers(20, size=300)
+    kept: list[int] = []
+    for row in np.argsort(-scores, kind="stable"):
+        gaps = np.linalg.norm(xy[kept].astype(float) - xy[row].astype(float), axis=1)
+        if not len(kept) or gaps.min() >= radius:
+            kept.append(int(row))
+    assert suppress_neighbors(xy, scores, radius).tolist() == kept
+
+
+def test_no_points() -> None:
+    assert len(suppress_neighbors(np.empty((0, 2)), np.empty(0), 2)) == 0
