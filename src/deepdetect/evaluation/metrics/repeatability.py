@@ -146,6 +146,26 @@ def mutual_nn_repeatability(
     return results
 
 
+def repeated_fractions(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    homography: np.ndarray,
+    sizes: Sizes,
+    radii_px: Sequence[float] = (1.0, 3.0),
+) -> list[float]:
+    """Return the values of `mutual_nn_repeatability` alone, without chance; its arguments.
+
+    Example:
+        >>> corners = np.array([[2.0, 2], [8, 3]])
+        >>> repeated_fractions(corners, corners + [[0, 0], [2, 0]], np.eye(3), ((16, 16), (16, 16)))
+        [0.5, 1.0]
+    """
+    visible0, visible1 = _in_overlap(points0, points1, homography, sizes)
+    fewest = min(len(visible0), len(visible1))
+    distances = _mutual_distances(visible0, visible1, max(radii_px))
+    return [float((distances <= r).sum() / fewest) if fewest else 0.0 for r in radii_px]
+
+
 def _in_overlap(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, sizes: Sizes
 ) -> tuple[np.ndarray, np.ndarray]:
