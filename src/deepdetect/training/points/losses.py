@@ -1,0 +1,227 @@
+"""Losses over pairs of views, both blind to the scale of the logits.
+
+The candidates' logits have a fixed standard deviation, so neither loss falls when the network only
+makes its logits sharper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import smooth_l1_loss, softplus
+
+from .candidates import Candidates
+from .recipe import PointsTrainingOptions
+
+KERNELS = ((0.6, 0.7), (0.4, 1.8))
+"""Weight and sigma in pixels of what a partner is worth by its distance."""
+
+REACH_PX = 5.0
+CLOSE_PX, NEAR_PX = 1.0, 3.0
+BISECTIONS = 40
+COMPARISONS = 4096
+NEAR_BUDGET = 3.0
+"""The ranking loss compares candidates among this many times the budget."""
+
+CONSISTENCY_WEIGHT = 0.3
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """Candidates of one view that see one of the other, by distance in the other.
+
+    Attributes:
+        first, second: (P,) rows of both views.
+        distance_px: (P,) in pixels of the view that the first one is projected into.
+        visible: (N,) whether the other view shows a candidate of the first.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    distance_px: np.ndarray
+    visible: np.ndarray
+
+
+@dataclass(frozen=True)
+class Direction:
+    """One view's candidates, those of the other, and the way from here to there.
+
+    Attributes:
+        here, there: candidates.
+        homography: (3, 3) float64 from here to there.
+        valid: (H, W) bool of the view there.
+    """
+
+    here: Candidates
+    there: Candidates
+    homography: np.ndarray
+    valid: np.ndarray
+
+    @cached_property
+    def mapped(self) -> Tensor:
+        """The candidates' positions in the view there, differentiable."""
+        return project(self.here.xy, self.homography)
+
+    @cached_property
+    def near(self) -> Correspondences:
+        """The candidates there within `REACH_PX`."""
+        from scipy.spatial import KDTree
+
+        mapped = self.mapped.detach().numpy().astype(np.float64)
+        places = self.there.xy.detach().numpy().astype(np.float64)
+        height, width = self.valid.shape
+        finite = np.isfinite(mapped).all(1) & (np.abs(mapped) < 1e6).all(1)
+        column, row = np.rint(np.where(finite[:, None], mapped, -1)).astype(int).T
+        inside = finite & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        inside[inside] = self.valid[row[inside], column[inside]]
+        rows = np.flatnonzero(inside)
+        if not len(rows) or not len(places):
+            none = np.zeros(0, np.int64)
+            return Correspondences(none, none, np.zeros(0), inside)
+        found = KDTree(mapped[rows]).sparse_distance_matrix(
+            KDTree(places), REACH_PX, output_type="coo_matrix"
+        )
+        return Correspondences(
+            rows[found.row], found.col.astype(np.int64), found.data, inside
+        )
+
+
+def project(xy: Tensor, homography: np.ndarray) -> Tensor:
+    """Map (N, 2) positions by a (3, 3) homography, differentiably."""
+    matrix = torch.from_numpy(homography / homography[2, 2]).to(xy.dtype)
+    mapped = xy @ matrix[:, :2].T + matrix[:, 2]
+    return mapped[:, :2] / mapped[:, 2:]
+
+
+def pair_loss(
+    first: Direction, second: Direction, density: float, options: PointsTrainingOptions
+) -> Tensor:
+    """Return the loss of a pair of views, seen in both directions.
+
+    Args:
+        first, second: from one view to the other, and back.
+        density: keypoints per pixel.
+        options: which loss, and its settings.
+    """
+    budget = density * first.valid.size
+    if options.loss == "budget":
+        loss = budget_loss(first, second, budget, options.temperature)
+    else:
+        loss = ranking_loss(first, second, budget, options.temperature)
+    if options.position_weight:
+        loss = loss + options.position_weight * position_loss(first, second, options.temperature)
+    return loss
+
+
+def choose_softly(logits: Tensor, budget: float, temperature: float) -> Tensor:
+    """Return sigmoid((logits - tau) / temperature), tau so that they sum to the budget."""
+    fixed = logits.detach().double()
+    if len(fixed) <= budget:
+        return torch.sigmoid((logits - logits.detach().min()) / temperature + 4)
+    low, high = fixed.min() - 20 * temperature, fixed.max() + 20 * temperature
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        if torch.sigmoid((fixed - middle) / temperature).sum() > budget:
+            low = middle
+        else:
+            high = middle
+    return torch.sigmoid((logits - low.float()) / temperature)
+
+
+def budget_loss(
+    first: Direction, second: Direction, budget: float, temperature: float
+) -> Tensor:
+    """Return less the expected fraction of repeats at a budget, with its exact gradient.
+
+    A candidate that becomes more likely drives out others at the border of the budget: its
+    reward counts less theirs.
+    """
+    chosen = [choose_softly(way.here.logits, budget, temperature) for way in (first, second)]
+    seen = [torch.from_numpy(way.near.visible) for way in (first, second)]
+    mass = min(float(g.detach()[v].sum()) for g, v in zip(chosen, seen, strict=True))
+    total = first.here.logits.sum() * 0
+    for way, g, other, visible in zip((first, second), chosen, chosen[::-1], seen, strict=True):
+        reward = _rewards(way, other.detach())
+        border = (g * (1 - g)).detach() * visible
+        level = (reward * border).sum() / border.sum().clamp(min=1e-6)
+        selected = way.here.shares * g
+        # The value is that of the selected ones; the gradient is that at a fixed budget.
+        total = total - (selected * (reward - level) * visible).sum() / max(mass, 1.0)
+    return total
+
+
+def _rewards(way: Direction, chosen_there: Tensor) -> Tensor:
+    near = way.near
+    rows, columns = torch.from_numpy(near.first), torch.from_numpy(near.second)
+    distance = torch.from_numpy(near.distance_px).float()
+    reward = torch.zeros(len(way.here.logits))
+    for weight, sigma in KERNELS:
+        worth = chosen_there[columns] * (-(distance**2) / (2 * sigma**2)).exp()
+        reward += weight * torch.zeros_like(reward).index_add(0, rows, worth).clamp(max=1)
+    return reward
+
+
+def mutual_pairs(way: Direction, radius_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows of both views that are mutual nearest neighbours, and their distances."""
+    near = way.near
+    close = near.distance_px <= radius_px
+    first, second, distance = near.first[close], near.second[close], near.distance_px[close]
+    order = np.argsort(distance, kind="stable")
+    first, second, distance = first[order], second[order], distance[order]
+    best = [np.unique(rows, return_index=True)[1] for rows in (first, second)]
+    both = np.intersect1d(*best)
+    return first[both], second[both], distance[both]
+
+
+def ranking_loss(
+    first: Direction, second: Direction, budget: float, temperature: float
+) -> Tensor:
+    """Compare candidates pair by pair: those found again among the other view's best come first.
+
+    And a candidate and its partner have the same logit: what is best must be so in both views.
+    """
+    total = first.here.logits.sum() * 0
+    for way in (first, second):
+        here, there = way.here.logits, way.there.logits
+        rows, partners, distance = mutual_pairs(way, NEAR_PX)
+        rank_there = _ranks(there)
+        found = np.zeros(len(here), np.float32)
+        repeated = rank_there[partners] < budget
+        found[rows[repeated]] = 0.4 + 0.6 * (distance[repeated] <= CLOSE_PX)
+        compared = np.flatnonzero(way.near.visible & (_ranks(here) < NEAR_BUDGET * budget))
+        if len(compared) > 1:
+            generator = np.random.default_rng(len(compared))
+            a, b = compared[generator.integers(len(compared), size=(2, COMPARISONS))]
+            gain = torch.from_numpy(found[a] - found[b]).clamp(min=0)
+            wrong = softplus((here[torch.from_numpy(b)] - here[torch.from_numpy(a)]) / temperature)
+            total = total + (gain * wrong).sum() / gain.sum().clamp(min=1)
+        if len(rows):
+            gap = (here[torch.from_numpy(rows)] - there[torch.from_numpy(partners)]) / temperature
+            total = total + CONSISTENCY_WEIGHT * smooth_l1_loss(gap, torch.zeros_like(gap))
+    return total / 2
+
+
+def _ranks(logits: Tensor) -> np.ndarray:
+    ranks = np.empty(len(logits), np.int64)
+    ranks[np.argsort(-logits.detach().numpy(), kind="stable")] = np.arange(len(logits))
+    return ranks
+
+
+def position_loss(first: Direction, second: Direction, temperature: float) -> Tensor:
+    """Return the mean distance of partners in pixels, those with high logits first."""
+    total = first.here.logits.sum() * 0
+    for way in (first, second):
+        rows, partners, _ = mutual_pairs(way, NEAR_PX)
+        if not len(rows):
+            continue
+        row, partner = torch.from_numpy(rows), torch.from_numpy(partners)
+        weight = torch.minimum(way.here.logits[row], way.there.logits[partner]).detach()
+        weight = torch.sigmoid(weight / (2 * temperature))
+        gap = way.mapped[row] - way.there.xy[partner]
+        distance = (gap.square().sum(1) + 1e-4).sqrt()
+        total = total + (weight * distance).sum() / weight.sum().clamp(min=1)
+    return total / 2

@@ -1,0 +1,264 @@
+"""Training of the head: steps, checkpoints, and the hard measure that picks the best weights."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch.utils.data import DataLoader
+
+from ..._shared.atomic import atomic_path
+from ..._shared.errors import OptionError, WeightsError
+from ..._shared.provenance import provenance
+from ...detector.network.points_head import PointsHead
+from ...detector.points import PyramidOptions
+from ...io.image import find_images
+from ..checkpoint import read_checkpoint, restore, save_checkpoint
+from ..dataset import loading
+from .candidates import find_candidates
+from .dataset import PairDataset, PairSample, PairSampler
+from .losses import Direction, pair_loss
+from .measure import HardMeasure, head_detector, measure, validation_pairs
+from .recipe import PointsTrainingOptions
+
+CHECKPOINT = "checkpoint.safetensors"
+BEST = "best.safetensors"
+CURVE = "curve.jsonl"
+
+
+@dataclass
+class PointsState:
+    """How far a run has come.
+
+    Attributes:
+        step: optimiser steps done.
+        loss_sum, loss_count: since the last measure.
+        seconds: CPU seconds of the training alone.
+        best_score: of the hard measure, so far.
+        points: a row for each measure.
+    """
+
+    step: int = 0
+    loss_sum: float = 0.0
+    loss_count: int = 0
+    seconds: float = 0.0
+    best_score: float = -1.0
+    points: list[dict[str, Any]] = field(default_factory=list)
+
+
+class PointsTrainer:
+    """A run over a folder of photographs, measured on another.
+
+    A run that was interrupted goes on from its last checkpoint, with the same result as one that
+    was not.
+
+    Args:
+        photos, validation: folders of photographs.
+        folder: of the run: checkpoint.safetensors, best.safetensors, curve.jsonl.
+        options: the recipe.
+        measure_every: steps from one hard measure to the next.
+        save_every: steps from one checkpoint to the next.
+        pairs_per_kind: of the hard measure.
+        workers: processes that render views.
+        log: takes lines for the user.
+
+    Raises:
+        ImageError: a folder is missing or empty.
+        OptionError: the folder holds a run with other options.
+        WeightsError: its checkpoint is damaged.
+    """
+
+    def __init__(
+        self,
+        photos: Path,
+        validation: Path,
+        folder: Path,
+        options: PointsTrainingOptions = PointsTrainingOptions(),
+        *,
+        measure_every: int = 500,
+        save_every: int = 100,
+        pairs_per_kind: int = 16,
+        workers: int = 0,
+        log: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self.options, self.folder, self.log = options, folder, log
+        self.measure_every, self.save_every, self.workers = measure_every, save_every, workers
+        self.files = find_images(photos)
+        self.pairs = validation_pairs(validation, pairs_per_kind)
+        torch.manual_seed(options.seed)
+        self.head = PointsHead()
+        self.optimizer = torch.optim.AdamW(
+            self.head.parameters(), options.learning_rate, weight_decay=options.weight_decay
+        )
+        self.state = PointsState()
+        self.run = {"options": options.to_json(), "photographs": len(self.files)}
+        folder.mkdir(parents=True, exist_ok=True)
+        self._resume()
+
+    def fit(self, last_step: int | None = None, seconds: float = math.inf) -> PointsState:
+        """Train to the last step of the recipe, or stop earlier, with a checkpoint.
+
+        Args:
+            last_step: stop when this many steps are done.
+            seconds: stop after this time.
+        """
+        state = self.state
+        end = self.options.steps if last_step is None else min(last_step, self.options.steps)
+        started = time.monotonic()
+        if not state.points:
+            self._measure()
+            self._save()
+        with loading(self._loader()) as batches:
+            while state.step < end and time.monotonic() - started < seconds:
+                before = time.process_time()
+                value = self.training_step(next(batches))
+                state.seconds += time.process_time() - before
+                state.loss_sum += value
+                state.loss_count += 1
+                state.step += 1
+                measured = state.step % self.measure_every == 0 or state.step == self.options.steps
+                if measured:
+                    self._measure()
+                if measured or state.step % self.save_every == 0:
+                    self._save()
+        self._save()
+        return state
+
+    def training_step(self, samples: Sequence[PairSample]) -> float:
+        """Make one optimiser step, and return the loss.
+
+        Raises:
+            OptionError: the loss or its gradients are not finite.
+        """
+        options = self.options
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.learning_rate_at(self.state.step)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss = batch_loss(self.head, samples, options)
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = torch.nn.utils.clip_grad_norm_(self.head.parameters(), options.max_gradient_norm)
+        if not (loss.isfinite() and norm.isfinite()):
+            raise OptionError(
+                f"the loss or its gradients are not finite at step {self.state.step}: "
+                "lower `learning_rate`"
+            )
+        self.optimizer.step()
+        return float(loss.detach())
+
+    def measure(self) -> HardMeasure:
+        """Measure the head as it is."""
+        return measure(head_detector(self.head, self._pyramid()), self.pairs)
+
+    def _pyramid(self) -> PyramidOptions:
+        return PyramidOptions(levels=self.options.levels)
+
+    def _loader(self) -> DataLoader[Any]:
+        return DataLoader(
+            PairDataset(self.files, self.options),
+            batch_sampler=PairSampler(self.options, self.state.step),
+            collate_fn=list,
+            num_workers=self.workers,
+            generator=torch.Generator(),
+        )
+
+    def _measure(self) -> None:
+        found, state = self.measure(), self.state
+        row: dict[str, Any] = {
+            "step": state.step,
+            "loss": state.loss_sum / max(state.loss_count, 1),
+            "cpu_seconds": round(state.seconds, 1),
+            "score": found.score,
+            **{kind: value.ravel().tolist() for kind, value in found.values.items()},
+        }
+        state.points.append(row)
+        state.loss_sum, state.loss_count = 0.0, 0
+        best = found.score > state.best_score
+        if best:
+            state.best_score = found.score
+            notes = {**self.run, **provenance(), "point": row}
+            save_head(self.head, self.folder / BEST, notes)
+        with atomic_path(self.folder / CURVE) as temporary:
+            temporary.write_text("".join(json.dumps(point) + "\n" for point in state.points))
+        self.log(
+            f"{state.step:6d} {row['cpu_seconds']:8.0f}s loss {row['loss']:+.4f} "
+            f"score {found.row()}{' *' if best else ''}"
+        )
+
+    def _save(self) -> None:
+        metadata = {**dataclasses.asdict(self.state), **self.run}
+        save_checkpoint(self.folder / CHECKPOINT, self.head, [self.optimizer], metadata)
+
+    def _resume(self) -> None:
+        path = self.folder / CHECKPOINT
+        if not path.exists():
+            return
+        found = read_checkpoint(path)
+        if any(found.metadata.get(name) != value for name, value in self.run.items()):
+            raise OptionError(
+                f"{self.folder} holds a run with other options: use the same ones to resume it, "
+                "or another folder"
+            )
+        if found.metadata.get("step"):
+            restore(found, self.head, [self.optimizer])
+        names = [each.name for each in dataclasses.fields(PointsState)]
+        try:
+            self.state = PointsState(**{name: found.metadata[name] for name in names})
+        except KeyError as error:
+            raise found.unfit(f"{error} is missing") from None
+
+
+def batch_loss(
+    head: torch.nn.Module, samples: Sequence[PairSample], options: PointsTrainingOptions
+) -> torch.Tensor:
+    """Return the mean loss of some pairs of views."""
+    logits = [
+        head(torch.from_numpy(np.concatenate(views))[:, None])[:, 0]
+        for views in zip(*(sample.levels for sample in samples), strict=True)
+    ]
+    losses = []
+    for k, sample in enumerate(samples):
+        pair = sample.pair
+        views = [
+            find_candidates([level[2 * k + v] for level in logits], pair.valid[v], options.sharpness)
+            for v in range(2)
+        ]
+        if min(len(view.logits) for view in views) < 2:
+            continue
+        there = Direction(views[0], views[1], pair.homography, pair.valid[1])
+        back = Direction(views[1], views[0], np.linalg.inv(pair.homography), pair.valid[0])
+        losses.append(pair_loss(there, back, sample.density, options))
+    if not losses:  # nothing to see in any of the views
+        return logits[0].sum() * 0
+    return torch.stack(losses).sum() / len(samples)
+
+
+def save_head(head: PointsHead, path: Path, notes: dict[str, Any]) -> None:
+    """Write a head's weights (safetensors) with notes."""
+    tensors = {name: value.detach().contiguous() for name, value in head.state_dict().items()}
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata={"notes": json.dumps(notes, default=str)})
+
+
+def load_head(path: Path) -> PointsHead:
+    """Read a head's weights.
+
+    Raises:
+        WeightsError: the file is missing, damaged or of another network.
+    """
+    head = PointsHead()
+    try:
+        head.load_state_dict(load_file(path))
+    except (SafetensorError, OSError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise WeightsError(f"{path} does not hold weights of this head ({reason})") from None
+    return head.eval()
