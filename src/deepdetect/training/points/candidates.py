@@ -88,7 +88,9 @@ def _maxima(
     padded = pad(logits[None, None], (RADIUS,) * 4, mode="replicate")[0, 0].reshape(-1)
     steps = torch.arange(window)
     offsets = (steps[:, None] * (width + 2 * RADIUS) + steps).reshape(-1)
-    windows = padded[(row * (width + 2 * RADIUS) + column)[:, None] + offsets]
+    places = (row * (width + 2 * RADIUS) + column)[:, None] + offsets
+    # Its gradient is much faster than that of indexing.
+    windows = padded.index_select(0, places.reshape(-1)).view(places.shape)
     middle = windows.shape[1] // 2
     center = windows[:, middle]
     shift = []

@@ -34,6 +34,7 @@ class PointsTrainingOptions:
         min_density, max_density: range of the budgets in keypoints per pixel, log-uniform.
         position_weight: of the distance between keypoints that are found again.
         kind_weights: how often each of `views.KINDS` is drawn, relative to the others.
+        initial_sigma_px: of the |det H| that the untrained head ranks by.
         seed: of the weights and the pairs.
     """
 
@@ -52,6 +53,7 @@ class PointsTrainingOptions:
     max_density: float = 0.016
     position_weight: float = 0.1
     kind_weights: tuple[float, ...] = (1.0,) * len(KINDS)
+    initial_sigma_px: float = 1.5
     seed: int = 0
 
     def __post_init__(self) -> None:

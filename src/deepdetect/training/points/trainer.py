@@ -96,7 +96,8 @@ class PointsTrainer:
         self.files = find_images(photos)
         self.pairs = validation_pairs(validation, pairs_per_kind)
         torch.manual_seed(options.seed)
-        self.head = PointsHead()
+        self.head = PointsHead(initial_sigma_px=options.initial_sigma_px)
+        self.head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.optimizer = torch.optim.AdamW(
             self.head.parameters(), options.learning_rate, weight_decay=options.weight_decay
         )
