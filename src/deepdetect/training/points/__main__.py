@@ -1,7 +1,7 @@
 """`python -m deepdetect.training.points`: train the head, or measure it beside its rivals.
 
-    python -m deepdetect.training.points train photos/train photos/val -o run --steps 20000
-    python -m deepdetect.training.points measure photos/val --head run/best.safetensors
+python -m deepdetect.training.points train photos/train photos/val -o run --steps 20000
+python -m deepdetect.training.points measure photos/val --head run/best.safetensors
 """
 
 from __future__ import annotations

@@ -42,9 +42,7 @@ class Candidates:
     scale: Tensor
 
 
-def find_candidates(
-    levels: Sequence[Tensor], valid: np.ndarray, sharpness: float
-) -> Candidates:
+def find_candidates(levels: Sequence[Tensor], valid: np.ndarray, sharpness: float) -> Candidates:
     """Find the candidates of one view.
 
     Args:
@@ -70,9 +68,7 @@ def find_candidates(
     return Candidates(xy[kept], logits, 1 / (around + rivals), scale)
 
 
-def _maxima(
-    logits: Tensor, full: tuple[int, int], valid: np.ndarray
-) -> tuple[Tensor, Tensor]:
+def _maxima(logits: Tensor, full: tuple[int, int], valid: np.ndarray) -> tuple[Tensor, Tensor]:
     """Return positions (N, 2) in the view, and the logits around them, (N, 25)."""
     height, width = logits.shape
     fixed = logits.detach()

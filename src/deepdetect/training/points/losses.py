@@ -76,7 +76,7 @@ class Direction:
         height, width = self.valid.shape
         finite = np.isfinite(mapped).all(1) & (np.abs(mapped) < 1e6).all(1)
         column, row = np.rint(np.where(finite[:, None], mapped, -1)).astype(int).T
-        inside = finite & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        inside: np.ndarray = finite & (column >= 0) & (row >= 0) & (column < width) & (row < height)
         inside[inside] = self.valid[row[inside], column[inside]]
         rows = np.flatnonzero(inside)
         if not len(rows) or not len(places):
@@ -85,9 +85,7 @@ class Direction:
         found = KDTree(mapped[rows]).sparse_distance_matrix(
             KDTree(places), REACH_PX, output_type="coo_matrix"
         )
-        return Correspondences(
-            rows[found.row], found.col.astype(np.int64), found.data, inside
-        )
+        return Correspondences(rows[found.row], found.col.astype(np.int64), found.data, inside)
 
 
 def project(xy: Tensor, homography: np.ndarray) -> Tensor:
@@ -132,9 +130,7 @@ def choose_softly(logits: Tensor, budget: float, temperature: float) -> Tensor:
     return torch.sigmoid((logits - low.float()) / temperature)
 
 
-def budget_loss(
-    first: Direction, second: Direction, budget: float, temperature: float
-) -> Tensor:
+def budget_loss(first: Direction, second: Direction, budget: float, temperature: float) -> Tensor:
     """Return less the expected fraction of repeats at a budget, with its exact gradient.
 
     A candidate that becomes more likely drives out others at the border of the budget: its
@@ -148,10 +144,11 @@ def budget_loss(
         reward = _rewards(way, other.detach())
         border = (g * (1 - g)).detach() * visible
         level = (reward * border).sum() / border.sum().clamp(min=1e-6)
-        selected = way.here.shares * g
-        # The value is that of the selected ones; the gradient is that at a fixed budget.
-        total = total - (selected * (reward - level) * visible).sum() / max(mass, 1.0)
-    return total
+        gain = (way.here.shares * g * (reward - level) * visible).sum() / max(mass, 1.0)
+        # The value is what is expected to be found again; the gradient that at a fixed budget.
+        value = (g.detach() * reward * visible).sum() / max(mass, 1.0)
+        total = total - value - (gain - gain.detach())
+    return total / 2
 
 
 def _rewards(way: Direction, chosen_there: Tensor) -> Tensor:
@@ -172,14 +169,14 @@ def mutual_pairs(way: Direction, radius_px: float) -> tuple[np.ndarray, np.ndarr
     first, second, distance = near.first[close], near.second[close], near.distance_px[close]
     order = np.argsort(distance, kind="stable")
     first, second, distance = first[order], second[order], distance[order]
-    best = [np.unique(rows, return_index=True)[1] for rows in (first, second)]
-    both = np.intersect1d(*best)
+    # The first of each row is its nearest.
+    _, best_first = np.unique(first, return_index=True)
+    _, best_second = np.unique(second, return_index=True)
+    both = np.intersect1d(best_first, best_second)
     return first[both], second[both], distance[both]
 
 
-def ranking_loss(
-    first: Direction, second: Direction, budget: float, temperature: float
-) -> Tensor:
+def ranking_loss(first: Direction, second: Direction, budget: float, temperature: float) -> Tensor:
     """Compare candidates pair by pair: those found again among the other view's best come first.
 
     And a candidate and its partner have the same logit: what is best must be so in both views.

@@ -146,7 +146,7 @@ class PointsTrainer:
             group["lr"] = options.learning_rate_at(self.state.step)
         self.optimizer.zero_grad(set_to_none=True)
         loss = batch_loss(self.head, samples, options)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.head.parameters(), options.max_gradient_norm)
         if not (loss.isfinite() and norm.isfinite()):
             raise OptionError(
@@ -230,7 +230,9 @@ def batch_loss(
     for k, sample in enumerate(samples):
         pair = sample.pair
         views = [
-            find_candidates([level[2 * k + v] for level in logits], pair.valid[v], options.sharpness)
+            find_candidates(
+                [level[2 * k + v] for level in logits], pair.valid[v], options.sharpness
+            )
             for v in range(2)
         ]
         if min(len(view.logits) for view in views) < 2:

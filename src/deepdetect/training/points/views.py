@@ -82,9 +82,7 @@ def _rotation(angle: float) -> np.ndarray:
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
 
-def draw_pair(
-    photo: np.ndarray, kind: str, side: int, generator: np.random.Generator
-) -> ViewPair:
+def draw_pair(photo: np.ndarray, kind: str, side: int, generator: np.random.Generator) -> ViewPair:
     """Draw two views of a photograph.
 
     Args:
@@ -97,9 +95,7 @@ def draw_pair(
     matrices = [place.matrix(side) for place in places]
     rendered = [render(photo, matrix, side) for matrix in matrices]
     affected = int(generator.integers(2))  # the view that has most of the blur or of the light
-    images = [
-        degrade(rendered[k][0], kind if k == affected else "", generator) for k in range(2)
-    ]
+    images = [degrade(rendered[k][0], kind if k == affected else "", generator) for k in range(2)]
     homography = matrices[1] @ np.linalg.inv(matrices[0])
     return ViewPair(
         images=(images[0], images[1]),
@@ -215,16 +211,14 @@ def degrade(image: np.ndarray, kind: str, generator: np.random.Generator) -> np.
         quality = uniform(5, 60) if chance() < 0.5 else None
     elif chance() < SUBTLE:
         quality = uniform(60, 95)
-    result = np.uint8(np.rint(255 * np.clip(values, 0, 1)))
+    result: np.ndarray = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
     if quality is not None:
         _, coded = cv2.imencode(".jpg", result, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
         result = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)
     return result
 
 
-def _relight(
-    values: np.ndarray, strength: float, generator: np.random.Generator
-) -> np.ndarray:
+def _relight(values: np.ndarray, strength: float, generator: np.random.Generator) -> np.ndarray:
     """Change gamma, gain and offset, by a ramp across the image as well."""
     uniform = generator.uniform
     gamma = math.exp(strength * uniform(-0.8, 0.8))
