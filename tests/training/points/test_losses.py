@@ -55,7 +55,6 @@ def test_logits_of_candidates_have_a_fixed_spread() -> None:
     )
     assert float(plain.logits.detach().std()) == pytest.approx(25, rel=1e-3)
     torch.testing.assert_close(plain.logits, sharp.logits, rtol=1e-3, atol=0.02)
-    assert bool((plain.shares > 0).all() and (plain.shares <= 1).all())
 
 
 @pytest.mark.parametrize("loss", LOSSES)
@@ -87,7 +86,7 @@ def test_the_soft_choice_meets_its_budget(budget: float) -> None:
 
 
 def test_descent_ranks_what_is_found_again_first() -> None:
-    """Ten candidates of fifty have partners; both losses raise just their logits (two by chance)."""
+    """Ten candidates of fifty have partners; both losses rank these first (two by chance)."""
     generator = np.random.default_rng(0)
     xy = [torch.tensor(generator.uniform(5, 90, (50, 2)), dtype=torch.float32) for _ in range(2)]
     xy[1][:10] = xy[0][:10] + 0.3
@@ -99,8 +98,7 @@ def test_descent_ranks_what_is_found_again_first() -> None:
         options = PointsTrainingOptions(loss=loss, position_weight=0)
         for _ in range(150):
             views = [
-                Candidates(p, 25 * (z - z.mean()) / z.std(), torch.ones(50), 25 / z.std())
-                for p, z in zip(xy, raw, strict=True)
+                Candidates(p, 25 * (z - z.mean()) / z.std()) for p, z in zip(xy, raw, strict=True)
             ]
             ways = Direction(*views, np.eye(3), VALID), Direction(*views[::-1], np.eye(3), VALID)
             optimizer.zero_grad()
@@ -115,8 +113,7 @@ def test_partners_are_mutual_and_positions_projected() -> None:
     homography = np.array([[1.2, 0.1, 3], [-0.1, 0.9, 2], [1e-4, 2e-4, 1]])
     xy = torch.tensor([[10.0, 20], [40, 50], [41, 50], [70, 30]])
     there = torch.cat([project(xy[[3, 1, 0]], homography), torch.tensor([[1.0, 1.0]])])
-    one = torch.ones(())
-    views = [Candidates(p, torch.zeros(4), torch.ones(4), one) for p in (xy, there)]
+    views = [Candidates(p, torch.zeros(4)) for p in (xy, there)]
     rows, partners, distance = mutual_pairs(Direction(*views, homography, VALID), 3.0)
     assert dict(zip(rows.tolist(), partners.tolist(), strict=True)) == {0: 2, 1: 1, 3: 0}
     np.testing.assert_allclose(distance, 0, atol=1e-4)

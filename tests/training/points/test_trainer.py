@@ -66,7 +66,7 @@ def test_other_options_do_not_resume(whole: PointsTrainer, textures) -> None:
 
 def test_a_file_of_something_else_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.safetensors").write_bytes(b"nonsense")
-    with pytest.raises(WeightsError, match="a.safetensors"):
+    with pytest.raises(WeightsError, match=r"a\.safetensors"):
         load_head(tmp_path / "a.safetensors")
 
 

@@ -1,7 +1,8 @@
 """Candidates: the local maxima of logits on a pyramid, as they are found at run time.
 
-Which pixels they are is not differentiable; their logits, their sub-pixel positions and their
-shares of the places around them are.
+Which pixels they are is not differentiable; their logits and their sub-pixel positions are. No loss
+rewards that a candidate stands out from its window: then the network sharpens all peaks and flattens
+their order (tried: the hard measure fell from .518 to .473 in 100 steps).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d, pad
+from torch.nn.functional import max_pool2d
 
 from ...features.suppression import suppress_neighbors
 
@@ -32,14 +33,10 @@ class Candidates:
     Attributes:
         xy: (N, 2) sub-pixel positions in the view, differentiable.
         logits: (N,) of mean 0 and standard deviation `sharpness`.
-        shares: (N,) of the softmax over the window and over the neighbours of other levels.
-        scale: what raw logits were multiplied with.
     """
 
     xy: Tensor
     logits: Tensor
-    shares: Tensor
-    scale: Tensor
 
 
 def find_candidates(levels: Sequence[Tensor], valid: np.ndarray, sharpness: float) -> Candidates:
@@ -52,28 +49,21 @@ def find_candidates(levels: Sequence[Tensor], valid: np.ndarray, sharpness: floa
     """
     height, width = valid.shape
     found = [_maxima(level, (width, height), valid) for level in levels]
-    xy, windows = (torch.cat([part[k] for part in found]) for k in range(2))
-    raw = windows[:, windows.shape[1] // 2]
+    xy = torch.cat([part[0] for part in found])
+    raw = torch.cat([part[1] for part in found])
     places, ranks = xy.detach().numpy(), raw.detach().numpy()
     kept = torch.from_numpy(suppress_neighbors(places, ranks, DISTANCE_PX).copy())
     spread = raw[kept].std() if len(kept) > 1 else raw.new_ones(())
     scale = sharpness / spread.clamp(min=MIN_SPREAD)
-    # The centre is the largest of its window.
-    around = (scale * (windows[kept] - raw[kept, None])).exp().sum(1)
-    rows, others = _neighbors(places, kept.numpy())
-    rivals = torch.zeros_like(around).index_add(
-        0, rows, (scale * (raw[others] - raw[kept[rows]])).clamp(max=0).exp()
-    )
     logits = scale * (raw[kept] - raw[kept].mean()) if len(kept) else raw
-    return Candidates(xy[kept], logits, 1 / (around + rivals), scale)
+    return Candidates(xy[kept], logits)
 
 
 def _maxima(logits: Tensor, full: tuple[int, int], valid: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Return positions (N, 2) in the view, and the logits around them, (N, 25)."""
+    """Return positions (N, 2) in the view, and logits (N,)."""
     height, width = logits.shape
     fixed = logits.detach()
-    window = 2 * RADIUS + 1
-    highest = max_pool2d(fixed[None, None], window, 1, RADIUS)[0, 0]
+    highest = max_pool2d(fixed[None, None], 2 * RADIUS + 1, 1, RADIUS)[0, 0]
     rows, columns = (t.numpy() for t in torch.nonzero(fixed == highest, as_tuple=True))
     scale = np.array([full[0] / width, full[1] / height])
     centers = (np.column_stack([columns, rows]) + 0.5) * scale - 0.5
@@ -81,34 +71,16 @@ def _maxima(logits: Tensor, full: tuple[int, int], valid: np.ndarray) -> tuple[T
     inner = (rows > 0) & (columns > 0) & (rows < height - 1) & (columns < width - 1)
     chosen = inner & valid[y, x]
     row, column = (torch.from_numpy(each[chosen]) for each in (rows, columns))
-    padded = pad(logits[None, None], (RADIUS,) * 4, mode="replicate")[0, 0].reshape(-1)
-    steps = torch.arange(window)
-    offsets = (steps[:, None] * (width + 2 * RADIUS) + steps).reshape(-1)
-    places = (row * (width + 2 * RADIUS) + column)[:, None] + offsets
-    # Its gradient is much faster than that of indexing.
-    windows = padded.index_select(0, places.reshape(-1)).view(places.shape)
-    middle = windows.shape[1] // 2
-    center = windows[:, middle]
-    shift = []
-    for step in (1, window):
-        before, after = windows[:, middle - step], windows[:, middle + step]
+    flat = logits.reshape(-1)
+    pixels = row * width + column
+
+    def at(step: int) -> Tensor:
+        return flat.index_select(0, pixels + step)  # its gradient is faster than indexing's
+
+    center, shift = at(0), []
+    for step in (1, width):
+        before, after = at(-step), at(step)
         bend = (2 * center - before - after).clamp(min=MIN_BEND)
         shift.append(((after - before) / (2 * bend)).clamp(-MAX_OFFSET_PX, MAX_OFFSET_PX))
     xy = torch.stack([column, row], 1) + torch.stack(shift, 1)
-    return (xy + 0.5) * torch.from_numpy(scale).float() - 0.5, windows
-
-
-def _neighbors(places: np.ndarray, kept: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Return pairs of a row of the kept ones and a suppressed candidate near it."""
-    from scipy.spatial import KDTree
-
-    if not len(kept):
-        return torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long)
-    near = KDTree(places[kept]).sparse_distance_matrix(
-        KDTree(places), DISTANCE_PX, output_type="coo_matrix"
-    )
-    other = near.col != kept[near.row]
-    return (
-        torch.from_numpy(near.row[other].astype(np.int64)),
-        torch.from_numpy(near.col[other].astype(np.int64)),
-    )
+    return (xy + 0.5) * torch.from_numpy(scale).float() - 0.5, center

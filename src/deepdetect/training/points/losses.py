@@ -76,16 +76,18 @@ class Direction:
         height, width = self.valid.shape
         finite = np.isfinite(mapped).all(1) & (np.abs(mapped) < 1e6).all(1)
         column, row = np.rint(np.where(finite[:, None], mapped, -1)).astype(int).T
-        inside: np.ndarray = finite & (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        inside[inside] = self.valid[row[inside], column[inside]]
+        inside = finite & (column >= 0) & (row >= 0) & (column < width) & (row < height)
         rows = np.flatnonzero(inside)
+        rows = rows[self.valid[row[rows], column[rows]]]
+        visible = np.zeros(len(mapped), bool)
+        visible[rows] = True
         if not len(rows) or not len(places):
             none = np.zeros(0, np.int64)
-            return Correspondences(none, none, np.zeros(0), inside)
+            return Correspondences(none, none, np.zeros(0), visible)
         found = KDTree(mapped[rows]).sparse_distance_matrix(
             KDTree(places), REACH_PX, output_type="coo_matrix"
         )
-        return Correspondences(rows[found.row], found.col.astype(np.int64), found.data, inside)
+        return Correspondences(rows[found.row], found.col.astype(np.int64), found.data, visible)
 
 
 def project(xy: Tensor, homography: np.ndarray) -> Tensor:
@@ -144,7 +146,7 @@ def budget_loss(first: Direction, second: Direction, budget: float, temperature:
         reward = _rewards(way, other.detach())
         border = (g * (1 - g)).detach() * visible
         level = (reward * border).sum() / border.sum().clamp(min=1e-6)
-        gain = (way.here.shares * g * (reward - level) * visible).sum() / max(mass, 1.0)
+        gain = (g * (reward - level) * visible).sum() / max(mass, 1.0)
         # The value is what is expected to be found again; the gradient that at a fixed budget.
         value = (g.detach() * reward * visible).sum() / max(mass, 1.0)
         total = total - value - (gain - gain.detach())
