@@ -47,6 +47,9 @@ def test_an_interrupted_run_ends_with_the_same_weights(whole, textures, tmp_path
     assert resumed.state.step == 3
     resumed.fit()
     torch.testing.assert_close(weights(resumed), weights(whole), rtol=0, atol=0)
+    torch.testing.assert_close(
+        resumed.average.state_dict(), whole.average.state_dict(), rtol=0, atol=0
+    )
     scores = [[point["score"] for point in run.state.points] for run in (resumed, whole)]
     assert scores[0] == scores[1]
 

@@ -26,6 +26,8 @@ class PointsTrainingOptions:
         warm_up: steps to the full learning rate.
         weight_decay: of AdamW.
         max_gradient_norm: gradients are clipped to it.
+        average_decay: of the running mean of the weights, which is what is measured and kept; 0
+            keeps those of the last step.
         loss: "budget": expected repeats at a fixed number of keypoints; "ranking": found again
             ones before others, pair by pair, and the same logit in both views.
         sharpness: standard deviation of the logits over the candidates of an image, to which they
@@ -42,16 +44,17 @@ class PointsTrainingOptions:
     pairs: int = 4
     side: int = 160
     levels: int = 5
-    learning_rate: float = 1.5e-3
+    learning_rate: float = 6e-4
     warm_up: int = 100
     weight_decay: float = 1e-4
     max_gradient_norm: float = 1.0
+    average_decay: float = 0.99
     loss: str = "budget"
     sharpness: float = 25.0
     temperature: float = 3.0
     min_density: float = 0.0012
     max_density: float = 0.016
-    position_weight: float = 0.1
+    position_weight: float = 0.0
     kind_weights: tuple[float, ...] = (1.0,) * len(KINDS)
     initial_sigma_px: float = 1.5
     seed: int = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import math
@@ -98,6 +99,8 @@ class PointsTrainer:
         torch.manual_seed(options.seed)
         self.head = PointsHead(initial_sigma_px=options.initial_sigma_px)
         self.head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.average = copy.deepcopy(self.head).requires_grad_(False)
+        self.both = torch.nn.ModuleDict({"head": self.head, "average": self.average})
         self.optimizer = torch.optim.AdamW(
             self.head.parameters(), options.learning_rate, weight_decay=options.weight_decay
         )
@@ -154,11 +157,20 @@ class PointsTrainer:
                 "lower `learning_rate`"
             )
         self.optimizer.step()
+        self._update_average()
         return float(loss.detach())
 
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        """Follow the weights; at first faster, so that the start is soon forgotten."""
+        decay = min(self.options.average_decay, (1 + self.state.step) / (10 + self.state.step))
+        weights = zip(self.average.parameters(), self.head.parameters(), strict=True)
+        for mean, parameter in weights:
+            mean.lerp_(parameter, 1 - decay)
+
     def measure(self) -> HardMeasure:
-        """Measure the head as it is."""
-        return measure(head_detector(self.head, self._pyramid()), self.pairs)
+        """Measure the average of the weights so far."""
+        return measure(head_detector(self.average, self._pyramid()), self.pairs)
 
     def _pyramid(self) -> PyramidOptions:
         return PyramidOptions(levels=self.options.levels)
@@ -187,7 +199,7 @@ class PointsTrainer:
         if best:
             state.best_score = found.score
             notes = {**self.run, **provenance(), "point": row}
-            save_head(self.head, self.folder / BEST, notes)
+            save_head(self.average, self.folder / BEST, notes)
         with atomic_path(self.folder / CURVE) as temporary:
             temporary.write_text("".join(json.dumps(point) + "\n" for point in state.points))
         self.log(
@@ -197,7 +209,7 @@ class PointsTrainer:
 
     def _save(self) -> None:
         metadata = {**dataclasses.asdict(self.state), **self.run}
-        save_checkpoint(self.folder / CHECKPOINT, self.head, [self.optimizer], metadata)
+        save_checkpoint(self.folder / CHECKPOINT, self.both, [self.optimizer], metadata)
 
     def _resume(self) -> None:
         path = self.folder / CHECKPOINT
@@ -210,7 +222,7 @@ class PointsTrainer:
                 "or another folder"
             )
         if found.metadata.get("step"):
-            restore(found, self.head, [self.optimizer])
+            restore(found, self.both, [self.optimizer])
         names = [each.name for each in dataclasses.fields(PointsState)]
         try:
             self.state = PointsState(**{name: found.metadata[name] for name in names})
