@@ -74,7 +74,7 @@ class Direction:
         mapped = self.mapped.detach().numpy().astype(np.float64)
         places = self.there.xy.detach().numpy().astype(np.float64)
         height, width = self.valid.shape
-        finite = np.isfinite(mapped).all(1) & (np.abs(mapped) < 1e6).all(1)
+        finite: np.ndarray = np.all(np.isfinite(mapped) & (np.abs(mapped) < 1e6), axis=1)
         column, row = np.rint(np.where(finite[:, None], mapped, -1)).astype(int).T
         inside = finite & (column >= 0) & (row >= 0) & (column < width) & (row < height)
         rows = np.flatnonzero(inside)
