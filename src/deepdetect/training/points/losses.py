@@ -17,11 +17,11 @@ from torch.nn.functional import smooth_l1_loss, softplus
 from .candidates import Candidates
 from .recipe import PointsTrainingOptions
 
-KERNELS = ((0.6, 0.7), (0.4, 1.8))
-"""Weight and sigma in pixels of what a partner is worth by its distance."""
-
-REACH_PX = 5.0
+REACH_PX = 3.0
 CLOSE_PX, NEAR_PX = 1.0, 3.0
+MIN_CHOICE = 0.1
+"""Candidates that are chosen with less than this have and are no partners."""
+
 BISECTIONS = 40
 COMPARISONS = 4096
 NEAR_BUDGET = 3.0
@@ -143,7 +143,7 @@ def budget_loss(first: Direction, second: Direction, budget: float, temperature:
     mass = min(float(g.detach()[v].sum()) for g, v in zip(chosen, seen, strict=True))
     total = first.here.logits.sum() * 0
     for way, g, other, visible in zip((first, second), chosen, chosen[::-1], seen, strict=True):
-        reward = _rewards(way, other.detach())
+        reward = _rewards(way, g.detach(), other.detach())
         border = (g * (1 - g)).detach() * visible
         level = (reward * border).sum() / border.sum().clamp(min=1e-6)
         gain = (g * (reward - level) * visible).sum() / max(mass, 1.0)
@@ -153,21 +153,39 @@ def budget_loss(first: Direction, second: Direction, budget: float, temperature:
     return total / 2
 
 
-def _rewards(way: Direction, chosen_there: Tensor) -> Tensor:
-    near = way.near
-    rows, columns = torch.from_numpy(near.first), torch.from_numpy(near.second)
-    distance = torch.from_numpy(near.distance_px).float()
+def _rewards(way: Direction, chosen_here: Tensor, chosen_there: Tensor) -> Tensor:
+    """Return what a candidate is worth: its partner's choice, by the distances of the measure.
+
+    One to one, as it is measured, and among those that may be chosen: with a sum over all near
+    candidates, crowds of points are rewarded, and fewer points are found again within 1 px.
+    """
+    possible = [each.detach().numpy() > MIN_CHOICE for each in (chosen_here, chosen_there)]
+    rows, partners, distance = mutual_pairs(way, NEAR_PX, possible[0], possible[1])
+    worth = torch.from_numpy(0.5 + 0.5 * (distance <= CLOSE_PX)).float()
     reward = torch.zeros(len(way.here.logits))
-    for weight, sigma in KERNELS:
-        worth = chosen_there[columns] * (-(distance**2) / (2 * sigma**2)).exp()
-        reward += weight * torch.zeros_like(reward).index_add(0, rows, worth).clamp(max=1)
+    reward[torch.from_numpy(rows)] = worth * chosen_there[torch.from_numpy(partners)]
     return reward
 
 
-def mutual_pairs(way: Direction, radius_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows of both views that are mutual nearest neighbours, and their distances."""
+def mutual_pairs(
+    way: Direction,
+    radius_px: float,
+    possible_here: np.ndarray | None = None,
+    possible_there: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rows of both views that are mutual nearest neighbours, and their distances.
+
+    Args:
+        way: from one view to the other.
+        radius_px: the largest distance.
+        possible_here, possible_there: (N,), (M,) bool: which candidates count; all by default.
+    """
     near = way.near
     close = near.distance_px <= radius_px
+    if possible_here is not None:
+        close = close & possible_here[near.first]
+    if possible_there is not None:
+        close = close & possible_there[near.second]
     first, second, distance = near.first[close], near.second[close], near.distance_px[close]
     order = np.argsort(distance, kind="stable")
     first, second, distance = first[order], second[order], distance[order]
