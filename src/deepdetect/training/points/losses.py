@@ -161,7 +161,7 @@ def _rewards(way: Direction, chosen_here: Tensor, chosen_there: Tensor) -> Tenso
     """
     possible = [each.detach().numpy() > MIN_CHOICE for each in (chosen_here, chosen_there)]
     rows, partners, distance = mutual_pairs(way, NEAR_PX, possible[0], possible[1])
-    worth = torch.from_numpy(0.5 + 0.5 * (distance <= CLOSE_PX)).float()
+    worth = torch.from_numpy(0.3 + 0.7 * (distance <= CLOSE_PX)).float()
     reward = torch.zeros(len(way.here.logits))
     reward[torch.from_numpy(rows)] = worth * chosen_there[torch.from_numpy(partners)]
     return reward
