@@ -46,12 +46,13 @@ def detect(
 ) -> None:
     """Detect the keypoints of IMAGES (files or folders).
 
-    Writes for each image STEM.npz (or .csv) with the positions and probabilities, and
-    the pictures STEM_keypoints.png and STEM_heatmap.png.
+    Writes for each image STEM.npz (or .csv) with the positions and scores, and the pictures
+    STEM_keypoints.png and STEM_heatmap.png. With --max-keypoints they are the best keypoints of
+    all scales; without, all pixels over the threshold.
 
     \b
     deepdetect detect photo.jpg
-    deepdetect detect photos/ -o keypoints --max-keypoints 2048 --nms-radius 2
+    deepdetect detect photos/ -o keypoints --max-keypoints 2048 --spread grid
     deepdetect detect photo.jpg --density 0.1 --format csv
     """
     from .._shared.errors import DeepDetectError
@@ -99,7 +100,10 @@ def _detect_one(
 
     rgb = load_image(path)
     started = time.perf_counter()
-    keypoints, heatmap = detector.detect(rgb, **selection, return_heatmap=True)
+    if pictures:
+        keypoints, heatmap = detector.detect(rgb, **selection, return_heatmap=True)
+    else:
+        keypoints = detector.detect(rgb, **selection)
     seconds = time.perf_counter() - started
     file = output / f"{path.stem}.{file_format}"
     save_keypoints(keypoints, file)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, overload
 
+import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
-from ..features.selection import SelectionOptions, select_keypoints
-from ..io.image import load_image
+from ..features.selection import SelectionOptions, check_ignore, select_keypoints
+from ..io.image import load_image, luma
 from .backends import RuntimeOptions, open_network
-from .heatmap import HeatmapOptions, compute_heatmap_and_logits
+from .heatmap import MAX_AUTO_PIXELS, HeatmapOptions, compute_heatmap_and_logits
+from .points.detection import PointOptions, detect_points
 from .pretrained import resolve_weights
 
 
@@ -146,6 +149,8 @@ class DeepDetect:
         nms_radius: int | None = ...,
         subpixel: bool | None = ...,
         ignore: np.ndarray | None = ...,
+        mode: Literal["auto", "dense", "points"] = ...,
+        spread: Literal["none", "grid", "anms"] = ...,
         return_heatmap: Literal[False] = ...,
     ) -> Keypoints: ...
 
@@ -160,6 +165,8 @@ class DeepDetect:
         nms_radius: int | None = ...,
         subpixel: bool | None = ...,
         ignore: np.ndarray | None = ...,
+        mode: Literal["auto", "dense", "points"] = ...,
+        spread: Literal["none", "grid", "anms"] = ...,
         return_heatmap: Literal[True],
     ) -> tuple[Keypoints, np.ndarray]: ...
 
@@ -174,34 +181,84 @@ class DeepDetect:
         nms_radius: int | None = None,
         subpixel: bool | None = None,
         ignore: np.ndarray | None = None,
+        mode: Literal["auto", "dense", "points"] = "auto",
+        spread: Literal["none", "grid", "anms"] = "none",
         return_heatmap: bool = False,
     ) -> Keypoints | tuple[Keypoints, np.ndarray]:
         """Detect keypoints.
+
+        Without `max_keypoints` they are dense: all pixels with a probability over the threshold.
+        With it, they are the best ones of all scales, ranked by how surely they are found again in
+        another photograph; the network is not run for them.
 
         Args:
             image: as for `heatmap`.
             threshold: tau: pixels with a probability above it.
             density: wanted keypoints per pixel, in (0, 1], instead of the threshold. This many
                 are returned even where there is little to detect.
-            max_keypoints: keep at most this many, the most probable ones, ranked by logits.
-            nms_radius: radius of non-maximum suppression in pixels. None: 1 with `max_keypoints`,
-                else 0.
-            subpixel: refine positions to a fraction of a pixel. None: with `max_keypoints` only.
+            max_keypoints: at most this many, the best ones.
+            nms_radius: of dense keypoints: radius of non-maximum suppression in pixels. None: 1
+                with `max_keypoints`, else 0.
+            subpixel: of dense keypoints: refine positions to a fraction of a pixel. None: with
+                `max_keypoints` only.
             ignore: (H, W) array, true where no keypoint is wanted.
+            mode: "dense", "points", or "auto": points with `max_keypoints` where none of
+                threshold, density, nms_radius and subpixel is given, else dense.
+            spread: of points: "none", "grid" (in turn the best of each cell), or "anms" (as far
+                from each other as their number allows).
             return_heatmap: return the heat map, too.
 
         Returns:
-            The keypoints in the order of rows and columns, on pixel centres unless `subpixel`;
-            with `return_heatmap`, the keypoints and the (H, W) float32 heat map.
+            The keypoints; with `return_heatmap`, the keypoints and the (H, W) float32 heat map.
+            Dense keypoints come in the order of rows and columns, on pixel centres unless
+            `subpixel`; points come best first, with sub-pixel positions and sizes.
 
         Raises:
             ImageError: the image cannot be read or is not fit.
-            OptionError: an option is out of its range.
+            OptionError: an option is out of its range, or options do not fit together.
         """
-        options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel, ignore)
-        heatmap, logits = self._run(load_image(image))
+        options = SelectionOptions(
+            threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread
+        )
+        rgb = load_image(image)
+        if options.uses_points:
+            keypoints = find_points(rgb, options, self.heatmap_options)
+            return (keypoints, self._run(rgb)[0]) if return_heatmap else keypoints
+        heatmap, logits = self._run(rgb)
         keypoints = select_keypoints(heatmap, options, logits)
         return (keypoints, heatmap) if return_heatmap else keypoints
+
+
+def find_points(
+    rgb: np.ndarray, options: SelectionOptions, seen: HeatmapOptions = HeatmapOptions()
+) -> Keypoints:
+    """Detect the best keypoints of all scales of a loaded image.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        options: how many, how they are spread, and where none is wanted.
+        seen: with the resolution "auto", images over two megapixels are scaled down to that, as
+            for the heat map; else the image is taken as it is.
+    """
+    gray = luma(rgb)
+    height, width = gray.shape
+    ignore = None if options.ignore is None else check_ignore(options.ignore, gray.shape)
+    scale = (MAX_AUTO_PIXELS / gray.size) ** 0.5
+    chosen = PointOptions(max_keypoints=options.max_keypoints, spread=options.spread)
+    if seen.resolution != "auto" or scale >= 1:
+        return detect_points(gray, chosen, ignore=ignore)
+    size = [max(1, round(side * scale)) for side in (width, height)]
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    if ignore is not None:
+        ignore = cv2.resize(ignore.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    found = detect_points(small, chosen, ignore=ignore)
+    factor = np.divide((width, height), size)
+    return replace(
+        found,
+        xy=(found.xy + 0.5) * factor - 0.5,
+        image_size=(width, height),
+        sizes=None if found.sizes is None else found.sizes * factor.mean(),
+    )
 
 
 def find_keypoints(
@@ -209,10 +266,14 @@ def find_keypoints(
 ) -> Keypoints:
     """Choose the keypoints of a loaded image, ranked by logits where the detector gives them.
 
+    Other detectors than ours have a heat map only: their keypoints are always dense.
+
     Raises:
         OptionError: the detector's map has another size than the image, or is not finite.
     """
     if isinstance(detector, DeepDetect):
+        if options.uses_points:
+            return find_points(rgb, options, detector.heatmap_options)
         own_map, own_logits = detector._run(rgb)
         return select_keypoints(own_map, options, own_logits)
     logits = None

@@ -42,12 +42,14 @@ class GuidedMatches:
             guided, sub-pixel positions where the pair was rectified.
         scores: (M,) float32 in [0, 1], higher is better.
         subpixel: whether the positions in the second image are sub-pixel.
+        rows1: (M,) int64 keypoints of the second image; None where the positions are others.
     """
 
     rows0: np.ndarray
     points1: np.ndarray
     scores: np.ndarray
     subpixel: bool = False
+    rows1: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.rows0)
@@ -59,7 +61,11 @@ class GuidedMatches:
         _, first = np.unique(pixels[best_first], axis=0, return_index=True)
         kept = np.sort(best_first[first])
         return replace(
-            self, rows0=self.rows0[kept], points1=self.points1[kept], scores=self.scores[kept]
+            self,
+            rows0=self.rows0[kept],
+            points1=self.points1[kept],
+            scores=self.scores[kept],
+            rows1=None if self.rows1 is None else self.rows1[kept],
         )
 
 

@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from .._shared.errors import OptionError
+from .._shared.errors import OptionError, unknown_name
 from .._shared.options import suggest_keywords
 from .keypoints import Keypoints, bayer_order
+
+MODES = ("auto", "dense", "points")
+SPREADS = ("none", "grid", "anms")
 
 MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined keypoint is still the one that it was found at."""
@@ -30,9 +33,15 @@ class SelectionOptions:
         subpixel: refine positions to the maximum of a parabola through the pixel and its two
             neighbours, in x and in y. None: with `max_keypoints` only.
         ignore: (H, W) bool or number array, true where keypoints are ignored.
+        mode: "dense" takes pixels of the heat map; "points" takes the best keypoints of all
+            scales, which are more repeatable where few are wanted, and need no heat map. "auto"
+            means points with `max_keypoints` and no other option of dense keypoints (threshold,
+            density, suppression, `subpixel`), else dense.
+        spread: of points: "none" takes the best; "grid" in turn the best of each cell of a grid;
+            "anms" the best that are as far from each other as their number allows.
 
     Raises:
-        OptionError: a value is out of its range.
+        OptionError: a value is unknown or out of its range, or options do not fit together.
     """
 
     threshold: float = 0.5
@@ -41,6 +50,8 @@ class SelectionOptions:
     nms_radius: int | None = None
     subpixel: bool | None = None
     ignore: np.ndarray | None = field(default=None, repr=False)
+    mode: str = "auto"
+    spread: str = "none"
 
     def __post_init__(self) -> None:
         if not 0 <= self.threshold <= 1:
@@ -56,6 +67,32 @@ class SelectionOptions:
                 raise OptionError(
                     f"`nms_radius` must be a whole number of pixels, not {self.nms_radius}"
                 )
+
+        if self.mode not in MODES:
+            raise unknown_name("mode", self.mode, MODES)
+        if self.spread not in SPREADS:
+            raise unknown_name("spread", self.spread, SPREADS)
+        if self.mode == "points" and (self.density is not None or self.nms_radius is not None):
+            raise OptionError(
+                "`density` and `nms_radius` belong to dense keypoints: leave them out, or use "
+                "mode='dense'"
+            )
+        if self.spread != "none" and not (self.uses_points and self.max_keypoints is not None):
+            raise OptionError(
+                f"`spread={self.spread!r}` needs `max_keypoints` and no option of dense keypoints"
+            )
+
+    @property
+    def uses_points(self) -> bool:
+        """Whether keypoints of all scales are wanted instead of pixels of the heat map."""
+        dense = (
+            self.max_keypoints is None
+            or self.density is not None
+            or self.nms_radius is not None
+            or self.subpixel is not None
+            or self.threshold != SelectionOptions.threshold
+        )
+        return self.mode == "points" or (self.mode == "auto" and not dense)
 
     @property
     def suppression_radius(self) -> int:
@@ -108,13 +145,7 @@ def select_keypoints(
     # With a density, all pixels but the impossible ones may be needed.
     wanted = heatmap > (options.threshold if options.density is None else 0.0)
     if options.ignore is not None:
-        ignore = np.asarray(options.ignore)
-        if ignore.shape != heatmap.shape:
-            raise OptionError(
-                f"the ignore mask has shape {ignore.shape}, the image (height, width) "
-                f"{heatmap.shape}: they must be equal"
-            )
-        wanted &= ~ignore.astype(bool)
+        wanted &= ~check_ignore(options.ignore, heatmap.shape)
     pixels = np.flatnonzero(wanted)
     ranks = ranking.ravel()
     if options.suppression_radius and len(pixels):
@@ -131,6 +162,21 @@ def select_keypoints(
         xy += np.stack([_peak_offset(ranking, row, column, axis) for axis in (1, 0)], 1)
     found = None if logits is None else ranks[pixels]
     return Keypoints(xy, heatmap.ravel()[pixels], (width, height), found)
+
+
+def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an ignore mask as (H, W) bool.
+
+    Raises:
+        OptionError: it differs from the image in size.
+    """
+    mask = np.asarray(ignore)
+    if mask.shape != shape:
+        raise OptionError(
+            f"the ignore mask has shape {mask.shape}, the image (height, width) {shape}: they "
+            "must be equal"
+        )
+    return mask.astype(bool)
 
 
 def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:

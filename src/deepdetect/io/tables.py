@@ -24,8 +24,8 @@ def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
     Args:
         keypoints: the keypoints.
         path: ending in .npz (arrays `keypoints` (N, 2) float32, `scores` (N,) float32,
-            `image_size` (width, height), and `logits` (N,) float32 where there are) or .csv
-            (columns x, y, score).
+            `image_size` (width, height), and `logits`, `sizes` and `angles` (N,) float32 where
+            there are) or .csv (columns x, y, score, and size and angle where there are).
 
     Raises:
         OptionError: the file's ending is another.
@@ -37,10 +37,18 @@ def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
             keypoints=keypoints.xy,
             scores=keypoints.scores,
             image_size=np.array(keypoints.image_size),
-            **({} if keypoints.logits is None else {"logits": keypoints.logits}),
+            **{name: values for name, values in _optional(keypoints) if values is not None},
         )
     else:
-        _save_csv(path, "x,y,score", np.column_stack([keypoints.xy, keypoints.scores]))
+        columns = [("x,y", keypoints.xy), ("score", keypoints.scores)]
+        known = (("size", keypoints.sizes), ("angle", keypoints.angles))
+        columns += [(name, values) for name, values in known if values is not None]
+        header = ",".join(name for name, _ in columns)
+        _save_csv(path, header, np.column_stack([values for _, values in columns]))
+
+
+def _optional(keypoints: Keypoints) -> list[tuple[str, np.ndarray | None]]:
+    return [(name, getattr(keypoints, name)) for name in ("logits", "sizes", "angles")]
 
 
 def load_keypoints(path: str | Path) -> Keypoints:
@@ -62,6 +70,8 @@ def load_keypoints(path: str | Path) -> Keypoints:
             arrays["scores"],
             tuple(arrays["image_size"]),
             arrays.get("logits"),
+            arrays.get("sizes"),
+            arrays.get("angles"),
         )
 
 

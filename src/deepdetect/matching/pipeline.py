@@ -200,8 +200,11 @@ def _guided_points(
         return nowhere, nowhere, np.empty(0, np.float32)
     if mutual:
         found = found.unique()
-    points1 = found.points1.astype(np.float32)
-    return keypoints[0].xy[found.rows0], points1, found.scores
+    points0 = keypoints[0].xy[found.rows0]
+    if found.rows1 is not None:
+        return points0, keypoints[1].xy[found.rows1], found.scores
+    # What is not at a keypoint of the second image is where the pixel of the first one is seen.
+    return np.rint(points0), found.points1.astype(np.float32), found.scores
 
 
 def unguided_matches(

@@ -211,8 +211,11 @@ def _reconstruct_rectified(pair: _Pair) -> Reconstruction:
     check_cameras(calibration, checks)
     with timer.stage("keypoints"):
         # Disparities are those of pixels.
-        selection = replace(options.selection, subpixel=False)
+        selection = options.selection
+        if not selection.uses_points:
+            selection = replace(selection, subpixel=False)
         keypoints = find_keypoints(pair.detector, image, selection)
+        keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
     check_keypoints(len(keypoints), options.selection)
     with timer.stage("matching"):
         found = compute_disparity(*pair.grays, disparity_options).at(keypoints)

@@ -153,7 +153,8 @@ def _sparse_matches(pair: ImagePair, first: InitialGeometry) -> GuidedMatches:
 
 def _at_keypoints(pair: ImagePair, found: DescriptorMatches) -> GuidedMatches:
     scores = np.clip(1 - found.ratios, 0, 1)
-    return GuidedMatches(found.rows0, pair.xy1[found.rows1].astype(np.float64), scores)
+    places = pair.xy1[found.rows1].astype(np.float64)
+    return GuidedMatches(found.rows0, places, scores, rows1=found.rows1)
 
 
 def _no_guide(first: InitialGeometry) -> Guide:

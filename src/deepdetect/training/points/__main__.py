@@ -1,7 +1,7 @@
-"""`python -m deepdetect.training.points`: train the head, or measure it beside its rivals.
+"""`python -m deepdetect.training.points`: train the ranker, or measure it beside its rivals.
 
 python -m deepdetect.training.points train photos/train photos/val -o run --steps 20000
-python -m deepdetect.training.points measure photos/val --head run/best.safetensors
+python -m deepdetect.training.points measure photos/val --ranker run/best.npz
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from typing import Any
 import click
 
 from ..._shared.errors import DeepDetectError
-from .recipe import LOSSES, PointsTrainingOptions
-from .views import KINDS
+from .recipe import PointsTrainingOptions
 
 PATH = click.Path(path_type=Path)
 DEFAULT = PointsTrainingOptions()
@@ -23,17 +22,16 @@ DEFAULT = PointsTrainingOptions()
 
 @click.group(context_settings={"show_default": True})
 def main() -> None:
-    """Train and measure the head that ranks keypoints."""
+    """Train and measure the ranker of keypoints."""
 
 
 def _recipe_options(function: Any) -> Any:
     """Add an option for each number of the recipe."""
     for each in reversed(dataclasses.fields(PointsTrainingOptions)):
         flag, default = f"--{each.name.replace('_', '-')}", getattr(DEFAULT, each.name)
-        if each.name == "loss":
-            settings: dict[str, Any] = {"type": click.Choice(LOSSES)}
-        elif isinstance(default, tuple):
-            settings = {"type": float, "nargs": len(default), "help": " ".join(KINDS)}
+        settings: dict[str, Any]
+        if isinstance(default, tuple):
+            settings = {"type": type(default[0]), "nargs": len(default)}
         else:
             settings = {"type": type(default)}
         function = click.option(flag, default=default, **settings)(function)
@@ -67,7 +65,7 @@ def train(
 
     Given again, the same command resumes an interrupted run. A line of the log: step, CPU seconds,
     loss, score, then repeatability @1 and @3 px at the lower budget, @1 and @3 px at the higher
-    one, as the mean and for each kind; a star marks the best so far, in best.safetensors.
+    one, as the mean and for each kind; a star marks the best so far, in best.npz.
     """
     import torch
 
@@ -92,32 +90,30 @@ def train(
 
 @main.command(name="measure")
 @click.argument("validation", type=PATH)
-@click.option("--head", "heads", type=PATH, multiple=True, help="Weights of a head, any number.")
+@click.option("--ranker", "rankers", type=PATH, multiple=True, help="A trained ranker; any number.")
 @click.option("--rivals/--no-rivals", "with_rivals", default=True, help="Measure the rivals, too.")
 @click.option("--pairs-per-kind", default=16, help="Pairs of each kind.")
 @click.option("--seed", default=0, help="Of the pairs; training measures by 0.")
 @click.option("--threads", default=1, help="Threads of torch.")
 def measure_all(
     validation: Path,
-    heads: tuple[Path, ...],
+    rankers: tuple[Path, ...],
     with_rivals: bool,
     pairs_per_kind: int,
     seed: int,
     threads: int,
 ) -> None:
-    """Print the hard measure of the rivals, of the untrained head, and of trained heads."""
+    """Print the hard measure of the rivals and of trained rankers."""
     import torch
 
-    from ...detector.network.points_head import PointsHead
-    from .measure import head_detector, measure, rivals, validation_pairs
-    from .trainer import load_head
+    from ...detector.points.ranker import load_ranker
+    from .measure import measure, points_detector, rivals, validation_pairs
 
     torch.set_num_threads(threads)
     try:
         pairs = validation_pairs(validation, pairs_per_kind, seed=seed)
         detectors = rivals() if with_rivals else {}
-        detectors["untrained head"] = head_detector(PointsHead().eval())
-        detectors |= {str(path): head_detector(load_head(path)) for path in heads}
+        detectors |= {str(path): points_detector(load_ranker(path)) for path in rankers}
         for name, detect in detectors.items():
             click.echo(f"{name:20s} {measure(detect, pairs).row()}")
     except DeepDetectError as error:

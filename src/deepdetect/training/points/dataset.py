@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from torch.utils.data import Dataset, Sampler
 
-from ...detector.points import PyramidOptions, pyramid
 from ...io.image import load_image, luma
+from .pairs import CandidatePair, candidate_pair
 from .recipe import PointsTrainingOptions
 from .views import KINDS, ViewPair, draw_pair
 
@@ -28,16 +28,14 @@ class PairIndex(NamedTuple):
 
 
 class PairSample(NamedTuple):
-    """A pair of views, both as pyramids, and the budget that it is trained for.
+    """A pair of views, and the budget that it is trained for.
 
     Attributes:
-        levels: for each level (2, h, w) uint8 of both views.
-        pair: the views.
+        pair: candidates of both views.
         density: keypoints per pixel.
     """
 
-    levels: list[np.ndarray]
-    pair: ViewPair
+    pair: CandidatePair
     density: float
 
 
@@ -61,11 +59,11 @@ class PairDataset(Dataset[PairSample]):
             pair = draw_pair(photo, kind, options.side, generator)
             if min(overlaps(pair)) > MIN_OVERLAP and np.ptp(pair.images[0]) > 20:
                 break
-        shape = PyramidOptions(levels=options.levels)
-        both = [pyramid(image.astype(np.float32) / 255, shape) for image in pair.images]
-        levels = [np.stack(views) for views in zip(*both, strict=True)]
+        # Upright descriptors cannot match turned and zoomed views: there all count as matchable.
+        described = options.match_weight > 0 and kind != "zoom"
+        candidates = candidate_pair(pair, options.max_candidates, described)
         low, high = np.log([options.min_density, options.max_density])
-        return PairSample(levels, pair, float(np.exp(generator.uniform(low, high))))
+        return PairSample(candidates, float(np.exp(generator.uniform(low, high))))
 
 
 def overlaps(pair: ViewPair) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Training of the head: steps, checkpoints, and the hard measure that picks the best weights."""
+"""Training of the ranker: steps, checkpoints, and the hard measure that picks the best weights."""
 
 from __future__ import annotations
 
@@ -14,27 +14,26 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch.utils.data import DataLoader
 
 from ..._shared.atomic import atomic_path
-from ..._shared.errors import OptionError, WeightsError
+from ..._shared.errors import OptionError
 from ..._shared.provenance import provenance
-from ...detector.network.points_head import PointsHead
-from ...detector.points import PyramidOptions
 from ...io.image import find_images
 from ..checkpoint import read_checkpoint, restore, save_checkpoint
 from ..dataset import loading
-from .candidates import find_candidates
-from .dataset import PairDataset, PairSample, PairSampler
-from .losses import Direction, pair_loss
-from .measure import HardMeasure, head_detector, measure, validation_pairs
+from .dataset import PairDataset, PairIndex, PairSample, PairSampler
+from .losses import pair_loss
+from .measure import HardMeasure, measure, points_detector, validation_pairs
+from .model import RankerModule, save_ranker
 from .recipe import PointsTrainingOptions
 
 CHECKPOINT = "checkpoint.safetensors"
-BEST = "best.safetensors"
+BEST = "best.npz"
 CURVE = "curve.jsonl"
+
+STATISTICS_PAIRS = 64
+"""Of views, whose features give mean and deviation."""
 
 
 @dataclass
@@ -65,7 +64,7 @@ class PointsTrainer:
 
     Args:
         photos, validation: folders of photographs.
-        folder: of the run: checkpoint.safetensors, best.safetensors, curve.jsonl.
+        folder: of the run: checkpoint.safetensors, best.npz, curve.jsonl.
         options: the recipe.
         measure_every: steps from one hard measure to the next.
         save_every: steps from one checkpoint to the next.
@@ -97,12 +96,11 @@ class PointsTrainer:
         self.files = find_images(photos)
         self.pairs = validation_pairs(validation, pairs_per_kind)
         torch.manual_seed(options.seed)
-        self.head = PointsHead(initial_sigma_px=options.initial_sigma_px)
-        self.head.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.average = copy.deepcopy(self.head).requires_grad_(False)
-        self.both = torch.nn.ModuleDict({"head": self.head, "average": self.average})
+        self.ranker = RankerModule(*self._statistics(), options.hidden)
+        self.average = copy.deepcopy(self.ranker).requires_grad_(False)
+        self.both = torch.nn.ModuleDict({"ranker": self.ranker, "average": self.average})
         self.optimizer = torch.optim.AdamW(
-            self.head.parameters(), options.learning_rate, weight_decay=options.weight_decay
+            self.ranker.parameters(), options.learning_rate, weight_decay=options.weight_decay
         )
         self.state = PointsState()
         self.run = {"options": options.to_json(), "photographs": len(self.files)}
@@ -148,9 +146,9 @@ class PointsTrainer:
         for group in self.optimizer.param_groups:
             group["lr"] = options.learning_rate_at(self.state.step)
         self.optimizer.zero_grad(set_to_none=True)
-        loss = batch_loss(self.head, samples, options)
+        loss = batch_loss(self.ranker, samples, options)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.head.parameters(), options.max_gradient_norm)
+        norm = torch.nn.utils.clip_grad_norm_(self.ranker.parameters(), options.max_gradient_norm)
         if not (loss.isfinite() and norm.isfinite()):
             raise OptionError(
                 f"the loss or its gradients are not finite at step {self.state.step}: "
@@ -164,16 +162,21 @@ class PointsTrainer:
     def _update_average(self) -> None:
         """Follow the weights; at first faster, so that the start is soon forgotten."""
         decay = min(self.options.average_decay, (1 + self.state.step) / (10 + self.state.step))
-        weights = zip(self.average.parameters(), self.head.parameters(), strict=True)
+        weights = zip(self.average.parameters(), self.ranker.parameters(), strict=True)
         for mean, parameter in weights:
             mean.lerp_(parameter, 1 - decay)
 
     def measure(self) -> HardMeasure:
         """Measure the average of the weights so far."""
-        return measure(head_detector(self.average, self._pyramid()), self.pairs)
+        return measure(points_detector(self.average.export({})), self.pairs)
 
-    def _pyramid(self) -> PyramidOptions:
-        return PyramidOptions(levels=self.options.levels)
+    def _statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and deviation of the features, over some pairs."""
+        dataset = PairDataset(self.files, self.options)
+        features = np.concatenate(
+            [side.features for k in range(STATISTICS_PAIRS) for side in dataset[_early(k)].pair.sides]
+        ).astype(np.float64)
+        return features.mean(0), features.std(0)
 
     def _loader(self) -> DataLoader[Any]:
         return DataLoader(
@@ -191,7 +194,10 @@ class PointsTrainer:
             "loss": state.loss_sum / max(state.loss_count, 1),
             "cpu_seconds": round(state.seconds, 1),
             "score": found.score,
-            **{kind: value.ravel().tolist() for kind, value in found.values.items()},
+            **{
+                kind: [*value.ravel().tolist(), found.correct[kind]]
+                for kind, value in found.repeatability.items()
+            },
         }
         state.points.append(row)
         state.loss_sum, state.loss_count = 0.0, 0
@@ -199,7 +205,7 @@ class PointsTrainer:
         if best:
             state.best_score = found.score
             notes = {**self.run, **provenance(), "point": row}
-            save_head(self.average, self.folder / BEST, notes)
+            save_ranker(self.average.export(notes), self.folder / BEST)
         with atomic_path(self.folder / CURVE) as temporary:
             temporary.write_text("".join(json.dumps(point) + "\n" for point in state.points))
         self.log(
@@ -230,50 +236,20 @@ class PointsTrainer:
             raise found.unfit(f"{error} is missing") from None
 
 
+def _early(number: int) -> PairIndex:
+    """Return an index before the first step: pairs that are not trained on."""
+    return PairIndex(2**31, number)
+
+
 def batch_loss(
-    head: torch.nn.Module, samples: Sequence[PairSample], options: PointsTrainingOptions
+    ranker: torch.nn.Module, samples: Sequence[PairSample], options: PointsTrainingOptions
 ) -> torch.Tensor:
-    """Return the mean loss of some pairs of views."""
-    logits = [
-        head(torch.from_numpy(np.concatenate(views))[:, None])[:, 0]
-        for views in zip(*(sample.levels for sample in samples), strict=True)
+    """Return the mean loss of some pairs of views; those with nothing to see are left out."""
+    losses = [
+        pair_loss(ranker, sample.pair, sample.density, options)
+        for sample in samples
+        if min(len(side.xy) for side in sample.pair.sides) > 1
     ]
-    losses = []
-    for k, sample in enumerate(samples):
-        pair = sample.pair
-        views = [
-            find_candidates(
-                [level[2 * k + v] for level in logits], pair.valid[v], options.sharpness
-            )
-            for v in range(2)
-        ]
-        if min(len(view.logits) for view in views) < 2:
-            continue
-        there = Direction(views[0], views[1], pair.homography, pair.valid[1])
-        back = Direction(views[1], views[0], np.linalg.inv(pair.homography), pair.valid[0])
-        losses.append(pair_loss(there, back, sample.density, options))
-    if not losses:  # nothing to see in any of the views
-        return logits[0].sum() * 0
+    if not losses:
+        return sum(parameter.sum() for parameter in ranker.parameters()) * 0
     return torch.stack(losses).sum() / len(samples)
-
-
-def save_head(head: PointsHead, path: Path, notes: dict[str, Any]) -> None:
-    """Write a head's weights (safetensors) with notes."""
-    tensors = {name: value.detach().contiguous() for name, value in head.state_dict().items()}
-    with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata={"notes": json.dumps(notes, default=str)})
-
-
-def load_head(path: Path) -> PointsHead:
-    """Read a head's weights.
-
-    Raises:
-        WeightsError: the file is missing, damaged or of another network.
-    """
-    head = PointsHead()
-    try:
-        head.load_state_dict(load_file(path))
-    except (SafetensorError, OSError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise WeightsError(f"{path} does not hold weights of this head ({reason})") from None
-    return head.eval()

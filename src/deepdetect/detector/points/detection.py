@@ -1,0 +1,113 @@
+"""Keypoints of all scales, best first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..._shared.errors import OptionError, unknown_name
+from ...features.keypoints import Keypoints
+from ...features.selection import SPREADS, check_ignore
+from ...features.sift_detector import spread_over_grid
+from ...features.suppression import spread_by_distance, suppress_neighbors
+from .candidate_features import describe_candidates
+from .ranker import Ranker, load_ranker
+from .scale_space import ScaleSpaceOptions, build_scale_space, find_candidates
+
+
+@dataclass(frozen=True)
+class PointOptions:
+    """Which candidates become keypoints.
+
+    Attributes:
+        max_keypoints: at most this many; None: all.
+        spread: "none": the best; "grid": in turn the best of each cell of a grid; "anms": the
+            best, at least so far from each other that there are just enough (adaptive
+            non-maximal suppression).
+        grid_cells: of "grid", along the longer side.
+        distance_px: least distance of two keypoints, also of different scales.
+        size_per_sigma: diameter of a keypoint, as descriptors take it, over the sigma of its
+            scale.
+        scales: of the scale space.
+
+    Raises:
+        OptionError: a value is unknown or out of its range.
+    """
+
+    max_keypoints: int | None = None
+    spread: str = "none"
+    grid_cells: int = 16
+    distance_px: float = 2.0
+    size_per_sigma: float = 2.5
+    scales: ScaleSpaceOptions = field(default_factory=ScaleSpaceOptions)
+
+    def __post_init__(self) -> None:
+        if self.max_keypoints is not None and self.max_keypoints < 1:
+            raise OptionError(f"`max_keypoints` must be at least 1, not {self.max_keypoints}")
+        if self.spread not in SPREADS:
+            raise unknown_name("spread", self.spread, SPREADS)
+        if self.spread != "none" and self.max_keypoints is None:
+            raise OptionError(f"`spread={self.spread!r}` needs `max_keypoints`: how many to spread")
+        if self.grid_cells < 1 or not self.distance_px > 0 or not self.size_per_sigma > 0:
+            raise OptionError("`grid_cells`, `distance_px` and `size_per_sigma` must be positive")
+
+
+def detect_points(
+    gray: np.ndarray,
+    options: PointOptions = PointOptions(),
+    *,
+    ignore: np.ndarray | None = None,
+    ranker: Ranker | None = None,
+) -> Keypoints:
+    """Detect keypoints of all scales.
+
+    Candidates are the maxima of |det Hessian| at seven scales; a small trained network ranks them
+    by how surely they are found again in another photograph of the same place.
+
+    Args:
+        gray: (H, W) uint8.
+        options: how many, and how they are spread.
+        ignore: (H, W) array, true where no keypoint is wanted.
+        ranker: None: the trained one inside the package.
+
+    Returns:
+        Keypoints with sub-pixel positions (centre of the first pixel (0, 0)) and sizes, best
+        first; their logits rank them, and their scores are the logits' sigmoid.
+
+    Example:
+        >>> gray = np.zeros((64, 64), np.uint8)
+        >>> gray[20:40, 24:44] = 255
+        >>> len(detect_points(gray, PointOptions(max_keypoints=4)))
+        4
+    """
+    space = build_scale_space(gray, options.scales)
+    candidates = find_candidates(space)
+    size = (gray.shape[1], gray.shape[0])
+    if not len(candidates):
+        none = np.empty(0, np.float32)
+        return Keypoints(np.empty((0, 2)), none, size, logits=none, sizes=none)
+    logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates))
+    if ignore is not None:
+        wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
+        candidates, logits = candidates[wanted], logits[wanted]
+    kept = suppress_neighbors(candidates.xy, logits, options.distance_px)
+    kept = kept[_choose(candidates.xy[kept], logits[kept], size, options)]
+    decay = np.exp(-np.abs(logits[kept]))
+    scores = np.where(logits[kept] >= 0, 1, decay) / (1 + decay)
+    sizes = options.size_per_sigma * candidates.sigma_px[kept]
+    return Keypoints(candidates.xy[kept], scores, size, logits=logits[kept], sizes=sizes)
+
+
+def _choose(
+    xy: np.ndarray, logits: np.ndarray, size: tuple[int, int], options: PointOptions
+) -> np.ndarray:
+    """Return rows of keypoints that are ordered from best to worst, in the same order."""
+    count = options.max_keypoints
+    if count is None or count >= len(xy):
+        return np.arange(len(xy))
+    if options.spread == "grid":
+        return np.sort(spread_over_grid(xy, logits, size, count, options.grid_cells))
+    if options.spread == "anms":
+        return np.sort(spread_by_distance(xy, logits, count))
+    return np.arange(count)

@@ -1,0 +1,172 @@
+"""Scale space of an image, and its candidates for keypoints: maxima of |det Hessian|."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ..._shared.errors import OptionError
+
+NMS_RADIUS = 2
+"""A candidate is the maximum of a window of 5x5 in its level."""
+
+LEAST_RESPONSE = 1e-8
+"""Of a candidate, in an image with values in [0, 1]: less is rounding."""
+
+MAX_OFFSET_PX = 0.499
+"""The nearest pixel of a refined position is still the one that it was found at."""
+
+_SECOND = np.array([[1, -2, 1]], np.float32)
+_MIXED = np.array([[1, 0, -1], [0, 0, 0], [-1, 0, 1]], np.float32) / 4
+_FIRST = np.array([[-0.5, 0, 0.5]], np.float32)
+
+
+@dataclass(frozen=True)
+class ScaleSpaceOptions:
+    """The scales of a scale space.
+
+    Attributes:
+        first_sigma_px: of the Gaussian of the finest level that has candidates, in pixels.
+        ratio: between the sigmas of neighbouring levels.
+        levels: number of levels that have candidates. There are one finer and two coarser ones
+            besides, which only the ranking looks at.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    first_sigma_px: float = 1.5
+    ratio: float = 1.35
+    levels: int = 7
+
+    def __post_init__(self) -> None:
+        if not self.first_sigma_px / self.ratio >= 0.5 or self.ratio <= 1 or self.levels < 1:
+            raise OptionError(
+                "a scale space needs a level or more, a ratio above 1 and a first sigma of at "
+                "least half a pixel times the ratio"
+            )
+
+    @property
+    def sigmas_px(self) -> np.ndarray:
+        """Sigmas of all levels in pixels, those without candidates included."""
+        return self.first_sigma_px * self.ratio ** np.arange(-1.0, self.levels + 2)
+
+
+@dataclass(frozen=True, eq=False)
+class ScaleSpace:
+    """Smoothed copies of an image, with derivatives that are normalised by their scale.
+
+    Attributes:
+        sigmas_px: (L,) of the levels.
+        smooth: (L, H, W) float32, the image in [0, 1] smoothed.
+        determinant: (L, H, W) float32, determinant of the Hessian times sigma^4.
+        trace: (L, H, W) float32, trace of the Hessian times sigma^2.
+        gradient: (L, H, W) float32, squared magnitude of the gradient times sigma^2.
+        highest: (L, H, W) float32, the largest |determinant| within `NMS_RADIUS` in x and y.
+    """
+
+    sigmas_px: np.ndarray
+    smooth: np.ndarray
+    determinant: np.ndarray
+    trace: np.ndarray
+    gradient: np.ndarray
+    highest: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Maxima of |det Hessian| in each level of a scale space.
+
+    Attributes:
+        level, row, column: (N,) where they are in the scale space.
+        xy: (N, 2) float64 sub-pixel positions in the image.
+        sigma_px: (N,) of their levels.
+    """
+
+    level: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+    xy: np.ndarray
+    sigma_px: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.level)
+
+    def __getitem__(self, rows: np.ndarray) -> Candidates:
+        """Return some of them, by a mask or by rows."""
+        parts = (self.level, self.row, self.column, self.xy, self.sigma_px)
+        return Candidates(*(part[rows] for part in parts))
+
+
+def build_scale_space(
+    gray: np.ndarray, options: ScaleSpaceOptions = ScaleSpaceOptions()
+) -> ScaleSpace:
+    """Smooth an image at all scales, and differentiate it.
+
+    Args:
+        gray: (H, W) uint8.
+        options: the scales.
+
+    Example:
+        >>> build_scale_space(np.zeros((32, 48), np.uint8)).smooth.shape
+        (10, 32, 48)
+    """
+    sigmas = options.sigmas_px
+    maps = [np.empty((len(sigmas), *gray.shape), np.float32) for _ in range(5)]
+    smooth, determinant, trace, gradient, highest = maps
+    window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)
+    current, reached = gray.astype(np.float32) / np.float32(255), 0.0
+    for k, sigma in enumerate(sigmas):
+        # Gaussians add up by their variances: each level smooths the one before.
+        current = cv2.GaussianBlur(current, (0, 0), float(np.sqrt(sigma**2 - reached**2)))
+        reached = sigma
+        smooth[k] = current
+        xx, yy, xy, dx, dy = (
+            cv2.filter2D(current, -1, kernel)
+            for kernel in (_SECOND, _SECOND.T, _MIXED, _FIRST, _FIRST.T)
+        )
+        determinant[k] = (xx * yy - xy * xy) * np.float32(sigma**4)
+        trace[k] = (xx + yy) * np.float32(sigma**2)
+        gradient[k] = (dx * dx + dy * dy) * np.float32(sigma**2)
+        highest[k] = cv2.dilate(np.abs(determinant[k]), window)
+    return ScaleSpace(sigmas, smooth, determinant, trace, gradient, highest)
+
+
+def find_candidates(space: ScaleSpace) -> Candidates:
+    """Find the maxima of |det Hessian| of each level but the finest and the two coarsest.
+
+    Their positions are refined by a parabola in x and in y. There are none in the outermost rows
+    and columns.
+    """
+    found = []
+    for k in range(1, len(space.sigmas_px) - 2):
+        response = np.abs(space.determinant[k])
+        peak = (response == space.highest[k]) & (response > LEAST_RESPONSE)
+        row, column = np.nonzero(peak[1:-1, 1:-1])
+        found.append(np.stack([np.full(len(row), k), row + 1, column + 1]))
+    level, row, column = np.concatenate(found, 1)
+    offset = np.stack(
+        [_peak_offset(space.determinant, level, row, column, *step) for step in ((0, 1), (1, 0))], 1
+    )
+    xy = np.stack([column, row], 1) + offset
+    return Candidates(level, row, column, xy, space.sigmas_px[level])
+
+
+def _peak_offset(
+    determinant: np.ndarray,
+    level: np.ndarray,
+    row: np.ndarray,
+    column: np.ndarray,
+    down: int,
+    across: int,
+) -> np.ndarray:
+    """Return the offset of the maximum of a parabola through a pixel and its two neighbours."""
+    before, middle, after = (
+        np.abs(determinant[level, row + step * down, column + step * across]).astype(np.float64)
+        for step in (-1, 0, 1)
+    )
+    bend = 2 * middle - before - after
+    offset = np.where(bend > 0, (after - before) / np.where(bend > 0, 2 * bend, 1), 0)
+    return np.clip(offset, -MAX_OFFSET_PX, MAX_OFFSET_PX)

@@ -1,0 +1,71 @@
+"""The ranker as a torch module, and as the file that it is run from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ..._shared.atomic import atomic_path
+from ...detector.points.ranker import MAX_DEVIATIONS, Ranker
+
+MIN_DEVIATION = 1e-3
+INITIAL_OUTPUT = 0.01
+"""The last layer starts at almost nothing: an untrained ranker ranks as |det Hessian| does."""
+
+
+class RankerModule(nn.Module):
+    """A perceptron of the features, added to the first of them.
+
+    Args:
+        mean, deviation: (F,) of the features.
+        hidden: units of the two hidden layers.
+    """
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, mean: np.ndarray, deviation: np.ndarray, hidden: Sequence[int]) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.from_numpy(mean.astype(np.float32)))
+        spread = np.maximum(deviation, MIN_DEVIATION).astype(np.float32)
+        self.register_buffer("deviation", torch.from_numpy(spread))
+        first, second = hidden
+        self.layers = nn.ModuleList(
+            [nn.Linear(len(mean), first), nn.Linear(first, second), nn.Linear(second, 1)]
+        )
+        with torch.no_grad():
+            self.layers[-1].weight.mul_(INITIAL_OUTPUT)
+            self.layers[-1].bias.zero_()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map (N, F) features to (N,) logits."""
+        values = (features - self.mean) / self.deviation
+        values = values.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+        for layer in self.layers[:-1]:
+            values = layer(values).relu()
+        logits: Tensor = features[:, 0] + self.layers[-1](values)[:, 0]
+        return logits
+
+    def export(self, notes: dict[str, Any]) -> Ranker:
+        """Return the same ranker without torch."""
+        layers = tuple(
+            (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
+            for layer in self.layers
+        )
+        text = json.dumps(notes, default=str, sort_keys=True)
+        return Ranker(self.mean.numpy().copy(), self.deviation.numpy().copy(), layers, text)
+
+
+def save_ranker(ranker: Ranker, path: Path) -> None:
+    """Write a ranker as `load_ranker` reads it: the same bytes for the same ranker."""
+    arrays = {"mean": ranker.mean, "deviation": ranker.deviation}
+    for k, (weight, bias) in enumerate(ranker.layers):
+        arrays |= {f"weight{k}": weight, f"bias{k}": bias}
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, notes=np.array(ranker.notes), **arrays)

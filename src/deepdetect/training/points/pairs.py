@@ -1,0 +1,131 @@
+"""Pairs of views as the ranker sees them: candidates, features, and which see the same place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...detector.points.candidate_features import describe_candidates
+from ...detector.points.scale_space import build_scale_space, find_candidates
+from ...features.sift import root_sift_descriptors
+from .views import ViewPair
+
+REACH_PX = 3.0
+DESCRIPTOR_SIZE_PX = 4.0
+RATIO = 0.85
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """The candidates of one view.
+
+    Attributes:
+        xy: (N, 2) float64 positions.
+        features: (N, F) float32.
+    """
+
+    xy: np.ndarray
+    features: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Candidates of one view that see one of the other, by distance in the other.
+
+    Attributes:
+        first, second: (P,) int64 rows of both views.
+        distance_px: (P,) in pixels of the view that the first one is projected into.
+        visible: (N,) bool: whether the other view shows a candidate of the first.
+        matchable: (P,) bool: whether the upright descriptors pass the ratio test against all
+            other candidates of the second view.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    distance_px: np.ndarray
+    visible: np.ndarray
+    matchable: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CandidatePair:
+    """Two views of one photograph.
+
+    Attributes:
+        sides: candidates of the first and the second view.
+        ways: from the first view to the second, and back.
+        area: of a view in pixels.
+    """
+
+    sides: tuple[Side, Side]
+    ways: tuple[Correspondences, Correspondences]
+    area: int
+
+
+def candidate_pair(pair: ViewPair, max_candidates: int, with_descriptors: bool) -> CandidatePair:
+    """Find the candidates of both views, and which see the same place.
+
+    Args:
+        pair: the views.
+        max_candidates: of each view; the strongest are kept.
+        with_descriptors: find out which are matchable; else all are said to be.
+    """
+    sides, described = [], []
+    for image, valid in zip(pair.images, pair.valid, strict=True):
+        space = build_scale_space(image)
+        candidates = find_candidates(space)
+        features = describe_candidates(space, candidates)
+        rows = np.flatnonzero(valid[candidates.row, candidates.column])
+        strongest = np.argsort(-features[rows, 0], kind="stable")[:max_candidates]
+        rows = rows[np.sort(strongest)]
+        sides.append(Side(candidates.xy[rows], features[rows]))
+        if with_descriptors:
+            xy = sides[-1].xy.astype(np.float32)
+            found = root_sift_descriptors(image, xy, DESCRIPTOR_SIZE_PX).astype(np.float32)
+            length = np.linalg.norm(found, axis=1, keepdims=True)
+            described.append(found / np.maximum(length, 1e-6))
+    back = np.linalg.inv(pair.homography)
+    ways = []
+    for k, homography in enumerate((pair.homography, back)):
+        here, there = sides[k], sides[1 - k]
+        similarity = described[k] @ described[1 - k].T if with_descriptors else None
+        ways.append(_correspondences(here.xy, there.xy, homography, pair.valid[1 - k], similarity))
+    return CandidatePair((sides[0], sides[1]), (ways[0], ways[1]), pair.images[0].size)
+
+
+def _correspondences(
+    here: np.ndarray,
+    there: np.ndarray,
+    homography: np.ndarray,
+    valid: np.ndarray,
+    similarity: np.ndarray | None,
+) -> Correspondences:
+    from scipy.spatial import KDTree
+
+    visible = np.zeros(len(here), bool)
+    none = np.zeros(0, np.int64)
+    if not len(here) or not len(there):
+        return Correspondences(none, none, np.zeros(0), visible, np.zeros(0, bool))
+    mapped = np.column_stack([here, np.ones(len(here))]) @ (homography / homography[2, 2]).T
+    depth = mapped[:, 2:]
+    before = depth[:, 0] > 0  # others lie behind the camera of the tilted view
+    mapped = np.where(before[:, None], mapped[:, :2] / np.where(before[:, None], depth, 1), -1e6)
+    height, width = valid.shape
+    column, row = np.rint(np.clip(mapped, -1e6, 1e6)).astype(np.int64).T
+    rows = np.flatnonzero((column >= 0) & (row >= 0) & (column < width) & (row < height))
+    rows = rows[valid[row[rows], column[rows]]]
+    visible[rows] = True
+    if not len(rows):
+        return Correspondences(none, none, np.zeros(0), visible, np.zeros(0, bool))
+    found = KDTree(mapped[rows]).sparse_distance_matrix(
+        KDTree(there), REACH_PX, output_type="coo_matrix"
+    )
+    first, second = rows[found.row], found.col.astype(np.int64)
+    matchable = np.ones(len(first), bool)
+    if similarity is not None:
+        others = similarity.copy()
+        others[first, second] = -1  # several candidates near the place may match as well
+        distance = np.sqrt(np.maximum(0, 2 - 2 * similarity[first, second]))
+        matchable = distance < RATIO * np.sqrt(np.maximum(0, 2 - 2 * others.max(1)))[first]
+    return Correspondences(first, second, found.data, visible, matchable)
