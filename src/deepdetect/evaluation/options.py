@@ -18,6 +18,7 @@ from .baselines.method import (
     LocalFeature,
     deepdetect_feature,
     with_common_descriptor,
+    with_own_scale,
 )
 from .baselines.opencv import CLASSICAL, STANDARD
 from .baselines.random import all_pixels_feature, random_feature
@@ -114,6 +115,7 @@ class BenchmarkOptions:
         others = [feature for feature in self.others if feature.name not in BASELINES]
         systems = {f.name: f for f in self.others if f.name in BASELINES}
         systems |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
+        scaled = [with_own_scale(ranked[name]) for name in chosen if ranked[name].own_scale]
         own = deepdetect_feature(
             self._native(),
             SelectionOptions(nms_radius=1, subpixel=True),
@@ -130,6 +132,7 @@ class BenchmarkOptions:
                     replace(f, name=f"{f.name}-own", title=f"{f.title}, own descriptors")
                     for f in systems.values()
                 ),
+                *scaled,
                 *others,
                 own,
                 with_common_descriptor(native),

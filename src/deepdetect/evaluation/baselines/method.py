@@ -36,6 +36,8 @@ class LocalFeature:
         chance: the points know nothing about the image, and the time they take means nothing.
         version: what results depend on besides the name: cached ones of another are not used.
         detection: what the keypoints depend on, where several features share them.
+        own_scale: how the keypoints are described at their own sizes and angles; None where they
+            have none.
     """
 
     name: str
@@ -47,6 +49,7 @@ class LocalFeature:
     chance: bool = False
     version: str = "1"
     detection: str = ""
+    own_scale: OwnScaleDescriptor | None = None
 
     def __post_init__(self) -> None:
         if not self.detection:
@@ -103,13 +106,17 @@ class OwnScaleDescriptor:
         return to_root_sift(scaled_sift_descriptors(gray, features.xy, sizes, angles), True)
 
 
-def with_own_scale(
-    feature: LocalFeature, descriptor: OwnScaleDescriptor = OwnScaleDescriptor()
-) -> LocalFeature:
+def with_own_scale(feature: LocalFeature) -> LocalFeature:
     """Return a feature whose keypoints are described at their own sizes and angles.
 
     Each position is taken once, as in `with_common_descriptor`: only the descriptors differ.
+
+    Raises:
+        OptionError: its keypoints have no sizes.
     """
+    descriptor = feature.own_scale
+    if descriptor is None:
+        raise OptionError(f"the keypoints of {feature.title} have no sizes of their own")
     return replace(
         feature,
         name=f"{feature.name}-own-scale",
