@@ -6,13 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
+import cv2
 import numpy as np
 import pytest
 
 from deepdetect.datasets.oxford import SCENES, load_oxford
-from deepdetect.datasets.types import read_homography
-
-pytestmark = pytest.mark.slow
+from deepdetect.datasets.types import PlanarPair, read_homography
+from deepdetect.geometry.homography_refinement import Refinement
+from deepdetect.io.image import luma
 
 MOVE = np.array([[1.01, 0.02, 3.0], [-0.02, 0.99, 2.0], [1e-4, 0, 1.0]])
 WRONG = np.array([[1.0, 0, 1.6], [0, 1, -1.2], [0, 0, 1]])
@@ -48,6 +49,7 @@ def refined(
     return results, output
 
 
+@pytest.mark.slow
 def test_wrong_homographies_become_true(
     script: ModuleType, folder: Path, refined: tuple[list, Path]
 ) -> None:
@@ -59,6 +61,7 @@ def test_wrong_homographies_become_true(
         assert script.displacement(true, found, (180, 140), (180, 140))[0] < 0.3
 
 
+@pytest.mark.slow
 def test_true_homographies_are_left_alone(refined: tuple[list, Path]) -> None:
     written = {path.parent.name for path in refined[1].rglob("*.refined")}
     assert written == {"graf"}
@@ -67,6 +70,7 @@ def test_true_homographies_are_left_alone(refined: tuple[list, Path]) -> None:
         assert (result.written is not None) == (result.pair.scene == "graf")
 
 
+@pytest.mark.slow
 def test_the_data_set_finds_the_files(folder: Path, refined: tuple[list, Path]) -> None:
     copy = refined[1] / "copy"
     shutil.copytree(folder, copy)
@@ -77,6 +81,7 @@ def test_the_data_set_finds_the_files(folder: Path, refined: tuple[list, Path]) 
     np.testing.assert_array_equal(scene.homographies[0], expected)
 
 
+@pytest.mark.slow
 def test_the_table_tells_what_moved(script: ModuleType, refined: tuple[list, Path]) -> None:
     table = script.refinement_table(refined[0])
     rows = {row[0]: row for row in table.rows}
@@ -98,8 +103,8 @@ def test_a_file_that_is_there_already_is_compared(
             script.refine_oxford(tmp_path / "oxford", tmp_path / "oxford")
         ).rows
     }
-    assert rows["graf 1-2"][5:7] == pytest.approx((0, 0), abs=1e-6)
-    assert rows["graf 1-3"][5:7] == (None, None)
+    assert rows["graf 1-2"][7:9] == pytest.approx((0, 0), abs=1e-6)
+    assert rows["graf 1-3"][7:9] == (None, None)
 
 
 @pytest.mark.slow
@@ -117,3 +122,36 @@ def test_the_script_writes_the_files_and_a_report(
     printed = capsys.readouterr().out
     assert "graf 1-2" in printed
     assert "files written to" in printed
+
+
+@pytest.mark.parametrize(
+    ("gain", "risen", "apart", "better"),
+    [
+        (0.05, 0.52, None, True),  # a clear gain needs nothing else
+        (0.003, 0.65, (0.02, 0.1), True),  # blurred: little gain, but nearly everywhere
+        (0.003, 0.56, (0.02, 0.1), False),  # a gain in a part of the image at the cost of the rest
+        (0.003, 0.65, (0.2, 0.9), False),  # from each start somewhere else
+        (0.003, 0.65, None, False),  # nothing confirms it
+        (0.0, 0.0, (0.02, 0.1), False),
+    ],
+)
+def test_better_is_a_clear_gain_or_a_clear_majority_with_both_starts(
+    script: ModuleType, gain: float, risen: float, apart: tuple[float, float] | None, better: bool
+) -> None:
+    pair = PlanarPair("scene", 2, Path("a"), Path("b"), np.eye(3))
+    refinement = Refinement(np.eye(3), 0.9 + gain, 0.9, 1)
+    found = script.RefinedPair(pair, 0.9, refinement, (0.3, 1.2), risen, apart, None, None)
+    assert found.better is better
+
+
+def test_the_correlation_rises_in_nearly_all_windows_under_the_truth(
+    script: ModuleType, photo: np.ndarray
+) -> None:
+    gray = luma(photo)
+    shift = np.array([[1.0, 0, 3], [0, 1, -2], [0, 0, 1]])
+    size = (gray.shape[1], gray.shape[0])
+    moved = cv2.GaussianBlur(cv2.warpPerspective(gray, shift, size), (0, 0), 1.5)
+    wrong = shift + np.array([[0, 0, 1.2], [0, 0, 0.8], [0, 0, 0]])
+    assert script.risen_fraction(gray, moved, wrong, shift) > 0.8
+    assert script.risen_fraction(gray, moved, shift, wrong) < 0.2
+    assert script.risen_fraction(gray, moved, shift, shift) == 0

@@ -32,6 +32,19 @@ def test_scenes_have_six_images_and_five_pairs(folder: Path) -> None:
     np.testing.assert_array_equal(pairs[3].homography, [[1, 0, 2], [0, 1, 5], [0, 0, 1]])
 
 
+def test_every_pair_says_what_changes(folder: Path) -> None:
+    kinds: dict[str, list[str]] = {}
+    for scene in load_oxford(folder):
+        assert {pair.kind for pair in scene.pairs()} == {scene.kind}
+        kinds.setdefault(scene.kind, []).append(scene.name)
+    assert kinds == {
+        "zoom and rotation": ["bark", "boat"],
+        "blur": ["bikes", "trees"],
+        "viewpoint": ["graf", "wall"],
+        "light and JPEG": ["leuven", "ubc"],
+    }
+
+
 def test_refined_homographies_are_taken_where_there_are(folder: Path) -> None:
     published = find_scene(load_oxford(folder), "graf").homographies
     refined = find_scene(load_oxford(folder, "refined"), "graf").homographies

@@ -9,12 +9,15 @@ from hypothesis.extra import numpy as arrays
 
 from deepdetect import OptionError
 from deepdetect.features.dense_sift import dense_sift
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.features.scale_space import nearest_layers
 from deepdetect.features.sift import (
     DESCRIPTORS,
     correlation_distance,
     get_descriptor,
     opencv_sift_descriptors,
     root_sift_descriptors,
+    scaled_sift_descriptors,
     sift_descriptors,
     to_root_sift,
 )
@@ -139,6 +142,32 @@ def test_pixel_centres_are_whole_numbers() -> None:
     wrong = sift_descriptors(turned, np.float32([width, height]) - xy, angle=180)
     assert np.abs(upright - right).max() <= 2
     assert np.linalg.norm(upright - wrong, axis=1).mean() > 20
+
+
+def test_at_their_own_scale_sifts_keypoints_have_sifts_descriptors(photo: np.ndarray) -> None:
+    gray = luma(photo)
+    sift = cv2.SIFT_create(contrastThreshold=0.01, enable_precise_upscale=True)
+    found, expected = sift.detectAndCompute(gray, None)
+    points = Keypoints.from_opencv(found, gray.shape[::-1])
+    assert len(set((points.octaves & 255).tolist())) >= 3
+    described = scaled_sift_descriptors(gray, points.xy, points.sizes, points.angles)
+    np.testing.assert_array_equal(described, expected)
+
+
+def test_at_their_own_scale_any_sizes_are_described_in_order() -> None:
+    gray = make_gray()
+    xy = make_points(count=60)
+    rng = np.random.default_rng(2)
+    sizes, angles = rng.uniform(0.5, 200, 60), rng.uniform(0, 360, 60)
+    found = scaled_sift_descriptors(gray, xy, sizes, angles)
+    order = rng.permutation(60)
+    again = scaled_sift_descriptors(gray, xy[order], sizes[order], angles[order])
+    assert (found.shape, found.dtype) == ((60, 128), np.uint8)
+    octave = nearest_layers(sizes, gray.shape)[0]
+    assert octave.min() == nearest_layers(sizes[order], gray.shape)[0].min()
+    np.testing.assert_array_equal(again, found[order])
+    none = scaled_sift_descriptors(gray, xy[:0], sizes[:0], angles[:0])
+    assert none.shape == (0, 128)
 
 
 def test_root_sift_has_a_length_of_512() -> None:

@@ -31,7 +31,14 @@ NAMES = (
     "--protocol",
     "protocols",
     multiple=True,
-    help="paper, standard or guided; may be repeated.  [default: all]",
+    help="paper, standard, guided or degraded; may be repeated.  [default: all but degraded]",
+)
+@click.option(
+    "--degraded-images",
+    type=click.Choice(["second", "both"]),
+    default="second",
+    show_default=True,
+    help="degraded: which images of a pair are made dark or blurred.",
 )
 @click.option(
     "--method",
@@ -74,6 +81,7 @@ def benchmark(
     data: Path,
     output: Path,
     protocols: tuple[str, ...],
+    degraded_images: Any,
     words: tuple[str, ...],
     baselines: str | None,
     preset: str,
@@ -98,7 +106,7 @@ def benchmark(
     from ..datasets.pair_selection import PairSelectionOptions
     from ..evaluation.baselines.plugin import find_feature
     from ..evaluation.benchmarks import BENCHMARKS
-    from ..evaluation.options import BASELINES, PROTOCOLS, BenchmarkOptions
+    from ..evaluation.options import BASELINES, DEFAULT_PROTOCOLS, BenchmarkOptions
     from ..evaluation.runner import run_benchmarks
     from ..matching.options import get_preset
 
@@ -116,12 +124,13 @@ def benchmark(
         classical = tuple(word for word in listed if word not in ("", "none"))
     options = BenchmarkOptions(
         make_detector(values),
-        protocols or PROTOCOLS,
+        protocols or DEFAULT_PROTOCOLS,
         classical,
         tuple(find_feature(word) for word in words),
         "rgb" if heatmap is None else heatmap.channels,
         geometry_weights,
         PairSelectionOptions(max_pairs),
+        degraded_images,
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)
     paths = report.save(output)

@@ -11,6 +11,9 @@ from .._shared.errors import ImageError
 from .download import RemoteDataset, RemoteFile
 from .types import PlanarScene, load_planar_scene
 
+ILLUMINATION, VIEWPOINT = "illumination", "viewpoint"
+"""The kinds of scenes."""
+
 SUFFIXES = (".ppm", ".png")
 NOT_IN_D2NET_SUBSET = frozenset(
     (
@@ -46,7 +49,17 @@ def load_hpatches(folder: str | Path) -> list[PlanarScene]:
     images = [f"{number}" for number in range(1, 7)]
     homographies = [f"H_1_{number}" for number in range(2, 7)]
     layout = "a scene has images 1 to 6"
-    return [load_planar_scene(path, images, homographies, SUFFIXES, layout) for path in scenes]
+    return [
+        load_planar_scene(
+            path,
+            images,
+            homographies,
+            SUFFIXES,
+            layout,
+            ILLUMINATION if path.name.startswith("i_") else VIEWPOINT,
+        )
+        for path in scenes
+    ]
 
 
 def is_illumination(scene: PlanarScene) -> bool:

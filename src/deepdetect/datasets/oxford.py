@@ -12,7 +12,19 @@ from .._shared.errors import OptionError, unknown_name
 from .download import RemoteDataset, RemoteFile
 from .types import PlanarScene, load_planar_scene
 
-SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
+KINDS = {
+    "bark": "zoom and rotation",
+    "bikes": "blur",
+    "boat": "zoom and rotation",
+    "graf": "viewpoint",
+    "leuven": "light and JPEG",
+    "trees": "blur",
+    "ubc": "light and JPEG",
+    "wall": "viewpoint",
+}
+"""What changes between the images of each scene."""
+
+SCENES = tuple(KINDS)
 SUFFIXES = (".png", ".ppm", ".pgm")
 
 
@@ -57,7 +69,9 @@ def _load_scene(folder: Path, truth: str) -> PlanarScene:
         ]
     images = [f"img{number}" for number in range(1, 7)]
     layout = f"the data set has the scenes {', '.join(SCENES)} with img1 to img6 each"
-    return load_planar_scene(folder, images, homographies, SUFFIXES, layout)
+    return load_planar_scene(
+        folder, images, homographies, SUFFIXES, layout, KINDS.get(folder.name, "")
+    )
 
 
 _HOST = "https://www.robots.ox.ac.uk/~vgg/research/affine/det_eval_files"

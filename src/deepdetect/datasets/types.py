@@ -22,6 +22,7 @@ class PlanarPair:
         first, second: the images' files.
         homography: (3, 3) float64, takes columns (x, y, 1) of the first image to the
             second; centre of the first pixel (0, 0).
+        kind: what changes between the two images; "" where the data set does not say.
     """
 
     scene: str
@@ -29,6 +30,7 @@ class PlanarPair:
     first: Path
     second: Path
     homography: np.ndarray
+    kind: str = ""
 
     @property
     def name(self) -> str:
@@ -44,16 +46,19 @@ class PlanarScene:
         name: the scene's name.
         images: the files, the first one first.
         homographies: one for each image but the first.
+        kind: what changes between its images; "" where the data set does not say.
     """
 
     name: str
     images: tuple[Path, ...]
     homographies: tuple[np.ndarray, ...]
+    kind: str = ""
 
     def pairs(self) -> Iterator[PlanarPair]:
         """Yield the pairs of the first image with each other one."""
         for k, homography in enumerate(self.homographies, start=2):
-            yield PlanarPair(self.name, k, self.images[0], self.images[k - 1], homography)
+            images = self.images[0], self.images[k - 1]
+            yield PlanarPair(self.name, k, *images, homography, self.kind)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +108,7 @@ def load_planar_scene(
     homographies: Sequence[str],
     suffixes: Sequence[str],
     layout: str,
+    kind: str = "",
 ) -> PlanarScene:
     """Load a scene from a folder.
 
@@ -112,6 +118,7 @@ def load_planar_scene(
         homographies: names of the text files of the others' homographies.
         suffixes: the image formats that are looked for, in this order.
         layout: what the folder must hold, for the error.
+        kind: as of `PlanarScene`.
 
     Raises:
         ImageError: a file is missing, or a homography is wrong.
@@ -123,4 +130,4 @@ def load_planar_scene(
             raise ImageError(f"there is no image {name} in {folder}: {layout}")
         files.append(found[0])
     matrices = tuple(read_homography(folder / name) for name in homographies)
-    return PlanarScene(folder.name, tuple(files), matrices)
+    return PlanarScene(folder.name, tuple(files), matrices, kind)

@@ -22,6 +22,7 @@ from .baselines.opencv import CLASSICAL, with_kd_trees
 from .charts import bar_chart
 from .context import BenchmarkContext
 from .options import BenchmarkOptions
+from .protocols.degraded import DEGRADED_TEXT, WHICH_TEXT, degraded_part
 from .protocols.foreground import foreground_part
 from .protocols.guided import guided_section
 from .protocols.paper import (
@@ -140,6 +141,10 @@ def plan_oxford(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
             for truth in reversed(truths)
         }
         plans.append(guided_section(context, options, pairs, "oxford_guided", "Oxford"))
+    if "degraded" in options.protocols:
+        truth = truths[-1]
+        by_truth, title = load_oxford(folder, truth), f"Oxford, {truth} homographies"
+        plans.append(_degraded_section(context, options, by_truth, "oxford_degraded", title))
     return plans
 
 
@@ -236,6 +241,8 @@ def plan_hpatches(context: BenchmarkContext, options: BenchmarkOptions) -> Plans
     if "guided" in options.protocols:
         truths = {"published": last}
         plans.append(guided_section(context, options, truths, "hpatches_guided", "HPatches"))
+    if "degraded" in options.protocols:
+        plans.append(_degraded_section(context, options, scenes, "hpatches_degraded", "HPatches"))
     return plans
 
 
@@ -346,6 +353,20 @@ def _standard_section(
     what = f"{title} ({len(pairs)} pairs)"
     part = standard_part(context, options.standard_features(), pairs, key, what)
     return SectionPlan(f"{title}, the standard protocol", (text,), [part])
+
+
+def _degraded_section(
+    context: BenchmarkContext,
+    options: BenchmarkOptions,
+    scenes: Sequence[PlanarScene],
+    key: str,
+    title: str,
+) -> SectionPlan:
+    pairs = [pair for scene in scenes for pair in scene.pairs()]
+    what = f"{title} ({len(pairs)} pairs)"
+    images = options.degraded_images
+    part = degraded_part(context, options.standard_features(), pairs, key, what, images)
+    return SectionPlan(f"{title}, dark and blurred", (DEGRADED_TEXT, WHICH_TEXT[images]), [part])
 
 
 def select_pairs(

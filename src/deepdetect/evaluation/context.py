@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -87,6 +90,7 @@ class BenchmarkContext:
     data: Path
     cache: StageCache = field(default_factory=lambda: StageCache(None))
     skipped: list[str] = field(default_factory=list)
+    _temporary: Path | None = field(default=None, init=False, repr=False)
     _recent: OrderedDict[tuple[str, str], ImageKeypoints] = field(
         default_factory=OrderedDict, init=False, repr=False
     )
@@ -98,6 +102,15 @@ class BenchmarkContext:
         """Return the folder of a data set: below `data`, or `data` itself."""
         below = self.data / name
         return below if below.is_dir() else self.data
+
+    def files_folder(self) -> Path:
+        """Return a folder for images that are made: in the cache's, or a temporary one."""
+        if self.cache.folder is not None:
+            return self.cache.folder
+        if self._temporary is None:
+            self._temporary = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
+            weakref.finalize(self, shutil.rmtree, self._temporary, ignore_errors=True)
+        return self._temporary
 
     def try_run(self, name: str, work: Callable[[], Any]) -> Any:
         """Do a piece of work; when it cannot be done, note that it is skipped and why.

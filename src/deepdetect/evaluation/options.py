@@ -18,11 +18,16 @@ from .baselines.method import (
     LocalFeature,
     deepdetect_feature,
     with_common_descriptor,
+    with_own_scale,
 )
 from .baselines.opencv import CLASSICAL, STANDARD
 from .baselines.random import all_pixels_feature, random_feature
 
-PROTOCOLS = ("paper", "standard", "guided")
+PROTOCOLS = ("paper", "standard", "guided", "degraded")
+DEFAULT_PROTOCOLS = PROTOCOLS[:3]
+"""All but the one that measures everything five times."""
+
+DegradedImages = Literal["second", "both"]
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 PAPER_RESOLUTION_PX = 480
 
@@ -36,25 +41,27 @@ class BenchmarkOptions:
 
     Attributes:
         detector: DeepDetect, with the weights that are evaluated.
-        protocols: one or more of "paper", "standard" and "guided".
+        protocols: one or more of "paper", "standard", "guided" and "degraded".
         classical: names of the classical baselines.
         others: further local features.
         channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
             feeds its own weights.
         geometry_weights: the weights for stereo pairs, one or more.
         pair_selection: which pairs of images with cameras are matched.
+        degraded_images: which images of a pair the protocol "degraded" degrades.
 
     Raises:
         OptionError: a name is unknown, or nothing is left to do.
     """
 
     detector: DeepDetect
-    protocols: tuple[str, ...] = PROTOCOLS
+    protocols: tuple[str, ...] = DEFAULT_PROTOCOLS
     classical: tuple[str, ...] = tuple(BASELINES)
     others: tuple[LocalFeature, ...] = ()
     channels: Literal["rgb", "bgr"] = "rgb"
     geometry_weights: tuple[str | Path, ...] = ("dense",)
     pair_selection: PairSelectionOptions = field(default_factory=PairSelectionOptions)
+    degraded_images: DegradedImages = "second"
 
     def __post_init__(self) -> None:
         for protocol in self.protocols:
@@ -62,6 +69,8 @@ class BenchmarkOptions:
                 raise unknown_name("protocol", protocol, PROTOCOLS)
         if not self.protocols:
             raise OptionError(f"choose a protocol: {' or '.join(PROTOCOLS)}")
+        if self.degraded_images not in ("second", "both"):
+            raise unknown_name("choice of images", self.degraded_images, ("second", "both"))
         if not self.geometry_weights:
             raise OptionError("geometry_weights must name at least one weights file")
         stems = [Path(weights).stem for weights in self.geometry_weights]
@@ -114,6 +123,7 @@ class BenchmarkOptions:
         others = [feature for feature in self.others if feature.name not in BASELINES]
         systems = {f.name: f for f in self.others if f.name in BASELINES}
         systems |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
+        scaled = [with_own_scale(ranked[name]) for name in chosen if ranked[name].own_scale]
         own = deepdetect_feature(
             self._native(),
             SelectionOptions(nms_radius=1, subpixel=True),
@@ -130,6 +140,7 @@ class BenchmarkOptions:
                     replace(f, name=f"{f.name}-own", title=f"{f.title}, own descriptors")
                     for f in systems.values()
                 ),
+                *scaled,
                 *others,
                 own,
                 with_common_descriptor(native),

@@ -1,4 +1,4 @@
-"""SIFT descriptors at given keypoints, all of one size and angle (paper, Section III-C).
+"""SIFT descriptors at keypoints of one size and angle (paper, Section III-C) or of their own.
 
 To add a descriptor, write a function `(gray, xy, size, angle) -> (N, D) uint8 or float32` and add
 it to `DESCRIPTORS`.
@@ -15,6 +15,7 @@ from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
 from .dense_sift import MAX_SIZE_PX, MIN_SIZE_PX, dense_sift
 from .keypoints import on_pixels
+from .scale_space import LAYERS, nearest_layers
 
 MIN_DENSE_DENSITY = 0.02
 """Keypoints per pixel from which all at once (`dense_sift`) is faster than one by one."""
@@ -59,8 +60,49 @@ def opencv_sift_descriptors(
     if angle != -1:
         for keypoint in keypoints:
             keypoint.angle = angle
-    described, descriptors = cv2.SIFT_create().compute(gray, keypoints)
-    if len(described) != len(xy):  # it would silently break the order of rows
+    return _compute(cv2.SIFT_create(), gray, keypoints)
+
+
+def scaled_sift_descriptors(
+    gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray, angles: np.ndarray
+) -> np.ndarray:
+    """Compute SIFT descriptors of keypoints at their own sizes and angles.
+
+    The gradients are those of the image of the scale space that is nearest to the size, as of
+    keypoints that SIFT detects itself. (`sift_descriptors` takes the finest image for all.)
+
+    Args:
+        gray: (H, W) uint8 luma.
+        xy: (N, 2) positions, centre of the first pixel (0, 0).
+        sizes: (N,) diameters in pixels: twice sigma, as of OpenCV's keypoints of SIFT. A descriptor
+            covers a square with six times this side.
+        angles: (N,) orientations in degrees, as of `dominant_angles`.
+
+    Returns:
+        (N, 128) uint8.
+
+    Example:
+        >>> gray = np.zeros((64, 64), np.uint8)
+        >>> scaled_sift_descriptors(gray, np.array([[30, 30]]), [5], [90]).shape
+        (1, 128)
+    """
+    if not len(xy):
+        return np.empty((0, 128), np.uint8)
+    octaves, layers = nearest_layers(sizes, gray.shape)
+    packed = (octaves & 255) | (layers << 8)  # as SIFT itself notes where a keypoint is from
+    columns = (*np.asarray(xy, np.float32).T.tolist(), list(sizes), list(angles), packed.tolist())
+    keypoints = [
+        cv2.KeyPoint(x, y, float(size), float(angle), 0.0, octave)
+        for x, y, size, angle, octave in zip(*columns, strict=True)
+    ]
+    # Without precise upscaling octave -1 is a quarter of a pixel off.
+    sift = cv2.SIFT_create(nOctaveLayers=LAYERS, enable_precise_upscale=True)
+    return _compute(sift, gray, keypoints)
+
+
+def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) -> np.ndarray:
+    described, descriptors = sift.compute(gray, keypoints)
+    if len(described) != len(keypoints):  # it would silently break the order of rows
         raise AssertionError("cv2.SIFT left out keypoints that were given to it")
     return descriptors.astype(np.uint8)  # they are whole numbers from 0 to 255
 

@@ -6,17 +6,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, SelectionOptions
+from deepdetect import DeepDetect, OptionError, SelectionOptions
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.evaluation.baselines.method import (
     COMMON_DESCRIPTOR,
+    OwnScaleDescriptor,
     PointDescriptor,
     deepdetect_feature,
     with_common_descriptor,
+    with_own_scale,
 )
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
-from deepdetect.features.sift import root_sift_descriptors, sift_descriptors
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.features.orientation import dominant_angles
+from deepdetect.features.sift import (
+    root_sift_descriptors,
+    scaled_sift_descriptors,
+    sift_descriptors,
+    to_root_sift,
+)
 from deepdetect.io.image import luma
 
 
@@ -90,3 +99,34 @@ def test_the_common_descriptor_replaces_any(photo: np.ndarray) -> None:
         expected = root_sift_descriptors(luma(crop), found.xy, 4.0, 0.0)
         np.testing.assert_array_equal(method.describe(crop, found), expected)
     assert PointDescriptor("rootsift", 4.0, 0.0) == COMMON_DESCRIPTOR
+
+
+def test_own_sizes_and_angles_are_those_of_the_keypoints_or_the_gradients(crop: np.ndarray) -> None:
+    gray = luma(crop)
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(10, 70, (30, 2))
+    sizes, angles = rng.uniform(3, 9, 30), rng.uniform(0, 360, 30)
+    points = Keypoints(xy, np.ones(30), (100, 80), sizes=sizes, angles=angles)
+    for factor in (1.0, 0.5):
+        found = OwnScaleDescriptor(factor).describe(crop, points)
+        by_hand = scaled_sift_descriptors(gray, points.xy, factor * points.sizes, points.angles)
+        np.testing.assert_array_equal(found, to_root_sift(by_hand))
+    turned = dataclasses.replace(points, angles=None)
+    angles = dominant_angles(gray, points.xy, points.sizes)
+    np.testing.assert_array_equal(
+        OwnScaleDescriptor().describe(crop, turned),
+        OwnScaleDescriptor().describe(crop, dataclasses.replace(points, angles=angles)),
+    )
+    with pytest.raises(OptionError, match="no sizes"):
+        OwnScaleDescriptor().describe(crop, Keypoints(xy, np.ones(30), (100, 80)))
+
+
+def test_points_at_their_own_scale_are_those_of_the_common_row(crop: np.ndarray) -> None:
+    common, own = (make(CLASSICAL["sift"]) for make in (with_common_descriptor, with_own_scale))
+    with pytest.raises(OptionError, match="FAST have no sizes"):
+        with_own_scale(CLASSICAL["fast"])
+    assert common.detection == own.detection
+    assert common.version != own.version
+    np.testing.assert_array_equal(common.detect(crop).xy, own.detect(crop).xy)
+    assert own.title == "SIFT, own size and angle"
+    assert own.describe(crop, own.detect(crop)).shape == (len(own.detect(crop)), 128)

@@ -16,21 +16,20 @@ from deepdetect.evaluation.baselines.method import (
     with_common_descriptor,
 )
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
+from deepdetect.evaluation.baselines.random import random_feature
 from deepdetect.evaluation.cache import StageCache
 from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.metrics import repeatability
 from deepdetect.evaluation.metrics.repeatability import mutual_nn_repeatability
 from deepdetect.evaluation.options import BenchmarkOptions
-from deepdetect.evaluation.protocols.standard import (
-    BUDGETS,
-    FeatureResult,
-    PairResult,
+from deepdetect.evaluation.protocols.standard import measure_pair, standard_part
+from deepdetect.evaluation.protocols.standard_results import BUDGETS, FeatureResult, PairResult
+from deepdetect.evaluation.protocols.standard_tables import (
     homography_table,
+    kind_table,
     matching_table,
-    measure_pair,
-    standard_part,
 )
-from deepdetect.evaluation.report import Report
+from deepdetect.evaluation.report import Report, Table
 from deepdetect.evaluation.runner import run_benchmarks
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.io.image import load_image
@@ -116,6 +115,37 @@ def test_learned_descriptors_are_matched_without_a_ratio_test(
     assert untested.pairs[1].all_matches == tested.pairs[1].all_matches
 
 
+def test_kinds_of_pairs_have_their_own_means(pairs: list[PlanarPair], tmp_path: Path) -> None:
+    kinds = "still", "darker"
+    chosen = [dataclasses.replace(p, kind=k) for p, k in zip(pairs, kinds, strict=True)]
+    result = measure(BenchmarkContext(tmp_path), FAST, chosen, (64, 2048))
+    still, darker = result.pairs
+    kind = kind_table([result], "key", "pairs")
+    assert [column.title for column in kind.columns[2:]] == [
+        f"{kind}: {what}" for kind in kinds for what in ("@1 px", "@3 px", "correct")
+    ]
+    # The budget of the table is not filled by these small images.
+    assert kind.rows[0][2:] == (
+        *(None, None, still.matches.correct[0]),
+        *(None, None, darker.matches.correct[0]),
+    )
+    (only,) = result.of_kind("darker").pairs
+    assert only is darker
+    value, chance = result.of_kind("darker").repeatability(64, 0) or (0, 0)
+    assert value == darker.repeatability[64][0].value > chance
+    assert result.repeatability(2048, 0) is None
+
+
+def test_the_time_of_a_pair_is_that_of_all_stages(pairs: list[PlanarPair], tmp_path: Path) -> None:
+    result = measure(BenchmarkContext(tmp_path), FAST, pairs, (64,))
+    one = result.pairs[0]
+    stages = [one.profiles[stage].seconds for stage in ("detect", "describe", "match")]
+    assert one.seconds == pytest.approx(2 * stages[0] + stages[1] + stages[2])
+    assert result.median_seconds() == pytest.approx(np.mean([p.seconds for p in result.pairs]))
+    assert dataclasses.replace(result, feature=random_feature(FAST)).median_seconds() is None
+    assert FeatureResult(FAST, []).median_seconds() is None
+
+
 def test_a_pair_that_fails_is_skipped_and_the_others_count(
     pairs: list[PlanarPair], tmp_path: Path
 ) -> None:
@@ -134,7 +164,7 @@ def test_a_pair_that_fails_is_skipped_and_the_others_count(
     (kept,) = [result for result in found.values() if result is not None]
     assert isinstance(kept, PairResult)
     tables = part.summarize({key: value for key, value in found.items() if value is not None})
-    assert all(table.rows[0][1] == 1 for table in tables[:-1])
+    assert all(table.rows[0][1] == 1 for table in tables if isinstance(table, Table))
     (note,) = context.skipped
     assert "smoky 1-2" in note
     assert "not this one" in note
@@ -186,6 +216,14 @@ def test_all_tables_of_the_section_have_all_methods(report: Report) -> None:
     heads = [c.title for c in tables["low_visibility_repeatability_1px"].columns]
     assert len(heads) == len(set(heads)) == 2 + 3 * len(BUDGETS) + 2
     assert any("Never works" in note for note in report.skipped)
+
+
+def test_the_figures_are_of_repeatability_accuracy_and_time(report: Report) -> None:
+    assert [figure.key for figure in report.figures()] == [
+        "low_visibility_accuracy",
+        *(f"low_visibility_repeatability_{radius}px" for radius in (1, 3)),
+        "low_visibility_time",
+    ]
 
 
 def test_a_method_that_never_works_has_dashes(report: Report) -> None:

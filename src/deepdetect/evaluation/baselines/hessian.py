@@ -12,7 +12,7 @@ from ...features.keypoints import Keypoints
 from ...features.selection import SelectionOptions, select_keypoints
 from ...features.suppression import suppress_neighbors
 from ...io.image import luma
-from .method import PAPER_DESCRIPTOR, LocalFeature
+from .method import PAPER_DESCRIPTOR, LocalFeature, OwnScaleDescriptor
 
 SIGMA_PX = 3.0
 
@@ -25,6 +25,10 @@ DISTANCE_PX = 2.0
 
 SIZE_PER_SIGMA = 5.0
 """Diameter of a keypoint: 2.5 sigma around it."""
+
+
+OWN_SCALE = OwnScaleDescriptor(0.5)
+"""A size of 2.5 sigma; SIFT has 2."""
 
 
 def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:
@@ -73,12 +77,14 @@ HESSIAN: dict[str, LocalFeature] = {
             f"|det Hessian|, sigma {SIGMA_PX:g}",
             lambda rgb: detect_hessian(luma(rgb)),
             PAPER_DESCRIPTOR.describe,
+            own_scale=OWN_SCALE,
         ),
         LocalFeature(
             "hessian-scales",
             f"|det Hessian|, {len(SIGMAS_PX)} scales",
             lambda rgb: detect_hessian_scales(luma(rgb)),
             PAPER_DESCRIPTOR.describe,
+            own_scale=OWN_SCALE,
         ),
     )
 }

@@ -12,8 +12,9 @@ import numpy as np
 from ..._shared.errors import DeepDetectError, OptionError
 from ...detector.detector import DeepDetect, find_keypoints
 from ...features.keypoints import Keypoints
+from ...features.orientation import dominant_angles
 from ...features.selection import SelectionOptions
-from ...features.sift import get_descriptor
+from ...features.sift import get_descriptor, scaled_sift_descriptors, to_root_sift
 from ...io.image import luma
 
 
@@ -35,6 +36,8 @@ class LocalFeature:
         chance: the points know nothing about the image, and the time they take means nothing.
         version: what results depend on besides the name: cached ones of another are not used.
         detection: what the keypoints depend on, where several features share them.
+        own_scale: how the keypoints are described at their own sizes and angles; None where they
+            have none.
     """
 
     name: str
@@ -46,6 +49,7 @@ class LocalFeature:
     chance: bool = False
     version: str = "1"
     detection: str = ""
+    own_scale: OwnScaleDescriptor | None = None
 
     def __post_init__(self) -> None:
         if not self.detection:
@@ -75,6 +79,54 @@ PAPER_DESCRIPTOR = PointDescriptor()
 
 COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
 """Of all detectors without descriptors of their own in the standard protocol."""
+
+
+@dataclass(frozen=True)
+class OwnScaleDescriptor:
+    """RootSIFT of keypoints that have sizes, at their own sizes and angles.
+
+    Where they have no angles, it is the dominant orientation of the gradients.
+
+    Attributes:
+        size_factor: the size that is described over that of the keypoint. A descriptor covers a
+            square with six times its size as the side.
+    """
+
+    size_factor: float = 1.0
+
+    def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
+        """Describe keypoints by positions, sizes and angles; (N, 128) uint8."""
+        if features.sizes is None:
+            raise OptionError("keypoints that have no sizes cannot be described at their own size")
+        gray = luma(rgb)
+        sizes = self.size_factor * features.sizes
+        angles = features.angles
+        if angles is None:
+            angles = dominant_angles(gray, features.xy, sizes)
+        return to_root_sift(scaled_sift_descriptors(gray, features.xy, sizes, angles), True)
+
+
+def with_own_scale(feature: LocalFeature) -> LocalFeature:
+    """Return a feature whose keypoints are described at their own sizes and angles.
+
+    Each position is taken once, as in `with_common_descriptor`: only the descriptors differ.
+
+    Raises:
+        OptionError: its keypoints have no sizes.
+    """
+    descriptor = feature.own_scale
+    if descriptor is None:
+        raise OptionError(f"the keypoints of {feature.title} have no sizes of their own")
+    return replace(
+        feature,
+        name=f"{feature.name}-own-scale",
+        title=f"{feature.title}, own size and angle",
+        detect=lambda rgb: feature.detect(rgb).distinct(),
+        describe=descriptor.describe,
+        binary=False,
+        version=f"{feature.version} {descriptor}",
+        detection=f"{feature.detection}, distinct",
+    )
 
 
 def with_common_descriptor(feature: LocalFeature) -> LocalFeature:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...features.keypoints import Keypoints
 from ...io.image import luma
-from .method import BaselineError, LocalFeature
+from .method import BaselineError, LocalFeature, OwnScaleDescriptor
 
 MAX_CORNERS = 1_000_000
 
@@ -190,7 +190,7 @@ def _corners(rgb: np.ndarray, corners: np.ndarray | None, scores: np.ndarray) ->
 CLASSICAL: dict[str, LocalFeature] = {
     feature.name: feature
     for feature in (
-        _opencv("sift", "SIFT"),
+        replace(_opencv("sift", "SIFT"), own_scale=OwnScaleDescriptor()),
         _opencv("sift-low", "SIFT, low settings"),
         _opencv("orb", "ORB", "ORB_create"),
         _opencv("orb-low", "ORB, low settings", "ORB_create"),

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,74 +13,33 @@ from ...geometry import GeometryOptions, estimate_geometry
 from ...io.image import load_image
 from ..baselines.method import LocalFeature
 from ..cache import matrix_digest
-from ..charts import line_chart
 from ..context import BenchmarkContext, MatchSettings, PairMatches
 from ..metrics.coverage import coverage
-from ..metrics.homography import (
-    CORNER_THRESHOLDS_PX,
-    Sizes,
-    accuracy_at,
-    area_under_curve,
-    corner_error,
-)
-from ..metrics.matching import MatchAccuracy, match_accuracy, mean_matching_accuracy
+from ..metrics.homography import Sizes, corner_error
+from ..metrics.matching import MatchAccuracy, match_accuracy
 from ..metrics.repeatability import Repeatability, mutual_nn_repeatability
-from ..profiling import Profile
-from ..report import Cell, Column, Figure, Table
 from ..tasks import Part, Shown, feature_part
-
-BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
-RADII_PX = (1.0, 2.0, 3.0)
-SEEDS = 5
-MATCHING_BUDGET = 2048
-RATIO = 0.85
-INLIER_THRESHOLD_PX = 3.0
-
-MIN_FILLED = 0.9
-"""A budget is shown where a method fills at least this fraction of it, on average."""
-
-MAX_CHANCE = 0.95
-"""Chance beyond which nothing can be distinguished from it."""
-
-PROFILED_STAGES = ("detect", "describe", "match")
-
-
-@dataclass(frozen=True)
-class PairResult:
-    """What one feature gives on one pair.
-
-    Attributes:
-        repeatability: by budget, the result at each of `RADII_PX`.
-        coverage: by budget, of the first image.
-        counts: by budget, and for the matching, the keypoints used in the image that has fewer.
-        matches: with the ratio test.
-        all_matches: mutual nearest neighbours without a ratio test.
-        corner_errors_px: of the homography by each seed.
-        profiles: by stage ("detect", "describe", "match"), when it was done.
-    """
-
-    repeatability: Mapping[int | None, list[Repeatability]]
-    coverage: Mapping[int | None, float]
-    counts: Mapping[int | None, int]
-    matches: MatchAccuracy
-    all_matches: MatchAccuracy
-    corner_errors_px: list[float]
-    profiles: Mapping[str, Profile]
-
-
-@dataclass(frozen=True)
-class FeatureResult:
-    """What one feature gives on the pairs that could be measured."""
-
-    feature: LocalFeature
-    pairs: list[PairResult]
-
-    def mean(self, value: Callable[[PairResult], float]) -> float | None:
-        """Average a value over the pairs where it is not NaN."""
-        return _mean(value(pair) for pair in self.pairs)
-
-
-Columns = Sequence[tuple[Column, Callable[[FeatureResult], Cell]]]
+from .standard_figures import accuracy_figure, repeatability_figure, time_figure
+from .standard_results import (
+    BUDGETS,
+    INLIER_THRESHOLD_PX,
+    MATCHING_BUDGET,
+    PROFILED_STAGES,
+    RADII_PX,
+    RATIO,
+    SEEDS,
+    FeatureResult,
+    PairResult,
+)
+from .standard_tables import (
+    accuracy_table,
+    cost_table,
+    homography_table,
+    kind_table,
+    kinds_of,
+    matching_table,
+    repeatability_table,
+)
 
 
 def standard_part(
@@ -113,13 +69,19 @@ def standard_part(
             FeatureResult(f, [found[f.name, p.name] for p in pairs if (f.name, p.name) in found])
             for f in features
         ]
+        repeatability_figures = [
+            repeatability_figure(results, k, key, what, budgets) for k in (0, len(RADII_PX) - 1)
+        ]
         return [
             *(repeatability_table(results, k, key, what, budgets) for k in range(len(RADII_PX))),
+            *([kind_table(results, key, what)] if kinds_of(results) else []),
             matching_table(results, key, what),
             homography_table(results, key, what),
             accuracy_table(results, key, what),
             cost_table(results, key, budgets),
             accuracy_figure(results, key, what),
+            *repeatability_figures,
+            time_figure(results, key, what),
         ]
 
     return feature_part(features, {pair.name: pair for pair in pairs}, "", measure, summarize)
@@ -156,6 +118,7 @@ def measure_pair(
         all_matches=_evaluate(everything, pair, sizes),
         corner_errors_px=_corner_errors(context, feature, pair, matches, settings, sizes[0]),
         profiles=dict(zip(PROFILED_STAGES, profiles, strict=True)),
+        kind=pair.kind,
     )
 
 
@@ -247,198 +210,3 @@ def _coverage(
 
 def _best(features: Keypoints, budget: int | None) -> np.ndarray:
     return (features if budget is None else features.best(budget)).xy
-
-
-def _tabulate(
-    results: Sequence[FeatureResult], key: str, title: str, columns: Columns, note: str
-) -> Table:
-    heads = (Column("method"), Column("pairs", ",d"), *(column for column, _ in columns))
-    rows = (
-        (one.feature.title, len(one.pairs), *(cell(one) for _, cell in columns)) for one in results
-    )
-    return Table(key, title, heads, tuple(rows), note)
-
-
-def repeatability_table(
-    results: Sequence[FeatureResult],
-    k: int,
-    key: str,
-    what: str,
-    budgets: Sequence[int | None] = BUDGETS,
-) -> Table:
-    """Tabulate the mutual-NN repeatability at the radius `RADII_PX[k]`."""
-    columns: list[tuple[Column, Callable[[FeatureResult], Cell]]] = []
-    for budget in budgets:
-        for place, title in enumerate(("", ": chance", ": chance-corrected")):
-            cell = partial(_value_and_chance, budget=budget, k=k, place=place)
-            columns.append((Column(f"{_name(budget)}{title}", ".3f"), cell))
-
-    def localization(pair: PairResult) -> float:
-        entry = pair.repeatability[MATCHING_BUDGET][k]
-        return entry.localization_px if entry.repeated else math.nan
-
-    columns += [
-        (Column("keypoints of all", ",.0f"), lambda one: one.mean(lambda p: p.counts[None])),
-        (
-            Column(f"localization at {MATCHING_BUDGET:,}, px", ".2f"),
-            lambda one: one.mean(localization),
-        ),
-    ]
-    note = (
-        "Keypoints that are mutual nearest neighbours, at most the radius apart, over the fewer of "
-        "the keypoints that both images show, each position once; by number of keypoints in each "
-        "image, mean over the pairs. Chance: the same number of random points. Chance-corrected: 0 "
-        f"is chance, 1 is all; a dash where chance is over {MAX_CHANCE:.0%}. A budget that a "
-        f"method does not fill to {MIN_FILLED:.0%} is a dash. Localization: mean distance of the "
-        "pairs of keypoints, where there are any."
-    )
-    title = f"Mutual-NN repeatability within {RADII_PX[k]:g} px, {what}"
-    return _tabulate(results, f"{key}_repeatability_{RADII_PX[k]:g}px", title, columns, note)
-
-
-def _value_and_chance(
-    result: FeatureResult, budget: int | None, k: int, place: int
-) -> float | None:
-    """Return the repeatability, its chance, or the chance-corrected value; None if not filled."""
-    filled = result.mean(lambda pair: pair.counts[budget])
-    if filled is None or (budget is not None and filled < MIN_FILLED * budget):
-        return None
-    entries = [pair.repeatability[budget][k] for pair in result.pairs]
-    value = float(np.mean([entry.value for entry in entries]))
-    chance = float(np.mean([entry.chance for entry in entries]))
-    corrected = None if chance > MAX_CHANCE else (value - chance) / (1 - chance)
-    return (value, chance, corrected)[place]
-
-
-def matching_table(results: Sequence[FeatureResult], key: str, what: str) -> Table:
-    """Tabulate the matches."""
-
-    def mean(value: Callable[[MatchAccuracy, int], float], t: int = 0) -> Callable[..., Cell]:
-        return lambda one: one.mean(lambda pair: value(pair.matches, t))
-
-    columns: Columns = [
-        (Column("keypoints", ",.0f"), lambda one: one.mean(lambda p: p.counts[MATCHING_BUDGET])),
-        (Column("matches", ",.0f"), mean(lambda found, _: found.matches)),
-        *(
-            (Column(f"{name} at {t} px", style), mean(value, t))
-            for name, style, value in (
-                ("correct", ",.0f", lambda found, t: found.correct[t - 1]),
-                ("precision", ".3f", MatchAccuracy.precision),
-                ("matching score", ".3f", MatchAccuracy.matching_score),
-            )
-            for t in (1, 3)
-        ),
-    ]
-    return _tabulate(results, f"{key}_matching", f"Matches, {what}", columns, MATCHING_NOTE)
-
-
-MATCHING_NOTE = (
-    f"The best {MATCHING_BUDGET:,} keypoints of each image; the same upright RootSIFT of size "
-    "4 for all, except for methods with descriptors of their own; mutual nearest neighbours, "
-    f"ratio {RATIO} (none for learned descriptors). Means over the pairs; no matches count as "
-    "a precision of 0."
-)
-
-
-def homography_table(results: Sequence[FeatureResult], key: str, what: str) -> Table:
-    """Tabulate the homographies that the matches give, with their spread over the seeds."""
-
-    def over_seeds(
-        metric: Callable[[Sequence[float], float], float], threshold: float, spread: bool
-    ) -> Callable[[FeatureResult], Cell]:
-        def cell(one: FeatureResult) -> Cell:
-            seeds = zip(*(pair.corner_errors_px for pair in one.pairs), strict=True)
-            values = [metric(errors, threshold) for errors in seeds]
-            if not values:
-                return None
-            return float(np.std(values, ddof=1) if spread else np.mean(values))
-
-        return cell
-
-    columns = [
-        (Column(title.format(name, threshold), ".3f"), over_seeds(metric, threshold, spread))
-        for name, metric in (("accuracy", accuracy_at), ("AUC", area_under_curve))
-        for threshold in CORNER_THRESHOLDS_PX
-        for title, spread in (("{} at {:g} px", False), ("± of {} {:g}", True))
-    ]
-    note = (
-        f"{MATCHING_NOTE} MAGSAC at {INLIER_THRESHOLD_PX:g} px. Error: mean distance of the first "
-        "image's corners from where the true homography takes them, at the images' own size; a "
-        "pair without a homography counts as wrong. Accuracy: fraction of the pairs within a "
-        "threshold; AUC: exact area under it, up to the threshold. Mean and standard deviation (±) "
-        f"over {SEEDS} seeds of MAGSAC."
-    )
-    return _tabulate(results, f"{key}_homography", f"Homographies, {what}", columns, note)
-
-
-def accuracy_table(results: Sequence[FeatureResult], key: str, what: str) -> Table:
-    """Tabulate the mean matching accuracy at 1 to 10 px."""
-
-    def accuracy(one: FeatureResult, t: int) -> Cell:
-        return _accuracy(one)[t - 1] if one.pairs else None
-
-    columns: Columns = [
-        (Column("matches", ",.0f"), lambda one: one.mean(lambda p: p.all_matches.matches)),
-        *((Column(f"{t} px", ".3f"), partial(accuracy, t=t)) for t in range(1, 11)),
-    ]
-    note = (
-        f"Mutual nearest neighbours of the best {MATCHING_BUDGET:,} keypoints, no ratio test for "
-        "any method: fraction of the matches within each distance, mean over the pairs."
-    )
-    title = f"Mean matching accuracy, {what}"
-    return _tabulate(results, f"{key}_accuracy", title, columns, note)
-
-
-def accuracy_figure(results: Sequence[FeatureResult], key: str, what: str) -> Figure:
-    """Draw the mean matching accuracy."""
-    lines = {
-        result.feature.title: (range(1, 11), _accuracy(result))
-        for result in results
-        if result.pairs
-    }
-    png = line_chart(lines, "error up to, px", "mean matching accuracy")
-    return Figure(f"{key}_accuracy", f"Mean matching accuracy, {what}", png)
-
-
-def _accuracy(result: FeatureResult) -> tuple[float, ...]:
-    return mean_matching_accuracy([pair.all_matches for pair in result.pairs])
-
-
-def cost_table(
-    results: Sequence[FeatureResult], key: str, budgets: Sequence[int | None] = BUDGETS
-) -> Table:
-    """Tabulate coverage, seconds and memory."""
-
-    def covered(one: FeatureResult, budget: int | None) -> Cell:
-        return one.mean(lambda pair: pair.coverage[budget])
-
-    def seconds(one: FeatureResult, stage: str) -> Cell:
-        known = one.pairs and not (one.feature.chance and stage == "detect")
-        values = [pair.profiles[stage].seconds for pair in one.pairs]
-        return float(np.median(values)) if known else None
-
-    def megabytes(one: FeatureResult, stage: str) -> Cell:
-        return max((pair.profiles[stage].memory / 1e6 for pair in one.pairs), default=None)
-
-    columns: Columns = [
-        *((Column(f"coverage, {_name(b)}", ".3f"), partial(covered, budget=b)) for b in budgets),
-        *((Column(f"{s}, s", ".3f"), partial(seconds, stage=s)) for s in PROFILED_STAGES),
-        *((Column(f"{s}, MB", ",.0f"), partial(megabytes, stage=s)) for s in PROFILED_STAGES),
-    ]
-    note = (
-        "Coverage: fraction of the cells of 32x32 px that hold a keypoint of the first image. "
-        "Seconds: the median when the results were made, on whatever else the machine did then; "
-        "detecting in one image, describing both, matching the pair at "
-        f"{MATCHING_BUDGET:,} keypoints (`deepdetect benchmark speed` compares on equal terms). "
-        "Memory: the largest growth of the process."
-    )
-    return _tabulate(results, f"{key}_cost", "Coverage, time and memory", columns, note)
-
-
-def _name(budget: int | None) -> str:
-    return "all" if budget is None else f"{budget:,}"
-
-
-def _mean(values: Iterable[float]) -> float | None:
-    known = [value for value in values if value == value]
-    return float(np.mean(known)) if known else None
