@@ -17,6 +17,7 @@ from .baselines.method import (
     COMMON_DESCRIPTOR,
     LocalFeature,
     deepdetect_feature,
+    points_feature,
     with_common_descriptor,
     with_own_scale,
 )
@@ -128,9 +129,10 @@ class BenchmarkOptions:
             self._native(),
             SelectionOptions(nms_radius=1, subpixel=True),
             name="deepdetect-sparse",
-            title="DeepDetect, native resolution, suppression 3x3, sub-pixel",
+            title="DeepDetect, pixels by logits, suppression 3x3, sub-pixel",
             descriptor=COMMON_DESCRIPTOR,
         )
+        points = points_feature(self._native())
         native = self.deepdetect_native()
         chance = random_feature(native, name="random-native"), all_pixels_feature()
         return without_repeats(
@@ -142,6 +144,8 @@ class BenchmarkOptions:
                 ),
                 *scaled,
                 *others,
+                with_common_descriptor(points),
+                with_own_scale(points),
                 own,
                 with_common_descriptor(native),
                 *(with_common_descriptor(feature) for feature in chance),

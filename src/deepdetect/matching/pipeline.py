@@ -17,7 +17,7 @@ from ..detector.heatmap import HeatmapOptions
 from ..features.keypoints import Keypoints
 from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors
 from ..features.matches import Guide, Matches
-from ..features.sift import get_descriptor
+from ..features.sift import get_descriptor, scaled_sift_descriptors, to_root_sift
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.residuals import epipolar_errors, transfer_errors
 from ..io.image import load_image, luma
@@ -171,7 +171,7 @@ def match_images(
             )
         points0, points1, scores = _guided_points(guided_pair, keypoints, chosen.mutual)
     else:
-        found = unguided_matches(grays, [points.xy for points in keypoints], chosen, timer)
+        found = unguided_matches(grays, keypoints, chosen, timer)
         points0, points1 = keypoints[0].xy[found.rows0], keypoints[1].xy[found.rows1]
         scores = np.clip(1 - found.ratios, 0, 1)
     with timer.stage("geometry"):
@@ -209,22 +209,22 @@ def _guided_points(
 
 def unguided_matches(
     grays: Sequence[np.ndarray],
-    points: Sequence[np.ndarray],
+    keypoints: Sequence[Keypoints],
     options: MatchingOptions,
     timer: StageTimer | None = None,
 ) -> DescriptorMatches:
     """Match all descriptors with all others.
 
+    Keypoints with sizes and angles are described at these, others all alike.
+
     Raises:
         OptionError: there are too many keypoints for the memory.
     """
     timer = timer or StageTimer()
-    check_memory([len(xy) for xy in points])
+    check_memory([len(each) for each in keypoints])
     with timer.stage("descriptors"):
-        describe = get_descriptor(options.descriptor)
         descriptors = [
-            describe(gray, xy, options.keypoint_size, options.angle)
-            for gray, xy in zip(grays, points, strict=True)
+            _describe(gray, each, options) for gray, each in zip(grays, keypoints, strict=True)
         ]
     with timer.stage("matching"):
         return match_descriptors(
@@ -234,8 +234,17 @@ def unguided_matches(
             ratio=options.ratio,
             mutual=options.mutual,
             seed=options.geometry.seed,
-            positions=(np.rint(points[0]), np.rint(points[1])),
+            positions=(np.rint(keypoints[0].xy), np.rint(keypoints[1].xy)),
         )
+
+
+def _describe(gray: np.ndarray, keypoints: Keypoints, options: MatchingOptions) -> np.ndarray:
+    """Return descriptors at the keypoints' own sizes and angles, or at those of the options."""
+    if keypoints.sizes is None or keypoints.angles is None:
+        describe = get_descriptor(options.descriptor)
+        return describe(gray, keypoints.xy, options.keypoint_size, options.angle)
+    found = scaled_sift_descriptors(gray, keypoints.xy, keypoints.sizes, keypoints.angles)
+    return to_root_sift(found, True) if options.descriptor == "rootsift" else found
 
 
 def _final_geometry(

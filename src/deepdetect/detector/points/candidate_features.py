@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .scale_space import Candidates, ScaleSpace
+from .hessian_scales import Candidates, ScaleSpace
 
 RING_RADII = (1.0, 2.0, 3.5, 6.0)
 """Of the rings around a candidate that are looked at, in sigmas."""
@@ -24,7 +24,9 @@ DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = 1e-7, 1e-6, 1e-8
 """Added before logarithms and divisions: responses of noise and rounding look like nothing."""
 
 
-def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
+def describe_candidates(
+    space: ScaleSpace, candidates: Candidates, rows: np.ndarray | None = None
+) -> np.ndarray:
     """Compute the features of candidates.
 
     The first is the logarithm of |det Hessian|, scaled. The others are: the same at neighbouring
@@ -35,11 +37,15 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
     Args:
         space: the scale space that the candidates were found in.
         candidates: all of them, since each is ranked among the others.
+        rows: those that are described; None: all.
 
     Returns:
-        (N, `FEATURES`) float32.
+        (N, `FEATURES`) float32, of the rows in their order.
     """
     levels, height, width = space.smooth.shape
+    rank = _ranks(candidates.strength(space))
+    if rows is not None:
+        candidates, rank = candidates[rows], rank[rows]
     flat = [
         maps.reshape(-1)
         for maps in (space.determinant, space.trace, space.gradient, space.smooth, space.highest)
@@ -85,8 +91,13 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
         columns += [response.mean(1) / 2, response.max(1) / 2, response.min(1) / 4]
         columns += [np.arctan(each / 2) for each in (light.mean(1), light.max(1), light.min(1))]
         columns += [slope.mean(1) / 2, slope.max(1) / 2]
-    rank = np.empty(len(own), np.int64)
-    rank[np.argsort(-own, kind="stable")] = np.arange(len(own))
     columns.append(np.log((rank + 1) / plane) / 2 + 3)
     columns.append((candidates.level - 4) / 3)
     return np.stack(columns, 1).astype(np.float32)
+
+
+def _ranks(strength: np.ndarray) -> np.ndarray:
+    """Return the place of each in the order from the strongest to the weakest."""
+    ranks = np.empty(len(strength), np.int64)
+    ranks[np.argsort(-strength, kind="stable")] = np.arange(len(strength))
+    return ranks

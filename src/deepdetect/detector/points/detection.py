@@ -8,12 +8,13 @@ import numpy as np
 
 from ..._shared.errors import OptionError, unknown_name
 from ...features.keypoints import Keypoints
+from ...features.orientation import dominant_angles
 from ...features.selection import SPREADS, check_ignore
 from ...features.sift_detector import spread_over_grid
 from ...features.suppression import spread_by_distance, suppress_neighbors
 from .candidate_features import describe_candidates
 from .ranker import Ranker, load_ranker
-from .scale_space import ScaleSpaceOptions, build_scale_space, find_candidates
+from .hessian_scales import ScaleSpaceOptions, build_scale_space, find_candidates
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,8 @@ class PointOptions:
 
     Attributes:
         max_keypoints: at most this many; None: all.
+        candidates_per_keypoint, min_candidates: with `max_keypoints`, so many times as many
+            candidates are ranked, but at least so many: those with the strongest response.
         spread: "none": the best; "grid": in turn the best of each cell of a grid; "anms": the
             best, at least so far from each other that there are just enough (adaptive
             non-maximal suppression).
@@ -36,6 +39,8 @@ class PointOptions:
     """
 
     max_keypoints: int | None = None
+    candidates_per_keypoint: int = 6
+    min_candidates: int = 8192
     spread: str = "none"
     grid_cells: int = 16
     distance_px: float = 2.0
@@ -49,6 +54,8 @@ class PointOptions:
             raise unknown_name("spread", self.spread, SPREADS)
         if self.spread != "none" and self.max_keypoints is None:
             raise OptionError(f"`spread={self.spread!r}` needs `max_keypoints`: how many to spread")
+        if self.candidates_per_keypoint < 1 or self.min_candidates < 1:
+            raise OptionError("`candidates_per_keypoint` and `min_candidates` must be 1 or more")
         if self.grid_cells < 1 or not self.distance_px > 0 or not self.size_per_sigma > 0:
             raise OptionError("`grid_cells`, `distance_px` and `size_per_sigma` must be positive")
 
@@ -72,8 +79,9 @@ def detect_points(
         ranker: None: the trained one inside the package.
 
     Returns:
-        Keypoints with sub-pixel positions (centre of the first pixel (0, 0)) and sizes, best
-        first; their logits rank them, and their scores are the logits' sigmoid.
+        Keypoints with sub-pixel positions (centre of the first pixel (0, 0)), sizes in pixels and
+        angles in degrees, best first; their logits rank them, and their scores are the logits'
+        sigmoid.
 
     Example:
         >>> gray = np.zeros((64, 64), np.uint8)
@@ -86,17 +94,24 @@ def detect_points(
     size = (gray.shape[1], gray.shape[0])
     if not len(candidates):
         none = np.empty(0, np.float32)
-        return Keypoints(np.empty((0, 2)), none, size, logits=none, sizes=none)
-    logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates))
+        return Keypoints(np.empty((0, 2)), none, size, logits=none, sizes=none, angles=none)
+    strength = candidates.strength(space)
+    rows = np.arange(len(candidates))
     if ignore is not None:
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
-        candidates, logits = candidates[wanted], logits[wanted]
+        rows = rows[wanted]
+    if options.max_keypoints is not None:
+        most = max(options.candidates_per_keypoint * options.max_keypoints, options.min_candidates)
+        rows = rows[np.argsort(-strength[rows], kind="stable")[:most]]
+    logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates, rows))
+    candidates = candidates[rows]
     kept = suppress_neighbors(candidates.xy, logits, options.distance_px)
     kept = kept[_choose(candidates.xy[kept], logits[kept], size, options)]
     decay = np.exp(-np.abs(logits[kept]))
     scores = np.where(logits[kept] >= 0, 1, decay) / (1 + decay)
-    sizes = options.size_per_sigma * candidates.sigma_px[kept]
-    return Keypoints(candidates.xy[kept], scores, size, logits=logits[kept], sizes=sizes)
+    xy, sizes = candidates.xy[kept], options.size_per_sigma * candidates.sigma_px[kept]
+    angles = dominant_angles(gray, xy, sizes)
+    return Keypoints(xy, scores, size, logits=logits[kept], sizes=sizes, angles=angles)
 
 
 def _choose(

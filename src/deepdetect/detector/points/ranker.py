@@ -82,7 +82,7 @@ def load_ranker(path: Path = WEIGHTS) -> Ranker:
 def _load(path: Path, state: int) -> Ranker:
     """Read a file; one whose state has changed since is read again."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             found = {name: file[name] for name in ("mean", "deviation", *_LAYERS, "notes")}
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         reason = (str(error).splitlines() or ["it is empty"])[0]

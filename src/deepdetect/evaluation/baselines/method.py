@@ -11,6 +11,8 @@ import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError
 from ...detector.detector import DeepDetect, find_keypoints
+from ...detector.points.detection import PointOptions
+from ...detector.points.ranker import WEIGHTS as RANKER
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
 from ...features.selection import SelectionOptions
@@ -165,6 +167,20 @@ def deepdetect_feature(
     version = f"{digest} {detector.backend} {detector.heatmap_options} {selection} {descriptor}"
     return heatmap_feature(
         detector, selection, name=name, title=title, descriptor=descriptor, version=version
+    )
+
+
+def points_feature(detector: DeepDetect) -> LocalFeature:
+    """Make a local feature of the ranked keypoints of all scales."""
+    selection = SelectionOptions(mode="points")
+    digest = hashlib.sha256(RANKER.read_bytes()).hexdigest()[:16]
+    return LocalFeature(
+        "deepdetect-points",
+        "DeepDetect, points",
+        lambda rgb: find_keypoints(detector, rgb, selection),
+        PAPER_DESCRIPTOR.describe,
+        version=f"{digest} {detector.heatmap_options.resolution} {PointOptions()}",
+        own_scale=OwnScaleDescriptor(),
     )
 
 

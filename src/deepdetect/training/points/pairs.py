@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...detector.points.candidate_features import describe_candidates
-from ...detector.points.scale_space import build_scale_space, find_candidates
+from ...detector.points.hessian_scales import build_scale_space, find_candidates
 from ...features.sift import root_sift_descriptors
 from .views import ViewPair
 

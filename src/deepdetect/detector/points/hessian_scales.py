@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..._shared.parallel import parallel_for
 
 NMS_RADIUS = 2
 """A candidate is the maximum of a window of 5x5 in its level."""
@@ -17,10 +18,6 @@ LEAST_RESPONSE = 1e-8
 
 MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined position is still the one that it was found at."""
-
-_SECOND = np.array([[1, -2, 1]], np.float32)
-_MIXED = np.array([[1, 0, -1], [0, 0, 0], [-1, 0, 1]], np.float32) / 4
-_FIRST = np.array([[-0.5, 0, 0.5]], np.float32)
 
 
 @dataclass(frozen=True)
@@ -94,6 +91,10 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.level)
 
+    def strength(self, space: ScaleSpace) -> np.ndarray:
+        """Return |det Hessian| sigma^4 of each, (N,) float32."""
+        return np.abs(space.determinant[self.level, self.row, self.column])
+
     def __getitem__(self, rows: np.ndarray) -> Candidates:
         """Return some of them, by a mask or by rows."""
         parts = (self.level, self.row, self.column, self.xy, self.sigma_px)
@@ -113,24 +114,28 @@ def build_scale_space(
         >>> build_scale_space(np.zeros((32, 48), np.uint8)).smooth.shape
         (10, 32, 48)
     """
+    from .hessian_kernel import differentiate
+
     sigmas = options.sigmas_px
     maps = [np.empty((len(sigmas), *gray.shape), np.float32) for _ in range(5)]
     smooth, determinant, trace, gradient, highest = maps
     window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)
+    strength = np.empty(gray.shape, np.float32)
     current, reached = gray.astype(np.float32) / np.float32(255), 0.0
     for k, sigma in enumerate(sigmas):
         # Gaussians add up by their variances: each level smooths the one before.
         current = cv2.GaussianBlur(current, (0, 0), float(np.sqrt(sigma**2 - reached**2)))
         reached = sigma
         smooth[k] = current
-        xx, yy, xy, dx, dy = (
-            cv2.filter2D(current, -1, kernel)
-            for kernel in (_SECOND, _SECOND.T, _MIXED, _FIRST, _FIRST.T)
+        parallel_for(
+            gray.shape[0],
+            differentiate,
+            cv2.copyMakeBorder(current, 1, 1, 1, 1, cv2.BORDER_REFLECT_101),
+            np.float32(sigma**2),
+            *(maps[k] for maps in (determinant, trace, gradient)),
+            strength,
         )
-        determinant[k] = (xx * yy - xy * xy) * np.float32(sigma**4)
-        trace[k] = (xx + yy) * np.float32(sigma**2)
-        gradient[k] = (dx * dx + dy * dy) * np.float32(sigma**2)
-        highest[k] = cv2.dilate(np.abs(determinant[k]), window)
+        cv2.dilate(strength, window, dst=highest[k])
     return ScaleSpace(sigmas, smooth, determinant, trace, gradient, highest)
 
 

@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect._shared.errors import OptionError
+from deepdetect.detector.points.detection import PointOptions, detect_points
+from deepdetect.detector.points.hessian_scales import build_scale_space, find_candidates
+
+
+@pytest.fixture(scope="module")
+def gray() -> np.ndarray:
+    generator = np.random.default_rng(3)
+    layers = [
+        cv2.GaussianBlur(generator.standard_normal((240, 320)), (0, 0), sigma) * sigma
+        for sigma in (1.5, 3, 6)
+    ]
+    total = np.sum(layers, axis=0)
+    return np.uint8(255 * (total - total.min()) / np.ptp(total))
+
+
+def test_points_come_best_first_with_all_that_descriptors_need(gray) -> None:
+    found = detect_points(gray, PointOptions(max_keypoints=300))
+    assert len(found) == 300
+    assert found.image_size == (320, 240)
+    assert (np.diff(found.logits) <= 0).all()
+    assert (np.diff(found.scores) <= 0).all()
+    assert set(np.round(found.sizes / 2.5, 3)) <= {
+        round(1.5 * 1.35**k, 3) for k in range(7)
+    }
+    assert ((found.angles >= 0) & (found.angles < 360)).all()
+    assert (found.xy % 1 != 0).mean() > 0.9  # sub-pixel
+
+
+def test_fewer_are_the_best_of_more(gray) -> None:
+    few, more = (detect_points(gray, PointOptions(max_keypoints=n)) for n in (100, 300))
+    np.testing.assert_array_equal(few.xy, more.xy[:100])
+    assert len(detect_points(gray)) > 1000
+
+
+def test_no_two_are_nearer_than_the_distance(gray) -> None:
+    for distance in (2.0, 6.0):
+        xy = detect_points(gray, PointOptions(max_keypoints=200, distance_px=distance)).xy
+        gaps = np.linalg.norm(xy[:, None] - xy, axis=2) + 1e9 * np.eye(len(xy))
+        assert gaps.min() >= distance - 1e-3
+
+
+def test_positions_follow_a_shift_of_the_image(gray) -> None:
+    first = detect_points(gray[:200, :280], PointOptions(max_keypoints=200)).xy
+    second = detect_points(gray[7:207, 12:292], PointOptions(max_keypoints=200)).xy + (12, 7)
+    inner = ((first > 50) & (first < (230, 150))).all(1)
+    gaps = np.linalg.norm(first[inner, None] - second, axis=2).min(1)
+    assert inner.sum() > 30
+    assert np.mean(gaps < 0.05) > 0.8
+
+
+def test_a_zoomed_image_has_the_same_points_at_larger_sizes(gray) -> None:
+    double = cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    first = detect_points(gray, PointOptions(max_keypoints=150))
+    second = detect_points(double, PointOptions(max_keypoints=600))
+    mapped = (second.xy + 0.5) / 2 - 0.5
+    gaps = np.linalg.norm(first.xy[:, None] - mapped, axis=2)
+    nearest = gaps.argmin(1)
+    found = gaps.min(1) < 1
+    assert found.mean() > 0.7
+    ratio = second.sizes[nearest[found]] / first.sizes[found]
+    assert np.median(ratio) == pytest.approx(2, rel=0.25)
+
+
+@pytest.mark.parametrize("spread", ["grid", "anms"])
+def test_spread_points_cover_more_of_the_image(gray, spread) -> None:
+    shaded = (gray * np.linspace(1, 0.15, 320)[None]).astype(np.uint8)
+    cells = []
+    for name in ("none", spread):
+        found = detect_points(shaded, PointOptions(max_keypoints=150, spread=name))
+        assert len(found) == 150
+        assert (np.diff(found.logits) <= 0).all()
+        cells.append(len(np.unique((found.xy // 32).astype(int), axis=0)))
+    assert cells[1] > cells[0]
+
+
+def test_no_point_is_where_the_mask_is_true(gray) -> None:
+    ignore = np.zeros(gray.shape, bool)
+    ignore[:, :160] = True
+    found = detect_points(gray, PointOptions(max_keypoints=100), ignore=ignore)
+    assert len(found) == 100
+    assert found.xy[:, 0].min() > 159
+    with pytest.raises(OptionError, match="ignore mask"):
+        detect_points(gray, ignore=ignore[1:])
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 200), (40, 40)])
+def test_images_without_structure_have_no_points(shape) -> None:
+    found = detect_points(np.full(shape, 80, np.uint8), PointOptions(max_keypoints=10))
+    assert len(found) == 0
+    assert found.sizes is not None
+    assert found.angles is not None
+
+
+def test_the_strongest_candidates_are_enough(gray) -> None:
+    """Ranking a part of the candidates hardly changes the best."""
+    few = detect_points(gray, PointOptions(max_keypoints=100, min_candidates=1))
+    everything = detect_points(gray, PointOptions(max_keypoints=100, min_candidates=10**6))
+    assert len(find_candidates(build_scale_space(gray))) > 600
+    same = (np.linalg.norm(few.xy[:, None] - everything.xy, axis=2).min(1) < 0.1).mean()
+    assert same > 0.9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"max_keypoints": 0}, "max_keypoints"),
+        ({"spread": "gird", "max_keypoints": 5}, "grid"),
+        ({"spread": "anms"}, "how many"),
+        ({"distance_px": 0}, "distance_px"),
+        ({"candidates_per_keypoint": 0}, "candidates_per_keypoint"),
+    ],
+)
+def test_wrong_options_are_reported(change, message) -> None:
+    with pytest.raises(OptionError, match=message):
+        PointOptions(**change)

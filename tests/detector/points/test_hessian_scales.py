@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect._shared.errors import OptionError
+from deepdetect.detector.points.hessian_scales import (
+    ScaleSpaceOptions,
+    build_scale_space,
+    find_candidates,
+)
+
+
+def blob(sigma: float, center=(40.3, 32.6), shape=(64, 80)) -> np.ndarray:
+    y, x = np.indices(shape)
+    squared = (x - center[0]) ** 2 + (y - center[1]) ** 2
+    return np.rint(255 * np.exp(-squared / (2 * sigma**2))).astype(np.uint8)
+
+
+def test_the_levels_are_gaussians_of_the_image() -> None:
+    gray = np.random.default_rng(0).integers(0, 256, (90, 120), np.uint8)
+    space = build_scale_space(gray)
+    for sigma, smooth in zip(space.sigmas_px, space.smooth, strict=True):
+        wanted = cv2.GaussianBlur(gray.astype(np.float64) / 255, (0, 0), float(sigma))
+        # Smoothing twice cuts the tails off twice.
+        np.testing.assert_allclose(smooth[30:-30, 30:-30], wanted[30:-30, 30:-30], atol=0.01)
+
+
+def test_derivatives_are_those_of_opencv() -> None:
+    gray = np.random.default_rng(1).integers(0, 256, (50, 70), np.uint8)
+    space = build_scale_space(gray)
+    for k, sigma in enumerate(space.sigmas_px):
+        xx, yy = (
+            cv2.filter2D(space.smooth[k], -1, kernel)
+            for kernel in (np.array([[1.0, -2, 1]]), np.array([[1.0], [-2], [1]]))
+        )
+        dx, dy = (
+            cv2.filter2D(space.smooth[k], -1, kernel)
+            for kernel in (np.array([[-0.5, 0, 0.5]]), np.array([[-0.5], [0], [0.5]]))
+        )
+        xy = cv2.filter2D(cv2.filter2D(space.smooth[k], -1, np.array([[-0.5, 0, 0.5]])), -1,
+                          np.array([[-0.5], [0], [0.5]]))
+        np.testing.assert_allclose(space.trace[k], (xx + yy) * sigma**2, atol=1e-5)
+        np.testing.assert_allclose(space.gradient[k], (dx**2 + dy**2) * sigma**2, atol=1e-5)
+        inner = np.s_[1:-1, 1:-1]
+        np.testing.assert_allclose(
+            space.determinant[k][inner], ((xx * yy - xy**2) * sigma**4)[inner], atol=1e-5
+        )
+
+
+def test_the_strongest_candidate_of_a_blob_is_its_centre_at_its_scale() -> None:
+    gray = blob(4.0)
+    space = build_scale_space(gray)
+    candidates = find_candidates(space)
+    best = int(np.argmax(candidates.strength(space)))
+    np.testing.assert_allclose(candidates.xy[best], (40.3, 32.6), atol=0.05)
+    # The response of a Gaussian of 4 px is largest where both have the same sigma.
+    assert candidates.sigma_px[best] == pytest.approx(4.0, rel=0.2)
+
+
+def test_candidates_are_maxima_of_their_windows() -> None:
+    gray = np.random.default_rng(2).integers(0, 256, (60, 80), np.uint8)
+    space = build_scale_space(gray)
+    candidates = find_candidates(space)
+    assert len(candidates) > 100
+    for k in range(0, len(candidates), 29):
+        level, row, column = (int(a[k]) for a in (candidates.level, candidates.row, candidates.column))
+        window = np.abs(space.determinant[level])[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+        assert np.abs(space.determinant[level, row, column]) == window.max()
+        assert np.abs(candidates.xy[k] - (column, row)).max() < 0.5
+
+
+def test_flat_and_tiny_images_have_no_candidates() -> None:
+    for shape in ((40, 50), (1, 1), (2, 30), (3, 3)):
+        assert len(find_candidates(build_scale_space(np.full(shape, 90, np.uint8)))) == 0
+
+
+@pytest.mark.parametrize("change", [{"levels": 0}, {"ratio": 1.0}, {"first_sigma_px": 0.1}])
+def test_wrong_options_are_reported(change) -> None:
+    with pytest.raises(OptionError, match="scale space needs"):
+        ScaleSpaceOptions(**change)

@@ -1,0 +1,78 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect._shared.errors import WeightsError
+from deepdetect.detector.points.candidate_features import FEATURES
+from deepdetect.detector.points.ranker import WEIGHTS, Ranker, load_ranker, notes_of
+
+
+def arrays(**changes) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    shapes = {
+        "mean": (FEATURES,), "deviation": (FEATURES,), "weight0": (5, FEATURES), "bias0": (5,),
+        "weight1": (4, 5), "bias1": (4,), "weight2": (1, 4), "bias2": (1,),
+    }
+    found = {name: rng.random(shape).astype(np.float32) + 0.5 for name, shape in shapes.items()}
+    return {**found, "notes": np.array("{}"), **changes}
+
+
+def test_the_logit_is_the_first_feature_and_a_perceptron(tmp_path: Path) -> None:
+    values = arrays()
+    np.savez(tmp_path / "a.npz", **values)
+    features = np.random.default_rng(1).normal(0, 3, (7, FEATURES)).astype(np.float32)
+    x = np.clip((features - values["mean"]) / values["deviation"], -6, 6)
+    x = np.maximum(x @ values["weight0"].T + values["bias0"], 0)
+    x = np.maximum(x @ values["weight1"].T + values["bias1"], 0)
+    wanted = features[:, 0] + (x @ values["weight2"].T + values["bias2"])[:, 0]
+    np.testing.assert_allclose(load_ranker(tmp_path / "a.npz").rank(features), wanted, rtol=1e-5)
+
+
+def test_the_ranker_in_the_package_is_small_and_says_where_it_is_from() -> None:
+    ranker = load_ranker()
+    assert isinstance(ranker, Ranker)
+    assert sum(w.size + b.size for w, b in ranker.layers) < 30_000
+    assert WEIGHTS.stat().st_size < 100_000
+    notes = notes_of(ranker)
+    assert json.loads(str(notes["options"]))["seed"] == 0
+    assert notes["photographs"] == 2705
+
+
+def test_no_candidates_have_no_logits() -> None:
+    assert load_ranker().rank(np.empty((0, FEATURES), np.float32)).shape == (0,)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"weight0": np.zeros((5, FEATURES - 1), np.float32)},
+        {"weight2": np.zeros((2, 4), np.float32), "bias2": np.zeros(2, np.float32)},
+        {"bias1": np.full(4, np.nan, np.float32)},
+        {"mean": np.zeros(3, np.float32)},
+        {"weight1": np.zeros(5, np.float32)},
+    ],
+)
+def test_another_network_is_reported(tmp_path: Path, changes) -> None:
+    np.savez(tmp_path / "a.npz", **arrays(**changes))
+    with pytest.raises(WeightsError, match=r"a\.npz holds another network"):
+        load_ranker(tmp_path / "a.npz")
+
+
+def test_damaged_and_missing_files_are_reported(tmp_path: Path) -> None:
+    with pytest.raises(WeightsError, match="there is no weights file"):
+        load_ranker(tmp_path / "none.npz")
+    np.savez(tmp_path / "a.npz", **arrays())
+    whole = (tmp_path / "a.npz").read_bytes()
+    cases = (b"", b"nonsense", whole[:200], whole[: len(whole) // 2])
+    for k, data in enumerate(cases):
+        path = tmp_path / f"{k}.npz"
+        path.write_bytes(data)
+        with pytest.raises(WeightsError, match="does not hold weights"):
+            load_ranker(path)
+    np.savez(tmp_path / "pickle.npz", **arrays(notes=np.array([{}], object)))
+    with pytest.raises(WeightsError, match="does not hold weights"):
+        load_ranker(tmp_path / "pickle.npz")
