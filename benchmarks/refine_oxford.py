@@ -235,7 +235,7 @@ def refinement_table(results: list[RefinedPair]) -> Table:
             result.risen,
             result.starts_apart[0] if result.starts_apart else None,
             *(result.apart or (None, None)),
-            "yes" if result.written else "no: the published one is as good",
+            "yes" if result.written else "no: not clearly better",
         )
         for result in results
     )

@@ -116,6 +116,8 @@ def test_no_classical_method_may_be_wanted(made, folder: Path, run) -> None:
         ("low_visibility", "'low-visibility'"),
         ("foreground --protocol papers", "'paper'"),
         ("foreground --protocol paper --protocol standart", "'standard'"),
+        ("foreground --protocol degradet", "'degraded'"),
+        ("foreground --degraded-images secondd", "'second'"),
         ("foreground --baselines siift", "'sift'"),
         ("foreground --baselines fast,fast-lo", "'fast-low'"),
         ("foreground --method shi-tomas", "'shi-tomasi'"),

@@ -35,7 +35,7 @@ NAMES = (
 )
 @click.option(
     "--degraded-images",
-    type=click.Choice(["second", "both"]),
+    metavar="second|both",
     default="second",
     show_default=True,
     help="degraded: which images of a pair are made dark or blurred.",

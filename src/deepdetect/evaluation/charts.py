@@ -99,6 +99,8 @@ def scatter_chart(
         axes.plot([x], [y], label=name, **{**style, "linestyle": "", "markersize": 8})
     if logarithmic and points:
         axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("{x:g}")
     axes.set_ylim(bottom=0)
     return _legend_saved(figure, axes)
 

@@ -130,4 +130,4 @@ def test_it_is_a_section_of_its_own_when_asked_for(
     assert len(plan) == len(options.standard_features()) * 40 * (1 + len(DEGRADATIONS))
     assert "Both images" in plan.text[1]
     with pytest.raises(OptionError, match="did you mean 'second'"):
-        dataclasses.replace(options, degraded_images="secnd")
+        dataclasses.replace(options, degraded_images="secondd")

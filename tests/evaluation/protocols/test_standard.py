@@ -22,6 +22,7 @@ from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.metrics import repeatability
 from deepdetect.evaluation.metrics.repeatability import mutual_nn_repeatability
 from deepdetect.evaluation.options import BenchmarkOptions
+from deepdetect.evaluation.protocols import standard_figures
 from deepdetect.evaluation.protocols.standard import measure_pair, standard_part
 from deepdetect.evaluation.protocols.standard_results import BUDGETS, FeatureResult, PairResult
 from deepdetect.evaluation.protocols.standard_tables import (
@@ -224,6 +225,27 @@ def test_the_figures_are_of_repeatability_accuracy_and_time(report: Report) -> N
         *(f"low_visibility_repeatability_{radius}px" for radius in (1, 3)),
         "low_visibility_time",
     ]
+
+
+def test_rows_with_the_same_keypoints_are_one_line(
+    pairs: list[PlanarPair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = []
+    monkeypatch.setattr(
+        standard_figures, "line_chart", lambda lines, *_, **__: drawn.append(lines) or b""
+    )
+    again = dataclasses.replace(FAST, name="again", title="Described otherwise")
+    context = BenchmarkContext(tmp_path)
+    results = [measure(context, feature, pairs, (32, 64, None)) for feature in (FAST, again)]
+    for k in (0, 2):
+        standard_figures.repeatability_figure(results, k, "key", "pairs", (32, 64, None))
+        (numbers, values) = drawn[-1]["FAST"]
+        assert list(drawn[-1]) == ["FAST"]
+        assert numbers == [32, 64]
+        expected = [
+            np.mean([p.repeatability[n][k].value for p in results[0].pairs]) for n in numbers
+        ]
+        assert values == pytest.approx(expected)
 
 
 def test_a_method_that_never_works_has_dashes(report: Report) -> None:

@@ -29,10 +29,17 @@ def repeatability_figure(
     what: str,
     budgets: Sequence[int | None],
 ) -> Figure:
-    """Draw the repeatability at `RADII_PX[k]` against the number of keypoints."""
+    """Draw the repeatability at `RADII_PX[k]` against the number of keypoints.
+
+    Of rows with the same keypoints, which differ in their descriptors, the first one is drawn.
+    """
     numbers = [budget for budget in budgets if budget is not None]
     lines = {}
+    drawn: set[str] = set()
     for result in results:
+        if result.feature.detection in drawn:
+            continue
+        drawn.add(result.feature.detection)
         found = [result.repeatability(budget, k) for budget in numbers]
         if any(found):
             values = [one[0] if one else math.nan for one in found]

@@ -135,7 +135,7 @@ def matching_table(results: Sequence[FeatureResult], key: str, what: str) -> Tab
 
 MATCHING_NOTE = (
     f"The best {MATCHING_BUDGET:,} keypoints of each image; the same upright RootSIFT of size "
-    "4 for all, except for methods with descriptors of their own; mutual nearest neighbours, "
+    "4 for all, except in the rows that name others; mutual nearest neighbours, "
     f"ratio {RATIO} (none for learned descriptors). Means over the pairs; no matches count as "
     "a precision of 0."
 )
