@@ -20,7 +20,9 @@ from deepdetect import (
     select_keypoints,
 )
 from deepdetect._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
+from deepdetect.detector.points.detection import PointOptions, detect_points
 from deepdetect.detector.pretrained import pretrained_weights
+from deepdetect.io.image import luma
 
 # The bundled weights change, so nothing here depends on the values that they give.
 
@@ -171,12 +173,66 @@ def test_a_constant_image_has_no_keypoint(
 # The keypoints.
 
 
+def test_a_number_of_keypoints_asks_for_points(detector: DeepDetect, image: np.ndarray) -> None:
+    found = detector.detect(image, max_keypoints=50)
+    wanted = detect_points(luma(image), PointOptions(max_keypoints=50))
+    np.testing.assert_array_equal(found.xy, wanted.xy)
+    assert found.sizes is not None
+    assert found.angles is not None
+    for options in ({"mode": "points"}, {"spread": "grid"}, {"spread": "anms"}):
+        assert detector.detect(image, max_keypoints=50, **options).sizes is not None
+    for options in ({"threshold": 0.6}, {"nms_radius": 1}, {"density": 0.1}, {"mode": "dense"}):
+        assert detector.detect(image, max_keypoints=50, **options).sizes is None
+    assert detector.detect(image).sizes is None  # dense stays the default
+
+
+def test_points_need_no_network(
+    detector: DeepDetect, image: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(detector, "_network", None)
+    assert len(detector.detect(image, max_keypoints=20)) == 20
+
+
+def test_points_of_large_images_are_found_on_two_megapixels(
+    detector: DeepDetect, image: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("deepdetect.detector.detector.MAX_AUTO_PIXELS", image[..., 0].size // 4)
+    whole = detector.configured(HeatmapOptions("native")).detect(image, max_keypoints=200)
+    half = detector.configured(HeatmapOptions("auto")).detect(image, max_keypoints=100)
+    assert half.image_size == whole.image_size
+    gaps = np.linalg.norm(half.xy[:, None] - whole.xy, axis=2)
+    assert np.mean(gaps.min(1) < 1.5) > 0.5
+    assert half.sizes.min() > 1.8 * whole.sizes.min()
+    ignore = np.zeros(image.shape[:2], bool)
+    ignore[:, : image.shape[1] // 2] = True
+    found = detector.configured(HeatmapOptions("auto")).detect(image, max_keypoints=50, ignore=ignore)
+    assert found.xy[:, 0].min() > image.shape[1] // 2 - 2
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"mode": "sparse"},
+        {"mode": "points", "density": 0.1},
+        {"mode": "points", "nms_radius": 1},
+        {"max_keypoints": 10, "spread": "greedy"},
+        {"spread": "grid"},
+        {"max_keypoints": 10, "nms_radius": 2, "spread": "grid"},
+    ],
+)
+def test_options_that_do_not_fit_together_are_reported(
+    detector: DeepDetect, image: np.ndarray, options: dict[str, Any]
+) -> None:
+    with pytest.raises(OptionError):
+        detector.detect(image, **options)
+
+
 @pytest.mark.parametrize(
     "options",
     [
         {},
         {"threshold": 0.3},
-        {"max_keypoints": 50},
+        {"max_keypoints": 50, "mode": "dense"},
         {"density": 0.1},
         {"density": 0.3, "nms_radius": 2},
         {"threshold": 0.1, "nms_radius": 3, "max_keypoints": 20},

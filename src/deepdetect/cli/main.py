@@ -24,6 +24,7 @@ from .register import register
 from .shards import shards
 from .stitch import stitch
 from .train import train
+from .train_points import train_points
 
 OLD_FLAGS = {
     "--against": "--compare",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -50,8 +51,8 @@ class SelectionOptions:
     nms_radius: int | None = None
     subpixel: bool | None = None
     ignore: np.ndarray | None = field(default=None, repr=False)
-    mode: str = "auto"
-    spread: str = "none"
+    mode: Literal["auto", "dense", "points"] = "auto"
+    spread: Literal["none", "grid", "anms"] = "none"
 
     def __post_init__(self) -> None:
         if not 0 <= self.threshold <= 1:

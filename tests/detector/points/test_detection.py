@@ -26,9 +26,9 @@ def test_points_come_best_first_with_all_that_descriptors_need(gray) -> None:
     assert found.image_size == (320, 240)
     assert (np.diff(found.logits) <= 0).all()
     assert (np.diff(found.scores) <= 0).all()
-    assert set(np.round(found.sizes / 2.5, 3)) <= {
-        round(1.5 * 1.35**k, 3) for k in range(7)
-    }
+    level = np.log(found.sizes / 2.5 / 1.5) / np.log(1.35)
+    np.testing.assert_allclose(level, np.rint(level), atol=1e-4)
+    assert set(np.rint(level)) <= set(range(7))
     assert ((found.angles >= 0) & (found.angles < 360)).all()
     assert (found.xy % 1 != 0).mean() > 0.9  # sub-pixel
 

@@ -1,119 +1,143 @@
-"""The losses beside what they are made of, and blind to the scale of the logits."""
-
 from __future__ import annotations
 
-import cv2
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
-from deepdetect.detector.points import PyramidOptions, detect_points, pyramid
-from deepdetect.training.points.candidates import Candidates, find_candidates
-from deepdetect.training.points.losses import (
-    Direction,
-    choose_softly,
-    mutual_pairs,
-    pair_loss,
-    project,
+from deepdetect.detector.points.candidate_features import FEATURES
+from deepdetect.training.points.losses import choose_softly, mutual_pairs, pair_loss
+from deepdetect.training.points.pairs import (
+    CandidatePair,
+    Correspondences,
+    Side,
+    candidate_pair,
 )
-from deepdetect.training.points.recipe import LOSSES, PointsTrainingOptions
+from deepdetect.training.points.recipe import PointsTrainingOptions
+from deepdetect.training.points.views import ViewPair
 
-from .conftest import texture
-
-VALID = np.ones((96, 96), bool)
-
-
-def levels_of(seed: int, shift: int = 0) -> list[torch.Tensor]:
-    image = np.roll(texture(seed, 96), shift, axis=1).astype(np.float32) / 255
-    maps = pyramid(cv2.GaussianBlur(image, (0, 0), 1.5), PyramidOptions(levels=3))
-    return [torch.from_numpy(level).requires_grad_() for level in maps]
+OPTIONS = PointsTrainingOptions()
+COUNT, REPEATED, AREA = 60, 30, 10_000
 
 
-def both_ways(first, second, homography=np.eye(3)) -> tuple[Direction, Direction]:
-    views = [find_candidates(levels, VALID, 25.0) for levels in (first, second)]
-    back = np.linalg.inv(homography)
-    return Direction(*views, homography, VALID), Direction(*views[::-1], back, VALID)
+class FirstFeature(torch.nn.Module):
+    """Ranks by a parameter for each candidate; a stand-in for a ranker that knows them all."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(0)
+        self.logits = torch.nn.Parameter(torch.randn(COUNT, generator=generator))
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        return self.logits[features[:, 0].long()]
 
 
-def test_candidates_are_the_points_of_run_time() -> None:
-    levels = levels_of(0)
-    found = find_candidates(levels, VALID, 25.0)
-    gray = texture(0, 96)
-    maps = iter(level.detach().numpy() for level in levels)
-    points = detect_points(gray, lambda level: next(maps), PyramidOptions(levels=3))
-    inner = (points.xy > 8).all(1) & (points.xy < 87).all(1)
-    ours = found.xy.detach().numpy()
-    gaps = np.linalg.norm(points.xy[inner][:, None] - ours[None], axis=2).min(1)
-    assert inner.sum() > 20
-    assert np.quantile(gaps, 0.95) < 1e-3
-
-
-def test_logits_of_candidates_have_a_fixed_spread() -> None:
-    levels = levels_of(1)
-    plain, sharp = (
-        find_candidates([factor * level + 3 for level in levels], VALID, 25.0) for factor in (1, 40)
+def known_pair(distance_px: float = 0.3) -> CandidatePair:
+    """Candidates far from each other; the first half of them are seen in both views."""
+    grid = np.stack(np.meshgrid(np.arange(10), np.arange(6)), -1).reshape(-1, 2) * 10.0
+    features = np.zeros((COUNT, FEATURES), np.float32)
+    features[:, 0] = np.arange(COUNT)
+    rows = np.arange(REPEATED)
+    way = Correspondences(
+        rows, rows, np.full(REPEATED, distance_px), np.ones(COUNT, bool), np.ones(REPEATED, bool)
     )
-    assert float(plain.logits.detach().std()) == pytest.approx(25, rel=1e-3)
-    torch.testing.assert_close(plain.logits, sharp.logits, rtol=1e-3, atol=0.02)
+    side = Side(grid, features)
+    return CandidatePair((side, side), (way, way), AREA)
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-def test_a_loss_has_no_gradient_along_the_scale(loss: str) -> None:
-    options = PointsTrainingOptions(loss=loss)
-    factor = torch.ones((), requires_grad=True)
-    first, second = levels_of(2), levels_of(2, shift=1)
-    ways = both_ways([factor * level for level in first], [factor * level for level in second])
-    pair_loss(*ways, 0.003, options).backward()
-    along = float(factor.grad)
-    across = max(float(level.grad.norm()) for level in (*first, *second))
-    assert abs(along) < 1e-3 * max(1.0, across)
-    assert across > 1e-4
+def value(ranker, pair, density=0.002, options=OPTIONS) -> float:
+    return pair_loss(ranker, pair, density, options).item()
 
 
-@pytest.mark.parametrize("loss", LOSSES)
-def test_the_same_view_twice_is_better_than_two_strangers(loss: str) -> None:
-    options = PointsTrainingOptions(loss=loss)
-    same = pair_loss(*both_ways(levels_of(3), levels_of(3)), 0.01, options)
-    other = pair_loss(*both_ways(levels_of(3), levels_of(4)), 0.01, options)
-    assert float(same.detach()) < float(other.detach())
+def test_the_soft_choice_sums_to_the_budget() -> None:
+    logits = torch.linspace(-50, 50, 101)
+    chosen = choose_softly(logits, 20, 3.0)
+    assert float(chosen.sum()) == pytest.approx(20, abs=0.01)
+    assert (chosen.diff() >= 0).all()
 
 
-@pytest.mark.parametrize("budget", [5, 40.0, 1e9])
-def test_the_soft_choice_meets_its_budget(budget: float) -> None:
-    logits = 25 * torch.randn(100, generator=torch.Generator().manual_seed(0))
-    chosen = choose_softly(logits, budget, 3.0)
-    assert float(chosen.sum()) == pytest.approx(min(budget, 100), rel=0.02)
+def test_training_brings_repeated_candidates_to_the_top() -> None:
+    ranker, pair = FirstFeature(), known_pair()
+    optimizer = torch.optim.Adam(ranker.parameters(), 0.05)
+    density = 20 / AREA
+    before = value(ranker, pair, density)
+    for _ in range(60):
+        optimizer.zero_grad()
+        loss = pair_loss(ranker, pair, density, OPTIONS)
+        loss.backward()
+        optimizer.step()
+    assert before > -0.8
+    assert loss.item() < -0.95
+    best = torch.argsort(ranker.logits, descending=True)[:20]
+    assert (best < REPEATED).all()
 
 
-def test_descent_ranks_what_is_found_again_first() -> None:
-    """Ten candidates of fifty have partners; both losses rank these first (two by chance)."""
-    generator = np.random.default_rng(0)
-    xy = [torch.tensor(generator.uniform(5, 90, (50, 2)), dtype=torch.float32) for _ in range(2)]
-    xy[1][:10] = xy[0][:10] + 0.3
-    for loss in LOSSES:
-        raw = [torch.tensor(generator.normal(size=50), dtype=torch.float32) for _ in range(2)]
-        for each in raw:
-            each.requires_grad_()
-        optimizer = torch.optim.Adam(raw, 0.05)
-        options = PointsTrainingOptions(loss=loss, position_weight=0)
-        for _ in range(150):
-            views = [
-                Candidates(p, 25 * (z - z.mean()) / z.std()) for p, z in zip(xy, raw, strict=True)
-            ]
-            ways = Direction(*views, np.eye(3), VALID), Direction(*views[::-1], np.eye(3), VALID)
-            optimizer.zero_grad()
-            pair_loss(*ways, generator.uniform(4, 20) / VALID.size, options).backward()
-            optimizer.step()
-        for each in raw:
-            best = each.detach().argsort(descending=True)[:10]
-            assert (best < 10).float().mean() > 0.5, loss
+def test_the_loss_does_not_see_the_scale_of_the_logits() -> None:
+    ranker, pair = FirstFeature(), known_pair()
+    first = value(ranker, pair)
+    with torch.no_grad():
+        ranker.logits.mul_(7).add_(3)
+    assert value(ranker, pair) == pytest.approx(first, abs=1e-3)
 
 
-def test_partners_are_mutual_and_positions_projected() -> None:
-    homography = np.array([[1.2, 0.1, 3], [-0.1, 0.9, 2], [1e-4, 2e-4, 1]])
-    xy = torch.tensor([[10.0, 20], [40, 50], [41, 50], [70, 30]])
-    there = torch.cat([project(xy[[3, 1, 0]], homography), torch.tensor([[1.0, 1.0]])])
-    views = [Candidates(p, torch.zeros(4)) for p in (xy, there)]
-    rows, partners, distance = mutual_pairs(Direction(*views, homography, VALID), 3.0)
-    assert dict(zip(rows.tolist(), partners.tolist(), strict=True)) == {0: 2, 1: 1, 3: 0}
-    np.testing.assert_allclose(distance, 0, atol=1e-4)
+def test_close_partners_are_worth_more() -> None:
+    ranker = FirstFeature()
+    close, near = (value(ranker, known_pair(d)) for d in (0.5, 2.0))
+    assert near == pytest.approx(close * (1 - OPTIONS.close_share), rel=0.01)
+
+
+def test_matchable_partners_are_worth_more() -> None:
+    ranker, pair = FirstFeature(), known_pair()
+    way = dataclasses.replace(pair.ways[0], matchable=np.zeros(REPEATED, bool))
+    other = dataclasses.replace(pair, ways=(way, way))
+    options = dataclasses.replace(OPTIONS, match_weight=1.0)
+    first, second = (value(ranker, p, options=options) for p in (pair, other))
+    assert second == pytest.approx(first / 2, rel=0.01)
+
+
+def test_mutual_pairs_are_each_others_nearest() -> None:
+    way = Correspondences(
+        np.array([0, 0, 1, 2]),
+        np.array([5, 6, 6, 7]),
+        np.array([1.0, 0.5, 0.2, 2.5]),
+        np.ones(3, bool),
+        np.ones(4, bool),
+    )
+    everyone = np.ones(3, bool), np.ones(8, bool)
+    assert mutual_pairs(way, 3.0, *everyone).tolist() == [2, 3]
+    assert mutual_pairs(way, 2.0, *everyone).tolist() == [2]
+    without = np.array([True, False, True]), everyone[1]
+    assert sorted(mutual_pairs(way, 3.0, *without).tolist()) == [1, 3]
+
+
+@pytest.mark.parametrize("with_descriptors", [False, True])
+def test_candidates_of_the_same_view_see_each_other(photo, with_descriptors) -> None:
+    side = 128
+    image, valid = photo[:side, :side], np.ones((side, side), bool)
+    valid[:, :20] = False
+    pair = candidate_pair(
+        ViewPair((image, image), (valid, valid), np.eye(3), "light"), 300, with_descriptors
+    )
+    assert len(pair.sides[0].xy) == 300
+    assert pair.sides[0].xy[:, 0].min() > 19
+    for way in pair.ways:
+        assert way.visible.all()
+        itself = way.first == way.second
+        assert itself.sum() == 300
+        assert (way.distance_px[itself] == 0).all()
+        assert way.distance_px[~itself].min() > 0
+        assert way.matchable[itself].mean() > 0.9
+
+
+def test_a_shift_is_followed(photo) -> None:
+    side = 128
+    images = photo[:side, :side], photo[5 : side + 5, 9 : side + 9]
+    valid = np.ones((side, side), bool)
+    shift = np.array([[1, 0, -9], [0, 1, -5], [0, 0, 1.0]])
+    pair = candidate_pair(ViewPair(images, (valid, valid), shift, "light"), 2000, False)
+    way = pair.ways[0]
+    seen = pair.sides[0].xy - (9, 5)
+    inside = ((seen > -0.5) & (seen < side - 0.5)).all(1)
+    np.testing.assert_array_equal(way.visible, inside)
+    assert len(np.unique(way.first[way.distance_px < 0.05])) > 0.5 * inside.sum()

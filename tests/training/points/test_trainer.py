@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from deepdetect._shared.errors import OptionError, WeightsError
-from deepdetect.training.points.measure import measure
+from deepdetect._shared.errors import OptionError
+from deepdetect.detector.points.ranker import load_ranker, notes_of
+from deepdetect.training.points.measure import measure, points_detector
 from deepdetect.training.points.recipe import PointsTrainingOptions
-from deepdetect.training.points.trainer import BEST, PointsTrainer, load_head
+from deepdetect.training.points.trainer import BEST, PointsTrainer
 
-OPTIONS = PointsTrainingOptions(steps=4, pairs=1, side=64, levels=2, warm_up=1)
+OPTIONS = PointsTrainingOptions(steps=4, pairs=1, side=96, hidden=(6, 4), warm_up=1)
 
 
 def trainer(textures: Path, folder: Path, options=OPTIONS, **settings) -> PointsTrainer:
@@ -21,7 +22,7 @@ def trainer(textures: Path, folder: Path, options=OPTIONS, **settings) -> Points
 
 
 def weights(run: PointsTrainer) -> torch.Tensor:
-    return torch.cat([p.detach().flatten() for p in run.head.parameters()])
+    return torch.cat([p.detach().flatten() for p in run.ranker.parameters()])
 
 
 @pytest.fixture(scope="module")
@@ -55,11 +56,24 @@ def test_an_interrupted_run_ends_with_the_same_weights(whole, textures, tmp_path
 
 
 def test_the_best_weights_are_those_of_the_best_measure(whole: PointsTrainer) -> None:
-    head = load_head(whole.folder / BEST)
-    from deepdetect.training.points.measure import head_detector
+    ranker = load_ranker(whole.folder / BEST)
+    found = measure(points_detector(ranker), whole.pairs)
+    assert found.score == pytest.approx(whole.state.best_score, abs=1e-6)
+    notes = notes_of(ranker)
+    assert notes["photographs"] == 4
+    assert notes["point"]["score"] == whole.state.best_score
 
-    found = measure(head_detector(head, whole._pyramid()), whole.pairs)
-    assert found.score == pytest.approx(whole.state.best_score)
+
+def test_an_untrained_ranker_ranks_by_the_first_feature(textures, tmp_path) -> None:
+    module = trainer(textures, tmp_path).ranker
+    features = module.mean + module.deviation * torch.randn(
+        200, len(module.mean), generator=torch.Generator().manual_seed(1)
+    )
+    logits = module(features)
+    correlation = torch.corrcoef(torch.stack([logits.detach(), features[:, 0]]))[0, 1]
+    assert correlation > 0.999
+    exported = module.export({"a": 1})
+    np.testing.assert_allclose(exported.rank(features.numpy()), logits.detach().numpy(), atol=1e-5)
 
 
 def test_other_options_do_not_resume(whole: PointsTrainer, textures) -> None:
@@ -67,14 +81,15 @@ def test_other_options_do_not_resume(whole: PointsTrainer, textures) -> None:
         trainer(textures, whole.folder, dataclasses.replace(OPTIONS, seed=1))
 
 
-def test_a_file_of_something_else_is_reported(tmp_path: Path) -> None:
-    (tmp_path / "a.safetensors").write_bytes(b"nonsense")
-    with pytest.raises(WeightsError, match=r"a\.safetensors"):
-        load_head(tmp_path / "a.safetensors")
-
-
 @pytest.mark.parametrize(
-    "change", [{"loss": "budgt"}, {"steps": 0}, {"min_density": 0}, {"kind_weights": (1, 1)}]
+    "change", [
+        {"hidden": (0, 4)},
+        {"steps": 0},
+        {"min_density": 0},
+        {"kind_weights": (1, 1)},
+        {"close_share": 2},
+        {"match_weight": -1},
+    ],
 )
 def test_wrong_options_are_reported(change) -> None:
     with pytest.raises(OptionError):
@@ -93,6 +108,7 @@ def test_the_measure_of_a_perfect_and_of_a_blind_detector(textures: Path) -> Non
         return Keypoints(generator.uniform(0, 95, (500, 2)), generator.random(500), (96, 96))
 
     found = measure(blind, pairs)
-    assert found.mean.shape == (2, 2)
-    assert found.score < 0.25
+    assert found.mean.shape == (3, 2)
+    assert found.score < 0.3
+    assert found.mean_correct < 0.05
     assert (found.mean[:, 1] >= found.mean[:, 0]).all()

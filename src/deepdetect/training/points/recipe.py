@@ -42,7 +42,7 @@ class PointsTrainingOptions:
         OptionError: a value is out of its range.
     """
 
-    steps: int = 2000
+    steps: int = 3000
     pairs: int = 4
     side: int = 224
     hidden: tuple[int, int] = (48, 32)
@@ -52,9 +52,9 @@ class PointsTrainingOptions:
     max_gradient_norm: float = 1.0
     average_decay: float = 0.995
     sharpness: float = 25.0
-    temperature: float = 3.0
-    min_density: float = 0.0012
-    max_density: float = 0.016
+    temperature: float = 0.6
+    min_density: float = 0.003
+    max_density: float = 0.025
     close_share: float = 0.7
     match_weight: float = 0.0
     max_candidates: int = 2000

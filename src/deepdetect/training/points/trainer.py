@@ -7,7 +7,7 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,10 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
-from ..._shared.atomic import atomic_path
 from ..._shared.errors import OptionError
+from ..._shared.progress import progress
 from ..._shared.provenance import provenance
+from ...detector.points.ranker import load_ranker, notes_of
 from ...io.image import find_images
 from ..checkpoint import read_checkpoint, restore, save_checkpoint
 from ..dataset import loading
@@ -26,11 +27,12 @@ from .dataset import PairDataset, PairIndex, PairSample, PairSampler
 from .losses import pair_loss
 from .measure import HardMeasure, measure, points_detector, validation_pairs
 from .model import RankerModule, save_ranker
+from .report import save_curves, write_model_card
 from .recipe import PointsTrainingOptions
 
 CHECKPOINT = "checkpoint.safetensors"
 BEST = "best.npz"
-CURVE = "curve.jsonl"
+CARD = "MODEL_CARD.md"
 
 STATISTICS_PAIRS = 64
 """Of views, whose features give mean and deviation."""
@@ -64,13 +66,13 @@ class PointsTrainer:
 
     Args:
         photos, validation: folders of photographs.
-        folder: of the run: checkpoint.safetensors, best.npz, curve.jsonl.
+        folder: of the run: checkpoint.safetensors, best.npz, curves.csv, curves.png, MODEL_CARD.md.
         options: the recipe.
         measure_every: steps from one hard measure to the next.
         save_every: steps from one checkpoint to the next.
         pairs_per_kind: of the hard measure.
         workers: processes that render views.
-        log: takes lines for the user.
+        quiet: show no progress bar and no measures.
 
     Raises:
         ImageError: a folder is missing or empty.
@@ -89,9 +91,9 @@ class PointsTrainer:
         save_every: int = 100,
         pairs_per_kind: int = 16,
         workers: int = 0,
-        log: Callable[[str], None] = lambda line: None,
+        quiet: bool = True,
     ) -> None:
-        self.options, self.folder, self.log = options, folder, log
+        self.options, self.folder, self.quiet = options, folder, quiet
         self.measure_every, self.save_every, self.workers = measure_every, save_every, workers
         self.files = find_images(photos)
         self.pairs = validation_pairs(validation, pairs_per_kind)
@@ -120,7 +122,8 @@ class PointsTrainer:
         if not state.points:
             self._measure()
             self._save()
-        with loading(self._loader()) as batches:
+        bar = progress(self.options.steps, "training", "step", self.quiet, state.step)
+        with bar, loading(self._loader()) as batches:
             while state.step < end and time.monotonic() - started < seconds:
                 before = time.process_time()
                 value = self.training_step(next(batches))
@@ -128,6 +131,7 @@ class PointsTrainer:
                 state.loss_sum += value
                 state.loss_count += 1
                 state.step += 1
+                bar.update(1)
                 measured = state.step % self.measure_every == 0 or state.step == self.options.steps
                 if measured:
                     self._measure()
@@ -206,12 +210,24 @@ class PointsTrainer:
             state.best_score = found.score
             notes = {**self.run, **provenance(), "point": row}
             save_ranker(self.average.export(notes), self.folder / BEST)
-        with atomic_path(self.folder / CURVE) as temporary:
-            temporary.write_text("".join(json.dumps(point) + "\n" for point in state.points))
-        self.log(
-            f"{state.step:6d} {row['cpu_seconds']:8.0f}s loss {row['loss']:+.4f} "
-            f"score {found.row()}{' *' if best else ''}"
-        )
+        self._write_card()
+        save_curves(state.points, self.folder)
+        mark = " *" if best else ""
+        self._say(f"{state.step:6d} loss {row['loss']:+.4f} score {found.row()}{mark}")
+
+    def _say(self, line: str) -> None:
+        if not self.quiet:
+            from tqdm import tqdm
+
+            tqdm.write(line)
+
+    def _write_card(self) -> None:
+        best = self.folder / BEST
+        if not best.exists():
+            return
+        ranker = load_ranker(best)
+        count = sum(parameter.numel() for parameter in self.ranker.parameters())
+        write_model_card(self.folder / CARD, best, count, notes_of(ranker), self.state.points)
 
     def _save(self) -> None:
         metadata = {**dataclasses.asdict(self.state), **self.run}
