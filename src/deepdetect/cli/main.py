@@ -103,6 +103,7 @@ for command in (
     label,
     shards,
     train,
+    train_points,
     average,
     datasets,
     evaluate,
