@@ -205,7 +205,9 @@ def test_points_of_large_images_are_found_on_two_megapixels(
     assert half.sizes.min() > 1.8 * whole.sizes.min()
     ignore = np.zeros(image.shape[:2], bool)
     ignore[:, : image.shape[1] // 2] = True
-    found = detector.configured(HeatmapOptions("auto")).detect(image, max_keypoints=50, ignore=ignore)
+    found = detector.configured(HeatmapOptions("auto")).detect(
+        image, max_keypoints=50, ignore=ignore
+    )
     assert found.xy[:, 0].min() > image.shape[1] // 2 - 2
 
 

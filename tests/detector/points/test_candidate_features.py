@@ -41,7 +41,10 @@ def test_a_quarter_turn_changes_nothing() -> None:
     here, first = features(gray)
     there, second = features(np.ascontiguousarray(np.rot90(gray)))
     # (x, y) is seen at (y, W - 1 - x) of the turned image.
-    place = {(int(k), int(r), int(c)): n for n, (k, r, c) in enumerate(zip(there.level, there.row, there.column, strict=True))}
+    place = {
+        (int(k), int(r), int(c)): n
+        for n, (k, r, c) in enumerate(zip(there.level, there.row, there.column, strict=True))
+    }
     side = len(gray)
     found = [
         (n, place[key])

@@ -39,8 +39,11 @@ def test_derivatives_are_those_of_opencv() -> None:
             cv2.filter2D(space.smooth[k], -1, kernel)
             for kernel in (np.array([[-0.5, 0, 0.5]]), np.array([[-0.5], [0], [0.5]]))
         )
-        xy = cv2.filter2D(cv2.filter2D(space.smooth[k], -1, np.array([[-0.5, 0, 0.5]])), -1,
-                          np.array([[-0.5], [0], [0.5]]))
+        xy = cv2.filter2D(
+            cv2.filter2D(space.smooth[k], -1, np.array([[-0.5, 0, 0.5]])),
+            -1,
+            np.array([[-0.5], [0], [0.5]]),
+        )
         np.testing.assert_allclose(space.trace[k], (xx + yy) * sigma**2, atol=1e-5)
         np.testing.assert_allclose(space.gradient[k], (dx**2 + dy**2) * sigma**2, atol=1e-5)
         inner = np.s_[1:-1, 1:-1]
@@ -65,8 +68,12 @@ def test_candidates_are_maxima_of_their_windows() -> None:
     candidates = find_candidates(space)
     assert len(candidates) > 100
     for k in range(0, len(candidates), 29):
-        level, row, column = (int(a[k]) for a in (candidates.level, candidates.row, candidates.column))
-        window = np.abs(space.determinant[level])[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
+        level, row, column = (
+            int(a[k]) for a in (candidates.level, candidates.row, candidates.column)
+        )
+        window = np.abs(space.determinant[level])[
+            max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3
+        ]
         assert np.abs(space.determinant[level, row, column]) == window.max()
         assert np.abs(candidates.xy[k] - (column, row)).max() < 0.5
 

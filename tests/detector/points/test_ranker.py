@@ -14,8 +14,14 @@ from deepdetect.detector.points.ranker import WEIGHTS, Ranker, load_ranker, note
 def arrays(**changes) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     shapes = {
-        "mean": (FEATURES,), "deviation": (FEATURES,), "weight0": (5, FEATURES), "bias0": (5,),
-        "weight1": (4, 5), "bias1": (4,), "weight2": (1, 4), "bias2": (1,),
+        "mean": (FEATURES,),
+        "deviation": (FEATURES,),
+        "weight0": (5, FEATURES),
+        "bias0": (5,),
+        "weight1": (4, 5),
+        "bias1": (4,),
+        "weight2": (1, 4),
+        "bias2": (1,),
     }
     found = {name: rng.random(shape).astype(np.float32) + 0.5 for name, shape in shapes.items()}
     return {**found, "notes": np.array("{}"), **changes}

@@ -82,7 +82,8 @@ def test_other_options_do_not_resume(whole: PointsTrainer, textures) -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [
+    "change",
+    [
         {"hidden": (0, 4)},
         {"steps": 0},
         {"min_density": 0},

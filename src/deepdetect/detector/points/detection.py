@@ -13,8 +13,8 @@ from ...features.selection import SPREADS, check_ignore
 from ...features.sift_detector import spread_over_grid
 from ...features.suppression import spread_by_distance, suppress_neighbors
 from .candidate_features import describe_candidates
-from .ranker import Ranker, load_ranker
 from .hessian_scales import ScaleSpaceOptions, build_scale_space, find_candidates
+from .ranker import Ranker, load_ranker
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """The hard measure: what a ranking is judged and chosen by, on photographs not trained on.
 
 One-to-one repeatability at fixed budgets, and correct matches by upright descriptors, on a fixed,
-seeded set of synthetic pairs, as many of each kind, by the functions of the benchmark. Points outside the photograph are dropped before the best
-are taken, for every detector alike.
+seeded set of synthetic pairs, as many of each kind, by the functions of the benchmark. Points
+outside the photograph are dropped before the best are taken, for every detector alike.
 """
 
 from __future__ import annotations

@@ -36,27 +36,26 @@ class RankerModule(nn.Module):
         spread = np.maximum(deviation, MIN_DEVIATION).astype(np.float32)
         self.register_buffer("deviation", torch.from_numpy(spread))
         first, second = hidden
-        self.layers = nn.ModuleList(
-            [nn.Linear(len(mean), first), nn.Linear(first, second), nn.Linear(second, 1)]
-        )
+        self.first = nn.Linear(len(mean), first)
+        self.second = nn.Linear(first, second)
+        self.output = nn.Linear(second, 1)
         with torch.no_grad():
-            self.layers[-1].weight.mul_(INITIAL_OUTPUT)
-            self.layers[-1].bias.zero_()
+            self.output.weight.mul_(INITIAL_OUTPUT)
+            self.output.bias.zero_()
 
     def forward(self, features: Tensor) -> Tensor:
         """Map (N, F) features to (N,) logits."""
         values = (features - self.mean) / self.deviation
         values = values.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
-        for layer in self.layers[:-1]:
-            values = layer(values).relu()
-        logits: Tensor = features[:, 0] + self.layers[-1](values)[:, 0]
+        values = self.second(self.first(values).relu()).relu()
+        logits: Tensor = features[:, 0] + self.output(values)[:, 0]
         return logits
 
     def export(self, notes: dict[str, Any]) -> Ranker:
         """Return the same ranker without torch."""
         layers = tuple(
             (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
-            for layer in self.layers
+            for layer in (self.first, self.second, self.output)
         )
         text = json.dumps(notes, default=str, sort_keys=True)
         return Ranker(self.mean.numpy().copy(), self.deviation.numpy().copy(), layers, text)

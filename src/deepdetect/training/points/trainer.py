@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Sequence
@@ -27,8 +26,8 @@ from .dataset import PairDataset, PairIndex, PairSample, PairSampler
 from .losses import pair_loss
 from .measure import HardMeasure, measure, points_detector, validation_pairs
 from .model import RankerModule, save_ranker
-from .report import save_curves, write_model_card
 from .recipe import PointsTrainingOptions
+from .report import save_curves, write_model_card
 
 CHECKPOINT = "checkpoint.safetensors"
 BEST = "best.npz"
@@ -178,7 +177,11 @@ class PointsTrainer:
         """Return mean and deviation of the features, over some pairs."""
         dataset = PairDataset(self.files, self.options)
         features = np.concatenate(
-            [side.features for k in range(STATISTICS_PAIRS) for side in dataset[_early(k)].pair.sides]
+            [
+                side.features
+                for k in range(STATISTICS_PAIRS)
+                for side in dataset[_early(k)].pair.sides
+            ]
         ).astype(np.float64)
         return features.mean(0), features.std(0)
 
@@ -267,5 +270,5 @@ def batch_loss(
         if min(len(side.xy) for side in sample.pair.sides) > 1
     ]
     if not losses:
-        return sum(parameter.sum() for parameter in ranker.parameters()) * 0
+        return torch.stack([p.sum() for p in ranker.parameters()]).sum() * 0
     return torch.stack(losses).sum() / len(samples)
