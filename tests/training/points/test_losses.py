@@ -17,7 +17,7 @@ from deepdetect.training.points.pairs import (
 from deepdetect.training.points.recipe import PointsTrainingOptions
 from deepdetect.training.points.views import ViewPair
 
-OPTIONS = PointsTrainingOptions()
+OPTIONS = PointsTrainingOptions(temperature=3.0)
 COUNT, REPEATED, AREA = 60, 30, 10_000
 
 
@@ -62,13 +62,13 @@ def test_training_brings_repeated_candidates_to_the_top() -> None:
     optimizer = torch.optim.Adam(ranker.parameters(), 0.05)
     density = 20 / AREA
     before = value(ranker, pair, density)
-    for _ in range(60):
+    for _ in range(300):
         optimizer.zero_grad()
         loss = pair_loss(ranker, pair, density, OPTIONS)
         loss.backward()
         optimizer.step()
-    assert before > -0.8
-    assert loss.item() < -0.95
+    assert before > -0.6
+    assert loss.item() < -0.7
     best = torch.argsort(ranker.logits, descending=True)[:20]
     assert (best < REPEATED).all()
 
