@@ -103,6 +103,8 @@ def test_a_preset_like_no_other_brings_the_whole_list() -> None:
         ("nms_radius", 2, "selection.nms_radius"),
         ("subpixel", True, "selection.subpixel"),
         ("ignore", MASK, "selection.ignore"),
+        ("mode", "points", "selection.mode"),
+        ("spread", "none", "selection.spread"),
         ("model", "homography", "geometry.model"),
         ("estimator", "ransac", "geometry.estimator"),
         ("inlier_threshold", 3.0, "geometry.inlier_threshold"),

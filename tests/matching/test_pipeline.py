@@ -389,21 +389,44 @@ def test_a_preset_without_its_heatmap_options_takes_a_stand_in(photo: np.ndarray
 
 def test_a_detector_keeps_its_own_resolution(photo: np.ndarray) -> None:
     squashing = DeepDetect(resolution=64, channels="bgr")
-    matches = match_images(photo, photo, squashing, max_keypoints=100)
-    np.testing.assert_array_equal(
-        matches.keypoints0.xy, squashing.detect(photo, max_keypoints=100).xy
-    )
+    chosen = {"max_keypoints": 100, "mode": "dense"}
+    matches = match_images(photo, photo, squashing, **chosen)
+    np.testing.assert_array_equal(matches.keypoints0.xy, squashing.detect(photo, **chosen).xy)
 
+
+@pytest.mark.parametrize("guided", [True, False])
+def test_points_are_matched_at_their_sub_pixel_positions(photo: np.ndarray, guided: bool) -> None:
+    moved = photo[5:, 9:]
+    found = match_images(photo, moved, max_keypoints=300, guided=guided, ratio=0.85, mutual=True)
+    assert found.keypoints0.sizes is not None
+    assert len(found) > 100
+    rows0 = {tuple(xy) for xy in found.keypoints0.xy.tolist()}
+    rows1 = {tuple(xy) for xy in found.keypoints1.xy.tolist()}
+    assert all(tuple(xy) in rows0 for xy in found.points0.tolist())
+    assert all(tuple(xy) in rows1 for xy in found.points1.tolist())
+    gaps = np.linalg.norm(found.points0 - (9, 5) - found.points1, axis=1)
+    assert np.median(gaps) < 0.1
+
+
+def test_points_of_a_turned_image_match_by_their_angles(photo: np.ndarray) -> None:
+    turned = np.ascontiguousarray(np.rot90(photo))
+    found = match_images(photo, turned, max_keypoints=300, guided=False, ratio=0.85, mutual=True)
+    width = photo.shape[1]
+    seen = np.column_stack([found.points0[:, 1], width - 1 - found.points0[:, 0]])
+    right = np.linalg.norm(seen - found.points1, axis=1) < 1
+    assert len(found) > 60
+    assert right.mean() > 0.9
 
 def test_heatmap_options_reach_the_network_and_leave_the_detector(
     photo: np.ndarray, network: DeepDetect
 ) -> None:
     before = network.heatmap_options
-    matches = match_images(photo, photo, network, resolution=64, channels="bgr", max_keypoints=100)
+    chosen = {"max_keypoints": 100, "mode": "dense"}
+    matches = match_images(photo, photo, network, resolution=64, channels="bgr", **chosen)
     assert network.heatmap_options == before
-    expected = DeepDetect(resolution=64, channels="bgr").detect(photo, max_keypoints=100)
+    expected = DeepDetect(resolution=64, channels="bgr").detect(photo, **chosen)
     np.testing.assert_array_equal(matches.keypoints0.xy, expected.xy)
-    native = network.detect(photo, max_keypoints=100)
+    native = network.detect(photo, **chosen)
     assert not np.array_equal(matches.keypoints0.xy, native.xy)
 
 

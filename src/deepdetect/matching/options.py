@@ -107,7 +107,7 @@ PRESETS: dict[str, MatchingOptions] = {
     # RGB, the angle unset, and every match evaluated by the true homography.
     "published": MatchingOptions(
         heatmap=HeatmapOptions(resolution=480, channels="bgr"),
-        selection=SelectionOptions(threshold=0.5),
+        selection=SelectionOptions(threshold=0.5, mode="dense"),
         descriptor="sift",
         keypoint_size=3.0,
         angle=-1.0,

@@ -48,6 +48,8 @@ def match_images(
     nms_radius: int | None = None,
     subpixel: bool | None = None,
     ignore: np.ndarray | None = None,
+    mode: Literal["auto", "dense", "points"] | None = None,
+    spread: Literal["none", "grid", "anms"] | None = None,
     resolution: Literal["auto", "native"] | int | None = None,
     channels: Literal["rgb", "bgr"] | None = None,
     descriptor: str | None = None,
@@ -88,8 +90,9 @@ def match_images(
         guide: which geometry guides where `model` leaves it open: "auto", "homography" or
             "fundamental".
         mutual: keep only mutual nearest neighbours; guided, the best match of each keypoint.
-        threshold, density, max_keypoints, nms_radius, subpixel, ignore: which pixels become
-            keypoints (`SelectionOptions`).
+        threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread: which pixels
+            or points become keypoints (`SelectionOptions`). With `max_keypoints` alone they are
+            the best ones of all scales, which need no network.
         resolution, channels: how the network sees the images (`HeatmapOptions`).
         descriptor, keypoint_size, angle, matcher, ratio: of matches by descriptors alone; they do
             not apply to guided ones (`MatchingOptions`).
@@ -127,6 +130,8 @@ def match_images(
         "nms_radius": nms_radius,
         "subpixel": subpixel,
         "ignore": ignore,
+        "mode": mode,
+        "spread": spread,
         "resolution": resolution,
         "channels": channels,
         "descriptor": descriptor,

@@ -73,6 +73,8 @@ def register(
     nms_radius: int | None = None,
     subpixel: bool | None = None,
     ignore: np.ndarray | None = None,
+    mode: Literal["auto", "dense", "points"] | None = None,
+    spread: Literal["none", "grid", "anms"] | None = None,
     resolution: Literal["auto", "native"] | int | None = None,
     channels: Literal["rgb", "bgr"] | None = None,
     mutual: bool | None = None,
@@ -87,8 +89,8 @@ def register(
     Args:
         image0, image1: anything `load_image` takes.
         detector: as for `match_images`.
-        threshold, density, max_keypoints, nms_radius, subpixel, ignore, resolution, channels,
-            mutual, seed, guided_options: as for `match_images`.
+        threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread, resolution,
+            channels, mutual, seed, guided_options: as for `match_images`.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
@@ -116,6 +118,8 @@ def register(
         nms_radius=nms_radius,
         subpixel=subpixel,
         ignore=ignore,
+        mode=mode,
+        spread=spread,
         resolution=resolution,
         channels=channels,
         mutual=mutual,

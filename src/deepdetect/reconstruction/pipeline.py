@@ -95,6 +95,8 @@ def reconstruct(
     max_keypoints: int | None = None,
     nms_radius: int | None = None,
     ignore: np.ndarray | None = None,
+    mode: Literal["auto", "dense", "points"] | None = None,
+    spread: Literal["none", "grid", "anms"] | None = None,
     disparity: DisparityOptions | None = None,
     two_view: TwoViewOptions | None = None,
     point_filter: PointFilterOptions | None = None,
@@ -117,8 +119,8 @@ def reconstruct(
             `Calibration`. Without one the focal length is taken from `focal_px`, or from EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         rectified: whether matches lie on the same row of both images. None: detected.
-        threshold, density, max_keypoints, nms_radius, ignore: which pixels become keypoints
-            (`SelectionOptions`). A density of 1 takes every pixel, and `DENSE` disparities. Without
+        threshold, density, max_keypoints, nms_radius, ignore, mode, spread: which pixels or points
+            become keypoints (`SelectionOptions`). A density of 1 takes every pixel, and `DENSE` disparities. Without
             `nms_radius`, pairs that are not rectified are matched without suppression.
         disparity, two_view, point_filter, seed: as of `ReconstructionOptions`.
         options: all options at once.
@@ -151,6 +153,8 @@ def reconstruct(
         "max_keypoints": max_keypoints,
         "nms_radius": nms_radius,
         "ignore": ignore,
+        "mode": mode,
+        "spread": spread,
         "disparity": disparity,
         "two_view": two_view,
         "point_filter": point_filter,
