@@ -417,6 +417,7 @@ def test_points_of_a_turned_image_match_by_their_angles(photo: np.ndarray) -> No
     assert len(found) > 60
     assert right.mean() > 0.9
 
+
 def test_heatmap_options_reach_the_network_and_leave_the_detector(
     photo: np.ndarray, network: DeepDetect
 ) -> None:

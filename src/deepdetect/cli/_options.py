@@ -39,10 +39,10 @@ class Resolution(click.ParamType):  # type: ignore[type-arg]  # generic in new v
 
 DETECTOR = FieldOptions(
     "detector.detector:DeepDetect",
-    names=("weights", "resolution", "backend", "providers", "threads"),
+    names=("weights", "resolution", "backend", "providers", "threads", "ranker"),
     flags={"providers": "--provider"},
     types={"resolution": Resolution()},
-    metavars={"weights": "NAME|FILE", "providers": "NAME"},
+    metavars={"weights": "NAME|FILE", "providers": "NAME", "ranker": "FILE"},
     defaults={"threads": "the backend's choice"},
 )
 

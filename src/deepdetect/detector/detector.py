@@ -18,6 +18,8 @@ from ..io.image import load_image, luma
 from .backends import RuntimeOptions, open_network
 from .heatmap import MAX_AUTO_PIXELS, HeatmapOptions, compute_heatmap_and_logits
 from .points.detection import PointOptions, detect_points
+from .points.ranker import WEIGHTS as RANKER
+from .points.ranker import Ranker, load_ranker
 from .pretrained import resolve_weights
 
 
@@ -44,13 +46,15 @@ class DeepDetect:
             preferred one first.
         threads: number of threads. None: the backend's choice.
         channels: "rgb", or "bgr" as the paper's published code feeds them.
+        ranker: npz file of `deepdetect train-points` that ranks points. None: the one inside the
+            package.
 
     Attributes:
         backend: name of the backend that runs.
         heatmap_options: the resolution and the order of the channels.
 
     Raises:
-        WeightsError: the weights are missing, damaged or do not fit.
+        WeightsError: the weights or the ranker are missing, damaged or do not fit.
         OptionError: an option is unknown or out of its range.
         MissingExtraError: the backend is not installed.
 
@@ -75,9 +79,12 @@ class DeepDetect:
         providers: tuple[str, ...] = (),
         threads: int | None = None,
         channels: Literal["rgb", "bgr"] = "rgb",
+        ranker: str | Path | None = None,
     ) -> None:
         self.weights = resolve_weights(weights)
         self.heatmap_options = HeatmapOptions(resolution, channels)
+        self.ranker = RANKER if ranker is None else Path(ranker)
+        load_ranker(self.ranker)
         self._runtime = RuntimeOptions(backend, providers, threads)
         self._network, self.backend = open_network(self.weights, self._runtime)
 
@@ -130,6 +137,10 @@ class DeepDetect:
     def _run(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of an image that `load_image` returned."""
         return compute_heatmap_and_logits(rgb, self._network, self.heatmap_options)
+
+    def _points(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
+        """Find points in an image that `load_image` returned."""
+        return find_points(rgb, options, self.heatmap_options, load_ranker(self.ranker))
 
     def __repr__(self) -> str:
         shown = self.heatmap_options
@@ -222,7 +233,7 @@ class DeepDetect:
         )
         rgb = load_image(image)
         if options.uses_points:
-            keypoints = find_points(rgb, options, self.heatmap_options)
+            keypoints = self._points(rgb, options)
             return (keypoints, self._run(rgb)[0]) if return_heatmap else keypoints
         heatmap, logits = self._run(rgb)
         keypoints = select_keypoints(heatmap, options, logits)
@@ -230,28 +241,34 @@ class DeepDetect:
 
 
 def find_points(
-    rgb: np.ndarray, options: SelectionOptions, seen: HeatmapOptions = HeatmapOptions()
+    rgb: np.ndarray,
+    options: SelectionOptions,
+    seen: HeatmapOptions = HeatmapOptions(),
+    ranker: Ranker | None = None,
 ) -> Keypoints:
     """Detect the best keypoints of all scales of a loaded image.
 
     Args:
         rgb: (H, W, 3) uint8.
         options: how many, how they are spread, and where none is wanted.
-        seen: with the resolution "auto", images over two megapixels are scaled down to that, as
-            for the heat map; else the image is taken as it is.
+        seen: images over two megapixels are scaled down to that, as for the heat map, unless the
+            resolution is "native".
+        ranker: None: the one inside the package.
     """
     gray = luma(rgb)
     height, width = gray.shape
     ignore = None if options.ignore is None else check_ignore(options.ignore, gray.shape)
     scale = (MAX_AUTO_PIXELS / gray.size) ** 0.5
     chosen = PointOptions(max_keypoints=options.max_keypoints, spread=options.spread)
-    if seen.resolution != "auto" or scale >= 1:
-        return detect_points(gray, chosen, ignore=ignore)
+    if seen.resolution == "native" or scale >= 1:
+        return detect_points(gray, chosen, ignore=ignore, ranker=ranker)
     size = [max(1, round(side * scale)) for side in (width, height)]
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     if ignore is not None:
-        ignore = cv2.resize(ignore.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    found = detect_points(small, chosen, ignore=ignore)
+        # Wherever a pixel of the small image, or one beside it, holds something to be ignored.
+        share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
+    found = detect_points(small, chosen, ignore=ignore, ranker=ranker)
     factor = np.divide((width, height), size)
     return replace(
         found,
@@ -266,16 +283,19 @@ def find_keypoints(
 ) -> Keypoints:
     """Choose the keypoints of a loaded image, ranked by logits where the detector gives them.
 
-    Other detectors than ours have a heat map only: their keypoints are always dense.
+    Other detectors than ours have a heat map only: their keypoints are dense.
 
     Raises:
-        OptionError: the detector's map has another size than the image, or is not finite.
+        OptionError: the detector's map has another size than the image, or is not finite; or
+            points are asked for by name of a detector that has none.
     """
     if isinstance(detector, DeepDetect):
         if options.uses_points:
-            return find_points(rgb, options, detector.heatmap_options)
+            return detector._points(rgb, options)
         own_map, own_logits = detector._run(rgb)
         return select_keypoints(own_map, options, own_logits)
+    if options.mode == "points" or options.spread != "none":
+        raise OptionError("only a DeepDetect detector has points: leave out `mode` and `spread`")
     logits = None
     if hasattr(detector, "heatmap_and_logits"):
         heatmap, logits = detector.heatmap_and_logits(rgb)

@@ -75,9 +75,9 @@ class Matches:
 
     Attributes:
         points0, points1: (M, 2) float32 positions in the first and in the second
-            image, matched row by row; centre of the first pixel (0, 0). Those of the first image
-            are keypoints of it; those of the second are, too, except where a fundamental matrix
-            guided.
+            image, matched row by row; centre of the first pixel (0, 0). Both are keypoints,
+            except where a fundamental matrix guided: then those of the first image are the pixels
+            of its keypoints, and those of the second where these pixels are seen.
         scores: (M,) float32 in [0, 1], higher is better. Guided by a homography, 1 - the
             dissimilarity of the two patches (0: only just more similar than unrelated patches); by
             a fundamental matrix, their correlation; else 1 - Lowe's ratio.

@@ -59,8 +59,7 @@ class SelectionOptions:
             raise OptionError(f"the threshold must lie in [0, 1], not {self.threshold}")
         if self.density is not None and not 0 < self.density <= 1:
             raise OptionError(f"the density must lie in (0, 1], not {self.density}")
-        if self.max_keypoints is not None and self.max_keypoints < 1:
-            raise OptionError(f"`max_keypoints` must be at least 1, not {self.max_keypoints}")
+        check_max_keypoints(self.max_keypoints)
         if self.nms_radius is not None:
             if self.nms_radius < 0:
                 raise OptionError(f"`nms_radius` must be 0 or more pixels, not {self.nms_radius}")
@@ -73,10 +72,10 @@ class SelectionOptions:
             raise unknown_name("mode", self.mode, MODES)
         if self.spread not in SPREADS:
             raise unknown_name("spread", self.spread, SPREADS)
-        if self.mode == "points" and (self.density is not None or self.nms_radius is not None):
+        if self.mode == "points" and self._has_dense_options:
             raise OptionError(
-                "`density` and `nms_radius` belong to dense keypoints: leave them out, or use "
-                "mode='dense'"
+                "threshold, density, `nms_radius` and `subpixel` belong to dense keypoints: leave "
+                "them out, or use mode='dense'"
             )
         if self.spread != "none" and not (self.uses_points and self.max_keypoints is not None):
             raise OptionError(
@@ -86,14 +85,19 @@ class SelectionOptions:
     @property
     def uses_points(self) -> bool:
         """Whether keypoints of all scales are wanted instead of pixels of the heat map."""
-        dense = (
-            self.max_keypoints is None
-            or self.density is not None
+        if self.mode != "auto":
+            return self.mode == "points"
+        return self.max_keypoints is not None and not self._has_dense_options
+
+    @property
+    def _has_dense_options(self) -> bool:
+        """Whether an option of dense keypoints differs from its default."""
+        return (
+            self.density is not None
             or self.nms_radius is not None
             or self.subpixel is not None
             or self.threshold != SelectionOptions.threshold
         )
-        return self.mode == "points" or (self.mode == "auto" and not dense)
 
     @property
     def suppression_radius(self) -> int:
@@ -163,6 +167,12 @@ def select_keypoints(
         xy += np.stack([_peak_offset(ranking, row, column, axis) for axis in (1, 0)], 1)
     found = None if logits is None else ranks[pixels]
     return Keypoints(xy, heatmap.ravel()[pixels], (width, height), found)
+
+
+def check_max_keypoints(count: int | None) -> None:
+    """Raise an OptionError where a largest number of keypoints is no whole number above 0."""
+    if count is not None and (count < 1 or count != int(count)):
+        raise OptionError(f"`max_keypoints` must be a whole number from 1 on, not {count}")
 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

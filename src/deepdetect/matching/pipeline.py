@@ -244,10 +244,18 @@ def unguided_matches(
 
 
 def _describe(gray: np.ndarray, keypoints: Keypoints, options: MatchingOptions) -> np.ndarray:
-    """Return descriptors at the keypoints' own sizes and angles, or at those of the options."""
-    if keypoints.sizes is None or keypoints.angles is None:
+    """Return descriptors at the keypoints' own sizes and angles, or at those of the options.
+
+    Another size or angle than the default, or another descriptor, is for all keypoints.
+    """
+    default = MatchingOptions()
+    alike = (options.keypoint_size, options.angle) != (default.keypoint_size, default.angle)
+    own = keypoints.sizes is not None and keypoints.angles is not None
+    if alike or not own or options.descriptor not in ("sift", "rootsift"):
         describe = get_descriptor(options.descriptor)
         return describe(gray, keypoints.xy, options.keypoint_size, options.angle)
+    assert keypoints.sizes is not None
+    assert keypoints.angles is not None
     found = scaled_sift_descriptors(gray, keypoints.xy, keypoints.sizes, keypoints.angles)
     return to_root_sift(found, True) if options.descriptor == "rootsift" else found
 

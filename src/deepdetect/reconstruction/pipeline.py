@@ -95,8 +95,8 @@ def reconstruct(
     max_keypoints: int | None = None,
     nms_radius: int | None = None,
     ignore: np.ndarray | None = None,
-    mode: Literal["auto", "dense", "points"] | None = None,
-    spread: Literal["none", "grid", "anms"] | None = None,
+    mode: Literal[auto, dense, points] | None = None,
+    spread: Literal[none, grid, anms] | None = None,
     disparity: DisparityOptions | None = None,
     two_view: TwoViewOptions | None = None,
     point_filter: PointFilterOptions | None = None,
@@ -286,8 +286,9 @@ def _reconstruct_general(pair: _Pair) -> Reconstruction:
     image, options, timer = pair.images[0], pair.options, pair.timer
     # Matches are refined from whole pixels of the left image. Suppression would leave few pixels
     # that are keypoints in both images.
-    radius = options.selection.nms_radius or 0
-    selection = replace(options.selection, subpixel=False, nms_radius=radius)
+    selection = options.selection
+    if not selection.uses_points:
+        selection = replace(selection, subpixel=False, nms_radius=selection.nms_radius or 0)
     with timer.stage("keypoints and matching"):
         found = match_images(
             *pair.images,

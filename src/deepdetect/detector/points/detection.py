@@ -9,11 +9,16 @@ import numpy as np
 from ..._shared.errors import OptionError, unknown_name
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
-from ...features.selection import SPREADS, check_ignore
+from ...features.selection import SPREADS, check_ignore, check_max_keypoints
 from ...features.sift_detector import spread_over_grid
 from ...features.suppression import spread_by_distance, suppress_neighbors
 from .candidate_features import describe_candidates
-from .hessian_scales import ScaleSpaceOptions, build_scale_space, find_candidates
+from .hessian_scales import (
+    ScaleSpaceOptions,
+    build_scale_space,
+    check_memory,
+    find_candidates,
+)
 from .ranker import Ranker, load_ranker
 
 
@@ -23,8 +28,9 @@ class PointOptions:
 
     Attributes:
         max_keypoints: at most this many; None: all.
-        candidates_per_keypoint, min_candidates: with `max_keypoints`, so many times as many
-            candidates are ranked, but at least so many: those with the strongest response.
+        candidates_per_keypoint, min_candidates: with `max_keypoints` and without `spread`, so
+            many times as many candidates are ranked, but at least so many: those with the
+            strongest response.
         spread: "none": the best; "grid": in turn the best of each cell of a grid; "anms": the
             best, at least so far from each other that there are just enough (adaptive
             non-maximal suppression).
@@ -48,8 +54,7 @@ class PointOptions:
     scales: ScaleSpaceOptions = field(default_factory=ScaleSpaceOptions)
 
     def __post_init__(self) -> None:
-        if self.max_keypoints is not None and self.max_keypoints < 1:
-            raise OptionError(f"`max_keypoints` must be at least 1, not {self.max_keypoints}")
+        check_max_keypoints(self.max_keypoints)
         if self.spread not in SPREADS:
             raise unknown_name("spread", self.spread, SPREADS)
         if self.spread != "none" and self.max_keypoints is None:
@@ -83,12 +88,16 @@ def detect_points(
         angles in degrees, best first; their logits rank them, and their scores are the logits'
         sigmoid.
 
+    Raises:
+        OptionError: the mask does not fit, or the image is too large for the memory.
+
     Example:
         >>> gray = np.zeros((64, 64), np.uint8)
         >>> gray[20:40, 24:44] = 255
         >>> len(detect_points(gray, PointOptions(max_keypoints=4)))
         4
     """
+    check_memory(gray.shape, options.scales)
     space = build_scale_space(gray, options.scales)
     candidates = find_candidates(space)
     size = (gray.shape[1], gray.shape[0])
@@ -100,7 +109,8 @@ def detect_points(
     if ignore is not None:
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted]
-    if options.max_keypoints is not None:
+    # The strongest alone would leave nothing to spread over dim regions.
+    if options.max_keypoints is not None and options.spread == "none":
         most = max(options.candidates_per_keypoint * options.max_keypoints, options.min_candidates)
         rows = rows[np.argsort(-strength[rows], kind="stable")[:most]]
     logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates, rows))

@@ -8,13 +8,16 @@ import cv2
 import numpy as np
 
 from ..._shared.errors import OptionError
-from ..._shared.parallel import parallel_for
+from ..._shared.parallel import available_memory, parallel_for
 
 NMS_RADIUS = 2
 """A candidate is the maximum of a window of 5x5 in its level."""
 
 LEAST_RESPONSE = 1e-8
 """Of a candidate, in an image with values in [0, 1]: less is rounding."""
+
+BYTES_PER_PIXEL_AND_LEVEL = 24
+"""Five maps of float32, and room for what is made of them."""
 
 MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined position is still the one that it was found at."""
@@ -99,6 +102,20 @@ class Candidates:
         """Return some of them, by a mask or by rows."""
         parts = (self.level, self.row, self.column, self.xy, self.sigma_px)
         return Candidates(*(part[rows] for part in parts))
+
+
+def check_memory(shape: tuple[int, ...], options: ScaleSpaceOptions = ScaleSpaceOptions()) -> None:
+    """Stop before a scale space fills the memory.
+
+    Raises:
+        OptionError: it would.
+    """
+    needed = shape[0] * shape[1] * BYTES_PER_PIXEL_AND_LEVEL * len(options.sigmas_px)
+    if needed > available_memory():
+        raise OptionError(
+            f"points of an image of {shape[1]}x{shape[0]} pixels need about {needed / 1e9:.0f} GB "
+            "of memory: use `resolution='auto'`, or a smaller image"
+        )
 
 
 def build_scale_space(

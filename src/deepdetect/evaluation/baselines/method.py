@@ -12,7 +12,6 @@ import numpy as np
 from ..._shared.errors import DeepDetectError, OptionError
 from ...detector.detector import DeepDetect, find_keypoints
 from ...detector.points.detection import PointOptions
-from ...detector.points.ranker import WEIGHTS as RANKER
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
 from ...features.selection import SelectionOptions
@@ -173,7 +172,7 @@ def deepdetect_feature(
 def points_feature(detector: DeepDetect) -> LocalFeature:
     """Make a local feature of the ranked keypoints of all scales."""
     selection = SelectionOptions(mode="points")
-    digest = hashlib.sha256(RANKER.read_bytes()).hexdigest()[:16]
+    digest = hashlib.sha256(detector.ranker.read_bytes()).hexdigest()[:16]
     return LocalFeature(
         "deepdetect-points",
         "DeepDetect, points",

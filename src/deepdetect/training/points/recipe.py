@@ -66,17 +66,31 @@ class PointsTrainingOptions:
             raise OptionError(
                 "steps, pairs, max_candidates and hidden must be 1 or more, the side 64 or more"
             )
+        if min(self.temperature, self.sharpness, self.learning_rate, self.max_gradient_norm) <= 0:
+            raise OptionError(
+                "temperature, sharpness, learning_rate and max_gradient_norm must be above 0"
+            )
+        if min(self.warm_up, self.weight_decay) < 0 or not 0 <= self.average_decay < 1:
+            raise OptionError(
+                "warm_up and weight_decay must not be negative, average_decay must lie in [0, 1)"
+            )
         if not 0 < self.min_density <= self.max_density:
             raise OptionError("the densities must be above 0, the lowest first")
         if not 0 <= self.close_share <= 1 or self.match_weight < 0:
             raise OptionError("close_share must lie in [0, 1], match_weight must not be negative")
-        if len(self.kind_weights) != len(KINDS) or min(self.kind_weights) < 0:
+        if len(self.kind_weights) != len(KINDS) or not (
+            min(self.kind_weights) >= 0 < sum(self.kind_weights)
+        ):
             raise OptionError(f"`kind_weights` needs a number for each of {', '.join(KINDS)}")
 
     def learning_rate_at(self, step: int) -> float:
         """Return the learning rate of a step: a linear warm-up into cosine annealing."""
         cosine = (1 + math.cos(math.pi * step / self.steps)) / 2
-        return self.learning_rate * (0.02 + 0.98 * cosine) * min(1.0, (step + 1) / self.warm_up)
+        return (
+            self.learning_rate
+            * (0.02 + 0.98 * cosine)
+            * min(1.0, (step + 1) / max(self.warm_up, 1))
+        )
 
     def to_json(self) -> str:
         """Return all options as one line of JSON."""
