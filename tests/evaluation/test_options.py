@@ -65,6 +65,7 @@ def test_the_rows_of_the_standard_protocol(options: BenchmarkOptions) -> None:
         *("harris-maxima-common", "shi-tomasi-eigenvalue-common"),
         *("hessian-common", "hessian-scales-common", "sift-own", "orb-many-own"),
         *("sift-own-scale", "hessian-own-scale", "hessian-scales-own-scale"),
+        *("deepdetect-points-common", "deepdetect-points-own-scale"),
         *("deepdetect-sparse", "deepdetect-native-common"),
         *("random-native-common", "all-pixels-common"),
     ]

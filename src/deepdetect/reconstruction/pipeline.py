@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -120,8 +120,8 @@ def reconstruct(
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         rectified: whether matches lie on the same row of both images. None: detected.
         threshold, density, max_keypoints, nms_radius, ignore, mode, spread: which pixels or points
-            become keypoints (`SelectionOptions`). A density of 1 takes every pixel, and `DENSE` disparities. Without
-            `nms_radius`, pairs that are not rectified are matched without suppression.
+            become keypoints (`SelectionOptions`). A density of 1 takes every pixel, and `DENSE`
+            disparities. Without `nms_radius`, pairs that are not rectified are matched without suppression.
         disparity, two_view, point_filter, seed: as of `ReconstructionOptions`.
         options: all options at once.
         progress: called with the name of each stage when it ends.

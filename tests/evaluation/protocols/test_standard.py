@@ -201,7 +201,7 @@ def report(low_visibility_folder: Path, edge_detector: DeepDetect, tmp_path_fact
 
 def test_all_tables_of_the_section_have_all_methods(report: Report) -> None:
     titles = [
-        *("FAST", "Never works", "DeepDetect, native resolution, suppression 3x3, sub-pixel"),
+        *("FAST", "Never works", "DeepDetect, pixels by logits, suppression 3x3, sub-pixel"),
         "DeepDetect, native resolution, all pixels over 0.5",
     ]
     tables = {table.key: table for table in report.tables()}
@@ -212,7 +212,7 @@ def test_all_tables_of_the_section_have_all_methods(report: Report) -> None:
     ]
     for table in tables.values():
         rows = [row[0] for row in table.rows]
-        assert len(rows) == 6
+        assert len(rows) == 8
         assert [title for title in titles if title in rows] == titles
     heads = [c.title for c in tables["low_visibility_repeatability_1px"].columns]
     assert len(heads) == len(set(heads)) == 2 + 3 * len(BUDGETS) + 2
@@ -265,6 +265,6 @@ def test_baselines_are_worth_what_chance_is(report: Report) -> None:
     assert every["all: chance-corrected"] is None, "nothing can be distinguished from chance"
     assert every["keypoints of all"] == 80 * 64
     # Of smoky's two images the random points differ; dusty's are one image twice.
-    own = rows["DeepDetect, native resolution, suppression 3x3, sub-pixel"]
+    own = rows["DeepDetect, pixels by logits, suppression 3x3, sub-pixel"]
     assert own["512: chance-corrected"] is None or own["512: chance-corrected"] > 0.3
     assert own["all"] > own["all: chance"]

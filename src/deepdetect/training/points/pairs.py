@@ -101,8 +101,6 @@ def _correspondences(
     valid: np.ndarray,
     similarity: np.ndarray | None,
 ) -> Correspondences:
-    from scipy.spatial import KDTree
-
     visible = np.zeros(len(here), bool)
     none = np.zeros(0, np.int64)
     if not len(here) or not len(there):
@@ -118,14 +116,14 @@ def _correspondences(
     visible[rows] = True
     if not len(rows):
         return Correspondences(none, none, np.zeros(0), visible, np.zeros(0, bool))
-    found = KDTree(mapped[rows]).sparse_distance_matrix(
-        KDTree(there), REACH_PX, output_type="coo_matrix"
-    )
-    first, second = rows[found.row], found.col.astype(np.int64)
+    # A few thousand candidates: all distances are quicker than a tree, and need no package.
+    squared = np.square(mapped[rows, :1] - there[:, 0]) + np.square(mapped[rows, 1:] - there[:, 1])
+    near, second = np.nonzero(squared < REACH_PX**2)
+    first, distance = rows[near], np.sqrt(squared[near, second])
     matchable = np.ones(len(first), bool)
     if similarity is not None:
         others = similarity.copy()
         others[first, second] = -1  # several candidates near the place may match as well
         distance = np.sqrt(np.maximum(0, 2 - 2 * similarity[first, second]))
         matchable = distance < RATIO * np.sqrt(np.maximum(0, 2 - 2 * others.max(1)))[first]
-    return Correspondences(first, second, found.data, visible, matchable)
+    return Correspondences(first, second, distance, visible, matchable)

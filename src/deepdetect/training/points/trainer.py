@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import hashlib
 import math
 import time
 from collections.abc import Sequence
@@ -94,6 +95,10 @@ class PointsTrainer:
     ) -> None:
         self.options, self.folder, self.quiet = options, folder, quiet
         self.measure_every, self.save_every, self.workers = measure_every, save_every, workers
+        if min(measure_every, save_every, pairs_per_kind) < 1 or workers < 0:
+            raise OptionError(
+                "measure_every, save_every and pairs_per_kind must be 1 or more, workers 0 or more"
+            )
         self.files = find_images(photos)
         self.pairs = validation_pairs(validation, pairs_per_kind)
         torch.manual_seed(options.seed)
@@ -104,7 +109,14 @@ class PointsTrainer:
             self.ranker.parameters(), options.learning_rate, weight_decay=options.weight_decay
         )
         self.state = PointsState()
-        self.run = {"options": options.to_json(), "photographs": len(self.files)}
+        self.run = {
+            "options": options.to_json(),
+            "photographs": len(self.files),
+            "photographs_digest": _digest(self.files, photos),
+            "validation_digest": _digest(find_images(validation), validation),
+            "pairs_per_kind": pairs_per_kind,
+            "measure_every": measure_every,
+        }
         folder.mkdir(parents=True, exist_ok=True)
         self._resume()
 
@@ -211,7 +223,11 @@ class PointsTrainer:
         best = found.score > state.best_score
         if best:
             state.best_score = found.score
-            notes = {**self.run, **provenance(), "point": row}
+            notes = {
+                **self.run,
+                **provenance(),
+                "point": {name: v for name, v in row.items() if name != "cpu_seconds"},
+            }
             save_ranker(self.average.export(notes), self.folder / BEST)
         self._write_card()
         save_curves(state.points, self.folder)
@@ -253,6 +269,12 @@ class PointsTrainer:
             self.state = PointsState(**{name: found.metadata[name] for name in names})
         except KeyError as error:
             raise found.unfit(f"{error} is missing") from None
+
+
+def _digest(files: Sequence[Path], folder: Path) -> str:
+    """Return a digest of the names and sizes of files."""
+    lines = [f"{file.relative_to(folder).as_posix()} {file.stat().st_size}" for file in files]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
 def _early(number: int) -> PairIndex:
