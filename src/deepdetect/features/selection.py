@@ -19,6 +19,12 @@ MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined keypoint is still the one that it was found at."""
 
 
+def check_max_keypoints(count: int | None) -> None:
+    """Raise an OptionError where a largest number of keypoints is no whole number above 0."""
+    if count is not None and (count < 1 or count != int(count)):
+        raise OptionError(f"`max_keypoints` must be a whole number from 1 on, not {count}")
+
+
 @dataclass(frozen=True, eq=False)
 class SelectionOptions:
     """Which pixels of a heat map become keypoints.
@@ -167,12 +173,6 @@ def select_keypoints(
         xy += np.stack([_peak_offset(ranking, row, column, axis) for axis in (1, 0)], 1)
     found = None if logits is None else ranks[pixels]
     return Keypoints(xy, heatmap.ravel()[pixels], (width, height), found)
-
-
-def check_max_keypoints(count: int | None) -> None:
-    """Raise an OptionError where a largest number of keypoints is no whole number above 0."""
-    if count is not None and (count < 1 or count != int(count)):
-        raise OptionError(f"`max_keypoints` must be a whole number from 1 on, not {count}")
 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -95,8 +95,8 @@ def reconstruct(
     max_keypoints: int | None = None,
     nms_radius: int | None = None,
     ignore: np.ndarray | None = None,
-    mode: Literal[auto, dense, points] | None = None,
-    spread: Literal[none, grid, anms] | None = None,
+    mode: Literal["auto", "dense", "points"] | None = None,
+    spread: Literal["none", "grid", "anms"] | None = None,
     disparity: DisparityOptions | None = None,
     two_view: TwoViewOptions | None = None,
     point_filter: PointFilterOptions | None = None,
@@ -121,7 +121,8 @@ def reconstruct(
         rectified: whether matches lie on the same row of both images. None: detected.
         threshold, density, max_keypoints, nms_radius, ignore, mode, spread: which pixels or points
             become keypoints (`SelectionOptions`). A density of 1 takes every pixel, and `DENSE`
-            disparities. Without `nms_radius`, pairs that are not rectified are matched without suppression.
+            disparities. Without `nms_radius`, pairs that are not rectified are matched without
+            suppression.
         disparity, two_view, point_filter, seed: as of `ReconstructionOptions`.
         options: all options at once.
         progress: called with the name of each stage when it ends.
