@@ -70,7 +70,7 @@ def test_training_brings_repeated_candidates_to_the_top() -> None:
     assert before > -0.6
     assert loss.item() < -0.7
     best = torch.argsort(ranker.logits, descending=True)[:20]
-    assert (best < REPEATED).all()
+    assert (best < REPEATED).float().mean() >= 0.7  # .5 by chance
 
 
 def test_the_loss_does_not_see_the_scale_of_the_logits() -> None:

@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError
-from ...detector.detector import DeepDetect, find_keypoints
+from ...detector.detector import DeepDetect, find_keypoints, find_points
+from ...detector.heatmap import HeatmapOptions
 from ...detector.points.detection import PointOptions
+from ...detector.points.ranker import WEIGHTS as RANKER
+from ...detector.points.ranker import load_ranker
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
 from ...features.selection import SelectionOptions
@@ -170,15 +173,16 @@ def deepdetect_feature(
 
 
 def points_feature(detector: DeepDetect) -> LocalFeature:
-    """Make a local feature of the ranked keypoints of all scales."""
-    selection = SelectionOptions(mode="points")
-    digest = hashlib.sha256(detector.ranker.read_bytes()).hexdigest()[:16]
+    """Make a local feature of the ranked keypoints of all scales, at the image's own size."""
+    selection, native = SelectionOptions(mode="points"), HeatmapOptions("native")
+    path = getattr(detector, "ranker", RANKER)  # a detector from outside the package has none
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
     return LocalFeature(
         "deepdetect-points",
         "DeepDetect, points",
-        lambda rgb: find_keypoints(detector, rgb, selection),
+        lambda rgb: find_points(rgb, selection, native, load_ranker(path)),
         PAPER_DESCRIPTOR.describe,
-        version=f"{digest} {detector.heatmap_options.resolution} {PointOptions()}",
+        version=f"{digest} {PointOptions()}",
         own_scale=OwnScaleDescriptor(),
     )
 

@@ -124,6 +124,6 @@ def _correspondences(
     if similarity is not None:
         others = similarity.copy()
         others[first, second] = -1  # several candidates near the place may match as well
-        distance = np.sqrt(np.maximum(0, 2 - 2 * similarity[first, second]))
-        matchable = distance < RATIO * np.sqrt(np.maximum(0, 2 - 2 * others.max(1)))[first]
+        unlike = np.sqrt(np.maximum(0, 2 - 2 * similarity[first, second]))
+        matchable = unlike < RATIO * np.sqrt(np.maximum(0, 2 - 2 * others.max(1)))[first]
     return Correspondences(first, second, distance, visible, matchable)
