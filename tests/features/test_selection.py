@@ -218,7 +218,7 @@ def test_an_ignore_mask_of_another_size(shape: tuple[int, ...]) -> None:
         ({"density": 0}, "density must lie in (0, 1], not 0"),
         ({"density": 1.5}, "density must lie in (0, 1], not 1.5"),
         ({"density": float("nan")}, "density must lie in (0, 1], not nan"),
-        ({"max_keypoints": 0}, "`max_keypoints` must be at least 1, not 0"),
+        ({"max_keypoints": 0}, "`max_keypoints` must be a whole number from 1 on, not 0"),
         ({"nms_radius": -1}, "`nms_radius` must be 0 or more pixels, not -1"),
     ],
 )

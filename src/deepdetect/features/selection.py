@@ -21,7 +21,7 @@ MAX_OFFSET_PX = 0.499
 
 def check_max_keypoints(count: int | None) -> None:
     """Raise an OptionError where a largest number of keypoints is no whole number above 0."""
-    if count is not None and (count < 1 or count != int(count)):
+    if count is not None and not (count >= 1 and count % 1 == 0):
         raise OptionError(f"`max_keypoints` must be a whole number from 1 on, not {count}")
 
 

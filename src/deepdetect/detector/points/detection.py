@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..._shared.errors import OptionError, unknown_name
+from ..._shared.options import check_ranges
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
 from ...features.selection import SPREADS, check_ignore, check_max_keypoints
@@ -59,10 +61,15 @@ class PointOptions:
             raise unknown_name("spread", self.spread, SPREADS)
         if self.spread != "none" and self.max_keypoints is None:
             raise OptionError(f"`spread={self.spread!r}` needs `max_keypoints`: how many to spread")
-        if self.candidates_per_keypoint < 1 or self.min_candidates < 1:
-            raise OptionError("`candidates_per_keypoint` and `min_candidates` must be 1 or more")
-        if self.grid_cells < 1 or not self.distance_px > 0 or not self.size_per_sigma > 0:
-            raise OptionError("`grid_cells`, `distance_px` and `size_per_sigma` must be positive")
+        check_ranges(
+            self,
+            positive=("distance_px", "size_per_sigma"),
+            between={
+                "candidates_per_keypoint": (1, math.inf),
+                "min_candidates": (1, math.inf),
+                "grid_cells": (1, math.inf),
+            },
+        )
 
 
 def detect_points(

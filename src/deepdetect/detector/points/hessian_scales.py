@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..._shared.options import check_ranges
 from ..._shared.parallel import available_memory, parallel_for
 
 NMS_RADIUS = 2
 """A candidate is the maximum of a window of 5x5 in its level."""
+
+MIN_SIGMA_PX = 0.5
+"""Of the finest level."""
 
 LEAST_RESPONSE = 1e-8
 """Of a candidate, in an image with values in [0, 1]: less is rounding."""
@@ -42,10 +47,18 @@ class ScaleSpaceOptions:
     levels: int = 7
 
     def __post_init__(self) -> None:
-        if not self.first_sigma_px / self.ratio >= 0.5 or self.ratio <= 1 or self.levels < 1:
+        check_ranges(
+            self,
+            between={
+                "ratio": (1.01, 4),
+                "first_sigma_px": (0.5, math.inf),
+                "levels": (1, math.inf),
+            },
+        )
+        if self.first_sigma_px / self.ratio < MIN_SIGMA_PX:
             raise OptionError(
-                "a scale space needs a level or more, a ratio above 1 and a first sigma of at "
-                "least half a pixel times the ratio"
+                f"`first_sigma_px` must be at least {MIN_SIGMA_PX} pixels times the ratio, not "
+                f"{self.first_sigma_px}"
             )
 
     @property

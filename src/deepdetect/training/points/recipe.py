@@ -8,6 +8,7 @@ import math
 from dataclasses import dataclass
 
 from ..._shared.errors import OptionError
+from ..._shared.options import check_ranges
 from .views import KINDS
 
 
@@ -62,22 +63,25 @@ class PointsTrainingOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.pairs, self.max_candidates, *self.hidden) < 1 or self.side < 64:
-            raise OptionError(
-                "steps, pairs, max_candidates and hidden must be 1 or more, the side 64 or more"
-            )
-        if min(self.temperature, self.sharpness, self.learning_rate, self.max_gradient_norm) <= 0:
-            raise OptionError(
-                "temperature, sharpness, learning_rate and max_gradient_norm must be above 0"
-            )
-        if min(self.warm_up, self.weight_decay) < 0 or not 0 <= self.average_decay < 1:
-            raise OptionError(
-                "warm_up and weight_decay must not be negative, average_decay must lie in [0, 1)"
-            )
-        if not 0 < self.min_density <= self.max_density:
-            raise OptionError("the densities must be above 0, the lowest first")
-        if not 0 <= self.close_share <= 1 or self.match_weight < 0:
-            raise OptionError("close_share must lie in [0, 1], match_weight must not be negative")
+        check_ranges(
+            self,
+            positive=(
+                *("learning_rate", "max_gradient_norm", "sharpness", "temperature"),
+                *("min_density", "max_density"),
+            ),
+            not_negative=("warm_up", "weight_decay", "match_weight", "seed"),
+            fractions=("close_share",),
+            between={
+                "steps": (1, math.inf),
+                "pairs": (1, math.inf),
+                "max_candidates": (1, math.inf),
+                "hidden": (1, math.inf),
+                "side": (64, math.inf),
+                "average_decay": (0, 0.999999),
+            },
+        )
+        if self.min_density > self.max_density:
+            raise OptionError("`min_density` must not be above `max_density`")
         if len(self.kind_weights) != len(KINDS) or not (
             min(self.kind_weights) >= 0 < sum(self.kind_weights)
         ):
