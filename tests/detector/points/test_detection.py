@@ -111,7 +111,7 @@ def test_the_strongest_candidates_are_enough(gray) -> None:
     ("change", "message"),
     [
         ({"max_keypoints": 0}, "max_keypoints"),
-        ({"spread": "girds", "max_keypoints": 5}, "grid"),
+        ({"spread": "grid2", "max_keypoints": 5}, "grid"),
         ({"spread": "anms"}, "how many"),
         ({"distance_px": 0}, "distance_px"),
         ({"candidates_per_keypoint": 0}, "candidates_per_keypoint"),
