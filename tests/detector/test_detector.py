@@ -21,6 +21,7 @@ from deepdetect import (
 )
 from deepdetect._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
 from deepdetect.detector.points.detection import PointOptions, detect_points
+from deepdetect.detector.points.ranker import load_ranker
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.io.image import luma
 
@@ -184,6 +185,22 @@ def test_a_number_of_keypoints_asks_for_points(detector: DeepDetect, image: np.n
     for options in ({"threshold": 0.6}, {"nms_radius": 1}, {"density": 0.1}, {"mode": "dense"}):
         assert detector.detect(image, max_keypoints=50, **options).sizes is None
     assert detector.detect(image).sizes is None  # dense stays the default
+
+
+def test_a_ranker_of_ones_own_ranks(image: np.ndarray, tmp_path: Path) -> None:
+    ranker = load_ranker()
+    layers = [(np.zeros_like(weight), np.zeros_like(bias)) for weight, bias in ranker.layers]
+    values = {f"weight{k}": weight for k, (weight, _) in enumerate(layers)}
+    values |= {f"bias{k}": bias for k, (_, bias) in enumerate(layers)}
+    path = tmp_path / "own.npz"
+    np.savez(path, mean=ranker.mean, deviation=ranker.deviation, notes="{}", **values)
+    own = DeepDetect(backend="onnxruntime", ranker=path)
+    found, bundled = (one.detect(image, max_keypoints=40) for one in (own, DeepDetect()))
+    assert not np.array_equal(found.xy, bundled.xy)
+    # Nothing is added to the first feature: the logarithm of |det Hessian|.
+    assert found.logits.max() <= 3
+    with pytest.raises(WeightsError, match=r"none\.npz"):
+        DeepDetect(ranker=tmp_path / "none.npz")
 
 
 def test_points_need_no_network(

@@ -408,6 +408,22 @@ def test_points_are_matched_at_their_sub_pixel_positions(photo: np.ndarray, guid
     assert np.median(gaps) < 0.1
 
 
+def test_a_size_for_all_keypoints_is_for_points_too(photo: np.ndarray) -> None:
+    settings = {"max_keypoints": 200, "guided": False, "ratio": 0.85, "mutual": True}
+    turned = np.ascontiguousarray(np.rot90(photo))
+    own = match_images(photo, turned, **settings)
+    upright = match_images(photo, turned, keypoint_size=4.0, **settings)
+    assert len(own) > 3 * len(upright)
+
+
+def test_only_our_detector_has_points(photo: np.ndarray) -> None:
+    for options in ({"mode": "points"}, {"max_keypoints": 50, "spread": "grid"}):
+        with pytest.raises(OptionError, match="only a DeepDetect detector has points"):
+            match_images(photo, photo, Corners(), **options)
+    found = match_images(photo, photo, Corners(), max_keypoints=50)
+    assert found.keypoints0.sizes is None
+
+
 def test_points_of_a_turned_image_match_by_their_angles(photo: np.ndarray) -> None:
     turned = np.ascontiguousarray(np.rot90(photo))
     found = match_images(photo, turned, max_keypoints=300, guided=False, ratio=0.85, mutual=True)

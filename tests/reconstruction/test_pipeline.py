@@ -552,3 +552,27 @@ def test_the_values_are_plain_and_complete(found: Any, posed: Any) -> None:
         )
         assert "true scale is not known" in values["scale"]
     assert values["pose"]["rotation"] == posed.pose.rotation.tolist()
+
+
+@pytest.mark.parametrize(
+    "options", [{"max_keypoints": 1500}, {"max_keypoints": 1500, "spread": "grid"}]
+)
+def test_points_of_a_rectified_pair_are_reconstructed(cones: Any, options: dict[str, Any]) -> None:
+    made = reconstruct(cones.left, cones.right, focal_px=500, rectified=True, **options)
+    assert 400 < len(made) <= 1500  # margins of depth edges and lonely points are left out
+    np.testing.assert_array_equal(made.pixels, np.rint(made.pixels))
+    assert shares(made, cones, 2)[0] > 0.95
+
+
+@pytest.mark.parametrize("spread", ["none", "anms"])
+def test_points_of_a_pair_that_is_not_rectified_are_reconstructed(turned: Any, spread: str) -> None:
+    made = reconstruct(
+        *(turned.left, turned.right),
+        calibration=turned.calibration,
+        rectified=False,
+        max_keypoints=1500,
+        spread=spread,
+    )
+    assert not made.rectified
+    assert 500 < len(made) <= 1500
+    assert np.median(made.reprojection_errors) < 1

@@ -80,6 +80,19 @@ def test_spread_points_cover_more_of_the_image(gray, spread) -> None:
     assert cells[1] > cells[0]
 
 
+@pytest.mark.parametrize("spread", ["grid", "anms"])
+def test_dim_regions_get_their_share_of_spread_points(spread) -> None:
+    """Also where the strongest candidates of an image all lie elsewhere."""
+    noise = np.random.default_rng(5).standard_normal((600, 800))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    contrast = np.where(np.arange(800) < 400, 8, 80) / smooth.std() / 3
+    shaded = np.uint8(np.clip(128 + smooth * contrast, 0, 255))
+    found = detect_points(
+        shaded, PointOptions(max_keypoints=200, spread=spread, min_candidates=100)
+    )
+    assert np.mean(found.xy[:, 0] < 400) > 0.3
+
+
 def test_no_point_is_where_the_mask_is_true(gray) -> None:
     ignore = np.zeros(gray.shape, bool)
     ignore[:, :160] = True
