@@ -1,1 +1,1 @@
-"""Training of the head that ranks keypoints, on pairs of views of photographs."""
+"""Training of the ranker of keypoints, on pairs of views of photographs."""

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..._shared.errors import OptionError
 from ...detector.detector import DeepDetect
 from ...detector.points.detection import PointOptions, detect_points
 from ...detector.points.ranker import Ranker
@@ -175,10 +174,3 @@ def rivals() -> dict[str, Detect]:
         "Harris": lambda gray: STANDARD["harris"].detect(color(gray)),
         "DeepDetect": ours,
     }
-
-
-def check_pairs(pairs: Sequence[ViewPair]) -> None:
-    """Raise an OptionError where a kind is missing."""
-    missing = set(KINDS) - {pair.kind for pair in pairs}
-    if missing:
-        raise OptionError(f"there are no pairs of the kinds {', '.join(sorted(missing))}")
