@@ -8,13 +8,15 @@ DISTANCE_STEP_PX = 0.25
 """To which the distance of `spread_by_distance` is found."""
 
 
-def suppress_neighbors(xy: np.ndarray, scores: np.ndarray, radius_px: float) -> np.ndarray:
+def suppress_neighbors(
+    xy: np.ndarray, scores: np.ndarray, radius_px: float | np.ndarray
+) -> np.ndarray:
     """Go through points from the best to the worst; keep those that are not near a kept one.
 
     Args:
         xy: (N, 2) positions.
         scores: (N,), the higher the better; of equal scores the first row comes first.
-        radius_px: near is strictly closer.
+        radius_px: near is strictly closer; (N,) radii: than the smaller one of both points.
 
     Returns:
         (K,) rows that are kept, best first.
@@ -31,9 +33,11 @@ def suppress_neighbors(xy: np.ndarray, scores: np.ndarray, radius_px: float) -> 
         return order
     places = np.asarray(xy, np.float64).reshape(-1, 2)[order]
     places = places - places.min(0)
-    columns, rows = (int(side) + 1 for side in places.max(0) / radius_px)
+    radii = np.broadcast_to(np.asarray(radius_px, np.float64), len(order))[order]
+    cell = float(radii.min())
+    columns, rows = (int(side) + 1 for side in places.max(0) / cell)
     x, y = (np.ascontiguousarray(axis) for axis in places.T)
-    kept: np.ndarray = keep_distant(x, y, float(radius_px), columns, rows)
+    kept: np.ndarray = keep_distant(x, y, radii, cell, columns, rows)
     return order[kept]
 
 

@@ -46,6 +46,14 @@ def test_no_two_are_nearer_than_the_distance(gray) -> None:
         assert gaps.min() >= distance - 1e-3
 
 
+def test_large_ones_keep_more_distance(gray) -> None:
+    points = detect_points(gray, PointOptions(max_keypoints=400, distance_per_sigma=2.0))
+    sigmas = points.sizes / PointOptions().size_per_sigma
+    gaps = np.linalg.norm(points.xy[:, None] - points.xy, axis=2) + 1e9 * np.eye(len(points))
+    assert (gaps >= 2 * np.minimum(sigmas[:, None], sigmas) - 1e-3).all()
+    assert gaps.min() < 6  # small ones do not
+
+
 def test_positions_follow_a_shift_of_the_image(gray) -> None:
     first = detect_points(gray[:200, :280], PointOptions(max_keypoints=200)).xy
     second = detect_points(gray[7:207, 12:292], PointOptions(max_keypoints=200)).xy + (12, 7)
@@ -127,6 +135,7 @@ def test_the_strongest_candidates_are_enough(gray) -> None:
         ({"spread": "grid2", "max_keypoints": 5}, "grid"),
         ({"spread": "anms"}, "how many"),
         ({"distance_px": 0}, "distance_px"),
+        ({"distance_per_sigma": -1}, "distance_per_sigma"),
         ({"candidates_per_keypoint": 0}, "candidates_per_keypoint"),
     ],
 )

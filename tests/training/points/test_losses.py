@@ -42,7 +42,7 @@ def known_pair(distance_px: float = 0.3) -> CandidatePair:
     way = Correspondences(
         rows, rows, np.full(REPEATED, distance_px), np.ones(COUNT, bool), np.ones(REPEATED, bool)
     )
-    side = Side(grid, features)
+    side = Side(grid, np.ones(COUNT), features)
     return CandidatePair((side, side), (way, way), AREA)
 
 

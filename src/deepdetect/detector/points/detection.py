@@ -38,6 +38,8 @@ class PointOptions:
             non-maximal suppression).
         grid_cells: of "grid", along the longer side.
         distance_px: least distance of two keypoints, also of different scales.
+        distance_per_sigma: least distance of two keypoints over the smaller one's sigma, so that
+            one structure is not found several times at neighbouring scales.
         size_per_sigma: diameter of a keypoint, as descriptors take it, over the sigma of its
             scale.
         scales: of the scale space.
@@ -52,6 +54,7 @@ class PointOptions:
     spread: str = "none"
     grid_cells: int = 16
     distance_px: float = 2.0
+    distance_per_sigma: float = 1.0
     size_per_sigma: float = 2.5
     scales: ScaleSpaceOptions = field(default_factory=ScaleSpaceOptions)
 
@@ -64,12 +67,18 @@ class PointOptions:
         check_ranges(
             self,
             positive=("distance_px", "size_per_sigma"),
+            not_negative=("distance_per_sigma",),
             between={
                 "candidates_per_keypoint": (1, math.inf),
                 "min_candidates": (1, math.inf),
                 "grid_cells": (1, math.inf),
             },
         )
+
+    def least_distances(self, sigma_px: np.ndarray) -> np.ndarray:
+        """Return (N,) radii within which a keypoint drives out others of its size or larger."""
+        radii: np.ndarray = np.maximum(self.distance_px, self.distance_per_sigma * sigma_px)
+        return radii
 
 
 def detect_points(
@@ -122,7 +131,9 @@ def detect_points(
         rows = rows[np.argsort(-strength[rows], kind="stable")[:most]]
     logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates, rows))
     candidates = candidates[rows]
-    kept = suppress_neighbors(candidates.xy, logits, options.distance_px)
+    kept = suppress_neighbors(
+        candidates.xy, logits, options.least_distances(candidates.sigma_px)
+    )
     kept = kept[_choose(candidates.xy[kept], logits[kept], size, options)]
     decay = np.exp(-np.abs(logits[kept]))
     scores = np.where(logits[kept] >= 0, 1, decay) / (1 + decay)

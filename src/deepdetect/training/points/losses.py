@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...detector.points.detection import PointOptions
 from ...features.suppression import suppress_neighbors
 from .pairs import CandidatePair, Correspondences, Side
 from .recipe import PointsTrainingOptions
 
 CLOSE_PX, NEAR_PX = 1.0, 3.0
-DISTANCE_PX = 2.0
-"""Least distance of two keypoints, as at run time."""
+RUN_TIME = PointOptions()
+"""Keypoints keep their distance as at run time."""
 
 MIN_CHOICE = 0.1
 """Candidates that are chosen with less than this have and are no partners."""
@@ -84,7 +85,8 @@ def _choose(
     options: PointsTrainingOptions,
 ) -> Chosen:
     logits = ranker(torch.from_numpy(side.features))
-    kept = torch.from_numpy(suppress_neighbors(side.xy, logits.detach().numpy(), DISTANCE_PX))
+    radii = RUN_TIME.least_distances(side.sigma_px)
+    kept = torch.from_numpy(suppress_neighbors(side.xy, logits.detach().numpy(), radii))
     fixed = logits[kept].detach()
     spread = fixed.std() if len(fixed) > 1 else fixed.new_ones(())
     scaled = (logits[kept] - fixed.mean()) * (options.sharpness / spread.clamp(min=MIN_SPREAD))

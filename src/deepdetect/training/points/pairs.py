@@ -22,10 +22,12 @@ class Side:
 
     Attributes:
         xy: (N, 2) float64 positions.
+        sigma_px: (N,) float64 of their scales.
         features: (N, F) float32.
     """
 
     xy: np.ndarray
+    sigma_px: np.ndarray
     features: np.ndarray
 
 
@@ -79,7 +81,7 @@ def candidate_pair(pair: ViewPair, max_candidates: int, with_descriptors: bool) 
         rows = np.flatnonzero(valid[candidates.row, candidates.column])
         strongest = np.argsort(-features[rows, 0], kind="stable")[:max_candidates]
         rows = rows[np.sort(strongest)]
-        sides.append(Side(candidates.xy[rows], features[rows]))
+        sides.append(Side(candidates.xy[rows], candidates.sigma_px[rows], features[rows]))
         if with_descriptors:
             xy = sides[-1].xy.astype(np.float32)
             found = root_sift_descriptors(image, xy, DESCRIPTOR_SIZE_PX).astype(np.float32)
