@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 PANORAMA = FieldOptions(
     "matching.stitching.panorama:stitch",
-    names=("scale", "max_canvas_megapixels", "registration_side", "seed"),
+    names=("scale", "max_canvas_megapixels", "registration_side", "max_keypoints", "seed"),
 )
 
 

@@ -6,15 +6,17 @@ it to `DESCRIPTORS`.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import cv2
 import numpy as np
 
+from .._shared.errors import OptionError
 from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
 from .dense_sift import MAX_SIZE_PX, MIN_SIZE_PX, dense_sift
-from .keypoints import on_pixels
+from .keypoints import Keypoints, on_pixels
 from .scale_space import LAYERS, nearest_layers
 
 MIN_DENSE_DENSITY = 0.02
@@ -98,6 +100,28 @@ def scaled_sift_descriptors(
     # Without precise upscaling octave -1 is a quarter of a pixel off.
     sift = cv2.SIFT_create(nOctaveLayers=LAYERS, enable_precise_upscale=True)
     return _compute(sift, gray, keypoints)
+
+
+def described_at_own_size(gray: np.ndarray, points: Keypoints) -> Keypoints:
+    """Return keypoints with RootSIFT descriptors at their own sizes and angles.
+
+    Args:
+        gray: (H, W) uint8 luma of the image that they are keypoints of.
+        points: keypoints with sizes and angles.
+
+    Raises:
+        OptionError: they have no sizes or angles.
+
+    Example:
+        >>> gray = np.random.default_rng(0).integers(0, 256, (64, 64)).astype(np.uint8)
+        >>> points = Keypoints([[30, 30]], [1], (64, 64), sizes=[5], angles=[90])
+        >>> described_at_own_size(gray, points).descriptors.shape
+        (1, 128)
+    """
+    if points.sizes is None or points.angles is None:
+        raise OptionError("these keypoints have no sizes and angles of their own: give them some")
+    found = scaled_sift_descriptors(gray, points.xy, points.sizes, points.angles)
+    return dataclasses.replace(points, descriptors=to_root_sift(found, overwrite=True))
 
 
 def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) -> np.ndarray:

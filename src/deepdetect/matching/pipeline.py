@@ -173,6 +173,7 @@ def match_images(
                 initial,
                 chosen.guided_options,
                 seeds,
+                (keypoints[0], keypoints[1]),
             )
         points0, points1, scores = _guided_points(guided_pair, keypoints, chosen.mutual)
     else:

@@ -189,7 +189,7 @@ def test_matches_that_are_there_already_are_not_made_again(
     other = warped(gray, MILD, (256, 256))
     expected = initial_geometry(gray, other)
     initial = initial_matches(gray, other)
-    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.detect_sift", None)
+    monkeypatch.setattr("deepdetect.matching.guided.sparse_matches.detect_sift", None)
     found = estimate_initial_geometry(initial)
     np.testing.assert_array_equal(found.matrix, expected.matrix)
 

@@ -131,9 +131,7 @@ def detect_points(
         rows = rows[np.argsort(-strength[rows], kind="stable")[:most]]
     logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates, rows))
     candidates = candidates[rows]
-    kept = suppress_neighbors(
-        candidates.xy, logits, options.least_distances(candidates.sigma_px)
-    )
+    kept = suppress_neighbors(candidates.xy, logits, options.least_distances(candidates.sigma_px))
     kept = kept[_choose(candidates.xy[kept], logits[kept], size, options)]
     decay = np.exp(-np.abs(logits[kept]))
     scores = np.where(logits[kept] >= 0, 1, decay) / (1 + decay)

@@ -1,27 +1,22 @@
-"""The initial geometry of a pair, from sparse SIFT matches, or that none can be trusted.
+"""The initial geometry of a pair, from sparse matches, or that none can be trusted.
 
 A look at small copies first, which is enough where the pair is clearly a plane; then plain SIFT on
 larger ones; simulated views (`asift`) only when that gives nothing. No DeepDetect keypoint takes
-part.
+part, but points of all scales, where the caller has matched them (`sparse_matches`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from ..._shared.errors import OptionError, unknown_name
-from ...features.keypoints import Keypoints
-from ...features.matchers import get_matcher, match_descriptors
-from ...features.sift_detector import detect_sift
 from ...geometry import GeometryOptions, estimate_geometry
 from ...geometry.acontrario import log10_nfa
 from ...geometry.model_selection import Parallax, measure_parallax
-from ...geometry.rescaling import downscale, scaled_fundamental, scaled_homography, scaled_points
+from ...geometry.rescaling import scaled_fundamental, scaled_homography, scaled_points
 from ...geometry.residuals import epipolar_errors, transfer_errors
 from ...geometry.semi_calibrated import (
     SemiCalibratedOptions,
@@ -31,10 +26,10 @@ from ...geometry.semi_calibrated import (
 from .along_lines import log10_chance, match_along_lines
 from .asift import simulated_views
 from .options import InitialGeometryOptions
+from .sparse_matches import InitialMatches, Points, initial_matches, match_features, separate
 
 MODELS = ("homography", "fundamental")
 
-Points = tuple[np.ndarray, np.ndarray]
 Size = tuple[int, int]
 
 
@@ -62,66 +57,6 @@ class InitialGeometry:
     num_views: int
     parallax: Parallax | None = None
     initial: InitialMatches | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class InitialMatches:
-    """Sparse matches of two images, before any geometry.
-
-    Attributes:
-        views: both images as uint8 luma, scaled down where they are large.
-        scales: of the views, at most 1.
-        features: SIFT keypoints of the views, with their descriptors.
-        matched: (M, 2) positions in both views.
-        ratios: (M,) of the ratio test.
-    """
-
-    views: tuple[np.ndarray, np.ndarray]
-    scales: tuple[float, float]
-    features: tuple[Keypoints, Keypoints]
-    matched: Points
-    ratios: np.ndarray
-
-    @property
-    def points0(self) -> np.ndarray:
-        """Matched positions in the first image at its own size, (M, 2) float64."""
-        return scaled_points(self.matched[0], 1 / self.scales[0])
-
-    @property
-    def points1(self) -> np.ndarray:
-        """Matched positions in the second image at its own size, (M, 2) float64."""
-        return scaled_points(self.matched[1], 1 / self.scales[1])
-
-
-def initial_matches(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    features: tuple[Keypoints, Keypoints] | None = None,
-    options: InitialGeometryOptions = InitialGeometryOptions(),
-) -> InitialMatches:
-    """Match sparse SIFT keypoints of two images, exactly, mutually and by the ratio test.
-
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        features: keypoints of both images, scaled down where they are large, with their
-            descriptors; None: they are detected.
-        options: how many keypoints, at which size, and the ratio.
-
-    Example:
-        >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
-        >>> found = initial_matches(image, image)
-        >>> bool((found.points0 == found.points1).all()), len(found.points0) > 10
-        (True, True)
-    """
-    view0, scale0 = downscale(gray0, options.max_side_px)
-    view1, scale1 = downscale(gray1, options.max_side_px)
-    if features is None:
-        with ThreadPoolExecutor(2) as pool:  # OpenCV's SIFT leaves a second processor idle
-            of_first = pool.submit(detect_sift, view0, options.sift)
-            of_second = detect_sift(view1, options.sift)
-            features = of_first.result(), of_second
-    points0, points1, ratios = _match(features[0], features[1], options)
-    return InitialMatches((view0, view1), (scale0, scale1), features, (points0, points1), ratios)
 
 
 def find_initial_geometry(
@@ -216,7 +151,7 @@ def geometry_of_seeds(
     )
     views = (width[0], height[0]), (width[1], height[1])
     scaled = (scaled_points(points0, scales[0]), scaled_points(points1, scales[1]))
-    points = _separate(*scaled, min_separation_px=options.min_separation_px)
+    points = separate(*scaled, min_separation_px=options.min_separation_px)
     found = _estimate((points[0], points[1]), model, seed, views, options)
     if found.log10_nfa < options.max_log10_nfa:
         return _upscale(found, scales[0], scales[1])
@@ -305,44 +240,15 @@ def _more_and_more_matches(
             other = initial.features[1 - side]
             gray = initial.views[side]
             for seen in simulated_views(gray, tilt, options.rotation_step_deg, of_view):
-                found = _match(seen, other, options)
+                found = match_features(seen, other, options)
                 points0 = np.concatenate([points0, found[side]])
                 points1 = np.concatenate([points1, found[1 - side]])
                 ratios = np.concatenate([ratios, found[2]])
                 views += 1
-        separate = partial(_separate, min_separation_px=options.min_separation_px)
-        points0, points1, ratios = separate(points0, points1, ratios)
+        points0, points1, ratios = separate(
+            points0, points1, ratios, min_separation_px=options.min_separation_px
+        )
         yield (points0, points1), ratios, views
-
-
-def _match(
-    first: Keypoints, second: Keypoints, options: InitialGeometryOptions
-) -> tuple[np.ndarray, ...]:
-    """Return matched positions in both images, and the ratios of the ratio test."""
-    assert first.descriptors is not None
-    assert second.descriptors is not None
-    found = match_descriptors(
-        first.descriptors,
-        second.descriptors,
-        get_matcher("exact"),
-        ratio=max(options.max_ratios),
-        mutual=True,
-    )
-    points0, points1 = first.xy[found.rows0], second.xy[found.rows1]
-    return _separate(points0, points1, found.ratios, min_separation_px=options.min_separation_px)
-
-
-def _separate(*matches: np.ndarray, min_separation_px: float) -> tuple[np.ndarray, ...]:
-    """Keep each place once in each image: one corner in many views is no further evidence.
-
-    The first two arrays are the positions in both images; others are kept like them.
-    """
-    for side in (0, 1):
-        places = np.rint(matches[side] / min_separation_px)
-        _, kept = np.unique(places, axis=0, return_index=True)
-        kept.sort()
-        matches = tuple(values[kept] for values in matches)
-    return matches
 
 
 def _estimate(
@@ -429,7 +335,7 @@ def _with_further_matches(
         return found
     assert found.matrix is not None
     further = match_along_lines(*initial.features, found.matrix, options.line_search)
-    points0, points1 = _separate(
+    points0, points1 = separate(
         np.concatenate([found.points0, further[0]]),
         np.concatenate([found.points1, further[1]]),
         min_separation_px=options.min_separation_px,

@@ -23,18 +23,21 @@ from .along_lines import LineSearchOptions
 
 @dataclass(frozen=True)
 class InitialGeometryOptions:
-    """How a geometry is estimated from sparse SIFT matches.
+    """How a geometry is estimated from sparse matches.
 
     Attributes:
         first_side_px: longer sides are scaled down to this for a first look, which decides where
             the pair is clearly a plane.
         first_max_keypoints: of each image in the first look.
         min_first_inliers, min_first_fraction: number and fraction of the matches of the first look
-            that agree with a homography, for it to decide.
+            that agree with a homography, for it to decide. The number holds for points as well.
         max_first_parallax: with more matches than this that agree on an epipole off the plane,
             relative to those on it, the first look does not decide.
         max_side_px: longer sides are scaled down to this: the initial geometry need not be fine.
         sift: the keypoints of each image.
+        min_points: where both images have at least so many points of all scales (a budget was
+            asked for), these take the place of SIFT's keypoints; where too few of their matches
+            agree, SIFT is tried.
         simulated_side_px, simulated_max_keypoints: side and keypoints of images of which views are
             simulated; each view gets half as many keypoints.
         max_ratios: of the ratio test, in the order in which they are tried: fewer matches, with
@@ -69,6 +72,7 @@ class InitialGeometryOptions:
     simulated_side_px: int = 320
     simulated_max_keypoints: int = 1000
     sift: SiftOptions = field(default_factory=SiftOptions)
+    min_points: int = 1000
     max_ratios: tuple[float, ...] = (0.85, 0.8)
     min_separation_px: float = 2.0
     homography_threshold_px: float = 3.0
@@ -89,7 +93,7 @@ class InitialGeometryOptions:
                 *("first_side_px", "max_side_px", "simulated_side_px", "min_first_inliers"),
                 *("min_separation_px", "tilts", "rotation_step_deg"),
                 *("homography_threshold_px", "fundamental_threshold_px", "first_max_keypoints"),
-                "simulated_max_keypoints",
+                *("simulated_max_keypoints", "min_points"),
             ),
             not_negative=("max_matches_to_search",),
             fractions=("max_ratios", "min_first_fraction", "max_first_parallax"),

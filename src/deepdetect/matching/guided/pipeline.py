@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...features.keypoints import Keypoints
 from ...features.matchers import DescriptorMatches
 from ...features.matches import Guide, GuidedMatches
 from .homography import (
@@ -20,12 +21,13 @@ from .homography import (
 )
 from .initial_geometry import (
     InitialGeometry,
-    InitialMatches,
+    estimate_initial_geometry,
     find_initial_geometry,
     geometry_of_seeds,
 )
 from .options import GuidedOptions
 from .rectified import match_by_rectification
+from .sparse_matches import InitialMatches, matches_of_points
 
 
 def guided_matches(
@@ -38,6 +40,7 @@ def guided_matches(
     initial: InitialMatches | None = None,
     options: GuidedOptions = GuidedOptions(),
     seeds: tuple[np.ndarray, np.ndarray] | None = None,
+    points: tuple[Keypoints, Keypoints] | None = None,
 ) -> tuple[Guide, GuidedMatches | None]:
     """Match the keypoints of two images by their geometry.
 
@@ -49,6 +52,8 @@ def guided_matches(
         initial: sparse matches of the pair, where `initial_matches` has made them already.
         options: all tuned numbers.
         seeds: (K, 2) sparse matches in both images that take the place of our own.
+        points: keypoints of both images, best first; where they have sizes and angles and are
+            enough, the sparse matches are made of them.
 
     Returns:
         The geometry that guided, and the matches; None when no geometry could be trusted.
@@ -56,7 +61,7 @@ def guided_matches(
     Raises:
         OptionError: the model is unknown, or the seeds are no matches.
     """
-    first = _initial_geometry(gray0, gray1, model, seed, initial, seeds, options)
+    first = _initial_geometry(gray0, gray1, model, seed, initial, seeds, points, options)
     if first.matrix is None:
         return _guide(first, None), None
     pair = ImagePair(gray0, gray1, xy0, xy1)
@@ -65,7 +70,9 @@ def guided_matches(
         matrix, found = _match_plane(pair, first, options, seed)
         if found is None:
             views, known = first.num_views, initial or first.initial
-            first = _initial_geometry(gray0, gray1, "fundamental", seed, known, seeds, options)
+            first = _initial_geometry(
+                gray0, gray1, "fundamental", seed, known, seeds, points, options
+            )
             first = replace(first, num_views=first.num_views + views)
             if first.matrix is None:
                 return _no_guide(first), None
@@ -86,13 +93,21 @@ def _initial_geometry(
     seed: int,
     initial: InitialMatches | None,
     seeds: tuple[np.ndarray, np.ndarray] | None,
+    points: tuple[Keypoints, Keypoints] | None,
     options: GuidedOptions,
 ) -> InitialGeometry:
-    """Return the initial geometry, from seeds where there are some."""
-    if seeds is None:
-        return find_initial_geometry(gray0, gray1, model, seed, options.initial_geometry, initial)
-    sizes = gray0.shape[::-1], gray1.shape[::-1]
-    return geometry_of_seeds(seeds, sizes, model, seed, options.initial_geometry)
+    """Return the initial geometry: of seeds, of points where they suffice, else of SIFT."""
+    chosen = options.initial_geometry
+    if seeds is not None:
+        sizes = gray0.shape[::-1], gray1.shape[::-1]
+        return geometry_of_seeds(seeds, sizes, model, seed, chosen)
+    if initial is None and points is not None:
+        matches = matches_of_points(gray0, gray1, points, chosen)
+        if matches is not None:
+            found = estimate_initial_geometry(matches, model, seed, chosen, simulate_views=False)
+            if len(found.points0) >= chosen.min_first_inliers:
+                return replace(found, initial=matches)
+    return find_initial_geometry(gray0, gray1, model, seed, chosen, initial)
 
 
 def _match_plane(

@@ -1,6 +1,6 @@
 """Homographies of many photographs into the frame of one.
 
-Which photographs overlap is found with few points. The pairs that do are registered by guided
+Which photographs overlap is found with few keypoints. The pairs that do are registered by guided
 matching, whose test by dense keypoints they must pass. The pairs with the most matches make a
 spanning tree; homographies composed along it are the start of a fit to all pairs at once.
 """
@@ -17,6 +17,7 @@ from ..._shared.errors import DeepDetectError
 from ...detector.detector import HeatmapDetector, find_keypoints
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
+from ...features.sift import described_at_own_size
 from ...features.sift_detector import detect_sift
 from ...geometry.residuals import transform_points
 from ...io.image import luma
@@ -77,6 +78,7 @@ def register_jointly(
     detector: HeatmapDetector,
     *,
     reference: int | None = None,
+    max_keypoints: int | None = None,
     options: StitchingOptions = DEFAULTS,
     seed: int = 0,
 ) -> JointRegistration:
@@ -86,13 +88,15 @@ def register_jointly(
         images: two or more, (H, W, 3) uint8 RGB each, their longer sides at most 1200 pixels.
         detector: gives the heat maps.
         reference: number of an image that must be among them; None for the most images.
+        max_keypoints: points of each image that find the overlaps and confirm the homographies;
+            None: SIFT's keypoints find them, dense ones confirm them.
         options: of panoramas.
         seed: of all random choices.
 
     Raises:
         DeepDetectError: no two images overlap, or the reference with none.
     """
-    views = [_prepare(image, detector, options) for image in images]
+    views = [_prepare(image, detector, max_keypoints, options) for image in images]
     pairs = _registered_pairs(views, options.min_partners, seed)
     groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
@@ -126,10 +130,20 @@ def register_jointly(
     return JointRegistration(homographies, matches, residual_px, left_out)
 
 
-def _prepare(image: np.ndarray, detector: HeatmapDetector, options: StitchingOptions) -> _Image:
+def _prepare(
+    image: np.ndarray,
+    detector: HeatmapDetector,
+    max_keypoints: int | None,
+    options: StitchingOptions,
+) -> _Image:
     gray = luma(image)
+    if max_keypoints is not None:
+        found = find_keypoints(detector, image, SelectionOptions(max_keypoints=max_keypoints))
+        if found.sizes is not None and found.angles is not None:
+            return _Image(gray, described_at_own_size(gray, found), np.rint(found.xy))
     # Without suppression: neighbouring pixels are what the verification compares.
-    selection = SelectionOptions(max_keypoints=options.max_keypoints, nms_radius=0, subpixel=False)
+    most = options.max_keypoints if max_keypoints is None else max_keypoints
+    selection = SelectionOptions(mode="dense", max_keypoints=most, nms_radius=0, subpixel=False)
     keypoints = find_keypoints(detector, image, selection)
     return _Image(gray, detect_sift(gray, options.sift), keypoints.xy)
 

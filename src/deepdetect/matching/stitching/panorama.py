@@ -13,6 +13,7 @@ from ..._shared.errors import OptionError
 from ..._shared.options import suggest_keywords
 from ..._shared.timing import StageTimer
 from ...detector.detector import DeepDetect, HeatmapDetector
+from ...features.selection import check_max_keypoints
 from ...geometry.rescaling import downscale, scaled_homography
 from ...io.image import load_image
 from ..guided import GuidedOptions
@@ -66,6 +67,7 @@ def stitch(
     scale: float = 1.0,
     max_canvas_megapixels: float = 50.0,
     registration_side: int = 640,
+    max_keypoints: int | None = None,
     options: StitchingOptions = DEFAULTS,
     seed: int = 0,
 ) -> Panorama:
@@ -85,6 +87,9 @@ def stitch(
         max_canvas_megapixels: a larger panorama is refused before it is drawn. It takes 22
             to 47 bytes of memory per pixel.
         registration_side: longer side in pixels to which photographs are reduced for registration.
+        max_keypoints: of each photograph at that size, by which the overlaps are found and
+            confirmed: the best points of all scales, which need no network. None: SIFT's find
+            them, dense keypoints confirm them.
         options: what counts as an overlap, the joint fit, exposure, seams and blending.
         seed: of all random choices.
 
@@ -107,6 +112,7 @@ def stitch(
         >>> panorama.image.shape
         (160, 240, 3)
     """
+    check_max_keypoints(max_keypoints)
     _check(images, reference, scale, max_canvas_megapixels, registration_side)
     timer = StageTimer()
     small: dict[int, tuple[np.ndarray, float]] = {}
@@ -122,6 +128,7 @@ def stitch(
             [rgb for rgb, _ in small.values()],
             DeepDetect() if detector is None else detector,
             reference=reference,
+            max_keypoints=max_keypoints,
             options=options,
             seed=seed,
         )
