@@ -1,0 +1,83 @@
+"""Matching with points beside dense matching: CPU seconds and correct matches.
+
+    python benchmarks/points_matching.py --keypoints 2048
+
+Eight pairs of the Oxford set, refined homographies. Dense guided matching; guided matching of the
+best pixels of the heat map, of points that begin with SIFT's keypoints, and of points that begin
+with themselves; points matched by descriptors alone. Times are CPU seconds of the process, each
+way run once after one that is not counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepdetect import DeepDetect, match_images
+from deepdetect.datasets.oxford import find_scene, load_oxford
+from deepdetect.datasets.types import PlanarPair
+from deepdetect.geometry import transform_points
+from deepdetect.matching.guided import GuidedOptions
+from deepdetect.matching.guided.options import InitialGeometryOptions
+
+OXFORD = Path(__file__).parents[2] / "shared" / "data" / "oxford"
+PAIRS = {"graf": 3, "wall": 3, "bikes": 3, "leuven": 3, "trees": 3, "ubc": 3, "boat": 6, "bark": 5}
+NEVER = GuidedOptions(initial_geometry=InitialGeometryOptions(min_points=10**9))
+UNGUIDED = {
+    **{"guided": False, "ratio": 0.85, "mutual": True},
+    **{"descriptor": "rootsift", "matcher": "exact"},
+}
+
+
+def main() -> None:
+    """Print a line for each pair, and the ratios of time."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--keypoints", type=int, default=2048)
+    parser.add_argument("--data", type=Path, default=OXFORD)
+    arguments = parser.parse_args()
+    budget = {"max_keypoints": arguments.keypoints}
+    ways: Mapping[str, Mapping[str, Any]] = {
+        "dense": {},
+        "best pixels": {**budget, "mode": "dense"},
+        "points after SIFT": {**budget, "guided_options": NEVER},
+        "points": budget,
+        "points unguided": {**budget, **UNGUIDED},
+    }
+    detector = DeepDetect()
+    scenes = load_oxford(arguments.data, "refined")
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
+    print("pair     " + "".join(f"{name:>28}" for name in ways))
+    for scene, number in PAIRS.items():
+        pair = list(find_scene(scenes, scene).pairs())[number - 2]
+        cells = []
+        for name, options in ways.items():
+            took, count, right = measure(
+                pair, lambda a, b, o=options: match_images(a, b, detector, **o)
+            )
+            seconds[name].append(took)
+            cells.append(f"{took:6.2f} s {right:7,} of {count:7,}")
+        print(f"{pair.name:9}" + "".join(f"{cell:>28}" for cell in cells), flush=True)
+    dense = np.array(seconds["dense"])
+    for name, values in seconds.items():
+        ratio = np.exp(np.log(np.array(values) / dense).mean())
+        print(f"{name}: {ratio:.2f} times the CPU seconds of dense (geometric mean)")
+
+
+def measure(pair: PlanarPair, match: Callable[[Any, Any], Any]) -> tuple[float, int, int]:
+    """Return CPU seconds, the number of matches, and how many are right within 1 px."""
+    match(pair.first, pair.second)
+    begin = time.process_time()
+    found = match(pair.first, pair.second)
+    took = time.process_time() - begin
+    places = transform_points(found.points0.astype(float), pair.homography)
+    right = np.linalg.norm(places - found.points1, axis=1) < 1
+    return took, len(found), int(right.sum())
+
+
+if __name__ == "__main__":
+    main()
