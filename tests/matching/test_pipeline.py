@@ -282,6 +282,30 @@ def test_selection_options_reach_both_images(photo: np.ndarray) -> None:
         assert (keypoints.xy[:, 0] >= 100).all()
 
 
+@pytest.mark.parametrize("guide", ["homography", "fundamental"])
+def test_mutual_matches_do_not_depend_on_which_image_comes_first(
+    photo: np.ndarray, guide: str
+) -> None:
+    second = warped(photo, WARP)
+    settings: dict[str, Any] = {"guide": guide, "density": 0.1, "mutual": True}
+    found = match_images(photo, second, **settings)
+    swapped = match_images(second, photo, **settings)
+    assert len(found) > 500
+    pairs = [
+        np.column_stack(points)
+        for points in ((found.points0, found.points1), (swapped.points1, swapped.points0))
+    ]
+    np.testing.assert_array_equal(*(np.unique(each, axis=0) for each in pairs))
+    assert share_correct(swapped, np.linalg.inv(WARP), 2) > 0.95
+    assert found.guide is not None
+    assert swapped.guide is not None
+    if guide == "homography":
+        product = found.guide.matrix @ swapped.guide.matrix
+        np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-6)
+    else:
+        np.testing.assert_allclose(found.guide.matrix, swapped.guide.matrix.T)
+
+
 def test_mutual_leaves_one_to_one(photo: np.ndarray) -> None:
     second = warped(photo, WARP)
     every = unguided(photo, second, Corners(), density=0.02, matcher="exact")

@@ -31,6 +31,13 @@ class Guide:
     log10_nfa: float
     simulated_views: int
 
+    def swapped(self) -> Guide:
+        """Return the geometry from the second image to the first."""
+        if self.matrix is None:
+            return self
+        inverse = np.linalg.inv if self.model == "homography" else np.transpose
+        return replace(self, matrix=inverse(self.matrix))
+
 
 @dataclass(frozen=True, eq=False)
 class GuidedMatches:
@@ -77,7 +84,8 @@ class Matches:
         points0, points1: (M, 2) float32 positions in the first and in the second
             image, matched row by row; centre of the first pixel (0, 0). Both are keypoints,
             except where a fundamental matrix guided: then those of the first image are the pixels
-            of its keypoints, and those of the second where these pixels are seen.
+            of its keypoints, and those of the second where these pixels are seen; with `mutual`
+            it may be the other way round.
         scores: (M,) float32 in [0, 1], higher is better. Guided by a homography, 1 - the
             dissimilarity of the two patches (0: only just more similar than unrelated patches); by
             a fundamental matrix, their correlation; else 1 - Lowe's ratio.

@@ -43,7 +43,7 @@ class MatchingOptions:
             "patchmatch" ("hamming" is for binary descriptors).
         ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
         mutual: keep only pairs that are each other's nearest; guided, of those that share a
-            keypoint of the second image only the best.
+            keypoint of the second image only the best, and swapped images give the same matches.
         guided: whether a geometry from a few matches guides the matching; else the matcher alone
             decides.
         guide: which one: "homography", "fundamental", or "auto": the one that fits

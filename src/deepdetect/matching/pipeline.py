@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -89,7 +90,8 @@ def match_images(
             "none"; it also chooses what guides.
         guide: which geometry guides where `model` leaves it open: "auto", "homography" or
             "fundamental".
-        mutual: keep only mutual nearest neighbours; guided, the best match of each keypoint.
+        mutual: keep only mutual nearest neighbours; guided, the best match of each keypoint, and
+            the same matches whichever image comes first.
         threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread: which pixels
             or points become keypoints (`SelectionOptions`). With `max_keypoints` alone they are
             the best ones of all scales, which need no network.
@@ -163,19 +165,10 @@ def match_images(
     found_guide, guided_pair = None, None
     if chosen.guided:
         with timer.stage("guided matching"):
-            found_guide, guided_pair = guided_matches(
-                grays[0],
-                grays[1],
-                np.rint(keypoints[0].xy),
-                np.rint(keypoints[1].xy),
-                chosen.guiding_model,
-                chosen.geometry.seed,
-                initial,
-                chosen.guided_options,
-                seeds,
-                (keypoints[0], keypoints[1]),
+            found_guide, guided_pair, positions = _match_guided(
+                grays, keypoints, chosen, initial, seeds
             )
-        points0, points1, scores = _guided_points(guided_pair, keypoints, chosen.mutual)
+        points0, points1, scores = positions
     else:
         found = unguided_matches(grays, keypoints, chosen, timer)
         points0, points1 = keypoints[0].xy[found.rows0], keypoints[1].xy[found.rows1]
@@ -195,6 +188,44 @@ def match_images(
         found_guide,
         guided_pair is not None and guided_pair.subpixel,
     )
+
+
+def _match_guided(
+    grays: tuple[np.ndarray, np.ndarray],
+    keypoints: Sequence[Keypoints],
+    options: MatchingOptions,
+    initial: InitialMatches | None,
+    seeds: tuple[np.ndarray, np.ndarray] | None,
+) -> tuple[Guide, GuidedMatches | None, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return what guided, the matches, and their positions in both images with their scores."""
+    first, second = keypoints
+    swapped = options.mutual and _comes_after(grays[0], grays[1])
+    if swapped:
+        grays, first, second = (grays[1], grays[0]), second, first
+        initial = None if initial is None else initial.swapped()
+        seeds = None if seeds is None else (seeds[1], seeds[0])
+    guide, found = guided_matches(
+        grays[0],
+        grays[1],
+        np.rint(first.xy),
+        np.rint(second.xy),
+        options.guiding_model,
+        options.geometry.seed,
+        initial,
+        options.guided_options,
+        seeds,
+        (first, second),
+    )
+    points0, points1, scores = _guided_points(found, (first, second), options.mutual)
+    if swapped:
+        return guide.swapped(), found, (points1, points0, scores)
+    return guide, found, (points0, points1, scores)
+
+
+def _comes_after(gray0: np.ndarray, gray1: np.ndarray) -> bool:
+    """Order images by what is in them, so that a pair and the swapped pair are matched alike."""
+    keys = [(gray.shape, hashlib.sha256(gray.tobytes()).digest()) for gray in (gray0, gray1)]
+    return keys[0] > keys[1]
 
 
 def _guided_points(

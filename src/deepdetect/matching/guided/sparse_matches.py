@@ -45,6 +45,16 @@ class InitialMatches:
         """Matched positions in the second image at its own size, (M, 2) float64."""
         return scaled_points(self.matched[1], 1 / self.scales[1])
 
+    def swapped(self) -> InitialMatches:
+        """Return the matches from the second image to the first."""
+        return InitialMatches(
+            self.views[::-1],
+            self.scales[::-1],
+            self.features[::-1],
+            self.matched[::-1],
+            self.ratios,
+        )
+
 
 def initial_matches(
     gray0: np.ndarray,
