@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,15 @@ import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.registry import resolve_name_or_path
+from .._shared.text_files import read_toml
 from .detectors import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
 from .visibility import Visibility
 
 SECTIONS: dict[str, Visibility] = {"normal": "normal", "low_visibility": "low"}
+
+MAX_FILE_BYTES = 16_000
+"""Longer settings files are refused: all settings of all detectors take 2,000 bytes, and the time
+to read some files of TOML grows with the square of their length."""
 
 
 @dataclass(frozen=True)
@@ -144,10 +148,10 @@ def read_label_settings(path: str | Path) -> LabelSettings:
         OptionError: the file cannot be read, or a name or value is wrong.
     """
     try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        content = read_toml(path, MAX_FILE_BYTES)
     except OSError as error:
         raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise OptionError(f"{path} is no valid TOML file ({error})") from None
     try:
         return _parsed(content)
