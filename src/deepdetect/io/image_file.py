@@ -167,7 +167,7 @@ def _check_size(size: tuple[int, int], name: str, max_megapixels: float) -> None
     if megapixels > max_megapixels:
         raise ImageError(
             f"{name} has {size[0]}x{size[1]} pixels, which is over {max_megapixels:g} megapixels: "
-            "make it smaller, or load it with a larger `max_megapixels`"
+            "make it smaller, or load it in Python with a larger `max_megapixels`"
         )
 
 
