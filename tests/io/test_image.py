@@ -421,13 +421,13 @@ def test_the_limit_of_pixels_is_raised_and_lowered_by_name(monkeypatch: pytest.M
             load_image(PNG, max_megapixels=wrong)
 
 
-def test_pillow_s_limit_of_one_tile_is_one_sentence(
+def test_pillow_s_own_limit_of_tiff_is_one_sentence(
     monkeypatch: pytest.MonkeyPatch, one_line: OneLine
 ) -> None:
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
     with pytest.raises(ImageError) as caught:
         load_image(encoded(RGB, "TIFF"))
-    assert "a tile or a frame that is too large" in one_line(caught.value)
+    assert "the most that Pillow reads of its format" in one_line(caught.value)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="memory is measured by the module resource")

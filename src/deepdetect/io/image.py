@@ -51,6 +51,7 @@ def load_image(image: Any, *, max_megapixels: float = MAX_MEGAPIXELS) -> np.ndar
             of these types too, signed and 32-bit integers are refused.
         max_megapixels: larger files are refused before they are decoded, as a file of few bytes
             can hold billions of pixels. One megapixel takes 3 MB, and up to 7 MB while it is read.
+            Of TIFF and WebP, Pillow reads 178 megapixels at most (`PIL.Image.MAX_IMAGE_PIXELS`).
 
     Returns:
         (H, W, 3) uint8 RGB.

@@ -94,8 +94,12 @@ def damaged_image(name: str, error: Exception | str) -> ImageError:
     """Return the error for a file that cannot be decoded."""
     from PIL import Image
 
-    if isinstance(error, Image.DecompressionBombError):  # Pillow's limit, where it looks once more
-        return ImageError(f"{name} has a tile or a frame that is too large: save it as PNG or JPEG")
+    if isinstance(error, Image.DecompressionBombError):  # some decoders look once more
+        limit = 2e-6 * (Image.MAX_IMAGE_PIXELS or 0)
+        return ImageError(
+            f"{name} is over {limit:.0f} megapixels, the most that Pillow reads of its format: "
+            "save it as PNG or JPEG, or raise PIL.Image.MAX_IMAGE_PIXELS"
+        )
     return ImageError(f"{name} is damaged or truncated ({error}): get it again")
 
 
