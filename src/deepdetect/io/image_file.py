@@ -100,7 +100,8 @@ def damaged_image(name: str, error: Exception | str) -> ImageError:
             f"{name} is over {limit:.0f} megapixels, the most that Pillow reads of its format: "
             "save it as PNG or JPEG, or raise PIL.Image.MAX_IMAGE_PIXELS"
         )
-    return ImageError(f"{name} is damaged or truncated ({error}): get it again")
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    return ImageError(f"{name} is damaged or truncated ({reason}): get it again")
 
 
 @contextmanager
