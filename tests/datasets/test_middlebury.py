@@ -67,6 +67,13 @@ def test_what_is_missing_or_wrong_is_named(scene: Path, one_line) -> None:
         ('{"ground_truth": {"file": "disparity.png"}}', "does not say"),
         ("[]", "does not say"),
         ("{", "does not say"),
+        ("[" * 100_000, "does not say"),
+        (
+            '{"ground_truth": {"file": "d.png", "unknown": 0, "value_per_pixel": 1'
+            + "0" * 400
+            + "}}",
+            "does not say",
+        ),
         (
             '{"ground_truth": {"file": "no.png", "value_per_pixel": 4, "unknown": 0}}',
             "no.png is missing",
@@ -88,6 +95,18 @@ def test_what_is_missing_or_wrong_is_named(scene: Path, one_line) -> None:
         with pytest.raises(ImageError, match=message) as error:
             load_middlebury(scene)
         one_line(error.value)
+    calibration.write_text(
+        '{"ground_truth": {"file": "disparity.png", "value_per_pixel": 4, "unknown": 0}}'
+    )
+    truth = scene / "disparity.png"
+    content = bytearray(truth.read_bytes())
+    content[content.index(b"IEND") - 5] ^= 1  # the last byte of the pixels' checksum
+    truth.write_bytes(content)
+    with pytest.raises(ImageError, match=r"disparity\.png is damaged"):
+        load_middlebury(scene)
+    Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(truth)
+    with pytest.raises(ImageError, match="no grey image"):
+        load_middlebury(scene)
     with pytest.raises(ImageError, match="no folder"):
         load_middlebury(scene / "left.png")
     calibration.unlink()

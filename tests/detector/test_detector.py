@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -123,6 +124,8 @@ def test_other_options_share_the_network(detector: DeepDetect, image: np.ndarray
 KINDS = {
     "path": lambda rgb, path: path,
     "text path": lambda rgb, path: str(path),
+    "bytes": lambda rgb, path: path.read_bytes(),
+    "file": lambda rgb, path: io.BytesIO(path.read_bytes()),
     "uint16": lambda rgb, path: rgb.astype(np.uint16) * 257,
     "float64": lambda rgb, path: rgb / 255,
     "float32": lambda rgb, path: (rgb / 255).astype(np.float32),

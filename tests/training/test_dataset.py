@@ -250,7 +250,7 @@ def test_an_error_of_a_worker_is_one_sentence(
     lost = FolderSource(source.images, LabelCache(tmp_path, OPTIONS.label_options))
     with pytest.raises(ImageError) as caught, loading(loader(lost, workers=workers)) as made:
         next(made)
-    assert one_line(caught.value).startswith("there is no mask")
+    assert one_line(caught.value).startswith("there is no file")
     assert not multiprocessing.active_children(), "they end with the block, whoever holds the error"
 
 

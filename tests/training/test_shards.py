@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import tarfile
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -192,6 +195,22 @@ def test_a_damaged_image_is_named(shards: Shards, source: ShardSource, tmp_path:
             damaged.load(0, source[0].normal[0])
 
 
+def test_a_label_of_too_many_pixels_is_not_decoded(
+    shards: Shards, source: ShardSource, tmp_path: Path, one_line: Callable[[BaseException], str]
+) -> None:
+    path, count = shards.training[0]
+    with tarfile.open(path) as old, tarfile.open(tmp_path / "copy.tar", "w") as new:
+        for member in old:
+            content = bytearray(old.extractfile(member).read())
+            if ".label." in member.name:
+                content[16:24] = (20_000).to_bytes(4, "big") * 2  # in the header
+                content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
+            new.addfile(member, io.BytesIO(content))
+    with pytest.raises(ImageError) as caught:
+        ShardSource(((tmp_path / "copy.tar", count),), OPTIONS).load(0, source[0].normal[0])
+    assert "the mask has 20000x20000 pixels" in one_line(caught.value)
+
+
 def test_an_index_cannot_name_files_elsewhere(shards: Shards, tmp_path: Path) -> None:
     shutil.copytree(shards.folder, tmp_path / "copy")
     path = tmp_path / "copy" / "shards.json"
@@ -200,3 +219,21 @@ def test_an_index_cannot_name_files_elsewhere(shards: Shards, tmp_path: Path) ->
     path.write_text(json.dumps(index))
     with pytest.raises(ImageError, match="copy/passwd is missing"):
         Shards.open(tmp_path / "copy", OPTIONS)
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"training": ', '{"training": 1}', "[1]"])
+def test_an_index_that_is_none_is_one_sentence(
+    content: str, shards: Shards, tmp_path: Path, one_line: Callable[[BaseException], str]
+) -> None:
+    (tmp_path / "shards.json").write_text(content)
+    with pytest.raises(ImageError) as caught:
+        Shards.open(tmp_path, OPTIONS)
+    assert "shards.json is damaged" in one_line(caught.value)
+
+
+def test_an_index_with_endless_counts_is_damaged(shards: Shards, tmp_path: Path) -> None:
+    index = json.loads((shards.folder / "shards.json").read_text())
+    index["training"][0]["images"] = float("inf")
+    (tmp_path / "shards.json").write_text(json.dumps(index))
+    with pytest.raises(ImageError, match="damaged"):
+        Shards.open(tmp_path, OPTIONS)

@@ -16,12 +16,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import ImageError, MissingExtraError
-from ..geometry.camera import read_calibration
+from .._shared.text_files import read_json
+from ..geometry.camera import MAX_FILE_BYTES, read_calibration
 from ..io.image import load_image
+from ..io.image_file import open_image
 from .download import RemoteDataset, RemoteFile
 from .types import CalibratedStereoPair, StereoPair
 
@@ -38,22 +39,29 @@ def load_middlebury(folder: str | Path) -> StereoPair:
     root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:
-        truth = json.loads(path.read_text(encoding="utf-8")).get("ground_truth")
+        truth = read_json(path, MAX_FILE_BYTES).get("ground_truth")
         if truth is None:
             raise ImageError(f"{root} has no ground truth: take a scene that has one")
         value, unknown = float(truth["value_per_pixel"]), float(truth["unknown"])
         file = root / truth["file"]
     except OSError as error:
         raise ImageError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise ImageError(f"{path} does not say how its ground truth is stored ({error})") from None
-    stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if file.is_file() else None
-    if stored is None or stored.ndim != 2 or not value > 0:
+    stored = _load_gray(file) if file.is_file() else None
+    if stored is None or not value > 0:
         raise ImageError(
             f"the ground truth {file} is missing, or no grey image with a scale above 0"
         )
     disparity = np.where(stored == unknown, np.nan, stored / value).astype(np.float32)
     return StereoPair(root.name, left, right, _enlarged(disparity, left.shape[:2]))
+
+
+def _load_gray(path: Path) -> np.ndarray | None:
+    """Read the grey values of an image of 8 or 16 bits, None if it has colours."""
+    with open_image(path) as image:
+        gray = image.mode == "L" or image.mode.startswith("I")
+        return np.asarray(image) if gray else None
 
 
 def load_calibrated_pair(folder: str | Path) -> CalibratedStereoPair:
