@@ -49,7 +49,7 @@ def match_by_homography(
         few, of all keypoints of the first image that the second one shows under it. Each keypoint
         of the first image is matched once at most, those of the second image perhaps more often.
     """
-    gray0, gray1 = pair.gray0, pair.gray1
+    gray1 = pair.gray1
     places = transform_points(pair.xy0, homography)
     rows1, distances = nearest_keypoint(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
     with np.errstate(invalid="ignore"):
@@ -62,12 +62,32 @@ def match_by_homography(
         rows0 = proposed
     if not len(rows0):
         return DescriptorMatches(rows0, rows0, np.empty(0, np.float32)), 0.0
-    warped, valid = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
-    ratios = dissimilarity(gray0, warped, valid, pair.xy0[rows0], verification, seed)
+    ratios = _compare(pair, homography, rows0, verification, seed)
     same = ratios < 1
     kept = same & near[rows0]
     matched = rows0[kept]
     return DescriptorMatches(matched, rows1[matched], ratios[kept]), float(same.mean())
+
+
+def _compare(
+    pair: ImagePair,
+    homography: np.ndarray,
+    rows0: np.ndarray,
+    options: VerificationOptions,
+    seed: int,
+) -> np.ndarray:
+    """Return the `dissimilarity` of keypoints, of large images on smaller copies."""
+    (gray0, scale0), (gray1, scale1) = (
+        downscale(gray, round(max(gray.shape) * min(1, np.sqrt(options.max_megapixels / area))))
+        for gray, area in ((each, each.size / 1e6) for each in (pair.gray0, pair.gray1))
+    )
+    pixels = pair.xy0[rows0]
+    if scale0 < 1 or scale1 < 1:
+        homography = scaled_homography(homography, scale0, scale1)
+        last = np.array(gray0.shape[::-1], np.float32) - 1
+        pixels = np.clip(np.rint((pixels + np.float32(0.5)) * scale0 - 0.5), 0, last)
+    warped, valid = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
+    return dissimilarity(gray0, warped, valid, pixels, options, seed)
 
 
 def refine_guiding_homography(

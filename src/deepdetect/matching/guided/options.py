@@ -124,6 +124,7 @@ class VerificationOptions:
         null_block_px: side of the blocks of the image that null pairs are taken from.
         max_null_blocks: at most this many blocks for each shift, chosen at random: all of them up
             to a megapixel.
+        max_megapixels: larger images are compared at this size, which bounds memory and time.
 
     Raises:
         OptionError: a value is out of its range.
@@ -138,13 +139,14 @@ class VerificationOptions:
     null_shifts: tuple[tuple[float, float], ...] = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
     null_block_px: int = 64
     max_null_blocks: int = 256
+    max_megapixels: float = 6.0
 
     def __post_init__(self) -> None:
         check_ranges(
             self,
             positive=(
                 *("keypoint_sizes_px", "lattice_px", "smoothing_sigma_px", "window_px"),
-                *("null_block_px", "max_null_blocks"),
+                *("null_block_px", "max_null_blocks", "max_megapixels"),
             ),
             fractions=("false_positive_rate", "min_support", "null_shifts"),
         )
