@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+
+from deepdetect import DeepDetectError
 
 OUTCOMES = ("right", "refused", "traceback", "crash", "hang", "wrong")
 DEFECTS = OUTCOMES[2:]
@@ -37,6 +40,22 @@ class Target:
     count: int
     batch: int = 250
     limit_s: float = 60.0
+
+
+Made = TypeVar("Made")
+
+
+def prepared(make: Callable[[], Made]) -> Callable[[], Made]:
+    """Make something once for all inputs; that it is refused is an error of the campaign's."""
+
+    @functools.cache
+    def once() -> Made:
+        try:
+            return make()
+        except DeepDetectError as error:
+            raise RuntimeError(f"{make.__name__} failed: {error}") from error
+
+    return once
 
 
 def expect(condition: object, what: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import json
 import tarfile
@@ -16,7 +15,7 @@ from PIL import Image
 
 from deepdetect.datasets.download import RemoteFile, _unpack
 
-from ..case import Target, expect
+from ..case import Target, expect, prepared
 from ..mutations import mutate
 from .images import scene
 
@@ -95,7 +94,7 @@ def shard_options() -> Any:
     )
 
 
-@functools.cache
+@prepared
 def shard_files() -> dict[str, bytes]:
     """Return the files of a folder of shards of three images."""
     from deepdetect.training.shards import write_shards
@@ -103,7 +102,7 @@ def shard_files() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as folder:
         images, output = Path(folder) / "images", Path(folder) / "shards"
         images.mkdir()
-        for k in range(3):
+        for k in range(6):
             Image.fromarray(np.roll(scene(), 5 * k, axis=1)).save(images / f"{k}.png")
         write_shards(images, output, shard_options(), workers=1)
         return {path.name: path.read_bytes() for path in output.iterdir()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from hypothesis.strategies import SearchStrategy
 
 from deepdetect import DeepDetect, load_image, match_images
 
-from ..case import Target, expect
+from ..case import Target, expect, prepared
 
 SIDES = (0, 1, 3, 4, 15, 16, 17, 40)
 TYPES = "uint8 uint16 >u2 int8 int16 int32 int64 uint32 float16 float32 float64 bool complex64 U3 O"
@@ -90,7 +89,7 @@ def is_allowed(array: np.ndarray) -> bool:
     return array.dtype.kind == "b" or array.dtype.str[1:] in ("u1", "u2")
 
 
-@functools.cache
+@prepared
 def detector() -> DeepDetect:
     """Return the detector of all inputs."""
     return DeepDetect()

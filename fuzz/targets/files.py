@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import json
 import tempfile
@@ -18,7 +17,7 @@ from deepdetect.io.depth import load_depth_png, save_depth_png
 from deepdetect.io.masks import encode_mask, load_mask
 from deepdetect.labels.settings import read_label_settings
 
-from ..case import Target, expect
+from ..case import Target, expect, prepared
 from ..mutations import mutate
 from .arrays import draw
 
@@ -61,7 +60,7 @@ SETTINGS = {
 EXTREMES = (0, -1, 1, 2, 3, 10**6, 2**31, 2**63, 1e30, -1e30, 1e-30, 0.5, "nan", "inf", '"a"', "[]")
 
 
-@functools.cache
+@prepared
 def keypoints_file() -> bytes:
     """Return an npz file of keypoints."""
     generator = np.random.default_rng(1)
@@ -124,7 +123,7 @@ def masks(generator: np.random.Generator, folder: Path) -> None:
     expect(found.dtype == bool and found.ndim == 2 and found.size > 0, "no mask")
 
 
-@functools.cache
+@prepared
 def depth_file() -> bytes:
     """Return a depth map."""
     with tempfile.TemporaryDirectory() as folder:

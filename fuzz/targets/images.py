@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import io
 import zlib
 from functools import partial
@@ -15,7 +14,7 @@ from PIL import Image, features
 
 from deepdetect import load_image
 
-from ..case import Target, expect
+from ..case import Target, expect, prepared
 from ..mutations import mutate
 
 ORIENTATION = 0x0112
@@ -23,7 +22,7 @@ LOSSLESS = ("PNG", "TIFF", "BMP", "PPM", "GIF")
 LOSSY = ("JPEG", "WEBP", "JPEG2000", "AVIF")
 
 
-@functools.cache
+@prepared
 def scene() -> np.ndarray:
     """Return a small picture with edges, (52, 60, 3) uint8."""
     noise = np.random.default_rng(0).integers(0, 256, (52, 60, 3)).astype(np.uint8)

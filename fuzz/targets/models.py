@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 import io
 import json
 import struct
@@ -16,12 +15,12 @@ import numpy as np
 from deepdetect import DeepDetect
 from deepdetect.detector.pretrained import pretrained_weights
 
-from ..case import Target, expect
+from ..case import Target, expect, prepared
 from ..mutations import mutate
 from .images import scene
 
 
-@functools.cache
+@prepared
 def expected_map() -> np.ndarray:
     """Return the heat map of the weights as they are."""
     return DeepDetect(backend="onnxruntime").heatmap(scene())
@@ -41,7 +40,7 @@ def check_map(found: np.ndarray) -> None:
     expect(found.min() >= 0 and found.max() <= 1, "a map that is no probability")
 
 
-@functools.cache
+@prepared
 def safetensors_file() -> bytes:
     """Return weights of the network as a safetensors file."""
     from safetensors.torch import save
@@ -79,7 +78,7 @@ def safetensors(generator: np.random.Generator, folder: Path) -> None:
     check_map(DeepDetect(path, backend="torch").heatmap(scene()))
 
 
-@functools.cache
+@prepared
 def checkpoint_parts() -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return tensors and metadata of a checkpoint of a small network after a step."""
     import torch
