@@ -103,7 +103,7 @@ def shard_files() -> dict[str, bytes]:
         images, output = Path(folder) / "images", Path(folder) / "shards"
         images.mkdir()
         for k in range(6):
-            Image.fromarray(np.roll(scene(), 5 * k, axis=1)).save(images / f"{k}.png")
+            Image.fromarray(np.roll(scene(), 5 * k, axis=1)).save(images / f"photo-{k}.png")
         write_shards(images, output, shard_options(), workers=1)
         return {path.name: path.read_bytes() for path in output.iterdir()}
 
