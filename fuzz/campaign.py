@@ -20,6 +20,7 @@ from tqdm import tqdm
 from .case import DEFECTS, OUTCOMES, Target
 
 ROOT = Path(__file__).parents[1]
+CHILD = (sys.executable, "-m", "fuzz.child")
 START_S = 120.0
 """Until the first input begins: packages are imported, and kernels compiled."""
 
@@ -102,7 +103,7 @@ def run_campaign(
 def run_batch(target: Target, seed: int, first: int, last: int) -> Iterable[tuple[int, str, str]]:
     """Yield number, outcome and reason of each input; a process that dies is replaced."""
     while first < last:
-        command = [sys.executable, "-m", "fuzz.child", target.name, *map(str, (seed, first, last))]
+        command = [*CHILD, target.name, *map(str, (seed, first, last))]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
         with subprocess.Popen(
             command,
