@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import functools
 import hashlib
 import http.server
@@ -9,7 +10,7 @@ import tarfile
 import threading
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from deepdetect.datasets import (
 )
 from deepdetect.datasets.download import content_digest
 
+OneLine = Callable[[BaseException], str]
 NAMES = [f"train/{k:04d}.jpg" for k in range(5)]
 
 
@@ -389,6 +391,64 @@ def test_what_is_no_archive_is_refused(
     with pytest.raises(DeepDetectError, match="no archive"):
         get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")
     assert list(tmp_path.iterdir()) == []
+
+
+def changed(content: bytes, place: int, value: int) -> bytes:
+    """Change a byte of each member's header, and the same field in the directory."""
+    shifts = {b"PK\3\4": 0, b"PK\1\2": 2}
+    data = bytearray(content)
+    for signature, shift in shifts.items():
+        start = 0
+        while (start := data.find(signature, start)) >= 0:
+            data[start + place + shift] = value
+            start += 4
+    return bytes(data)
+
+
+def zipped(names: list[str]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as file:
+        for name in names:
+            file.writestr(name, b"content")
+    return buffer.getvalue()
+
+
+DAMAGED_ARCHIVES = {
+    "encrypted": changed(archive(), 6, 1),
+    "compressed in an unknown way": changed(archive(), 8, 99),
+    "of a later version": changed(archive(), 4, 255),
+    "a name too long": zipped(["a" * 300 + ".jpg"]),
+    "a file that is a folder, too": zipped(["a.jpg", "a.jpg/b.jpg"]),
+    "a folder that is a file, too": zipped(["a.jpg/b.jpg", "a.jpg"]),
+    "an offset before its start": archive()[600_000:],
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGED_ARCHIVES)
+def test_damaged_archives_are_one_sentence_and_do_not_stay(
+    kind: str, dataset: RemoteDataset, server: Server, tmp_path: Path, one_line: OneLine
+) -> None:
+    server.content = DAMAGED_ARCHIVES[kind]
+    with pytest.raises(DeepDetectError) as caught:
+        get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")
+    assert f"{server.url} is no archive that can be unpacked (" in one_line(caught.value)
+    assert list(tmp_path.iterdir()) == []
+    server.content = archive()
+    assert unpacked(get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")) == NAMES
+
+
+def test_a_full_disk_is_no_damaged_archive(
+    dataset: RemoteDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_line: OneLine
+) -> None:
+    def extract(*arguments: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(zipfile.ZipFile, "extract", extract)
+    with pytest.raises(DeepDetectError) as caught:
+        get_dataset(dataset, tmp_path / "tiny")
+    assert "(No space left on device): make room" in one_line(caught.value)
+    monkeypatch.undo()
+    assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
 
 
 @pytest.mark.parametrize("name", ["oxford", "middlebury", "hpatches"])

@@ -67,6 +67,13 @@ def test_what_is_missing_or_wrong_is_named(scene: Path, one_line) -> None:
         ('{"ground_truth": {"file": "disparity.png"}}', "does not say"),
         ("[]", "does not say"),
         ("{", "does not say"),
+        ("[" * 100_000, "does not say"),
+        (
+            '{"ground_truth": {"file": "d.png", "unknown": 0, "value_per_pixel": 1'
+            + "0" * 400
+            + "}}",
+            "does not say",
+        ),
         (
             '{"ground_truth": {"file": "no.png", "value_per_pixel": 4, "unknown": 0}}',
             "no.png is missing",

@@ -79,6 +79,18 @@ def test_views_may_differ(tmp_path: Path) -> None:
     [
         ("{", "not valid JSON"),
         ("\ufeff nonsense \n more", "not valid JSON"),
+        ("[" * 100_000, "nested too deep"),
+        ('{"focal_px": ' + "[" * 900 + "]" * 900 + "}", "one or two numbers"),
+        (" " * 2**20 + "{}", "longer than 1048576 bytes"),
+        ({"focal_px": 10**400}, "focal length must be finite"),
+        ('{"focal_px": ' + "9" * 9999 + "}", "not valid JSON"),
+        ('{"focal_px": 1e999}', "focal length must be finite"),
+        ({"focal_px": 900, "cx": -(10**400)}, "cx must be finite"),
+        ({"focal_px": 900, "width": 10**400}, "width must be finite"),
+        ({"focal_px": 900, "baseline_mm": 10**400}, "baseline must be finite"),
+        ({"focal_px": 900, "disparity_offset_px": 10**400}, "disparity_offset_px must be finite"),
+        ({"focal_px": [[1000, 1000], 3]}, r"focal length must be a number, not \[1000, 1000\]"),
+        ({"focal_px": {"x": 1000}}, "focal length must be a number"),
         ("[1]", "must hold one object"),
         ({}, 'no "focal_px"'),
         ({"focal_px": None}, 'no "focal_px"'),
@@ -106,7 +118,15 @@ def test_what_is_wrong_is_said(tmp_path: Path, one_line, values: Any, message: s
     path = written(tmp_path, values)
     with pytest.raises(ReconstructionError, match=message) as error:
         read_calibration(path, SIZE, SIZE)
-    assert str(path) in one_line(error.value)
+    message = one_line(error.value)
+    assert str(path) in message
+    assert len(message) < 300 + len(str(path))
+
+
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
+    path = written(tmp_path, "\ufeff" + json.dumps({"focal_px": 900}))
+    assert path.read_bytes().startswith(b"\xef\xbb\xbf")
+    assert read_calibration(path, SIZE, SIZE).camera0 == Camera(SIZE, 900)
 
 
 def test_a_missing_file_is_said(tmp_path: Path, one_line) -> None:

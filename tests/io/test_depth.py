@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import io
+import zlib
 from pathlib import Path
 
 import cv2
@@ -7,6 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from deepdetect._shared.errors import DeepDetectError, ImageError, OptionError
 from deepdetect.io.depth import load_depth_png, save_depth_npz, save_depth_png
@@ -126,3 +130,47 @@ def test_other_pictures_are_no_depth_maps(photo_path: Path, tmp_path: Path, one_
     assert "no depth map" in one_line(caught.value)
     with pytest.raises(DeepDetectError, match="there is no file"):
         load_depth_png(tmp_path / "none.png")
+
+
+def depth_png(values: np.ndarray, scale: object = 1.0, unit: str = "mm") -> bytes:
+    chunks = PngInfo()
+    chunks.add_text("value_per_unit", str(scale))
+    chunks.add_text("unit", unit)
+    file = io.BytesIO()
+    Image.fromarray(values).save(file, "PNG", pnginfo=chunks)
+    return file.getvalue()
+
+
+DEPTH16 = np.arange(600, dtype=np.uint16).reshape(20, 30)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (depth_png(DEPTH16, "nan"), "value_per_unit is nan"),
+        (depth_png(DEPTH16, 0), "value_per_unit is 0"),
+        (depth_png(DEPTH16, -1), "value_per_unit is -1"),
+        (depth_png(DEPTH16, "inf"), "value_per_unit is inf"),
+        (depth_png(DEPTH16, "far"), "carries its scale"),
+        (depth_png(DEPTH16, unit="furlong"), "its unit is 'furlong' instead of one of mm, base"),
+        (depth_png(np.zeros((20, 30, 3), np.uint8)), "RGB instead of 16-bit grey"),
+        (depth_png(DEPTH16.astype(np.uint8)), "L instead of 16-bit grey"),
+        (depth_png(DEPTH16)[:-30], "damaged"),
+    ],
+)
+def test_what_is_no_depth_map_of_ours_is_refused(content: bytes, words: str, one_line) -> None:
+    assert load_depth_png(depth_png(DEPTH16, 2))[0][1, 0] == 15
+    with pytest.raises(ImageError) as caught:
+        load_depth_png(content)
+    assert words in one_line(caught.value)
+
+
+def test_depth_maps_of_too_many_pixels_are_not_decoded(one_line) -> None:
+    with pytest.raises(ImageError) as caught:
+        load_depth_png(depth_png(DEPTH16), max_megapixels=599e-6)
+    assert "the depth map has 30x20 pixels, which is over" in one_line(caught.value)
+    content = bytearray(depth_png(DEPTH16))
+    content[16:24] = (20_000).to_bytes(4, "big") * 2  # in the header
+    content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
+    with pytest.raises(ImageError, match="20000x20000 pixels"):
+        load_depth_png(bytes(content))

@@ -1,11 +1,16 @@
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import struct
+import subprocess
+import sys
 import warnings
+import zlib
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +19,8 @@ from hypothesis import strategies as st
 from PIL import EpsImagePlugin, Image, ImageOps
 from PIL.PngImagePlugin import PngInfo
 
-from deepdetect._shared.errors import ImageError
+import deepdetect.io.image
+from deepdetect._shared.errors import ImageError, OptionError
 from deepdetect.io.image import (
     IMAGE_SUFFIXES,
     MINIMUM_SIDE,
@@ -23,6 +29,7 @@ from deepdetect.io.image import (
     luma,
     scale_short_side,
 )
+from deepdetect.io.image_file import FORMATS
 
 OneLine = Callable[[BaseException], str]
 
@@ -30,6 +37,7 @@ RNG = np.random.default_rng(7)
 RGB = RNG.integers(0, 256, (18, 25, 3), dtype=np.uint8)
 GREY = RGB[:, :, 0]
 ALPHA = RNG.integers(0, 256, (18, 25, 1), dtype=np.uint8)
+OPAQUE = np.full((18, 25, 1), 255, np.uint8)
 DEEP = RNG.integers(0, 65536, (18, 25), dtype=np.uint16)
 DEEP_RGB = RNG.integers(0, 65536, (18, 25, 3), dtype=np.uint16)
 
@@ -92,10 +100,17 @@ PIL_IMAGES = {
     "LA": (Image.fromarray(np.dstack([GREY, ALPHA])), triple(GREY)),
     "P": (PALETTE, np.array(PALETTE.getpalette(), np.uint8).reshape(-1, 3)[np.asarray(PALETTE)]),
     "1": (Image.fromarray(GREY > 99), triple(np.where(GREY > 99, 255, 0))),
+    "La": (Image.fromarray(np.dstack([GREY, OPAQUE])).convert("La"), triple(GREY)),
+    "RGBa": (Image.fromarray(np.dstack([RGB, OPAQUE])).convert("RGBa"), RGB),
+    "RGBX": (Image.fromarray(RGB).convert("RGBX"), RGB),
+    "PA": (Image.fromarray(np.dstack([GREY, ALPHA])).convert("PA"), triple(GREY)),
     "I;16": (Image.fromarray(DEEP), DEEP_GREY),
     "I;16B": (Image.frombytes("I;16B", (25, 18), DEEP.astype(">u2").tobytes()), DEEP_GREY),
     "F": (Image.fromarray((GREY / 255).astype(np.float32)), triple(GREY)),
 }
+
+
+NO_PNG = ("I;16B", "F", "La", "RGBa", "RGBX", "PA")
 
 
 @pytest.mark.parametrize("mode", PIL_IMAGES)
@@ -107,7 +122,14 @@ def test_pil_images(mode: str) -> None:
     np.testing.assert_array_equal(loaded, expected)
 
 
-@pytest.mark.parametrize("mode", [mode for mode in PIL_IMAGES if mode not in ("I;16B", "F")])
+@pytest.mark.parametrize("mode", PIL_IMAGES)
+def test_strips_of_large_images_fit_together(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    given, expected = PIL_IMAGES[mode]
+    monkeypatch.setattr(deepdetect.io.image, "STRIP_PIXELS", 4 * 25 + 3)  # 4 rows, the last ones 2
+    np.testing.assert_array_equal(load_image(given), expected)
+
+
+@pytest.mark.parametrize("mode", [mode for mode in PIL_IMAGES if mode not in NO_PNG])
 @pytest.mark.parametrize("as_text", [True, False])
 def test_files(mode: str, as_text: bool, tmp_path: Path) -> None:
     given, expected = PIL_IMAGES[mode]
@@ -340,6 +362,13 @@ def test_a_file_starts_no_program(
     assert not started.exists()
 
 
+def test_all_suffixes_are_of_formats_that_are_read() -> None:
+    Image.init()
+    formats = {Image.registered_extensions()[suffix] for suffix in IMAGE_SUFFIXES}
+    assert formats <= set(FORMATS)
+    assert not set(FORMATS) & {"EPS", "WMF", "FITS", "PDF", "HDF5", "GRIB", "BUFR", "MPEG"}
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
 def test_a_named_pipe_is_not_waited_for(tmp_path: Path, one_line: OneLine) -> None:
     path = tmp_path / "photo.png"
@@ -349,14 +378,143 @@ def test_a_named_pipe_is_not_waited_for(tmp_path: Path, one_line: OneLine) -> No
     assert f"{path} is a pipe or a device" in one_line(caught.value)
 
 
-def test_large_images_load_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 300)  # RGB has 450; an error comes at 600
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "GIF"])
+def test_large_images_load_in_silence(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    content = encoded(RGB, kind)
+    expected = load_image(content)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 300)  # it has 450; an error comes at 600
     with warnings.catch_warnings(record=True) as caught:
         warnings.resetwarnings()
-        np.testing.assert_array_equal(load_image(PNG), RGB)
+        np.testing.assert_array_equal(load_image(content), expected)
     assert caught == []
-    with pytest.raises(ImageError, match="decompression bomb"):  # warnings are errors in tests
-        load_image(PNG)
+
+
+def claims_to_be(width: int, height: int) -> bytes:
+    """Return a PNG file of a few bytes whose header states a size."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        checksum = zlib.crc32(kind + content).to_bytes(4, "big")
+        return len(content).to_bytes(4, "big") + kind + content + checksum
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    data = chunk(b"IDAT", zlib.compress(bytes(99)))
+    return PNG[:8] + chunk(b"IHDR", header) + data + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("size", [(20_001, 10_000), (2**31 - 1, 2**31 - 1)])
+def test_a_file_of_too_many_pixels_is_not_decoded(size: tuple[int, int], one_line: OneLine) -> None:
+    content = claims_to_be(*size)
+    with pytest.raises(ImageError) as caught:
+        load_image(content)
+    message = one_line(caught.value)
+    assert f"{size[0]}x{size[1]} pixels, which is over 200 megapixels" in message
+    assert "`max_megapixels`" in message
+
+
+def test_the_limit_of_pixels_is_raised_and_lowered_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)  # Pillow's own, which is for all programs
+    np.testing.assert_array_equal(load_image(PNG, max_megapixels=450e-6), RGB)
+    with pytest.raises(ImageError, match="25x18 pixels, which is over"):
+        load_image(PNG, max_megapixels=449e-6)
+    for wrong in (0, -1, float("nan")):
+        with pytest.raises(OptionError, match="must be above 0"):
+            load_image(PNG, max_megapixels=wrong)
+
+
+def test_pillow_s_limit_of_one_tile_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, one_line: OneLine
+) -> None:
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    with pytest.raises(ImageError) as caught:
+        load_image(encoded(RGB, "TIFF"))
+    assert "a tile or a frame that is too large" in one_line(caught.value)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="memory is measured by the module resource")
+def test_a_large_image_is_held_once_in_each_form() -> None:
+    """The PIL image and the array: 4 bytes for each pixel of a grey image, and no more copies."""
+    program = """
+import io, resource, sys
+import numpy as np
+from PIL import Image
+from deepdetect.io.image import load_image
+file = io.BytesIO()
+Image.new("L", (8000, 5000)).save(file, "PNG", compress_level=1)
+load_image(np.zeros((16, 16), np.uint8))
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+load_image(file)
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print((after - before) * (1 if sys.platform == "darwin" else 1024) / 40e6)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) < 5
+
+
+class OtherPath:
+    """Something that is a path for `open`, and no `Path`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+
+class OneWay(io.RawIOBase):
+    """Bytes that come once, as from a socket."""
+
+    def __init__(self, content: bytes) -> None:
+        self.source = io.BytesIO(content)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        return self.source.readinto(buffer)
+
+
+OPENED: dict[str, Callable[[Path], Any]] = {
+    "PurePath": PurePath,
+    "os.PathLike": OtherPath,
+    "bytearray": lambda path: bytearray(path.read_bytes()),
+    "BytesIO": lambda path: io.BytesIO(path.read_bytes()),
+    "open file": lambda path: path.open("rb"),
+    "unbuffered file": lambda path: path.open("rb", buffering=0),
+    "file that cannot go back": lambda path: OneWay(path.read_bytes()),
+}
+
+
+@pytest.mark.parametrize("kind", OPENED)
+def test_paths_and_files_of_every_kind(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "photo.png"
+    path.write_bytes(PNG)
+    given = OPENED[kind](path)
+    with given if hasattr(given, "close") else contextlib.nullcontext():
+        if "open" in kind:
+            given.read(5)  # wherever it is
+        np.testing.assert_array_equal(load_image(given), RGB)
+        assert not getattr(given, "closed", False)
+        if "cannot" not in kind:
+            np.testing.assert_array_equal(load_image(given), RGB)
+
+
+def test_files_that_give_no_bytes_are_one_sentence(tmp_path: Path, one_line: OneLine) -> None:
+    path = tmp_path / "photo.png"
+    path.write_bytes(PNG)
+    with path.open("rb") as closed:
+        pass
+    with path.open(encoding="latin1") as text:
+        for given in (closed, text, io.StringIO("text")):
+            with pytest.raises(ImageError) as caught:
+                load_image(given)
+            assert 'with the mode "rb"' in one_line(caught.value)
+    with path.open("rb") as file:
+        file.seek(9)
+        path.write_bytes(PNG[:40])
+        with pytest.raises(ImageError) as caught:
+            load_image(file)
+    assert str(path) in one_line(caught.value)
 
 
 def test_a_pil_image_of_a_cut_file() -> None:

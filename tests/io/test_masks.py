@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import io
+import os
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from deepdetect._shared.errors import ImageError
-from deepdetect.io.masks import load_mask, save_mask
+from deepdetect.io.masks import load_mask, load_mask_settings, save_mask
 
 MASK = np.random.default_rng(3).random((19, 26)) > 0.6
 
@@ -85,3 +88,40 @@ def test_bad_files(
     with pytest.raises(ImageError) as caught:
         load_mask(path)
     assert str(path) in one_line(caught.value)
+
+
+def test_masks_of_too_many_pixels_are_not_decoded(
+    tmp_path: Path, one_line: Callable[[BaseException], str]
+) -> None:
+    path = tmp_path / "mask.png"
+    save_mask(np.zeros((20, 30), bool), path, "settings")
+    for source in (path, path.read_bytes(), io.BytesIO(path.read_bytes())):
+        with pytest.raises(ImageError) as caught:
+            load_mask(source, max_megapixels=599e-6)
+        assert "30x20 pixels, which is over" in one_line(caught.value)
+        assert load_mask(source, max_megapixels=600e-6).shape == (20, 30)
+    content = bytearray(path.read_bytes())
+    content[16:24] = (20_000).to_bytes(4, "big") * 2  # in the header
+    content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
+    path.write_bytes(content)
+    with pytest.raises(ImageError) as caught:
+        load_mask(path)
+    assert "20000x20000 pixels" in one_line(caught.value)
+    assert load_mask_settings(path) is None
+
+
+def test_a_damaged_mask_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "mask.png"
+    save_mask(MASK, path)
+    content = bytearray(path.read_bytes())
+    content[content.index(b"IEND") - 5] ^= 1  # the last byte of the pixels' checksum
+    path.write_bytes(content)
+    with pytest.raises(ImageError, match="damaged"):
+        load_mask(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_named_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "mask.png")
+    with pytest.raises(ImageError, match="is a pipe"):
+        load_mask(tmp_path / "mask.png")

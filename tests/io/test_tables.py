@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import io
+import tracemalloc
+import zipfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -133,3 +137,93 @@ def test_logits_survive_the_round_trip(tmp_path: Path) -> None:
     assert found.logits is not None
     assert found.logits.tolist() == [17.5, 40]
     assert found.best(1).xy.tolist() == [[3.5, 4]]
+
+
+def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", method) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return file.getvalue()
+
+
+def npy(array: np.ndarray, **header: object) -> bytes:
+    """Return the content of a npy file, whose header may be of another array."""
+    file = io.BytesIO()
+    stated = np.lib.format.header_data_from_array_1_0(array) | header
+    np.lib.format.write_array_header_1_0(file, stated)
+    return file.getvalue() + array.tobytes()
+
+
+XY, SCORES = np.ones((4, 2), np.float32), np.ones(4, np.float32)
+WHOLE = {
+    "keypoints.npy": npy(XY),
+    "scores.npy": npy(SCORES),
+    "image_size.npy": npy(np.array([9, 9])),
+}
+
+
+def flagged(content: bytes, bit: int) -> bytes:
+    """Set a flag of the first member, in its own header and in the directory."""
+    changed = bytearray(content)
+    changed[6] |= bit
+    changed[content.index(b"PK\1\2") + 8] |= bit
+    return bytes(changed)
+
+
+DAMAGED = {
+    "4 TB asked for": zipped(WHOLE | {"scores.npy": npy(SCORES, shape=(10**12,))}),
+    "4 TB of nothing": zipped(WHOLE | {"scores.npy": npy(SCORES, shape=(10**12, 0))}),
+    "less than stated": zipped(WHOLE | {"scores.npy": npy(SCORES, shape=(5,))}),
+    "a negative size": zipped(WHOLE | {"scores.npy": npy(SCORES, shape=(-4,))}),
+    "one number as size": zipped(WHOLE | {"image_size.npy": npy(np.array([9]))}),
+    "no size": zipped(WHOLE | {"image_size.npy": npy(np.array(9))}),
+    "words as scores": zipped(WHOLE | {"scores.npy": npy(np.array(["a"] * 4))}),
+    "a cut header": zipped(WHOLE | {"scores.npy": npy(SCORES)[:30]}),
+    "a broken header": zipped(WHOLE | {"scores.npy": npy(SCORES).replace(b"{", b"'")}),
+    "an unended header": zipped(WHOLE | {"scores.npy": npy(SCORES).replace(b"}", b" ")}),
+    "no array": zipped(WHOLE | {"scores.npy": b"words"}),
+    "encrypted": flagged(zipped(WHOLE), 1),
+    "patched": flagged(zipped(WHOLE), 32),
+    "LZMA": zipped(WHOLE, zipfile.ZIP_LZMA),
+    "BZIP2": zipped(WHOLE, zipfile.ZIP_BZIP2),
+    "one npy": npy(XY),
+    "empty": b"",
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_damaged_files_are_one_sentence(
+    kind: str, tmp_path: Path, one_line: Callable[[BaseException], str]
+) -> None:
+    path = tmp_path / "k.npz"
+    path.write_bytes(zipped(WHOLE, zipfile.ZIP_DEFLATED))
+    assert len(load_keypoints(path)) == 4
+    path.write_bytes(DAMAGED[kind])
+    tracemalloc.start()
+    try:
+        with pytest.raises(DeepDetectError) as caught:
+            load_keypoints(path)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+    assert f"{path} holds no keypoints (" in one_line(caught.value)
+
+
+def test_every_flipped_bit_is_one_sentence_or_harmless(
+    tmp_path: Path, one_line: Callable[[BaseException], str]
+) -> None:
+    path = tmp_path / "k.npz"
+    save_keypoints(keypoints(40), path)
+    content = path.read_bytes()
+    refused = 0
+    for place in range(len(content)):
+        changed = bytearray(content)
+        changed[place] ^= 1 << place % 8
+        path.write_bytes(changed)
+        try:
+            load_keypoints(path)
+        except DeepDetectError as error:
+            one_line(error)
+            refused += 1
+    assert refused > len(content) / 2

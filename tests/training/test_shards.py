@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import shutil
 import tarfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -200,3 +201,21 @@ def test_an_index_cannot_name_files_elsewhere(shards: Shards, tmp_path: Path) ->
     path.write_text(json.dumps(index))
     with pytest.raises(ImageError, match="copy/passwd is missing"):
         Shards.open(tmp_path / "copy", OPTIONS)
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"training": ', '{"training": 1}', "[1]"])
+def test_an_index_that_is_none_is_one_sentence(
+    content: str, shards: Shards, tmp_path: Path, one_line: Callable[[BaseException], str]
+) -> None:
+    (tmp_path / "shards.json").write_text(content)
+    with pytest.raises(ImageError) as caught:
+        Shards.open(tmp_path, OPTIONS)
+    assert "shards.json is damaged" in one_line(caught.value)
+
+
+def test_an_index_with_endless_counts_is_damaged(shards: Shards, tmp_path: Path) -> None:
+    index = json.loads((shards.folder / "shards.json").read_text())
+    index["training"][0]["images"] = float("inf")
+    (tmp_path / "shards.json").write_text(json.dumps(index))
+    with pytest.raises(ImageError, match="damaged"):
+        Shards.open(tmp_path, OPTIONS)

@@ -89,7 +89,12 @@ def _numbers(value: object) -> list[float]:
     """Return a number, or those of nested tuples; NaN for anything else."""
     if isinstance(value, tuple):
         return [number for one in value for number in _numbers(one)]
-    return [float(value) if isinstance(value, Real) else math.nan]
+    if not isinstance(value, Real):
+        return [math.nan]
+    try:
+        return [float(value)]
+    except OverflowError:  # an integer of over 308 digits, which is in no range
+        return [math.nan]
 
 
 def replace_options(options: Options, **changes: Any) -> Options:

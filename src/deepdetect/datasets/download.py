@@ -6,6 +6,7 @@ COCO with its 19 GB needs.
 
 from __future__ import annotations
 
+import errno
 import gzip
 import hashlib
 import json
@@ -13,7 +14,6 @@ import re
 import shutil
 import tarfile
 import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources, util
@@ -35,6 +35,12 @@ TIMEOUT_SECONDS = 60.0
 
 ARCHIVE_SUFFIXES = (".zip", ".tar.gz", ".tgz", ".tar")
 GZIP_SIGNATURE = b"\x1f\x8b"
+
+WRITE_ERRORS = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
+    *(errno.EMFILE, errno.ENFILE),
+)
+"""What the disk or the system refuses; other errors of unpacking lie in the archive."""
 
 
 @dataclass(frozen=True)
@@ -346,9 +352,12 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
             with tarfile.open(archive) as tar:
                 members = tar.getmembers()
                 _extract(members, lambda one: tar.extract(one, target, filter="data"), quiet)
-    except (zipfile.BadZipFile, tarfile.TarError, gzip.BadGzipFile, zlib.error, EOFError):
+    except Exception as error:  # zip, tar and their compressions raise many kinds
+        if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
+            raise
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise DeepDetectError(
-            f"{file.urls[0]} is no archive that can be unpacked: try again"
+            f"{file.urls[0]} is no archive that can be unpacked ({reason}): try again"
         ) from None
     if file.inside and (target / file.inside).is_dir():
         for entry in sorted((target / file.inside).iterdir()):

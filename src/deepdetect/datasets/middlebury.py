@@ -20,7 +20,8 @@ import cv2
 import numpy as np
 
 from .._shared.errors import ImageError, MissingExtraError
-from ..geometry.camera import read_calibration
+from .._shared.text_files import read_json
+from ..geometry.camera import MAX_FILE_BYTES, read_calibration
 from ..io.image import load_image
 from .download import RemoteDataset, RemoteFile
 from .types import CalibratedStereoPair, StereoPair
@@ -38,14 +39,14 @@ def load_middlebury(folder: str | Path) -> StereoPair:
     root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:
-        truth = json.loads(path.read_text(encoding="utf-8")).get("ground_truth")
+        truth = read_json(path, MAX_FILE_BYTES).get("ground_truth")
         if truth is None:
             raise ImageError(f"{root} has no ground truth: take a scene that has one")
         value, unknown = float(truth["value_per_pixel"]), float(truth["unknown"])
         file = root / truth["file"]
     except OSError as error:
         raise ImageError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         raise ImageError(f"{path} does not say how its ground truth is stored ({error})") from None
     stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) if file.is_file() else None
     if stored is None or stored.ndim != 2 or not value > 0:

@@ -20,6 +20,7 @@ import numpy as np
 from .._shared.errors import ImageError
 from ..geometry.triangulation import cross_matrix
 from ..io.image import load_image
+from ..io.image_file import open_image
 from .pair_selection import PairSelectionOptions, sequence_pairs, unordered_pairs
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
@@ -334,12 +335,10 @@ def _scaled(
 
 def _image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) without decoding the pixels."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as opened:
+        with open_image(path) as opened:
             size, turned = opened.size, opened.getexif().get(ORIENTATION_TAG, 1) != 1
-    except Exception:  # Pillow raises many kinds; this says what is wrong
+    except ImageError:  # of the file's head only; this says what is wrong
         height, width = load_image(path).shape[:2]
         return width, height
     if turned:

@@ -18,7 +18,8 @@ Other keys are ignored. The names follow the calib.txt of Middlebury 2014 (Schar
 
 from __future__ import annotations
 
-import json
+import math
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,11 +28,15 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import ReconstructionError
+from .._shared.text_files import read_json
 
 Size = tuple[int, int]
 
 MAX_OFFSET_ERROR_PX = 0.5
 """By how much cx of both views and the disparity offset may contradict each other."""
+
+MAX_FILE_BYTES = 1 << 20
+"""Longer calib.json files are refused; usual ones have a few hundred bytes."""
 
 
 @dataclass(frozen=True, init=False)
@@ -67,7 +72,8 @@ class Camera:
         width, height = _pair("the image size", size)
         if min(width, height) < 1:
             raise ReconstructionError(f"an image size must be positive, not {size}")
-        focal = _pair("the focal length", (focal_px,) * 2 if np.ndim(focal_px) == 0 else focal_px)
+        single = not isinstance(focal_px, (list, tuple)) and np.ndim(focal_px) == 0
+        focal = _pair("the focal length", (focal_px, focal_px) if single else focal_px)
         if min(focal) <= 0:
             raise ReconstructionError(
                 f"the focal length must be above 0 pixels, not {min(focal):g}: give it in pixels "
@@ -206,7 +212,7 @@ def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
             another size.
     """
     try:
-        values = json.loads(Path(path).read_text(encoding="utf-8"))
+        values = read_json(path, MAX_FILE_BYTES)
     except OSError as error:
         reason = error.strerror or type(error).__name__
         raise ReconstructionError(f"{path} cannot be read ({reason}): check the path") from None
@@ -267,16 +273,21 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
     try:
         first, second = value
     except (TypeError, ValueError):
-        raise ReconstructionError(f"{name} must be one or two numbers, not {value!r}") from None
+        shown = reprlib.repr(value)
+        raise ReconstructionError(f"{name} must be one or two numbers, not {shown}") from None
     return _number(name, first), _number(name, second)
 
 
 def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise ReconstructionError(f"{name} must be a number, not {value!r}")
-    if not np.isfinite(value):
-        raise ReconstructionError(f"{name} must be finite, not {value}")
-    return float(value)
+        raise ReconstructionError(f"{name} must be a number, not {reprlib.repr(value)}")
+    try:
+        number = float(value)
+    except OverflowError:  # an integer of over 308 digits
+        number = math.inf
+    if not math.isfinite(number):
+        raise ReconstructionError(f"{name} must be finite, not {number}")
+    return number
 
 
 def _text(size: Sequence[float]) -> str:

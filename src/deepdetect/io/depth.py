@@ -12,6 +12,7 @@ from PIL import Image, PngImagePlugin
 from .._shared.atomic import atomic_path
 from .._shared.errors import ImageError, OptionError, unknown_name
 from ..geometry.point_cloud import UNITS
+from .image_file import MAX_MEGAPIXELS, file_name, open_image
 
 MAX_UINT16 = 65535
 
@@ -86,24 +87,46 @@ def save_depth_png(
     return DepthPng(unit, scale, int(fits.sum()), int((known & ~fits).sum()))
 
 
-def load_depth_png(path: str | Path) -> tuple[np.ndarray, str]:
+def load_depth_png(
+    source: Any, *, max_megapixels: float = MAX_MEGAPIXELS
+) -> tuple[np.ndarray, str]:
     """Read a depth map that `save_depth_png` wrote.
+
+    Args:
+        source: a path, the content of a file as bytes, or an open binary file.
+        max_megapixels: larger files are refused before they are decoded.
 
     Returns:
         (H, W) float32 depths, NaN where unknown, and their unit.
 
     Raises:
-        ImageError: the file is missing, or is no such depth map.
+        ImageError: the file is missing, damaged, too large, or is no such depth map.
     """
-    try:
-        with Image.open(path) as image:
-            values, info = np.asarray(image), image.info
-        scale, unit = float(info["value_per_unit"]), str(info["unit"])
-    except FileNotFoundError:
-        raise ImageError(f"there is no file {path}: check the path") from None
-    except (OSError, ValueError, KeyError) as error:
-        raise ImageError(f"{path} is no depth map that carries its scale ({error})") from None
+    with open_image(source, what="depth map", max_megapixels=max_megapixels) as image:
+        scale, unit = _scale_and_unit(image, file_name(source, "depth map"))
+        values = np.asarray(image)
     return np.where(values == 0, np.nan, values / scale).astype(np.float32), unit
+
+
+def _scale_and_unit(image: Any, name: str) -> tuple[float, str]:
+    """Return what `save_depth_png` wrote beside the pixels."""
+    try:
+        scale, unit = float(image.info["value_per_unit"]), str(image.info["unit"])
+    except (KeyError, TypeError, ValueError):
+        raise ImageError(
+            f"{name} is no depth map that carries its scale and unit: take one that "
+            "save_depth_png wrote"
+        ) from None
+    wrong = ""
+    if not (image.mode == "I" or image.mode.startswith("I;16")):
+        wrong = f"its pixels are {image.mode} instead of 16-bit grey"
+    elif not 0 < scale < np.inf:
+        wrong = f"value_per_unit is {scale:g} instead of a number above 0"
+    elif unit not in UNITS:
+        wrong = f"its unit is {unit[:40]!r} instead of one of {', '.join(UNITS)}"
+    if wrong:
+        raise ImageError(f"{name} is no depth map that can be used, {wrong}: write it again")
+    return scale, unit
 
 
 def save_depth_npz(depth: np.ndarray, path: str | Path, unit: str, **arrays: np.ndarray) -> None:

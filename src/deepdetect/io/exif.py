@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .._shared.errors import ReconstructionError
 from ..geometry.camera import Calibration, Camera, Size
+from .image_file import file_name, is_file, open_image
 
 DIAGONAL_35MM_MM = float(np.hypot(36, 24))
 """Diagonal of a frame of 35 mm film, which the equivalent focal length refers to (CIPA)."""
@@ -40,7 +39,7 @@ def calibration_from_exif(image0: Any, image1: Any, size0: Size, size1: Size) ->
     """Read a calibration from two photographs; the principal points are in the middle.
 
     Args:
-        image0, image1: paths, file contents as bytes, or PIL images, as for `load_image`.
+        image0, image1: files or PIL images, as for `load_image`.
         size0, size1: (width, height) in pixels as `load_image` returns them: files are turned
             upright, PIL images are not.
 
@@ -58,13 +57,13 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
     with FocalLengthIn35mmFilm or it is missing; else that of FocalLengthIn35mmFilm.
 
     Args:
-        image: a path, a file's content as bytes, or a PIL image.
+        image: a path, a file's content as bytes, an open binary file, or a PIL image.
         size: (width, height) in pixels, as `load_image` returns it.
 
     Raises:
         ReconstructionError: it carries no usable focal length, or has been cropped since.
     """
-    name = f"{image}" if isinstance(image, (str, Path)) else "the image"
+    name = file_name(image)
     tags, orientation = _tags(image)
     turned = orientation in TRANSPOSED and not hasattr(image, "getexif")
     own = (size[1], size[0]) if turned else size
@@ -98,14 +97,11 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
 
 def _tags(image: Any) -> tuple[dict[int, Any], int]:
     """Read the EXIF tags and the orientation; unreadable tags count as missing."""
-    from PIL import Image
-
     try:
         if hasattr(image, "getexif"):
             exif = image.getexif()
-        elif isinstance(image, (str, Path, bytes)):
-            file = io.BytesIO(image) if isinstance(image, bytes) else image
-            with Image.open(file) as opened:
+        elif is_file(image):
+            with open_image(image) as opened:
                 exif = opened.getexif()
         else:
             return {}, 1

@@ -5,18 +5,15 @@ Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 
 from __future__ import annotations
 
-import io
-import stat
-import warnings
-import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import cv2
 import numpy as np
 
 from .._shared.errors import ImageError
+from .image_file import MAX_MEGAPIXELS, damaged_image, file_name, is_file, open_image
 
 MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
@@ -24,48 +21,57 @@ MINIMUM_SIDE = 16
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
 """File name suffixes of the images that `find_images` lists."""
 
-FORMATS = (
-    *("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "AVIF"),
-    *("PSD", "QOI", "SGI", "PCX"),
-    *("HEIF", "JXL"),  # where a plug-in of Pillow has registered them
-    "TGA",  # has no signature, so it comes last
-)
-"""Formats that are read: all are decoded in this process, unlike EPS, which starts Ghostscript."""
-
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+ORIENTATION_TAG = 0x0112
 SAMPLE_FORMAT, SIGNED = 339, 2  # a tag of TIFF, and its value for signed integers
 
+STRIP_PIXELS = 1 << 20
+"""PIL images are converted by strips of about this size: whole copies take gigabytes."""
 
-def load_image(image: Any) -> np.ndarray:
+UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    2: lambda image: cv2.flip(image, 1),
+    3: lambda image: cv2.rotate(image, cv2.ROTATE_180),
+    4: lambda image: cv2.flip(image, 0),
+    5: cv2.transpose,
+    6: lambda image: cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE),
+    7: lambda image: cv2.flip(cv2.transpose(image), -1),
+    8: lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),
+}
+"""What undoes each orientation of EXIF."""
+
+
+def load_image(image: Any, *, max_megapixels: float = MAX_MEGAPIXELS) -> np.ndarray:
     """Read an image of any usual kind as 8-bit RGB.
 
     Args:
-        image: a path; the content of an image file as bytes; a PIL image; or an array
+        image: a path; the content of an image file as bytes, or a file opened in binary mode,
+            which is read from its beginning; a PIL image; or an array
             (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) in the order RGB(A): uint8, uint16 (full
             range 0..65535) or float in [0, 1]. The alpha channel is dropped. Files, also as
             bytes, are turned upright by their EXIF tag. Pixels of files and PIL images are
             of these types too, signed and 32-bit integers are refused.
+        max_megapixels: larger files are refused before they are decoded, as a file of few bytes
+            can hold billions of pixels. One megapixel takes 3 MB, and up to 7 MB while it is read.
 
     Returns:
         (H, W, 3) uint8 RGB.
 
     Raises:
         ImageError: the file is missing, truncated, damaged (as far as its format lets one
-            see) or no image, the array has a wrong shape, type or range or holds NaN, or a
-            side is shorter than 16 pixels.
+            see), too large or no image, the array has a wrong shape, type or range or holds
+            NaN, or a side is shorter than 16 pixels.
+        OptionError: `max_megapixels` is not above 0.
 
     Example:
         >>> load_image(np.zeros((20, 30), np.uint16)).shape
         (20, 30, 3)
     """
-    if isinstance(image, (str, Path)):
-        rgb, name = _read_file(Path(image), str(image)), str(image)
-    elif isinstance(image, bytes):
-        rgb, name = _read_file(io.BytesIO(image), "the image"), "the image"
-    elif hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
-        rgb, name = _from_pil(image), "the image"
+    name = "the image"
+    if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
+        rgb = _from_pil(image, name)
+    elif is_file(image):
+        rgb, name = _read_file(image, max_megapixels), file_name(image)
     else:
-        rgb, name = _from_array(image), "the image"
+        rgb = _from_array(image, name)
     if min(rgb.shape[:2]) < MINIMUM_SIDE:
         height, width = rgb.shape[:2]
         raise ImageError(
@@ -122,102 +128,29 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     return found
 
 
-def _read_file(file: Path | io.BytesIO, name: str) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        if isinstance(file, io.BytesIO):
-            return _decode(file, name)
-        mode = file.stat().st_mode
-        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise ImageError(f"{name} is a pipe or a device: save the image as a file first")
-        # Pillow gets no path: it would map uncompressed TIFF into memory, and turn it wrongly.
-        with file.open("rb") as opened:
-            return _decode(opened, name)
-    except FileNotFoundError:
-        raise ImageError(f"there is no file {name}: check the path") from None
-    except IsADirectoryError:
-        raise ImageError(f"{name} is a folder: name an image file") from None
-    except UnidentifiedImageError:
-        raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG") from None
-    except Image.DecompressionBombError:
-        raise ImageError(f"{name} has over 178 million pixels: make it smaller") from None
-    except PermissionError:
-        raise ImageError(f"{name} may not be read: check its rights") from None
-    except ImageError:
-        raise
-    except Exception as error:  # Pillow's decoders raise many kinds
-        raise _damaged(name, error) from None
+def _read_file(source: Any, max_megapixels: float) -> np.ndarray:
+    with open_image(source, max_megapixels=max_megapixels) as image:
+        rgb = _from_pil(image, file_name(source))
+        orientation = _orientation(image)
+    del image  # its pixels, before they are needed once more
+    return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
 
-def _decode(file: BinaryIO, name: str) -> np.ndarray:
-    from PIL import Image
-
-    _check_png(file, name)
-    _hide_warning_of_large_images()
-    Image.init()  # registers all formats; that of AVIF is not in every Pillow
-    with Image.open(file, formats=[key for key in FORMATS if key in Image.OPEN]) as opened:
-        return _from_pil(opened, name, upright=True)
-
-
-def _check_png(file: BinaryIO, name: str) -> None:
-    """Check the checksums of a PNG file, if it is one: Pillow skips those of the pixels."""
-    if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
-        kind = b""
-        while kind != b"IEND":
-            header = file.read(8)
-            left, kind = int.from_bytes(header[:4], "big"), header[4:]
-            checksum = zlib.crc32(kind)
-            # In pieces, as a damaged length may be 4 GB.
-            while left and (piece := file.read(min(left, 1 << 20))):
-                checksum = zlib.crc32(piece, checksum)
-                left -= len(piece)
-            if file.read(4) != checksum.to_bytes(4, "big"):
-                raise _damaged(name, "a checksum of the PNG file is wrong or missing")
-    file.seek(0)
-
-
-def _hide_warning_of_large_images() -> None:
-    """Hide Pillow's warning of 89 to 178 million pixels, unless the program filters it itself."""
-    from PIL import Image
-
-    kind = Image.DecompressionBombWarning
-    # Not catch_warnings, which is not safe with threads.
-    if not any(category is kind for _, _, category, *_ in warnings.filters):
-        warnings.filterwarnings("ignore", category=kind, append=True)
-
-
-def _upright(image: Any) -> Any:
-    """Turn a loaded picture upright by its EXIF tag; a broken tag is ignored."""
-    from PIL import Image
-
+def _orientation(image: Any) -> Any:
+    """Return the EXIF orientation of a loaded image; a broken tag is ignored."""
     if image.format == "TIFF":  # Pillow has turned it when it loaded it
-        return image
+        return 1
     try:
-        orientation = image.getexif().get(0x0112, 1)
-    except Exception:
-        return image
-    turns = {
-        2: Image.Transpose.FLIP_LEFT_RIGHT,
-        3: Image.Transpose.ROTATE_180,
-        4: Image.Transpose.FLIP_TOP_BOTTOM,
-        5: Image.Transpose.TRANSPOSE,
-        6: Image.Transpose.ROTATE_270,
-        7: Image.Transpose.TRANSVERSE,
-        8: Image.Transpose.ROTATE_90,
-    }
-    return image.transpose(turns[orientation]) if orientation in turns else image
+        return image.getexif().get(ORIENTATION_TAG, 1)
+    except Exception:  # Pillow's readers raise many kinds
+        return 1
 
 
-def _damaged(name: str, error: Exception | str) -> ImageError:
-    return ImageError(f"{name} is damaged or truncated ({error}): get it again")
-
-
-def _from_pil(image: Any, name: str = "the image", *, upright: bool = False) -> np.ndarray:
+def _from_pil(image: Any, name: str) -> np.ndarray:
     try:
         image.load()
     except Exception as error:  # Pillow's decoders raise many kinds
-        raise _damaged(name, error) from None
+        raise damaged_image(name, error) from None
     # Pillow holds 16-bit PGM, and 10.3 also 16-bit PNG, in 32 bits; all else may have any range.
     wide = image.mode == "I" and image.format not in ("PNG", "PPM")
     if wide or SIGNED in getattr(image, "tag_v2", {}).get(SAMPLE_FORMAT, ()):
@@ -225,10 +158,21 @@ def _from_pil(image: Any, name: str = "the image", *, upright: bool = False) -> 
             f"{name} holds 32-bit or signed integers, whose range is not known: convert it "
             "to 8 bits (mode L or RGB), 16 bits without sign (mode I;16) or float in [0, 1]"
         )
-    if upright:
-        image = _upright(image)
+    width, height = image.size
+    rgb = np.empty((height, width, 3), np.uint8)
+    rows = max(1, STRIP_PIXELS // max(1, width))
+    for top in range(0, height, rows):
+        bottom = min(top + rows, height)
+        strip = image if rows >= height else image.crop((0, top, width, bottom))
+        rgb[top:bottom] = _strip_to_rgb(strip, name)
+    return rgb
+
+
+def _strip_to_rgb(image: Any, name: str) -> np.ndarray:
     if image.mode == "P" and isinstance(image.info.get("transparency"), bytes):
         image = image.convert("RGBA")  # Pillow warns when it drops such an alpha at once
+    if image.mode == "La":
+        image = image.convert("LA")  # the only mode that Pillow converts it to
     if image.mode == "I":
         return _from_array(np.asarray(image).astype(np.uint16), name)
     if image.mode.startswith("I;16") or image.mode == "F":

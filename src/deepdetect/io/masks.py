@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import ImageError
+from .image_file import MAX_MEGAPIXELS, open_image
 
 SETTINGS_KEY = "deepdetect-label"
 """Keyword of the PNG text chunk that holds the settings a mask was made with."""
@@ -38,40 +40,31 @@ def encode_mask(mask: np.ndarray, settings: str = "") -> bytes:
     return content.getvalue()
 
 
-def load_mask(path: str | Path | bytes) -> np.ndarray:
+def load_mask(source: Any, *, max_megapixels: float = MAX_MEGAPIXELS) -> np.ndarray:
     """Read a mask of any bit depth: True where a pixel is brighter than half.
 
     In a file that holds only zeros and ones, the ones are True.
 
     Args:
-        path: the file, or its content.
+        source: a path, the content of a file as bytes, or an open binary file.
+        max_megapixels: larger files are refused before they are decoded.
 
     Returns:
         (H, W) bool.
 
     Raises:
-        ImageError: the file is missing, damaged or no image.
+        ImageError: the file is missing, damaged, too large or no image.
     """
-    from PIL import Image
-
-    name = "the mask" if isinstance(path, bytes) else path
-    try:
-        with Image.open(io.BytesIO(path) if isinstance(path, bytes) else path) as opened:
-            deep = opened.mode.startswith("I")  # 16 bits per pixel
-            values = np.asarray(opened if deep else opened.convert("L"))
-        return values > (0 if values.max() <= 1 else 32767 if deep else 127)
-    except FileNotFoundError:
-        raise ImageError(f"there is no mask {name}: check the path") from None
-    except (OSError, SyntaxError, ValueError) as error:
-        raise ImageError(f"{name} is not a mask that can be read ({error})") from None
+    with open_image(source, what="mask", max_megapixels=max_megapixels) as opened:
+        deep = opened.mode.startswith("I")  # 16 bits per pixel
+        values = np.asarray(opened if deep else opened.convert("L"))
+    return values > (0 if values.max() <= 1 else 32767 if deep else 127)
 
 
 def load_mask_settings(path: str | Path) -> str | None:
     """Return the settings text stored in a mask file, or None when it has none."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as opened:
+        with open_image(path, what="mask") as opened:
             return opened.info.get(SETTINGS_KEY)
-    except (OSError, SyntaxError, ValueError):
+    except ImageError:
         return None

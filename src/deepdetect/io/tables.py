@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+import os
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -16,6 +18,9 @@ from ..features.keypoints import Keypoints
 from ..features.matches import Guide, Matches
 
 FORMATS = ("npz", "csv")
+
+MAX_DEFLATE_RATIO = 1032
+"""By how much zip's usual compression can shrink at most (https://zlib.net/zlib_tech.html)."""
 
 
 def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
@@ -152,16 +157,46 @@ def load_matches(path: str | Path) -> Matches:
 
 @contextmanager
 def _reading(path: str | Path, content: str) -> Iterator[Any]:
-    """Open an npz file; errors of reading it, and of names that it lacks, say so."""
+    """Open an npz file; errors of reading it, and of what it lacks, say so."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            yield arrays
+        with Path(path).open("rb") as file:
+            _check_npz(file)
+            with np.load(file, allow_pickle=False) as arrays:
+                yield arrays
     except FileNotFoundError:
         raise DeepDetectError(f"there is no file {path}: check the path") from None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # zip, its compressions and NumPy raise many kinds
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise DeepDetectError(
-            f"{path} holds no {content} ({error}): write the file again"
+            f"{path} holds no {content} ({reason}): write the file again"
         ) from None
+
+
+def _check_npz(file: BinaryIO) -> None:
+    """Check that the arrays have the sizes that they state: NumPy allocates them first.
+
+    Raises:
+        ValueError: they have not, or are compressed in another way than NumPy's.
+    """
+    length = file.seek(0, os.SEEK_END)
+    with zipfile.ZipFile(file) as archive:
+        for entry in archive.infolist():
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"{entry.filename} is compressed in an unknown way")
+            if entry.file_size > MAX_DEFLATE_RATIO * min(entry.compress_size, length):
+                raise ValueError(f"{entry.filename} states a wrong size")
+            with archive.open(entry) as member:
+                version = np.lib.format.read_magic(member)
+                # Version 3.0 is 2.0 with names of columns in UTF-8, which ours do not have.
+                read_header = (
+                    np.lib.format.read_array_header_1_0
+                    if version == (1, 0)
+                    else np.lib.format.read_array_header_2_0
+                )
+                shape, _, dtype = read_header(member)
+                if math.prod(shape) * dtype.itemsize != entry.file_size - member.tell():
+                    raise ValueError(f"{entry.filename} does not have the size that it states")
+    file.seek(0)
 
 
 def _or_empty(matrix: np.ndarray | None) -> np.ndarray:

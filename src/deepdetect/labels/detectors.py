@@ -7,8 +7,9 @@ masks (H, W) bool.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -16,9 +17,26 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import check_ranges
+
+Limits = dict[str, tuple[float, float]]
 
 AGAST_OAST_9_16 = 3
 """`AgastFeatureDetector::OAST_9_16`; not every OpenCV exports it to Python."""
+
+# Beyond the ranges of the settings OpenCV ends the process, runs for minutes, takes another number
+# (modulo 256), or raises an error.
+GRAY_LEVELS = (0, 255)
+"""Range of differences of grey levels."""
+
+BLOCK_SIZES = (1, 255)
+"""Range of the widths of windows, in pixels."""
+
+KERNEL_SIZES = (1, 31)
+"""Range of the widths of Sobel filters, in pixels."""
+
+MAX_CANNY_THRESHOLD = 2040
+"""Largest sum of both gradients of the 3x3 Sobel filter, in grey levels."""
 
 
 def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
@@ -62,6 +80,11 @@ class SiftSettings:
     sigma: float = 1.6
     octave_layers: int = 3
 
+    def __post_init__(self) -> None:
+        limits: Limits = {"contrast_threshold": (0, 1), "edge_threshold": (1, 1e6)}
+        limits |= {"sigma": (0.1, 20), "octave_layers": (1, 20)}
+        check_ranges(self, between=limits)
+
 
 def sift_mask(gray: np.ndarray, settings: SiftSettings) -> np.ndarray:
     """Mark SIFT keypoints: extrema of the difference-of-Gaussians scale space (Lowe, 2004)."""
@@ -84,13 +107,20 @@ class OrbSettings:
     edge_threshold: int = 13
     fast_threshold: int = 13
 
+    def __post_init__(self) -> None:
+        limits: Limits = {"features": (1, 1e7), "scale_factor": (1.01, 10), "levels": (1, 32)}
+        limits |= {"edge_threshold": (0, 1000), "fast_threshold": GRAY_LEVELS}
+        check_ranges(self, between=limits)
+
 
 def orb_mask(gray: np.ndarray, settings: OrbSettings) -> np.ndarray:
     """Mark ORB keypoints: FAST corners on an image pyramid (Rublee et al., 2011)."""
+    # OpenCV refuses levels of less than a pixel.
+    most = 1 + int(math.log(min(gray.shape)) / math.log(settings.scale_factor))
     detector = cv2.ORB_create(
         nfeatures=settings.features,
         scaleFactor=settings.scale_factor,
-        nlevels=settings.levels,
+        nlevels=min(settings.levels, most),
         edgeThreshold=settings.edge_threshold,
         fastThreshold=settings.fast_threshold,
     )
@@ -104,6 +134,9 @@ class BriskSettings:
     threshold: int = 11
     octaves: int = 3
 
+    def __post_init__(self) -> None:
+        check_ranges(self, between={"threshold": GRAY_LEVELS, "octaves": (0, 16)})
+
 
 @lru_cache(maxsize=8)
 def _brisk(settings: BriskSettings) -> cv2.Feature2D:
@@ -113,6 +146,9 @@ def _brisk(settings: BriskSettings) -> cv2.Feature2D:
 
 def brisk_mask(gray: np.ndarray, settings: BriskSettings) -> np.ndarray:
     """Mark BRISK keypoints: AGAST corners in a scale space (Leutenegger et al., 2011)."""
+    # OpenCV refuses octaves of less than a pixel; in each, a layer has 2/3 of the size.
+    most = (2 * min(gray.shape) // 3).bit_length()
+    settings = replace(settings, octaves=min(settings.octaves, most))
     return keypoints_mask(gray, _brisk(settings).detect(gray, None))
 
 
@@ -122,6 +158,9 @@ class FastSettings:
 
     threshold: int = 13
     suppression: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self, between={"threshold": GRAY_LEVELS})
 
 
 def fast_mask(gray: np.ndarray, settings: FastSettings) -> np.ndarray:
@@ -138,6 +177,9 @@ class AgastSettings:
 
     threshold: int = 13
     suppression: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self, between={"threshold": GRAY_LEVELS})
 
 
 def agast_mask(gray: np.ndarray, settings: AgastSettings) -> np.ndarray:
@@ -161,6 +203,14 @@ class HarrisSettings:
     relative_threshold: float = 0.001
     dilate: bool = True
 
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            fractions=("k", "relative_threshold"),
+            odd=("aperture",),
+            between={"block_size": BLOCK_SIZES, "aperture": KERNEL_SIZES},
+        )
+
 
 def harris_mask(gray: np.ndarray, settings: HarrisSettings) -> np.ndarray:
     """Mark corners of the gradient covariance (Harris and Stephens, 1988).
@@ -182,6 +232,11 @@ class ShiTomasiSettings:
     minimum_distance: float = 1.0
     block_size: int = 2
 
+    def __post_init__(self) -> None:
+        limits: Limits = {"corners": (0, 1e7), "quality_level": (1e-6, 1)}
+        limits |= {"minimum_distance": (0, 1000), "block_size": BLOCK_SIZES}
+        check_ranges(self, between=limits)
+
 
 def shi_tomasi_mask(gray: np.ndarray, settings: ShiTomasiSettings) -> np.ndarray:
     """Mark corners by the smaller eigenvalue of the gradient covariance (Shi and Tomasi, 1994)."""
@@ -202,6 +257,10 @@ class CannySettings:
     low_threshold: float = 150.0
     high_threshold: float = 250.0
 
+    def __post_init__(self) -> None:
+        limits = dict.fromkeys(("low_threshold", "high_threshold"), (0, MAX_CANNY_THRESHOLD))
+        check_ranges(self, between=limits)
+
 
 def canny_mask(gray: np.ndarray, settings: CannySettings) -> np.ndarray:
     """Mark thin edges: gradient maxima with hysteresis (Canny, 1986)."""
@@ -214,6 +273,14 @@ class SobelSettings:
 
     kernel_size: int = 11
     relative_threshold: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            fractions=("relative_threshold",),
+            odd=("kernel_size",),
+            between={"kernel_size": KERNEL_SIZES},
+        )
 
 
 def sobel_mask(gray: np.ndarray, settings: SobelSettings) -> np.ndarray:
@@ -258,6 +325,23 @@ DETECTORS: tuple[LabelDetector, ...] = (
         "sobel", "edge", sobel_mask, SobelSettings(), SobelSettings(relative_threshold=0.5)
     ),
 )
+
+
+def run_detector(detector: LabelDetector, gray: np.ndarray, settings: Any) -> np.ndarray:
+    """Return what a detector marks in a (H, W) uint8 grey image, (H, W) bool.
+
+    Raises:
+        OptionError: OpenCV refuses the settings for this image.
+    """
+    try:
+        return detector.mask(gray, settings)
+    except (cv2.error, ValueError, OverflowError) as error:
+        reason = (str(error).strip().splitlines() or ["no reason given"])[-1]
+        size = f"{gray.shape[1]}x{gray.shape[0]}"
+        raise OptionError(
+            f"OpenCV refuses {settings} for an image of {size} pixels ({reason}): change them"
+        ) from None
+
 
 DETECTOR_NAMES: tuple[str, ...] = tuple(detector.name for detector in DETECTORS)
 

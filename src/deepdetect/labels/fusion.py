@@ -8,7 +8,7 @@ import numpy as np
 
 from .._shared.options import suggest_keywords
 from ..viz.draw import draw_masks
-from .detectors import DETECTOR_NAMES, select_detectors
+from .detectors import DETECTOR_NAMES, run_detector, select_detectors
 from .settings import SettingChange, settings_for
 from .visibility import Visibility, VisibilityChoice, check_visibility, visibility_of
 
@@ -77,6 +77,9 @@ def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
     Returns:
         The label, whose `mask` is the pixelwise OR.
 
+    Raises:
+        OptionError: OpenCV refuses the settings of a detector for this image.
+
     Example:
         >>> square = np.zeros((32, 32), np.uint8)
         >>> square[8:24, 8:24] = 255
@@ -88,7 +91,7 @@ def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
     marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
     for detector in select_detectors(options.detectors):
         settings = settings_for(detector, visibility, options.changes)
-        marked[detector.kind] |= detector.mask(gray, settings)
+        marked[detector.kind] |= run_detector(detector, gray, settings)
     return Label(marked["keypoint"], marked["edge"], visibility)
 
 

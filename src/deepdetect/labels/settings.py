@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.registry import resolve_name_or_path
-from .detectors import DETECTOR_NAMES, DETECTORS, LabelDetector, select_detectors
+from .._shared.text_files import read_toml
+from .detectors import (
+    DETECTOR_NAMES,
+    DETECTORS,
+    LabelDetector,
+    run_detector,
+    select_detectors,
+)
 from .visibility import Visibility
 
 SECTIONS: dict[str, Visibility] = {"normal": "normal", "low_visibility": "low"}
+
+MAX_FILE_BYTES = 16_000
+"""Longer settings files are refused: all settings of all detectors take 2,000 bytes, and the time
+to read some files of TOML grows with the square of their length."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +41,8 @@ class SettingChange:
         value: its new value.
 
     Raises:
-        OptionError: a name is unknown, or the value has another type than the default.
+        OptionError: a name is unknown, or the value has another type than the default or is out
+            of its range.
 
     Example:
         >>> SettingChange("fast", "normal", "threshold", 20).value
@@ -58,6 +68,8 @@ class SettingChange:
         known = [field.name for field in dataclasses.fields(default)]
         if self.name not in known:
             raise unknown_name(f"setting of {self.detector}", self.name, known)
+        if not _is_finite(self.value):
+            raise OptionError(f"the setting {self.name} of {self.detector} must be finite")
         kind = type(getattr(default, self.name))
         fits = type(self.value) is kind or (kind is float and type(self.value) is int)
         if not fits:
@@ -65,9 +77,19 @@ class SettingChange:
                 f"the setting {self.name} of {self.detector} must be of type {kind.__name__}, "
                 f"not {self.value!r}"
             )
-        if not math.isfinite(self.value):
-            raise OptionError(f"the setting {self.name} of {self.detector} must be finite")
         object.__setattr__(self, "value", kind(self.value))
+        try:
+            dataclasses.replace(default, **{self.name: self.value})
+        except OptionError as error:
+            raise OptionError(f"settings of {self.detector}: {error}") from None
+
+
+def _is_finite(value: object) -> bool:
+    """Whether a value is no number, or one that a float can hold."""
+    try:
+        return not isinstance(value, (int, float)) or math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def settings_for(
@@ -144,10 +166,10 @@ def read_label_settings(path: str | Path) -> LabelSettings:
         OptionError: the file cannot be read, or a name or value is wrong.
     """
     try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        content = read_toml(path, MAX_FILE_BYTES)
     except OSError as error:
         raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise OptionError(f"{path} is no valid TOML file ({error})") from None
     try:
         return _parsed(content)
@@ -174,13 +196,7 @@ def _parsed(content: dict[str, Any]) -> LabelSettings:
 def _try(detector: LabelDetector, visibility: Visibility, changes: list[SettingChange]) -> None:
     """Run a detector once, so that values which OpenCV refuses are reported at once."""
     pattern = (np.indices((64, 64)).sum(0) // 8 % 2 * 200).astype(np.uint8)
-    try:
-        detector.mask(pattern, settings_for(detector, visibility, changes))
-    except (cv2.error, ValueError, OverflowError) as error:
-        reason = str(error).strip().splitlines()[-1]
-        raise OptionError(
-            f"OpenCV refuses the settings of {detector.name} for {visibility} images ({reason})"
-        ) from None
+    run_detector(detector, pattern, settings_for(detector, visibility, changes))
 
 
 def _changes(detector: str, sections: Any) -> list[SettingChange]:

@@ -26,6 +26,7 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, ImageError, OptionError
 from .._shared.parallel import map_in_processes
 from .._shared.progress import progress
+from .._shared.text_files import read_json
 from ..io.image import load_image
 from ..io.masks import encode_mask, load_mask
 from ..labels import LabelOptions
@@ -34,6 +35,10 @@ from .recipe import TrainingOptions
 from .views import SourceImage, View, list_images, render, train_val_split, views_of
 
 INDEX = "shards.json"
+
+MAX_INDEX_BYTES = 1 << 26
+"""Longer indices are refused; a line has some 70 bytes, and stands for hundreds of images."""
+
 Files = tuple[tuple[Path, int], ...]
 
 
@@ -59,7 +64,7 @@ class Shards:
                 tuple((folder / Path(row["file"]).name, int(row["images"])) for row in index[kind])
                 for kind in ("training", "validation")
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise _damaged(folder / INDEX, error) from None
         _check_options(folder, index, options)
         for path, _ in training + validation:
@@ -292,8 +297,8 @@ def _read(path: Path, place: tuple[int, int]) -> bytes:
 
 def _read_index(folder: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads((folder / INDEX).read_text()))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+        return dict(read_json(folder / INDEX, MAX_INDEX_BYTES))
+    except (OSError, ValueError, TypeError) as error:
         raise _damaged(folder / INDEX, error) from None
 
 

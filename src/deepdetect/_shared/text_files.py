@@ -1,0 +1,55 @@
+"""Small files of JSON or TOML that users write, or get from others."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+
+def read_json(path: str | Path, max_bytes: int) -> Any:
+    """Read a JSON file in UTF-8, with or without a byte order mark.
+
+    Args:
+        path: the file.
+        max_bytes: longer files are refused.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is longer, no UTF-8, no JSON, or nested too deep.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "calib.json"
+        >>> _ = path.write_text('{"focal_px": 1250}')
+        >>> read_json(path, 1000)
+        {'focal_px': 1250}
+    """
+    text = _read_text(path, max_bytes)
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+
+
+def read_toml(path: str | Path, max_bytes: int) -> dict[str, Any]:
+    """Read a TOML file as `read_json` reads JSON; the time may grow with the square of its length.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is longer, no UTF-8, no TOML, or nested too deep.
+    """
+    text = _read_text(path, max_bytes)
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None
+
+
+def _read_text(path: str | Path, max_bytes: int) -> str:
+    with Path(path).open("rb") as file:
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise ValueError(f"it is longer than {max_bytes} bytes")
+    return content.decode("utf-8-sig")

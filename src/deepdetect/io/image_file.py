@@ -1,0 +1,181 @@
+"""Image files of any kind, opened in one place: which formats, how large, and what is damaged."""
+
+from __future__ import annotations
+
+import io
+import os
+import stat
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, BinaryIO
+
+from .._shared.errors import ImageError, OptionError
+
+FORMATS = (
+    *("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "AVIF"),
+    *("PSD", "QOI", "SGI", "PCX"),
+    *("HEIF", "JXL"),  # where a plug-in of Pillow has registered them
+    "TGA",  # has no signature, so it comes last
+)
+"""Formats that are read: all are decoded in this process, unlike EPS, which starts Ghostscript."""
+
+MAX_MEGAPIXELS = 200.0
+"""Largest images that are read unless more is asked for: the largest sensors of phones have 200."""
+
+SIGNATURE_BYTES = 16
+"""Length of the beginning of a file that Pillow tells formats by."""
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+@contextmanager
+def open_image(
+    source: Any, *, what: str = "image", max_megapixels: float = MAX_MEGAPIXELS
+) -> Iterator[Any]:
+    """Open an image file as a PIL image; its pixels are decoded when it is loaded.
+
+    Args:
+        source: a path; the content of a file, as bytes; or a binary file, which is read from its
+            beginning and stays open.
+        what: what errors call an image that has no name.
+        max_megapixels: larger images are refused before they are decoded.
+
+    Yields:
+        The image. Errors of Pillow in the block become those below.
+
+    Raises:
+        ImageError: the file is missing, truncated, damaged (as far as its format lets one see),
+            too large or no image.
+        OptionError: `max_megapixels` is not above 0.
+    """
+    if not max_megapixels > 0:
+        raise OptionError(f"`max_megapixels` must be above 0, not {max_megapixels}")
+    name = file_name(source, what)
+    try:
+        with _binary_file(source, name) as file:
+            _check_png(file, name)
+            with _identify(file, name) as image:
+                _check_size(image.size, name, max_megapixels)
+                yield image
+    except FileNotFoundError:
+        raise ImageError(f"there is no file {name}: check the path") from None
+    except IsADirectoryError:
+        raise ImageError(f"{name} is a folder: name an image file") from None
+    except PermissionError:
+        raise ImageError(f"{name} may not be read: check its rights") from None
+    except (ImageError, OptionError):
+        raise
+    except Exception as error:  # Pillow's decoders raise many kinds
+        raise damaged_image(name, error) from None
+
+
+def file_name(source: Any, what: str = "image") -> str:
+    """Return what errors call a file: its path where it has one, else "the image"."""
+    if is_path(source):
+        return os.fsdecode(source)
+    name = getattr(source, "name", None)
+    return name if isinstance(name, str) and hasattr(source, "read") else f"the {what}"
+
+
+def is_path(source: Any) -> bool:
+    """Whether it is a path: text or any `os.PathLike`."""
+    return isinstance(source, (str, os.PathLike))
+
+
+def is_file(source: Any) -> bool:
+    """Whether `open_image` takes it: a path, bytes or an open file."""
+    return is_path(source) or isinstance(source, (bytes, bytearray)) or hasattr(source, "read")
+
+
+def damaged_image(name: str, error: Exception | str) -> ImageError:
+    """Return the error for a file that cannot be decoded."""
+    from PIL import Image
+
+    if isinstance(error, Image.DecompressionBombError):  # Pillow's limit, where it looks once more
+        return ImageError(f"{name} has a tile or a frame that is too large: save it as PNG or JPEG")
+    return ImageError(f"{name} is damaged or truncated ({error}): get it again")
+
+
+@contextmanager
+def _binary_file(source: Any, name: str) -> Iterator[BinaryIO]:
+    """Open a path or bytes; rewind an open file, or read it whole where that cannot be done."""
+    if isinstance(source, (bytes, bytearray)):
+        yield io.BytesIO(source)
+    elif is_path(source):
+        mode = os.stat(source).st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise ImageError(f"{name} is a pipe or a device: save the image as a file first")
+        # Pillow gets no path: it would map uncompressed TIFF into memory, and turn it wrongly.
+        with open(source, "rb") as file:
+            yield file
+    else:
+        if getattr(source, "closed", False) or isinstance(source, io.TextIOBase):
+            raise ImageError(f'{name} is no open binary file: open it with the mode "rb"')
+        try:
+            source.seek(0)
+        except (AttributeError, OSError):
+            source = io.BytesIO(source.read())
+        yield source
+
+
+def _check_png(file: BinaryIO, name: str) -> None:
+    """Check the checksums of a PNG file, if it is one: Pillow skips those of the pixels."""
+    if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
+        kind = b""
+        while kind != b"IEND":
+            header = file.read(8)
+            left, kind = int.from_bytes(header[:4], "big"), header[4:]
+            checksum = zlib.crc32(kind)
+            # In pieces, as a damaged length may be 4 GB.
+            while left and (piece := file.read(min(left, 1 << 20))):
+                checksum = zlib.crc32(piece, checksum)
+                left -= len(piece)
+            if file.read(4) != checksum.to_bytes(4, "big"):
+                raise damaged_image(name, "a checksum of the PNG file is wrong or missing")
+    file.seek(0)
+
+
+def _identify(file: BinaryIO, name: str) -> Any:
+    """Open a file with the first of the formats that takes it.
+
+    As `PIL.Image.open`, which has a limit of its own that only the whole program can raise.
+    """
+    from PIL import Image
+
+    _hide_warning_of_large_images()
+    Image.init()  # registers all formats; that of AVIF is not in every Pillow
+    start = file.read(SIGNATURE_BYTES)
+    for key in FORMATS:
+        if key not in Image.OPEN:
+            continue
+        factory, accept = Image.OPEN[key]
+        try:
+            accepted = accept is None or accept(start)
+            if accepted and not isinstance(accepted, str):  # a text says which library is missing
+                file.seek(0)
+                return factory(file, "")
+        except (SyntaxError, IndexError, TypeError, struct.error):
+            continue
+    raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG")
+
+
+def _check_size(size: tuple[int, int], name: str, max_megapixels: float) -> None:
+    megapixels = size[0] * size[1] / 1e6
+    if megapixels > max_megapixels:
+        raise ImageError(
+            f"{name} has {size[0]}x{size[1]} pixels, which is over {max_megapixels:g} megapixels: "
+            "make it smaller, or load it in Python with a larger `max_megapixels`"
+        )
+
+
+def _hide_warning_of_large_images() -> None:
+    """Hide Pillow's warning of 89 to 178 million pixels, unless the program filters it itself."""
+    from PIL import Image
+
+    kind = Image.DecompressionBombWarning
+    # Not catch_warnings, which is not safe with threads.
+    if not any(category is kind for _, _, category, *_ in warnings.filters):
+        warnings.filterwarnings("ignore", category=kind, append=True)
