@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import tempfile
@@ -15,6 +16,7 @@ from deepdetect import Keypoints, OptionError, load_keypoints, load_matches, sav
 from deepdetect.geometry.camera import read_calibration
 from deepdetect.io.depth import load_depth_png, save_depth_png
 from deepdetect.io.masks import encode_mask, load_mask
+from deepdetect.labels.detectors import DETECTORS
 from deepdetect.labels.settings import read_label_settings
 
 from ..case import Target, expect, prepared
@@ -47,15 +49,7 @@ CALIBRATIONS = strategies.dictionaries(
 ).map(lambda values: {"focal_px": 500.0, **values})
 
 SETTINGS = {
-    "fast": ["threshold"],
-    "orb": ["levels", "max_keypoints", "scale_factor", "edge_threshold", "patch_size"],
-    "sift": ["contrast_threshold", "edge_threshold", "sigma", "octave_layers", "max_keypoints"],
-    "harris": ["block_size", "aperture", "k", "relative_threshold"],
-    "shi-tomasi": ["max_corners", "quality_level", "minimum_distance", "block_size"],
-    "canny": ["low_threshold", "high_threshold", "aperture"],
-    "sobel": ["aperture", "relative_threshold"],
-    "brisk": ["threshold", "octaves", "pattern_scale"],
-    "agast": ["threshold"],
+    entry.name: [field.name for field in dataclasses.fields(entry.normal)] for entry in DETECTORS
 }
 EXTREMES = (0, -1, 1, 2, 3, 10**6, 2**31, 2**63, 1e30, -1e30, 1e-30, 0.5, "nan", "inf", '"a"', "[]")
 
