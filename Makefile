@@ -29,7 +29,7 @@ install_locked = $(call install,$(1)) --no-deps --require-hashes -r $(2)
 install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requirements/torch.txt
 install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
 
-.PHONY: demo test test-all test-opencv4 test-lowest coverage lint spelling types contracts check \
+.PHONY: demo test test-all fuzz test-opencv4 test-lowest coverage lint spelling types contracts check \
 	format lock upgrade check-lock dist clean
 
 demo: $(VENV)/.demo
@@ -39,8 +39,14 @@ demo: $(VENV)/.demo
 test: $(VENV)/.test
 	$(VENV)/bin/python $(PYTEST) $(TESTS)
 
+# All tests, and ten minutes of wrong input and kills.
 test-all: $(VENV)/.test test-opencv4
 	$(VENV)/bin/python $(PYTEST) --runslow
+	$(VENV)/bin/python -m fuzz --seconds 540 --kills 8
+
+# All wrong input and all kills of docs/reliability.md: about an hour.
+fuzz: $(VENV)/.test
+	$(VENV)/bin/python -m fuzz
 
 test-opencv4: $(VENV_OPENCV4)/.test
 	$(VENV_OPENCV4)/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_OPENCV4)

@@ -151,6 +151,12 @@ def test_file_formats(suffix: str, exact: bool, photo: np.ndarray, tmp_path: Pat
     assert difference.max() == 0 if exact else difference.mean() < 6
 
 
+def test_half_precision_is_rounded_like_any_other() -> None:
+    steps = np.linspace(0, 1, 4096).astype(np.float16).reshape(64, 64)
+    expected = np.rint(steps.astype(np.float64) * 255)
+    np.testing.assert_array_equal(load_image(steps)[:, :, 0], expected)
+
+
 def test_palette_with_transparency_loads_in_silence(tmp_path: Path) -> None:
     # Pillow warns about such files, which are common; a warning is an error in these tests.
     path = tmp_path / "palette.png"

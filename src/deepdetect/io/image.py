@@ -215,7 +215,7 @@ def _to_uint8(array: np.ndarray, name: str) -> np.ndarray:
                 f"a float image must lie in [0, 1], {name} spans "
                 f"[{array.min():g}, {array.max():g}]: scale it first"
             )
-        return np.rint(array * 255).astype(np.uint8)
+        return np.rint(array * np.float32(255)).astype(np.uint8)
     raise ImageError(
         f"an image array of type {array.dtype} is not understood: use uint8, uint16 or float"
     )

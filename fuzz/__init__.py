@@ -1,0 +1,1 @@
+"""Wrong input by the ten thousand: `python -m fuzz`, or `make fuzz`."""

@@ -1,0 +1,129 @@
+"""Arrays of all types and shapes, drawn by hypothesis."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import numpy as np
+from hypothesis import strategies
+from hypothesis.extra import numpy as arrays
+from hypothesis.strategies import SearchStrategy
+
+from deepdetect import DeepDetect, load_image, match_images
+
+from ..case import Target, expect, prepared
+
+SIDES = (0, 1, 3, 4, 15, 16, 17, 40)
+TYPES = "uint8 uint16 >u2 int8 int16 int32 int64 uint32 float16 float32 float64 bool complex64 U3 O"
+
+
+def draw(strategy: SearchStrategy[Any], generator: np.random.Generator) -> Any:
+    """Draw one value, the same for the same state of the generator."""
+    found: list[Any] = []
+
+    @hypothesis.seed(int(generator.integers(2**32)))
+    @hypothesis.settings(
+        max_examples=4,
+        database=None,
+        deadline=None,
+        phases=[hypothesis.Phase.generate],
+        suppress_health_check=list(hypothesis.HealthCheck),
+    )
+    @hypothesis.given(strategy)
+    def take(value: Any) -> None:
+        found.append(value)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        take()
+    return found[-1]  # the first ones are the simplest
+
+
+SHAPES = strategies.one_of(
+    strategies.tuples(strategies.sampled_from((16, 17, 40)), strategies.sampled_from((16, 30))),
+    strategies.tuples(
+        *[strategies.sampled_from((16, 17, 40))] * 2, strategies.sampled_from((0, 1, 2, 3, 4, 5))
+    ),
+    strategies.lists(strategies.sampled_from(SIDES), max_size=4).map(tuple),
+)
+IN_RANGE = strategies.floats(0, 1, width=16)
+
+
+@strategies.composite
+def any_array(draw_value: Any) -> np.ndarray:
+    """Draw an array of any type and shape; floats often in [0, 1]."""
+    kind = np.dtype(draw_value(strategies.sampled_from(TYPES.split())))
+    shape = draw_value(SHAPES)
+    if kind.kind == "O":
+        return np.full(shape, None)
+    elements = IN_RANGE if kind.kind == "f" and draw_value(strategies.booleans()) else None
+    found: np.ndarray = draw_value(arrays.arrays(kind, shape, elements=elements))
+    return found
+
+
+def loaded(generator: np.random.Generator, folder: Path) -> None:
+    """Load an array; the stated contract says what comes of it."""
+    array = draw(any_array(), generator)
+    allowed = is_allowed(array)
+    found = load_image(array)  # refused: one sentence
+    expect(allowed, f"{array.dtype} of shape {array.shape} was taken")
+    expected = array if array.ndim == 3 else array[:, :, None]
+    expected = expected[:, :, :3].astype(np.float64)
+    scale = {"u1": 1.0, "u2": 255 / 65535}.get(array.dtype.str[1:], 255.0)
+    expected = np.broadcast_to(expected * scale, found.shape)
+    expect(found.dtype == np.uint8, f"of type {found.dtype}")
+    expect(np.abs(found - expected).max() <= 0.51, "pixels are wrong")
+
+
+def is_allowed(array: np.ndarray) -> bool:
+    """Whether `load_image` says that it takes an array."""
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] not in (1, 3, 4)):
+        return False
+    if min(array.shape[:2]) < 16:
+        return False
+    if array.dtype.kind == "f":
+        return bool(np.isfinite(array).all() and array.min() >= 0 and array.max() <= 1)
+    return array.dtype.kind == "b" or array.dtype.str[1:] in ("u1", "u2")
+
+
+@prepared
+def detector() -> DeepDetect:
+    """Return the detector of all inputs."""
+    return DeepDetect()
+
+
+def detected(generator: np.random.Generator, folder: Path) -> None:
+    """Detect keypoints in an array, dense or points."""
+    array = draw(any_array(), generator)
+    budget = [None, 1, 50][int(generator.integers(3))]
+    found = detector().detect(array, max_keypoints=budget)
+    expect(is_allowed(array), f"{array.dtype} of shape {array.shape} was taken")
+    height, width = array.shape[:2]
+    expect(found.image_size == (width, height), f"of an image of {found.image_size}")
+    expect(np.isfinite(found.xy).all() and np.isfinite(found.scores).all(), "not finite")
+    inside = (found.xy > -0.51) & (found.xy < np.array([width, height]) - 0.49)
+    expect(inside.all(), "keypoints outside the image")
+    expect(((found.scores >= 0) & (found.scores <= 1)).all(), "scores are no probabilities")
+    expect(budget is None or len(found) <= budget, "more keypoints than asked for")
+
+
+def matched(generator: np.random.Generator, folder: Path) -> None:
+    """Match two arrays."""
+    first, second = (draw(any_array(), generator) for _ in range(2))
+    if generator.random() < 0.5:  # a pair that has matches
+        first = np.kron(generator.integers(0, 256, (20, 24)), np.ones((4, 4))).astype(np.uint8)
+        second = np.roll(first, 3, axis=1)
+    budget = [None, 100][int(generator.integers(2))]
+    found = match_images(first, second, detector(), max_keypoints=budget)
+    expect(len(found.points0) == len(found.points1) == len(found.inliers), "rows do not fit")
+    expect(np.isfinite(found.points0).all() and np.isfinite(found.points1).all(), "not finite")
+
+
+TARGETS = (
+    Target("arrays", "arrays, load_image", loaded, 3000, 500),
+    Target("arrays-detect", "arrays, detect", detected, 800, 200),
+    Target("arrays-match", "arrays, match_images", matched, 200, 50),
+)
