@@ -155,7 +155,7 @@ def test_altered_rows_of_measures_are_refused(kind: str, whole: PointsTrainer) -
         rows.append(rows[-1])
     else:
         rows[0]["light"][0] = "0.5"
-    with pytest.raises(ValueError, match="zoom|points|light"):
+    with pytest.raises(ValueError, match=r"zoom|points|light"):
         PointsState.from_json(stored, last_step=4)
 
 
