@@ -30,7 +30,7 @@ install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requ
 install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
 
 .PHONY: demo test test-all fuzz test-opencv4 test-lowest coverage lint spelling types contracts check \
-	format lock upgrade check-lock dist clean
+	format lock upgrade check-lock audit sbom dist clean
 
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
@@ -88,13 +88,22 @@ upgrade: $(VENV)/bin/uv
 check-lock: $(VENV)/bin/uv
 	$(VENV)/bin/python requirements/lock.py --check
 
+# Known vulnerabilities of the locked packages, where data can be reached.
+audit: $(VENV)/bin/uv
+	$(VENV)/bin/python requirements/audit.py
+
+# A bill of materials of the locked packages, as CycloneDX JSON.
+sbom: $(VENV)/bin/uv
+	$(VENV)/bin/uvx --from cyclonedx-bom==7.5.0 cyclonedx-py requirements requirements/lock.txt \
+		--pyproject pyproject.toml --output-format JSON --output-reproducible --output-file sbom.json
+
 dist: $(VENV)/.test
 	rm -rf dist
 	$(VENV)/bin/python -m build --no-isolation
 
 clean:
 	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(DEMO_OUTPUT)
-	rm -rf build dist htmlcov .coverage .coverage.* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
+	rm -rf build dist sbom.json htmlcov .coverage .coverage.* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 
 %/bin/uv: requirements/uv.txt
 	$(PYTHON) -m venv $*

@@ -2,11 +2,14 @@ from __future__ import annotations
 
 import errno
 import os
-import tempfile
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from deepdetect._shared import atomic
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.errors import DeepDetectError
 
@@ -36,7 +39,7 @@ def test_a_whole_file_appears(as_text: bool, tmp_path: Path) -> None:
     assert names(target.parent) == ["out.txt"]
 
 
-@pytest.mark.parametrize("name", ["out.png", "out.tar.gz", "out", ".hidden", "out.safetensors"])
+@pytest.mark.parametrize("name", ["out.png", "out.tar.gz", "out", ".hidden", 251 * "o" + ".npz"])
 def test_the_temporary_name_keeps_the_suffix(name: str, tmp_path: Path) -> None:
     with atomic_path(tmp_path / name) as temporary:
         assert temporary.suffix in (Path(name).suffix, ".part")
@@ -120,10 +123,10 @@ def test_a_target_that_is_a_folder(tmp_path: Path) -> None:
 
 
 def test_an_unwritable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> tuple[int, str]:
+    def refuse(*_: object, **__: object) -> int:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(tempfile, "mkstemp", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     check_refusal(tmp_path / "out.txt")
 
 
@@ -138,3 +141,56 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
         check_refusal(folder / "out.txt")
     finally:
         folder.chmod(0o700)
+
+
+def start_writer(folder: Path) -> subprocess.Popen[str]:
+    """Start a process that writes a file and does not end."""
+    code = (
+        "import sys, time\n"
+        "from deepdetect._shared.atomic import atomic_path\n"
+        "with atomic_path(sys.argv[1]):\n"
+        "    print('writing', flush=True)\n"
+        "    time.sleep(600)\n"
+    )
+    writer = subprocess.Popen(
+        [sys.executable, "-c", code, str(folder / "out.npz")], stdout=subprocess.PIPE, text=True
+    )
+    assert writer.stdout is not None
+    assert writer.stdout.readline() == "writing\n"
+    return writer
+
+
+@pytest.mark.skipif(os.name != "posix", reason="elsewhere only the age tells")
+def test_what_a_killed_process_left_is_removed_and_what_a_live_one_writes_is_not(
+    tmp_path: Path,
+) -> None:
+    living, killed = start_writer(tmp_path), start_writer(tmp_path)
+    try:
+        killed.send_signal(signal.SIGKILL)
+        killed.wait()
+        assert len(names(tmp_path)) == 2
+        with atomic_path(tmp_path / "other.txt") as temporary:
+            temporary.write_text("whole")
+        kept, other = names(tmp_path)
+        assert other == "other.txt"
+        assert f"-{living.pid}-" in kept
+    finally:
+        for process in (living, killed):
+            process.kill()
+            process.wait()
+            process.communicate()
+
+
+@pytest.mark.parametrize(("age_s", "stays"), [(3600.0, True), (2 * atomic.ABANDONED_S, False)])
+def test_files_of_another_machine_are_removed_after_a_day(
+    tmp_path: Path, age_s: float, stays: bool
+) -> None:
+    foreign = tmp_path / ".out.00000000-1-0123abcd.part.npz"
+    users = tmp_path / ".out.part.npz"
+    for path in (foreign, users):
+        path.touch()
+        os.utime(path, (path.stat().st_mtime - age_s,) * 2)
+    with atomic_path(tmp_path / "new"):
+        pass
+    assert foreign.exists() == stays
+    assert users.exists()

@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import pickle
+
 import pytest
 
 from deepdetect._shared.errors import (
+    BatchError,
     DeepDetectError,
     ImageError,
     MissingExtraError,
@@ -54,3 +57,9 @@ def test_unknown_name_without_a_near_one_lists_the_known(given: object) -> None:
     assert "did you mean" not in message
     assert "sift, orb" in message
     assert repr(given) in message
+
+
+def test_the_failures_of_many_files_survive_pickling() -> None:
+    error = pickle.loads(pickle.dumps(BatchError("2 of 3 failed", ["a.png: b", "c.png: d"])))
+    assert str(error) == "2 of 3 failed; the first: a.png: b"
+    assert error.failures == ("a.png: b", "c.png: d")

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 import os
 import platform
+import signal
 import subprocess
 import sys
 import threading
@@ -107,6 +108,53 @@ def test_workers_end_when_the_parent_is_killed(tmp_path: Path) -> None:
     process.kill()
     process.wait()
     _wait_until(lambda: not any(_runs(int(path.read_text())) for path in pids))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs process groups")
+@pytest.mark.parametrize("moment", ["while a worker starts", "while it works"])
+def test_ctrl_c_ends_all_processes_without_a_word_of_theirs(moment: str, tmp_path: Path) -> None:
+    starting = moment == "while a worker starts"
+    (tmp_path / "endless.py").write_text(
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from deepdetect._shared.parallel import map_in_processes\n"
+        "def work(task):\n"
+        "    Path(f'at{task}').touch()\n"
+        f"    time.sleep({0 if starting else 600})\n"
+        "if __name__ == '__main__':\n"
+        "    try:\n"
+        "        list(map_in_processes(work, range(100), 2))\n"
+        "    except KeyboardInterrupt:\n"
+        "        sys.exit(130)\n"
+    )
+    if starting:  # the initializer imports it
+        (tmp_path / "cv2.py").write_text(
+            "import time\n"
+            "from pathlib import Path\n"
+            "import os\n"
+            "Path(f'import{os.getpid()}').touch()\n"
+            "time.sleep(1)\n"
+            "setNumThreads = print\n"
+        )
+    paths = os.pathsep.join([str(tmp_path), *sys.path])
+    process = subprocess.Popen(
+        [sys.executable, "endless.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": paths},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    found = "import*" if starting else "at*"
+    _wait_until(lambda: len(list(tmp_path.glob(found))) == 2)
+    os.killpg(process.pid, signal.SIGINT)
+    try:
+        _, told = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert told == ""
+    assert len(list(tmp_path.glob("at*"))) < 100
 
 
 def _runs(pid: int) -> bool:

@@ -1,7 +1,14 @@
 from __future__ import annotations
 
+import errno
 import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +22,7 @@ def test_writes_keypoints_and_pictures(run, photos: Path) -> None:
     result = run("detect", photos / "cat.jpg", "-o", "out")
     assert result.exit_code == 0, result.output
     assert {p.name for p in Path("out").iterdir()} == {
+        ".deepdetect",
         "cat.npz",
         "cat_keypoints.png",
         "cat_heatmap.png",
@@ -43,7 +51,7 @@ def test_csv_and_no_pictures(run, photos: Path) -> None:
         *("--density", 0.05),
     )
     assert result.exit_code == 0
-    assert [p.name for p in Path("out").iterdir()] == ["cat.csv"]
+    assert [p.name for p in Path("out").glob("[!.]*")] == ["cat.csv"]
     lines = Path("out/cat.csv").read_text().splitlines()
     assert lines[0] == "x,y,score"
     assert len(lines) == 1 + round(0.05 * 150 * 200)
@@ -70,8 +78,10 @@ def test_one_bad_image_does_not_stop_the_others(run, photos: Path, tmp_path: Pat
     bad = tmp_path / "bad.png"
     bad.write_bytes((photos / "left.png").read_bytes()[:2000])
     result = run("detect", bad, photos / "cat.jpg", "-o", "out", "--no-pictures")
-    assert result.exit_code == 2
-    assert "1 of 2 images failed" in result.stderr
+    assert result.exit_code == 1
+    *_, told, failure = result.stderr.splitlines()
+    assert told == "deepdetect: 1 of 2 images failed, the others are done:"
+    assert str(bad) in failure
     assert Path("out/cat.npz").exists()
     assert not Path("out/bad.npz").exists()
 
@@ -96,3 +106,206 @@ def test_resolution(run, photos: Path, resolution: str) -> None:
     chosen = resolution if resolution == "native" else int(resolution)
     expected = DeepDetect(resolution=chosen).detect(photos / "cat.jpg")
     np.testing.assert_array_equal(load_keypoints("out/cat.npz").xy, expected.xy)
+
+
+def detect(run, images: Path, *more: object) -> list[dict[str, Any]]:
+    """Detect without pictures into "out" and return the report on each image."""
+    result = run("detect", images, "-o", "out", "--no-pictures", "--json", *more)
+    assert result.exit_code == 0, result.output
+    images_done: list[dict[str, Any]] = json.loads(result.stdout)["images"]
+    return images_done
+
+
+def copies(photos: Path, folder: Path, count: int = 2) -> Path:
+    folder.mkdir()
+    for k in range(count):
+        shutil.copy(photos / "cat.jpg", folder / f"{k}.jpg")
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def test_what_is_done_is_skipped(run, photos: Path) -> None:
+    first = detect(run, photos)
+    assert not any(image["skipped"] for image in first)
+    Path("out/left.npz").unlink()
+    kept = Path("out/cat.npz").stat().st_mtime_ns
+    again = detect(run, photos)
+    assert {Path(i["image"]).stem: i["skipped"] for i in again} == {
+        "cat": True,
+        "left": False,
+        "right": True,
+    }
+    for before, after in zip(first, again, strict=True):
+        same = {"image", "width", "height", "keypoints", "density", "file", "pictures"}
+        assert {n: before[n] for n in same} == {n: after[n] for n in same}
+    assert Path("out/cat.npz").stat().st_mtime_ns == kept
+    result = run("detect", photos, "-o", "out", "--no-pictures")
+    assert result.stdout.count("already done") == 3
+    assert not any(image["skipped"] for image in detect(run, photos, "--overwrite"))
+
+
+def test_pictures_and_other_formats_of_the_same_keypoints_are_added(run, photos: Path) -> None:
+    detect(run, photos / "cat.jpg")
+    kept = contents(Path("out"))
+    assert not detect(run, photos / "cat.jpg", "--pictures")[0]["skipped"]
+    assert not detect(run, photos / "cat.jpg", "--format", "csv")[0]["skipped"]
+    assert len(contents(Path("out"))) == 4
+    assert contents(Path("out")).items() >= kept.items()
+    assert detect(run, photos / "cat.jpg", "--pictures")[0]["skipped"]
+
+
+def test_a_copied_folder_is_still_known(run, photos: Path) -> None:
+    detect(run, photos / "cat.jpg")
+    shutil.copytree("out", "copy", copy_function=shutil.copyfile)  # with new times
+    shutil.rmtree("out")
+    Path("copy").rename("out")
+    assert detect(run, photos / "cat.jpg")[0]["skipped"]
+
+
+def test_an_image_that_has_changed_is_done_again(run, photos: Path) -> None:
+    folder = copies(photos, Path("in"))
+    detect(run, folder)
+    shutil.copy(photos / "left.png", folder / "1.jpg")
+    assert [image["skipped"] for image in detect(run, folder)] == [True, False]
+    np.testing.assert_array_equal(
+        load_keypoints("out/1.npz").xy, DeepDetect().detect(photos / "left.png").xy
+    )
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["--threshold", 0.6], "--threshold"),
+        (["--weights", "dense"], "--weights"),
+        (["--resolution", 240], "--resolution"),
+        (["--ignore", "ignore.png"], "--ignore"),
+        (["--format", "csv", "--density", 0.1], "--density"),
+    ],
+)
+def test_what_was_made_with_other_settings_is_replaced_on_request_only(
+    run, photos: Path, more: list[object], told: str
+) -> None:
+    Image.fromarray(np.full((150, 200), 255, np.uint8)).save("ignore.png")
+    detect(run, photos / "cat.jpg")
+    before = contents(Path("out"))
+    result = run("detect", photos / "cat.jpg", "-o", "out", "--no-pictures", *more)
+    assert result.exit_code == 2
+    assert f"made with other settings ({told})" in result.stderr
+    assert "--overwrite" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert contents(Path("out")) == before
+    assert not detect(run, photos / "cat.jpg", *more, "--overwrite")[0]["skipped"]
+    assert contents(Path("out")) != before
+    assert detect(run, photos / "cat.jpg", *more)[0]["skipped"]
+
+
+def _of_another_image(photos: Path) -> None:
+    Path("other").mkdir()
+    shutil.copy(photos / "left.png", "other/0.png")
+    shutil.rmtree("in")
+    Path("other").rename("in")
+
+
+def _edited(photos: Path) -> None:
+    shutil.copy("out/1.npz", "out/0.npz")
+    with Path("out/0.npz").open("ab") as file:
+        file.write(b"more")
+
+
+def _without_record(photos: Path) -> None:
+    shutil.rmtree("out/.deepdetect")
+
+
+def _damaged_record(photos: Path) -> None:
+    Path("out/.deepdetect/detect/0.json").write_text("[" * 100_000)
+
+
+def _strange_record(photos: Path) -> None:
+    path = Path("out/.deepdetect/detect/0.json")
+    record = json.loads(path.read_text())
+    path.write_text(json.dumps({**record, "files": {"../0.npz": 3}, "numbers": 3}))
+
+
+@pytest.mark.parametrize(
+    "change", [_of_another_image, _edited, _without_record, _damaged_record, _strange_record]
+)
+def test_outputs_of_something_else_are_never_replaced_silently(
+    run, photos: Path, change: Callable[[Path], None]
+) -> None:
+    detect(run, copies(photos, Path("in")))
+    change(photos)
+    before = contents(Path("out"))
+    result = run("detect", "in", "-o", "out", "--no-pictures")
+    assert result.exit_code == 2
+    assert "0.npz exists already" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    assert contents(Path("out")) == before
+    detect(run, Path("in"), "--overwrite")
+
+
+def test_an_input_is_never_written_over(run, photos: Path) -> None:
+    shutil.copy(photos / "left.png", "a.png")
+    shutil.copy(photos / "right.png", "a_heatmap.png")
+    before = contents(Path())
+    result = run("detect", "a.png", "a_heatmap.png", "-o", ".", "--overwrite")
+    assert result.exit_code == 2
+    assert "is an input" in result.stderr
+    assert contents(Path()) == before
+
+
+def test_a_full_disk_stops_all_images_at_once(
+    run, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+
+    def full(*_: object, **__: object) -> None:
+        calls.append(1)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np.lib.format, "write_array", full)
+    result = run("detect", photos, "-o", "out", "--no-pictures")
+    assert result.exit_code == 2
+    assert "No space left" in result.stderr.splitlines()[-1]
+    assert len(calls) == 1
+    assert not contents(Path("out"))
+
+
+def start(folder: Path, output: Path) -> subprocess.Popen[bytes]:
+    arguments = ["detect", str(folder), "-o", str(output), "--no-pictures"]
+    return subprocess.Popen(
+        [sys.executable, "-m", "deepdetect", *arguments],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def test_two_commands_into_one_folder_do_not_harm_each_other(run, photos: Path) -> None:
+    folder = copies(photos, Path("in"), 8)
+    both = [start(folder, Path("out")) for _ in range(2)]
+    assert [process.wait(timeout=120) for process in both] == [0, 0]
+    expected = DeepDetect().detect(photos / "cat.jpg")
+    for k in range(8):
+        np.testing.assert_array_equal(load_keypoints(f"out/{k}.npz").xy, expected.xy)
+    assert len(contents(Path("out"))) == 8
+    assert all(image["skipped"] for image in detect(run, folder))
+
+
+def test_a_killed_run_goes_on_where_it_stopped(run, photos: Path) -> None:
+    folder = copies(photos, Path("in"), 30)
+    process = start(folder, Path("out"))
+    deadline = time.monotonic() + 120
+    while not list(Path().glob("out/*.npz")):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    done = len(contents(Path("out")))
+    assert done < 30, "it was killed too late for this test"
+    skipped = sum(image["skipped"] for image in detect(run, folder))
+    assert 0 < skipped + 1 <= done + 1 <= 30
+    assert sorted(contents(Path("out"))) == sorted(f"{k}.npz" for k in range(30))
+    assert len({*contents(Path("out")).values()}) == 1

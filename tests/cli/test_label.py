@@ -79,8 +79,10 @@ def test_a_bad_image_is_reported_and_the_others_are_done(run, photos: Path) -> N
     Path("in/bad.jpg").write_bytes(b"not a photograph")
     Path("in/good.png").write_bytes((photos / "left.png").read_bytes())
     result = run("label", "in", "-o", "masks", "--workers", 1)
-    assert result.exit_code == 2
-    assert "bad.jpg" in result.stderr
+    assert result.exit_code == 1
+    *_, told, failure = result.stderr.splitlines()
+    assert told == "deepdetect: 1 of 2 images failed, the others are done:"
+    assert "bad.jpg" in failure
     assert [p.name for p in Path("masks").iterdir()] == ["good.png"]
 
 
@@ -101,3 +103,60 @@ def test_masks_below_the_photographs_are_not_labelled_themselves(run, photos: Pa
         result = run("label", "in", "-o", "in/masks", "--workers", 1)
         assert result.exit_code == 0, result.output
         assert expected in result.stdout
+
+
+def test_a_mask_of_another_image_is_not_passed_off(run, photos: Path) -> None:
+    for folder, name in (("a", "left.png"), ("b", "right.png")):
+        Path(folder).mkdir()
+        Path(folder, "x.png").write_bytes((photos / name).read_bytes())
+    assert run("label", "a", "-o", "masks", "--workers", 1).exit_code == 0
+    before = Path("masks/x.png").read_bytes()
+    result = run("label", "b", "-o", "masks", "--workers", 1)
+    assert result.exit_code == 2
+    assert "another image of the same name" in result.stderr
+    assert "--overwrite" in result.stderr
+    assert Path("masks/x.png").read_bytes() == before
+    assert run("label", "b", "-o", "masks", "--workers", 1, "--overwrite").exit_code == 0
+    assert Path("masks/x.png").read_bytes() != before
+
+
+def test_an_image_that_has_changed_is_labelled_again(run, photos: Path) -> None:
+    Path("x.png").write_bytes((photos / "left.png").read_bytes())
+    run("label", "x.png", "-o", "masks", "--workers", 1)
+    Path("x.png").write_bytes((photos / "right.png").read_bytes())
+    result = run("label", "x.png", "-o", "masks", "--workers", 1)
+    assert "1 labelled, 0 already done" in result.stdout
+    expected = fuse(luma(load_image(photos / "right.png"))).mask
+    np.testing.assert_array_equal(np.asarray(Image.open("masks/x.png")), expected)
+
+
+def test_masks_without_a_note_of_their_image_are_kept(run, photos: Path) -> None:
+    """As of training, which knows images by their content."""
+    from dataclasses import asdict
+
+    from deepdetect.io.masks import save_mask
+
+    settings = json.dumps(asdict(LabelOptions(visibility="auto")), sort_keys=True)
+    save_mask(np.zeros((150, 200), bool), "masks/cat.png", settings)
+    result = run("label", photos / "cat.jpg", "-o", "masks", "--workers", 1)
+    assert "0 labelled, 1 already done" in result.stdout
+
+
+def test_a_figure_is_never_written_over_a_mask(run, photos: Path) -> None:
+    Path("in").mkdir()
+    for name in ("x.png", "x_labels.png"):
+        Path("in", name).write_bytes((photos / "left.png").read_bytes())
+    result = run("label", "in", "-o", "masks", "--workers", 1, "--visualize")
+    assert result.exit_code == 2
+    assert "would both write" in result.stderr
+    assert not Path("masks").exists()
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_full_disk_stops_all_images_at_once(run, photos: Path, workers: int) -> None:
+    Path("masks").write_text("no folder can be made here")
+    result = run("label", photos, "-o", "masks", "--workers", workers)
+    assert result.exit_code == 2
+    told = result.stderr.splitlines()[-1]
+    assert told.startswith("deepdetect: cannot write")
+    assert "images failed" not in result.stderr

@@ -188,3 +188,32 @@ def test_wrong_options_are_said(options: dict, named: str, one_line) -> None:
     with pytest.raises(OptionError) as caught:
         evaluate(**options)
     assert named in one_line(caught.value)
+
+
+def test_samples_that_cannot_be_read_are_listed_and_not_scored(
+    tmp_path: Path, photo: np.ndarray
+) -> None:
+    from click.testing import CliRunner
+
+    from deepdetect.cli import main
+
+    for name in "abc":
+        Image.fromarray(photo[:64, :64]).save(tmp_path / f"image_{name}.png")
+        Image.fromarray(photo[:64, :64, 0] > 99).save(tmp_path / f"mask_image_{name}.png")
+    whole = evaluate(samples=tmp_path)
+    assert whole.failures == ()
+    (tmp_path / "image_a.png").write_bytes(b"damaged")
+    (tmp_path / "mask_image_b.png").unlink()
+    found = evaluate(samples=tmp_path)
+    assert [score.images for score in found.masks.values()] == [1]
+    assert found.masks["normal"].loss == pytest.approx(whole.masks["normal"].loss)
+    assert len(found.failures) == 2
+    result = CliRunner().invoke(main, ["evaluate", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "normal" in result.stdout
+    *_, told, first, second = result.stderr.splitlines()
+    assert told == "deepdetect: 2 of 3 samples are not in the scores:"
+    assert "image_a.png" in first
+    assert "mask_image_b.png" in second
+    (tmp_path / "image_c.png").unlink()
+    assert CliRunner().invoke(main, ["evaluate", str(tmp_path)]).exit_code == 2

@@ -103,6 +103,21 @@ def _not_finite(tensors: dict[str, torch.Tensor], name: str) -> None:
     tensors[name] = torch.full_like(tensors[name], float("nan"))
 
 
+def _negative(tensors: dict[str, torch.Tensor], name: str) -> None:
+    tensors[name] = torch.full_like(tensors[name], -1)
+
+
+@pytest.mark.parametrize("name", ["optimizer.step.0.weight", "optimizer.exp_avg_sq.0.weight"])
+def test_a_negative_count_or_square_is_refused(tmp_path: Path, name: str, one_line) -> None:
+    network, optimizers = trained()
+    save_checkpoint(tmp_path / "c.safetensors", network, optimizers, {})
+    tensors = dict(read_checkpoint(tmp_path / "c.safetensors").tensors)
+    _negative(tensors, name)
+    with pytest.raises(WeightsError, match=f"{name} is negative.*delete it") as caught:
+        restore(Checkpoint(tmp_path / "c.safetensors", {}, tensors), *trained(steps=0))
+    one_line(caught.value)
+
+
 @pytest.mark.parametrize("change", [_shorter, _doubled, _missing, _not_finite])
 @pytest.mark.parametrize(
     ("optimizer", "name"),
@@ -156,6 +171,11 @@ def test_the_state_of_a_run_is_given_back() -> None:
         {"step": 1.5},
         {"step": True},
         {"images": None},
+        {"images": 10**400},
+        {"loss_sum": 10**400},
+        {"loss_count": 0},
+        {"points": [asdict(POINT), asdict(POINT)]},
+        {"points": [{**asdict(POINT), "step": 13}]},
         {"loss_sum": float("nan")},
         {"loss_sum": "0.7"},
         {"loss_count": "2"},

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetectError, ImageError, OptionError
+from deepdetect import ImageError, OptionError
+from deepdetect._shared.errors import BatchError
 from deepdetect.io.image import luma
 from deepdetect.labels import LabelOptions, fuse
 from deepdetect.training.recipe import Stage, TrainingOptions
@@ -129,8 +130,17 @@ def copies(photographs: Path, folder: Path) -> Path:
 def test_an_unreadable_photograph_can_be_mended(photographs: Path, tmp_path: Path) -> None:
     folder, output = copies(photographs, tmp_path / "photos"), tmp_path / "out"
     bad = folder / "photo05.png"
-    bad.write_bytes(b"no image")
-    with pytest.raises(DeepDetectError, match=r"1 of \d shards .*photo05\.png is not an image"):
+    worse = folder / "photo06.png"
+    good = worse.read_bytes()
+    for path in (bad, worse):
+        path.write_bytes(b"no image")
+    with pytest.raises(
+        BatchError, match=r"2 of 12 images .*photo05\.png is not an image"
+    ) as caught:
+        write_shards(folder, output, OPTIONS, shard_size=12, workers=1)
+    assert [Path(failure.split()[0]) for failure in caught.value.failures] == [bad, worse]
+    worse.write_bytes(good)
+    with pytest.raises(BatchError, match=r"1 of 12 images .*photo05\.png is not an image"):
         write_shards(folder, output, OPTIONS, shard_size=2, workers=1)
     left = {path: path.stat().st_mtime_ns for path in output.iterdir()}
     assert left

@@ -217,16 +217,51 @@ def test_an_altered_checkpoint_is_refused(
 def test_damaged_best_weights_do_not_stop_a_run(
     run: Path, tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The next validation writes them again; after the last one they are missed."""
+    """The next validation writes them again."""
     with monkeypatch.context() as patch, interrupted(patch, "training_step", 6):
         fit(tmp_path)
     (tmp_path / "best.safetensors").write_bytes(b"damaged")
     fit(tmp_path)
     assert tensors_equal(tmp_path / "checkpoint.safetensors", run / "checkpoint.safetensors")
     load_network(tmp_path / "best.safetensors")
-    (tmp_path / "best.safetensors").write_bytes(b"damaged")
-    with pytest.raises(WeightsError, match="missing or damaged"):
-        fit(tmp_path)
+
+
+def _damaged(path: Path) -> None:
+    path.write_bytes(b"damaged")
+
+
+def _not_finite(path: Path) -> None:
+    tensors = {
+        name: torch.full_like(value, float("nan")) if value.is_floating_point() else value
+        for name, value in load_file(path).items()
+    }
+    save_file(tensors, path, metadata=read_notes(path))
+
+
+def _without_notes(path: Path) -> None:
+    save_file(load_file(path), path)
+
+
+def _of_another_point(path: Path) -> None:
+    save_file(load_file(path), path, metadata={**read_notes(path), "point": '{"step": "1"}'})
+
+
+@pytest.mark.parametrize(
+    "change", [Path.unlink, _damaged, _not_finite, _without_notes, _of_another_point]
+)
+def test_damaged_best_weights_of_a_finished_run_are_replaced_by_the_last(
+    change: Any, run: Path, tmp_path: Path, fit
+) -> None:
+    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
+    change(tmp_path / "best.safetensors")
+    lines: list[str] = []
+    result = fit(tmp_path, log=lines.append)
+    assert [line for line in lines if "missing or damaged" in line and "last weights" in line]
+    assert result.best == result.points[-1]
+    last = load_file(run / "checkpoint.safetensors")
+    for name, value in load_file(tmp_path / "best.safetensors").items():
+        assert torch.equal(value, last[f"network.{name}"])
+    assert DeepDetect(tmp_path / "deepdetect.onnx").backend
 
 
 @pytest.mark.slow

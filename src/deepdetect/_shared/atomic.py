@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import os
-import tempfile
+import platform
+import re
+import secrets
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -11,10 +16,24 @@ from pathlib import Path
 
 from .errors import DeepDetectError
 
+ABANDONED_S = 24 * 3600.0
+"""Age from which a temporary file of another machine is taken for that of a process that died."""
+
+STEM_LENGTH = 40
+"""Characters of the final name in a temporary one, which must not become too long."""
+
+# Stem, machine, process, a random number, "part" and the suffix of the final file.
+_TEMPORARY = re.compile(r"\..*\.(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}\.part(\..*)?")
+
+_cleared: set[Path] = set()
+"""Folders in which this process has looked for what others left behind."""
+
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside the final one, which is renamed when the block succeeds.
+
+    The first time in a folder, temporary files of processes that were killed are removed.
 
     Args:
         path: the final path. Missing folders are created. The temporary name keeps the suffix,
@@ -38,11 +57,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     temporary: Path | None = None
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(
-            prefix=f".{final.stem}.", suffix=f".part{final.suffix}", dir=final.parent
-        )
-        os.close(handle)
-        temporary = Path(name)
+        clear_abandoned(final.parent)
+        owner = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+        name = final.with_name(f".{final.stem[:STEM_LENGTH]}.{owner}.part{final.suffix}")
+        # Nobody else reads what is not whole.
+        os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
+        temporary = name
         yield temporary
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(final)
@@ -56,9 +76,52 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def clear_abandoned(folder: Path) -> None:
+    """Remove the temporary files of `atomic_path` in a folder whose processes have ended.
+
+    A process looks once in each folder. Whether a process of another machine, or of another
+    container, has ended is not known: its files are removed when they are a day old.
+    """
+    folder = folder.absolute()
+    if folder in _cleared:
+        return
+    _cleared.add(folder)
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            match = _TEMPORARY.fullmatch(entry.name)
+            if match is not None and _is_abandoned(entry, match["machine"], int(match["process"])):
+                with contextlib.suppress(OSError):
+                    os.unlink(entry)
+
+
+def _is_abandoned(entry: os.DirEntry[str], machine: str, process: int) -> bool:
+    if machine == _machine() and os.name == "posix":
+        try:
+            os.kill(process, 0)  # only asks
+        except ProcessLookupError:
+            return True
+        except (OSError, OverflowError):  # another user's
+            return False
+        return False
+    try:
+        return time.time() - entry.stat(follow_symlinks=False).st_mtime > ABANDONED_S
+    except OSError:
+        return False
+
+
+@lru_cache(maxsize=1)
+def _machine() -> str:
+    """Return a digest of what the numbers of processes are unique in."""
+    try:
+        namespace = os.readlink("/proc/self/ns/pid")  # containers may share a name and a folder
+    except OSError:
+        namespace = ""
+    return hashlib.sha256(f"{platform.node()} {namespace}".encode()).hexdigest()[:8]
+
+
 @lru_cache(maxsize=1)
 def _umask() -> int:
-    """Return the mode bits that new files lack: mkstemp creates private files."""
+    """Return the mode bits that new files lack: temporary files are private."""
     umask = os.umask(0o077)  # it can only be read by setting it
     os.umask(umask)
     return umask

@@ -33,6 +33,24 @@ class MissingExtraError(DeepDetectError):
     """An optional package is needed for what was asked and is not installed."""
 
 
+class BatchError(DeepDetectError):
+    """Some of many files could not be worked on; the others are done.
+
+    The command line lists them and ends with exit code 1.
+
+    Args:
+        summary: how many, and what happened to the others.
+        failures: a sentence on each, with its name.
+    """
+
+    def __init__(self, summary: str, failures: Iterable[str]) -> None:
+        self.summary, self.failures = summary, tuple(failures)
+        super().__init__(f"{summary}; the first: {self.failures[0]}")
+
+    def __reduce__(self) -> tuple[type[BatchError], tuple[str, tuple[str, ...]]]:
+        return type(self), (self.summary, self.failures)
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
     """Return the error for an unknown name, which suggests the nearest known one.
 

@@ -10,13 +10,22 @@ import ctypes
 import multiprocessing
 import os
 import platform
+import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
+from types import FrameType
 from typing import Any, TypeVar
 
 from .errors import DeepDetectError, OptionError
@@ -68,30 +77,91 @@ def map_in_processes(
         return
     # Spawned, not forked: a fork copies the locks of the parent's threads.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
+    ended = context.Event()
+    pool = ProcessPoolExecutor(
+        count, mp_context=context, initializer=_start_worker, initargs=(ended,)
+    )
     remaining = iter(tasks)
-    pending = {
-        pool.submit(function, task) for _, task in zip(range(4 * count), remaining, strict=False)
-    }
+
+    def submit(places: Iterable[object]) -> set[Future[Outcome]]:
+        with _interrupts_held():  # processes are started, which inherit it
+            return {
+                pool.submit(_run_task, function, task)
+                for _, task in zip(places, remaining, strict=False)
+            }
+
     try:
+        pending = submit(range(4 * count))
         while pending:
             done, pending = wait(pending, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
-            pending |= {
-                pool.submit(function, task) for _, task in zip(done, remaining, strict=False)
-            }
+            pending |= submit(done)
     except BrokenProcessPool:
         raise DeepDetectError(
             "a worker process died, most likely for lack of memory: "
             "use fewer `workers`, or smaller images"
         ) from None
     finally:
+        ended.set()  # some are queued where they cannot be cancelled
         pool.shutdown(cancel_futures=True)
 
 
-def _start_worker() -> None:
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Let Ctrl-C wait while processes are started, and in these until `_start_worker`."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    # Or the first process starts it, and it ends the mask.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Interrupts:
+    """What Ctrl-C, which all processes of a terminal get, does to a worker: it ends its task."""
+
+    ended: Any = None  # the event that no further task is wanted
+    at_work = False
+    stopped = False
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Remember the signal; where a task is done, end it."""
+        self.stopped = True
+        if self.at_work:
+            raise KeyboardInterrupt
+
+    def run(self, function: Callable[[Task], Outcome], task: Task) -> Outcome:
+        """Do a task, unless the work has been stopped."""
+        if self.stopped or self.ended.is_set():
+            raise CancelledError
+        self.at_work = True
+        try:
+            return function(task)
+        finally:
+            self.at_work = False
+
+
+_interrupts = _Interrupts()
+
+
+def _run_task(function: Callable[[Task], Outcome], task: Task) -> Outcome:
+    return _interrupts.run(function, task)
+
+
+def _start_worker(ended: Any) -> None:
     """Prepare a worker: one OpenCV thread, freed memory is kept, and it ends with the parent."""
+    _interrupts.ended = ended
+    signal.signal(signal.SIGINT, _interrupts.handle)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+
     import cv2
 
     cv2.setNumThreads(1)

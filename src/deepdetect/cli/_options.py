@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os.path
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import BatchError, DeepDetectError, OptionError
 from ._generated import FieldOptions, given_only
 
 if TYPE_CHECKING:
@@ -73,6 +72,9 @@ format_option = click.option(
 )
 pictures_option = click.option(
     "--pictures/--no-pictures", default=True, show_default=True, help="Write pictures as PNG."
+)
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace what exists already, and do all of it again."
 )
 workers_option = click.option(
     "--workers",
@@ -194,22 +196,28 @@ def check_inputs_survive(outputs: Iterable[Path], inputs: Sequence[Path], advice
 
     The advice says what to do, as "give the model another name by -o".
     """
-    there = [path for path in inputs if os.path.exists(path)]
+    # Not by name: links, and capitals on some systems, give one file several.
+    there = {_identity(path) for path in inputs} - {None}
     for output in outputs:
-        # Not by name: links, and capitals on some systems, give one file several.
-        if os.path.exists(output) and any(os.path.samefile(output, path) for path in there):
+        if _identity(output) in there:
             raise OptionError(f"{output} would be written over, which is an input: {advice}")
 
 
+def _identity(path: Path) -> tuple[int, int] | None:
+    """Return what tells a file from all others, or None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
 def report_failures(failures: Sequence[str], total: int) -> None:
-    """Raise a DeepDetectError when some of several images failed, naming the first."""
+    """Raise a BatchError when some of several images failed; of a single one, its error."""
     if failures and total == 1:
         raise DeepDetectError(failures[0])
     if failures:
-        raise DeepDetectError(
-            f"{len(failures)} of {total} images failed, the others are done; the first: "
-            f"{failures[0]}"
-        )
+        raise BatchError(f"{len(failures)} of {total} images failed, the others are done", failures)
 
 
 def print_json(value: Any) -> None:

@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from .. import __version__
 from ._generated import generated_command, given_only
 from ._options import (
     DETECTOR,
     PATH,
     SELECTION,
+    check_inputs_survive,
     expand_images,
     format_option,
     json_option,
     make_detector,
     output_option,
+    overwrite_option,
     pictures_option,
     print_json,
     report_failures,
 )
+
+if TYPE_CHECKING:
+    from ..detector.detector import DeepDetect
+    from ._records import OutputRecords
 
 
 @generated_command(SELECTION, DETECTOR, short_help="Keypoints of photographs.")
@@ -34,6 +41,7 @@ from ._options import (
 )
 @format_option
 @pictures_option
+@overwrite_option
 @json_option
 def detect(
     images: tuple[Path, ...],
@@ -41,6 +49,7 @@ def detect(
     ignore: Path | None,
     file_format: str,
     pictures: bool,
+    overwrite: bool,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -50,79 +59,119 @@ def detect(
     STEM_keypoints.png and STEM_heatmap.png. With --max-keypoints they are the best keypoints of
     all scales; without, all pixels over the threshold.
 
+    Images that are done are skipped when the same command runs again. What was made from other
+    images, with other options or by something else is replaced with --overwrite only. An image
+    that cannot be read does not stop the others: they are listed at the end, with exit code 1.
+
     \b
     deepdetect detect photo.jpg
     deepdetect detect photos/ -o keypoints --max-keypoints 2048 --spread grid
     deepdetect detect photo.jpg --density 0.1 --format csv
     """
-    from .._shared.errors import DeepDetectError
     from .._shared.progress import progress
+    from ..features.selection import SelectionOptions
     from ..io.masks import load_mask
+    from ._records import OutputRecords, file_digest
 
     paths = expand_images(images, output)
+    outputs = {path: _outputs(path, output, file_format, pictures) for path in paths}
+    written = [file for files in outputs.values() for file in files.values()]
+    check_inputs_survive(written, paths, "choose another folder with -o")
     mask = load_mask(ignore) if ignore is not None else None
     detector = make_detector(values)
-    selection = {**given_only(values), "ignore": mask}
+    selection = vars(SelectionOptions(**given_only(values), ignore=mask))
+    settings = {
+        **selection,
+        "ignore": None if ignore is None else file_digest(ignore),
+        "weights": file_digest(detector.weights),
+        "ranker": file_digest(detector.ranker),
+        "resolution": detector.heatmap_options.resolution,
+        "backend": detector.backend,
+        "version": __version__,
+    }
+    records = OutputRecords("detect", output, settings, overwrite)
+    for path, files in outputs.items():  # before any work
+        records.find(path, list(files.values()))
     results: list[dict[str, Any]] = []
     failures = []
     with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:
-        for path in paths:
+        for path, files in outputs.items():
             try:
-                results.append(
-                    _detect_one(path, detector, selection, output, file_format, pictures)
-                )
-            except DeepDetectError as error:
-                failures.append(str(error))
+                results.append(_detect_one(path, detector, selection, files, records))
+            except _Failure as failure:
+                failures.append(str(failure))
             bar.update(1)
     if as_json:
         print_json({"backend": detector.backend, "images": results, "failures": failures})
     else:
         for result in results:
+            how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"
             click.echo(
                 f"{result['image']}: {result['keypoints']:,} keypoints, "
-                f"density {result['density']:.3f}, {result['seconds']:.2f} s -> {result['file']}"
+                f"density {result['density']:.3f}, {how} -> {result['file']}"
             )
     report_failures(failures, len(paths))
 
 
+class _Failure(Exception):
+    """One image cannot be worked on; whatever else is raised concerns all of them."""
+
+
+def _outputs(path: Path, output: Path, file_format: str, pictures: bool) -> dict[str, Path]:
+    """Return the files that are made of an image, by what they hold."""
+    files = {"file": output / f"{path.stem}.{file_format}"}
+    if pictures:
+        for name in ("keypoints", "heatmap"):
+            files[name] = output / f"{path.stem}_{name}.png"
+    return files
+
+
 def _detect_one(
     path: Path,
-    detector: Any,
+    detector: DeepDetect,
     selection: dict[str, Any],
-    output: Path,
-    file_format: str,
-    pictures: bool,
+    files: dict[str, Path],
+    records: OutputRecords,
 ) -> dict[str, Any]:
-    """Detect, save and draw the keypoints of one image; return its numbers."""
+    """Detect, save and draw the keypoints of one image unless it is done; return its numbers."""
+    from .._shared.errors import DeepDetectError, MissingExtraError, WeightsError
     from ..io.image import load_image
     from ..io.tables import save_keypoints
     from ..viz.draw import add_caption, draw_heatmap, draw_keypoints, save_picture
 
-    rgb = load_image(path)
-    started = time.perf_counter()
-    if pictures:
-        keypoints, heatmap = detector.detect(rgb, **selection, return_heatmap=True)
-    else:
-        keypoints = detector.detect(rgb, **selection)
-    seconds = time.perf_counter() - started
-    file = output / f"{path.stem}.{file_format}"
-    save_keypoints(keypoints, file)
-    drawn = {}
-    if pictures:
+    paths = list(files.values())
+    drawn = {name: file for name, file in files.items() if name != "file"}
+    shown = {"file": files["file"], "pictures": drawn}
+    try:
+        # Another command may have done it meanwhile.
+        done = records.find(path, paths)
+        if done is not None:
+            return {"image": path, **done, **shown, "skipped": True}
+        rgb = load_image(path)
+        started = time.perf_counter()
+        if drawn:
+            keypoints, heatmap = detector.detect(rgb, **selection, return_heatmap=True)
+        else:
+            keypoints = detector.detect(rgb, **selection)
+        seconds = time.perf_counter() - started
+    except (MissingExtraError, WeightsError):  # concern all images
+        raise
+    except DeepDetectError as error:
+        named = str(error) if str(path) in str(error) else f"{path}: {error}"
+        raise _Failure(named) from error
+    records.begin(path, paths)
+    save_keypoints(keypoints, files["file"])
+    if drawn:
         caption = f"{len(keypoints):,} keypoints, density {keypoints.density:.3f}"
-        for name, picture in (
-            ("keypoints", add_caption(draw_keypoints(rgb, keypoints), caption)),
-            ("heatmap", draw_heatmap(heatmap)),
-        ):
-            drawn[name] = output / f"{path.stem}_{name}.png"
-            save_picture(picture, drawn[name])
-    return {
-        "image": path,
+        picture = add_caption(draw_keypoints(rgb, keypoints), caption)
+        save_picture(picture, drawn["keypoints"])
+        save_picture(draw_heatmap(heatmap), drawn["heatmap"])
+    numbers = {
         "width": rgb.shape[1],
         "height": rgb.shape[0],
         "keypoints": len(keypoints),
         "density": round(keypoints.density, 6),
         "seconds": round(seconds, 4),
-        "file": file,
-        "pictures": drawn,
     }
+    records.finish(path, paths, numbers)
+    return {"image": path, **numbers, **shown, "skipped": False}

@@ -63,12 +63,14 @@ def evaluate(
     1,000 matches are correct), ratio 0.99, correct under 1 px; with --labels also what the
     labels give there. With --scale, whether the quality holds on larger and smaller images.
 
+    Samples that cannot be read are listed at the end, with exit code 1, and are in no score.
+
     \b
     deepdetect evaluate samples/
     deepdetect evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
     deepdetect evaluate samples/ --scale 0.5 --scale 1 --scale 2
     """
-    from .._shared.errors import OptionError
+    from .._shared.errors import BatchError, OptionError
     from ..datasets.oxford import load_oxford
     from ..detector.heatmap import HeatmapOptions
     from ..evaluation.evaluate import evaluate as run
@@ -99,14 +101,17 @@ def evaluate(
         if labels:
             further["labels"] = {"oxford": asdict(on_oxford[-1])}
         print_json({**results[0], **further})
-        return
-    _print_scores(names, found)
-    if scales:
-        click.echo()
-        _print_scales(names, found)
-    if on_oxford:
-        click.echo()
-        _print_oxford([*names, "labels"] if labels else names, on_oxford)
+    else:
+        _print_scores(names, found)
+        if scales:
+            click.echo()
+            _print_scales(names, found)
+        if on_oxford:
+            click.echo()
+            _print_oxford([*names, "labels"] if labels else names, on_oxford)
+    if failures := found[0].failures:
+        total = len(failures) + sum(score.images for score in found[0].masks.values())
+        raise BatchError(f"{len(failures)} of {total} samples are not in the scores", failures)
 
 
 def _values(evaluation: Evaluation) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from ._options import (
     expand_images,
     json_option,
     label_settings_option,
+    overwrite_option,
     print_json,
     report_failures,
     workers_option,
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
     "than 64 grey levels from the 1st to the 99th percentile.",
 )
 @click.option("--visualize", is_flag=True, help="Also write STEM_labels.png, the paper's Figure 4.")
-@click.option("--overwrite", is_flag=True, help="Replace masks that exist already.")
+@overwrite_option
 @workers_option
 @json_option
 def label(
@@ -59,7 +60,9 @@ def label(
     """Mark the keypoints and edges of IMAGES (files or folders) by nine classical detectors.
 
     Writes a 1-bit PNG mask STEM.png for each image: white where one of the detectors
-    marks the pixel. Masks that exist already are skipped.
+    marks the pixel. Masks that exist already are skipped, unless their image has changed; what
+    was made of another image or with other settings is replaced with --overwrite only. An image
+    that cannot be read does not stop the others: they are listed at the end, with exit code 1.
 
     \b
     deepdetect label photos/ -o masks
@@ -67,14 +70,22 @@ def label(
     """
     from .._shared.progress import progress
     from ..labels import LabelOptions
-    from ..labels.batch import LabelTarget, LabelTask, label_files, unfinished_tasks
+    from ..labels.batch import (
+        LabelTarget,
+        LabelTask,
+        image_state,
+        label_files,
+        unfinished_tasks,
+    )
 
     settings = chosen_label_settings(detectors, label_settings)
     options = LabelOptions(settings.detectors, visibility, settings.changes)
     tasks = []
     for image in expand_images(images, output):
         figure = output / f"{image.stem}_labels.png" if visualize else None
-        target = LabelTarget(output / f"{image.stem}.png", options, figure)
+        target = LabelTarget(
+            output / f"{image.stem}.png", options, figure, image_state=image_state(image)
+        )
         tasks.append(LabelTask(image, (target,)))
     _check_outputs(tasks, overwrite)
     left = tasks if overwrite else unfinished_tasks(tasks)
@@ -110,15 +121,30 @@ def label(
 
 
 def _check_outputs(tasks: Sequence[LabelTask], overwrite: bool) -> None:
-    """Check that no image is replaced, and no mask that was made with other settings."""
+    """Check that no image is replaced, no mask that is another's, and no output by another."""
     images = {task.image.resolve() for task in tasks}
-    for target in (target for task in tasks for target in task.targets):
+    makers: dict[Path, Path] = {}
+    for task in tasks:
+        (target,) = task.targets
         for path in (target.mask, target.figure):
-            if path is not None and path.resolve() in images:
+            if path is None:
+                continue
+            if path.resolve() in images:
                 raise OptionError(
                     f"{path} would replace an image that is to be labelled: "
                     "choose another folder with -o"
                 )
+            if path in makers:
+                raise OptionError(
+                    f"{makers[path]} and {task.image} would both write {path}: rename one, or "
+                    "leave out --visualize"
+                )
+            makers[path] = task.image
+        if not overwrite and target.is_of_another_image:
+            raise OptionError(
+                f"{target.mask} exists already, made from another image of the same name: "
+                "choose another folder with -o, or replace it with --overwrite"
+            )
         if not overwrite and target.is_stale:
             raise OptionError(
                 f"{target.mask} exists already, made with other settings: "

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from .._shared.errors import DeepDetectError
+from .._shared.errors import BatchError, DeepDetectError
 from ._generated import with_flags
 from .average import average
 from .benchmark import benchmark
@@ -47,7 +47,10 @@ OLD_FLAGS = {
 
 
 class Commands(click.Group):
-    """A group that names the nearest right command, and ends with exit code 2 on user errors."""
+    """A group that names the nearest right command, and ends with exit code 2 on user errors.
+
+    With 1 where some of many files could not be worked on.
+    """
 
     def resolve_command(self, context: click.Context, args: list[str]) -> Any:
         name = args[0]
@@ -65,6 +68,11 @@ class Commands(click.Group):
             if error.ctx is None or not any(new in each.opts for each in error.ctx.command.params):
                 raise
             raise click.UsageError(f"{error.message} Did you mean '{new}'?", error.ctx) from None
+        except BatchError as error:
+            click.echo(f"deepdetect: {error.summary}:", err=True)
+            for failure in error.failures:
+                click.echo(f"  {failure}", err=True)
+            context.exit(1)
         except DeepDetectError as error:
             command = self.get_command(context, context.invoked_subcommand or "")
             click.echo(f"deepdetect: {with_flags(str(error), command)}", err=True)

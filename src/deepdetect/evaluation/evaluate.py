@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError
+from .._shared.errors import ImageError, OptionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from ..datasets.oxford import load_oxford
@@ -26,6 +26,7 @@ from .options import PAPER_RESOLUTION_PX, THRESHOLDS
 from .protocols.masks import (
     ScaleScore,
     check_scales,
+    readable_samples,
     sample_images,
     score_at_scale,
     score_samples,
@@ -59,11 +60,13 @@ class Evaluation:
         masks: against the known masks of samples, by visibility, "normal" and "low".
         scales: against the labels of scaled images, a row for each scale and visibility.
         oxford: by the paper's protocol.
+        failures: a sentence on each sample that cannot be read and is not in the scores.
     """
 
     masks: dict[str, MaskScore] = field(default_factory=dict)
     scales: tuple[ScaleScore, ...] = ()
     oxford: OxfordScore | None = None
+    failures: tuple[str, ...] = ()
 
 
 @suggest_keywords
@@ -87,7 +90,7 @@ def evaluate(
         quiet: show no progress bars.
 
     Raises:
-        ImageError: an image, a mask or a homography is missing.
+        ImageError: there is no sample that can be read, or a homography is missing.
         OptionError: a scale is not above 0, or there are no samples to scale.
         MissingExtraError: `oxford` needs the extra "benchmark".
 
@@ -106,8 +109,11 @@ def evaluate(
     detector = DeepDetect() if detector is None else detector
     masks: dict[str, MaskScore] = {}
     rows: list[ScaleScore] = []
+    failures: tuple[str, ...] = ()
     if samples is not None:
-        images = sample_images(samples)
+        images, failures = readable_samples(sample_images(samples))
+        if not images:
+            raise ImageError(failures[0])
         masks = score_samples(detector.heatmap, _shown(images, "scoring", quiet))
         for scale in scales:
             rows += score_at_scale(detector, _shown(images, f"scale {scale:g}", quiet), scale)
@@ -115,6 +121,7 @@ def evaluate(
         masks,
         tuple(rows),
         None if oxford is None else evaluate_oxford(detector, load_oxford(oxford), quiet=quiet),
+        failures,
     )
 
 

@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import WeightsError
 from .model_card import CurvePoint
 from .optim import state_shapes
+
+MAX_INTEGER = 2**53
+"""Larger ones may have no equal among the floats that they are divided by."""
 
 
 @dataclass
@@ -46,22 +50,44 @@ class TrainingState:
         Raises:
             ValueError: a value is missing, of another type or out of its range.
         """
-        counts = {name: _number(values, name, int) for name in ("step", "images", "loss_count")}
+        counts = {name: read_number(values, name, int) for name in ("step", "images", "loss_count")}
         if counts["step"] > last_step:
             raise ValueError(f"step {counts['step']} lies behind the last one, {last_step}")
-        rows = values.get("points")
-        if not isinstance(rows, list):
-            raise ValueError("points is not a list")
-        kinds = {
-            field.name: int if field.type == "int" else float
-            for field in dataclasses.fields(CurvePoint)
-        }
-        points = []
-        for row in rows:
-            if not isinstance(row, dict):
-                raise ValueError("a point is not an object")
-            points.append(CurvePoint(**{name: _number(row, name, k) for name, k in kinds.items()}))
-        return cls(**counts, loss_sum=_number(values, "loss_sum", float), points=points)
+        points = [read_point(row) for row in read_rows(values)]
+        check_steps([point.step for point in points], counts["step"])
+        measured = points[-1].step if points else 0
+        if (counts["loss_count"] == 0) != (counts["step"] == measured):
+            raise ValueError("loss_count does not fit the last point")
+        return cls(**counts, loss_sum=read_number(values, "loss_sum", float), points=points)
+
+
+def read_point(row: Any) -> CurvePoint:
+    """Read a point of the loss curves from JSON.
+
+    Raises:
+        ValueError: a value is missing, of another type or out of its range.
+    """
+    if not isinstance(row, dict):
+        raise ValueError("a point is not an object")
+    kinds = {
+        field.name: int if field.type == "int" else float
+        for field in dataclasses.fields(CurvePoint)
+    }
+    return CurvePoint(**{name: read_number(row, name, kind) for name, kind in kinds.items()})
+
+
+def read_rows(values: Mapping[str, Any]) -> list[Any]:
+    """Return the list "points" of a mapping; raise a ValueError where it is none."""
+    rows = values.get("points")
+    if not isinstance(rows, list):
+        raise ValueError("points is not a list")
+    return rows
+
+
+def check_steps(steps: Sequence[int], last: int) -> None:
+    """Raise a ValueError where the steps of points do not rise, or lie behind the last one."""
+    if any(a >= b for a, b in pairwise([*steps, last + 1])):
+        raise ValueError("points are not in the order of their steps")
 
 
 @dataclass(frozen=True)
@@ -146,6 +172,11 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimizers: Sequence[Opt
             raise checkpoint.unfit(f"{name} is {is_now}, it should be {should}")
         if not tensors[name].isfinite().all():
             raise checkpoint.unfit(f"{name} is not finite")
+        if (
+            name.startswith(("optimizer.step.", "optimizer.exp_avg_sq."))
+            and tensors[name].min() < 0
+        ):
+            raise checkpoint.unfit(f"{name} is negative")
     network.load_state_dict({name: tensors[f"network.{name}"] for name in network.state_dict()})
     for optimizer, parameter, shapes in trained:
         optimizer.state[parameter] = {
@@ -161,12 +192,16 @@ def _like(value: Tensor, parameter: Tensor) -> Tensor:
     return value.to(parameter.device, copy=True)
 
 
-def _number(values: Mapping[str, Any], name: str, kind: type) -> Any:
-    """Return a finite number of a mapping, not negative if it is an integer."""
+def read_number(values: Mapping[str, Any], name: str, kind: type) -> Any:
+    """Return a finite number of a mapping, not negative if it is an integer.
+
+    Raises:
+        ValueError: it is missing, of another type or out of its range.
+    """
     value: Any = values.get(name)
-    whole = isinstance(value, int) and not isinstance(value, bool)
+    whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_INTEGER
     if kind is int and whole and value >= 0:
         return value
-    if kind is float and (whole or isinstance(value, float)) and math.isfinite(value):
+    if kind is float and (whole or (isinstance(value, float) and math.isfinite(value))):
         return float(value)
     raise ValueError(f"{name} is not a number that it can be")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError
+from .._shared.errors import BatchError
 from .._shared.progress import progress
 from ..io.image import luma
 from ..io.masks import load_mask
@@ -52,7 +52,8 @@ class LabelCache:
         """Make the labels that do not exist yet, in parallel; return how many were made.
 
         Raises:
-            DeepDetectError: an image cannot be read; the other labels are made all the same.
+            BatchError: images cannot be read; the other labels are made all the same.
+            DeepDetectError: a label cannot be written.
         """
         there = {path.name for path in self.folder.glob("*.png")} if self.folder.is_dir() else set()
         tasks = []
@@ -73,9 +74,10 @@ class LabelCache:
             reports = label_files(tasks, workers, lambda _: bar.update(1))
         failures = {report.image: report.error for report in reports if report.error is not None}
         if failures:
-            raise DeepDetectError(
+            raise BatchError(
                 f"{len(failures)} of {len(wanted)} images cannot be read, the labels of the "
-                f"others are kept; the first: {next(iter(failures.values()))}"
+                "others are kept",
+                failures.values(),
             )
         return total
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import DeepDetectError, ImageError, OptionError
+from .._shared.errors import BatchError, ImageError, OptionError
 from .._shared.parallel import map_in_processes
 from .._shared.progress import progress
 from .._shared.text_files import read_json
@@ -157,7 +157,8 @@ def write_shards(
     Raises:
         ImageError: the folder is missing, or has too few images.
         OptionError: the folder has shards that were made with other options.
-        DeepDetectError: images cannot be read; the other shards are kept.
+        BatchError: images cannot be read; the shards without them are kept.
+        DeepDetectError: a shard cannot be written.
 
     Example:
         >>> write_shards("images", "shards", TrainingOptions())  # doctest: +SKIP
@@ -182,17 +183,17 @@ def write_shards(
                 files[kind].append((path, len(chosen)))
                 if not path.exists():
                     tasks.append((path, task))
-    failures = []
+    failures: list[str] = []
     total = sum(len(task.images) for _, task in tasks)
     with progress(total, "shards", "image", quiet) as bar:
-        for count, failure in map_in_processes(_write_shard, tasks, workers):
+        for count, unread in map_in_processes(_write_shard, tasks, workers):
             bar.update(count)
-            if failure is not None:
-                failures.append(failure)
+            failures += unread
     if failures:
-        raise DeepDetectError(
-            f"{len(failures)} of {len(tasks)} shards cannot be written, the others are kept; "
-            f"the first: {failures[0]}"
+        raise BatchError(
+            f"{len(failures)} of {len(listed)} images cannot be read, the shards without them are "
+            "kept",
+            sorted(failures),
         )
     index: dict[str, Any] = {"options": _fixed_options(options)}
     for kind, rows in files.items():
@@ -238,20 +239,32 @@ def _deal(images: Sequence[SourceImage], root: Path, shard_size: int) -> list[li
     return shards
 
 
-def _write_shard(job: tuple[Path, _ShardTask]) -> tuple[int, str | None]:
-    """Write one shard; return the number of its images, and what went wrong or None."""
+class _UnreadError(Exception):
+    """A shard is not complete."""
+
+
+def _write_shard(job: tuple[Path, _ShardTask]) -> tuple[int, list[str]]:
+    """Write one shard, if all of its images can be read; return their number, and what fails."""
     path, task = job
+    failures: list[str] = []
     try:
         with atomic_path(path) as temporary, tarfile.open(temporary, "w") as tar:
             for k, image in enumerate(task.images):
-                for ending, content in _files_of(image, task).items():
+                try:
+                    files = _files_of(image, task)
+                except ImageError as error:
+                    failures.append(str(error))
+                    continue
+                for ending, content in files.items():
                     # No time of writing: the same images give the same file.
                     member = tarfile.TarInfo(f"{k:06d}_{image.digest}.{ending}")
                     member.size = len(content)
                     tar.addfile(member, io.BytesIO(content))
-    except DeepDetectError as error:
-        return len(task.images), str(error)
-    return len(task.images), None
+            if failures:
+                raise _UnreadError
+    except _UnreadError:
+        pass
+    return len(task.images), failures
 
 
 def _files_of(image: SourceImage, task: _ShardTask) -> dict[str, bytes]:

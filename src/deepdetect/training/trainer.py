@@ -27,7 +27,14 @@ from ..detector.network.weights import (
 )
 from ..detector.pretrained import resolve_weights
 from ..evaluation.metrics.masks import MaskScore, mean_score
-from .checkpoint import Checkpoint, TrainingState, read_checkpoint, restore, save_checkpoint
+from .checkpoint import (
+    Checkpoint,
+    TrainingState,
+    read_checkpoint,
+    read_point,
+    restore,
+    save_checkpoint,
+)
 from .dataset import CropDataset, TrainingData, ValidationDataset, loading, prepare_data
 from .learner import Learner
 from .model_card import CurvePoint, save_curves, write_model_card
@@ -39,6 +46,9 @@ BEST = "best.safetensors"
 ONNX = "deepdetect.onnx"
 CARD = "MODEL_CARD.md"
 FULL_IMAGE_PIXELS = 480 * 480
+
+SAME_RUN = ("options", "start", "photographs", "photographs_digest")
+"""Notes of weights that tell their run."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +163,8 @@ class Trainer:
             self.log(f"training on {self.engine.describe()}")
         if state.step in milestones and state.step not in {point.step for point in state.points}:
             self._validate()  # the run was interrupted while it validated
+        if state.step == self.schedule.steps and self.best is None and self.context.is_main:
+            self._keep(state.points[-1])  # they were damaged, and no further validation comes
         bar = progress(self.schedule.steps, "training", "step", self.log is None, state.step)
         with bar, loading(self.loader(state.step)) as batches:
             for images, masks in batches:
@@ -220,16 +232,23 @@ class Trainer:
         if not self.context.is_main:
             return
         if self.best is None or point.validation_loss < self.best.validation_loss:
-            self.best = point
-            metadata = {
-                **self.run,
-                **self.metadata,
-                "photographs": str(self.schedule.images),
-                "photographs_digest": self.data.digest,
-                "point": json.dumps(dataclasses.asdict(point)),
-            }
-            save_weights(self.network, self.folder / BEST, metadata)
+            self._keep(point)
         save_curves(state.points, self.folder)
+
+    def _keep(self, point: CurvePoint) -> None:
+        """Write the weights as the best so far."""
+        self.best = point
+        notes = {**self._notes(), "point": json.dumps(dataclasses.asdict(point))}
+        save_weights(self.network, self.folder / BEST, notes)
+
+    def _notes(self) -> dict[str, str]:
+        """Return what is written into the weights, but for their point of the loss curves."""
+        return {
+            **self.run,
+            **self.metadata,
+            "photographs": str(self.schedule.images),
+            "photographs_digest": self.data.digest,
+        }
 
     def _mean_score(self, scores: list[MaskScore]) -> MaskScore:
         """Average over the images of all processes."""
@@ -262,11 +281,26 @@ class Trainer:
             raise found.unfit(error) from None
         restore(found, self.network, self.learner.optimizers)
         self.state = state
+        self.best = self._read_best()
+        if self.best is None and state.points and self.log is not None:
+            at_end = state.step == self.schedule.steps
+            self.log(
+                f"{self.folder / BEST} is missing or damaged: it is written again "
+                f"{'with the last weights' if at_end else 'at the next validation'}"
+            )
+
+    def _read_best(self) -> CurvePoint | None:
+        """Return the point of the best weights so far; None where these are missing or damaged."""
+        own = self._notes()
         try:
-            load_network(self.folder / BEST)
-            self.best = CurvePoint(**json.loads(read_notes(self.folder / BEST)["point"]))
-        except (WeightsError, KeyError, TypeError, ValueError):
-            self.best = None  # the next validation writes it
+            tensors = load_network(self.folder / BEST).state_dict().values()
+            notes = read_notes(self.folder / BEST)
+            point = read_point(json.loads(notes["point"]))
+        except (WeightsError, KeyError, ValueError, RecursionError):
+            return None
+        same_run = all(notes.get(name) == own[name] for name in SAME_RUN)
+        whole = own.keys() <= notes.keys() and all(value.isfinite().all() for value in tensors)
+        return point if same_run and whole else None
 
     def _check_same_run(self, checkpoint: Checkpoint) -> None:
         before = checkpoint.metadata

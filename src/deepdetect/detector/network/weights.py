@@ -22,12 +22,18 @@ def save_weights(network: nn.Module, path: str | Path, notes: dict[str, str]) ->
         network: the network.
         path: file ending in .safetensors.
         notes: text to be kept in the file's header.
+
+    Raises:
+        DeepDetectError: the file cannot be written.
     """
     tensors = {
         name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
     }
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata=notes)
+        try:
+            save_file(tensors, temporary, metadata=notes)
+        except SafetensorError as error:  # a full disk
+            raise OSError(str(error)) from None
 
 
 def load_network(path: str | Path) -> ESPNet:

@@ -50,12 +50,34 @@ def score_samples(
     """
     scores: dict[str, list[MaskScore]] = {"normal": [], "low": []}
     for path in images:
-        rgb = load_image(path)
-        mask = load_mask(path.with_name(f"mask_{path.name}"))
-        if mask.shape != rgb.shape[:2]:
-            raise ImageError(f"the mask of {path} has another size than the image")
+        rgb, mask = load_sample(path)
         scores[visibility_of(luma(rgb))].append(score_heatmap(heatmap(rgb), mask))
     return {name: mean_score(listed) for name, listed in scores.items() if listed}
+
+
+def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Load a sample: (H, W, 3) uint8 RGB, and its known mask, (H, W) bool.
+
+    Raises:
+        ImageError: one of them is missing or damaged, or the mask is of another size.
+    """
+    rgb = load_image(path)
+    mask = load_mask(path.with_name(f"mask_{path.name}"))
+    if mask.shape != rgb.shape[:2]:
+        raise ImageError(f"the mask of {path} has another size than the image")
+    return rgb, mask
+
+
+def readable_samples(images: Iterable[Path]) -> tuple[list[Path], tuple[str, ...]]:
+    """Return the samples that can be loaded, and a sentence on each of the others."""
+    whole, failures = [], []
+    for path in images:
+        try:
+            load_sample(path)
+            whole.append(path)
+        except ImageError as error:
+            failures.append(str(error))
+    return whole, tuple(failures)
 
 
 CERTAIN_LOGIT = 200.0

@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,27 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
-from ..._shared.errors import OptionError
+from ..._shared.errors import OptionError, WeightsError
 from ..._shared.progress import progress
 from ..._shared.provenance import provenance
 from ...detector.points.ranker import load_ranker, notes_of
 from ...io.image import find_images
-from ..checkpoint import read_checkpoint, restore, save_checkpoint
+from ..checkpoint import (
+    check_steps,
+    read_checkpoint,
+    read_number,
+    read_rows,
+    restore,
+    save_checkpoint,
+)
 from ..dataset import loading
 from .dataset import PairDataset, PairIndex, PairSample, PairSampler
 from .losses import pair_loss
 from .measure import HardMeasure, measure, points_detector, validation_pairs
 from .model import RankerModule, save_ranker
 from .recipe import PointsTrainingOptions
-from .report import save_curves, write_model_card
+from .report import MEASURES, save_curves, write_model_card
+from .views import KINDS
 
 CHECKPOINT = "checkpoint.safetensors"
 BEST = "best.npz"
@@ -56,6 +64,31 @@ class PointsState:
     seconds: float = 0.0
     best_score: float = -1.0
     points: list[dict[str, Any]] = field(default_factory=list)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any], last_step: int) -> PointsState:
+        """Read the state from a checkpoint's metadata.
+
+        Raises:
+            ValueError: a value is missing, of another type or out of its range.
+        """
+        step, loss_count = (read_number(values, name, int) for name in ("step", "loss_count"))
+        if step > last_step:
+            raise ValueError(f"step {step} lies behind the last one, {last_step}")
+        rows = read_rows(values)
+        for row in rows:
+            _check_row(row)
+        check_steps([row["step"] for row in rows], step)
+        if not rows:
+            raise ValueError("there are no points")
+        return cls(
+            step,
+            read_number(values, "loss_sum", float),
+            loss_count,
+            read_number(values, "seconds", float),
+            read_number(values, "best_score", float),
+            rows,
+        )
 
 
 class PointsTrainer:
@@ -133,6 +166,9 @@ class PointsTrainer:
         if not state.points:
             self._measure()
             self._save()
+        if state.best_score < 0 and state.step == self.options.steps:
+            self._keep(state.points[-1])  # they were damaged, and no further measure comes
+            self._write_card()
         bar = progress(self.options.steps, "training", "step", self.quiet, state.step)
         with bar, loading(self._loader()) as batches:
             while state.step < end and time.monotonic() - started < seconds:
@@ -222,17 +258,27 @@ class PointsTrainer:
         state.loss_sum, state.loss_count = 0.0, 0
         best = found.score > state.best_score
         if best:
-            state.best_score = found.score
-            notes = {
-                **self.run,
-                **provenance(),
-                "point": {name: v for name, v in row.items() if name != "cpu_seconds"},
-            }
-            save_ranker(self.average.export(notes), self.folder / BEST)
+            self._keep(row)
         self._write_card()
         save_curves(state.points, self.folder)
         mark = " *" if best else ""
         self._say(f"{state.step:6d} loss {row['loss']:+.4f} score {found.row()}{mark}")
+
+    def _keep(self, row: dict[str, Any]) -> None:
+        """Write the average of the weights as the best so far."""
+        self.state.best_score = row["score"]
+        point = {name: value for name, value in row.items() if name != "cpu_seconds"}
+        notes = {**self.run, **provenance(), "point": point}
+        save_ranker(self.average.export(notes), self.folder / BEST)
+
+    def _is_best_whole(self) -> bool:
+        """Return whether the best weights can be read, and are of this run."""
+        try:
+            notes: dict[str, Any] = notes_of(load_ranker(self.folder / BEST))
+            _check_row({"cpu_seconds": 0, **notes["point"]})
+        except (WeightsError, KeyError, TypeError, ValueError, AttributeError, RecursionError):
+            return False
+        return all(notes.get(name) == value for name, value in self.run.items())
 
     def _say(self, line: str) -> None:
         if not self.quiet:
@@ -262,13 +308,35 @@ class PointsTrainer:
                 f"{self.folder} holds a run with other options: use the same ones to resume it, "
                 "or another folder"
             )
-        if found.metadata.get("step"):
-            restore(found, self.both, [self.optimizer])
-        names = [each.name for each in dataclasses.fields(PointsState)]
         try:
-            self.state = PointsState(**{name: found.metadata[name] for name in names})
-        except KeyError as error:
-            raise found.unfit(f"{error} is missing") from None
+            state = PointsState.from_json(found.metadata, self.options.steps)
+        except ValueError as error:
+            raise found.unfit(error) from None
+        if state.step:
+            restore(found, self.both, [self.optimizer])
+        self.state = state
+        if not self._is_best_whole():
+            state.best_score = PointsState.best_score
+            at_end = state.step == self.options.steps
+            self._say(
+                f"{self.folder / BEST} is missing or damaged: it is written again "
+                f"{'with the last weights' if at_end else 'at the next measure'}"
+            )
+
+
+def _check_row(row: Any) -> None:
+    """Raise a ValueError where a row of measures is not as `PointsTrainer` writes it."""
+    if not isinstance(row, dict):
+        raise ValueError("a point is not an object")
+    read_number(row, "step", int)
+    for name in ("loss", "cpu_seconds", "score"):
+        read_number(row, name, float)
+    for kind in KINDS:
+        listed = row.get(kind)
+        if not isinstance(listed, list) or len(listed) != len(MEASURES):
+            raise ValueError(f"{kind} is not a list of {len(MEASURES)} numbers")
+        for value in listed:
+            read_number({kind: value}, kind, float)
 
 
 def _digest(files: Sequence[Path], folder: Path) -> str:

@@ -1,0 +1,154 @@
+"""Records of what a command wrote, by which the same command goes on where it stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from .._shared.atomic import atomic_path, clear_abandoned
+from .._shared.errors import OptionError
+
+FOLDER = ".deepdetect"
+ADVICE = "choose another folder with -o, or replace it with --overwrite"
+
+
+class OutputRecords:
+    """What a command made in a folder, from which files and how: a JSON file for each input.
+
+    Two commands may write to one folder: a record is written before the outputs, which both then
+    know as theirs, and again, with their sizes and digests, when they are whole.
+
+    Args:
+        command: its name.
+        folder: of the outputs; the records are in `.deepdetect/COMMAND` in it.
+        settings: all that the outputs depend on besides the input, as JSON would give it back.
+        overwrite: replace whatever there is.
+    """
+
+    def __init__(
+        self, command: str, folder: Path, settings: Mapping[str, Any], overwrite: bool = False
+    ) -> None:
+        self.folder = folder / FOLDER / command
+        self.settings = dict(settings)
+        self.overwrite = overwrite
+        clear_abandoned(folder)
+
+    def find(self, source: Path, outputs: Sequence[Path]) -> dict[str, Any] | None:
+        """Return the numbers of an input whose outputs are done, None where work is left.
+
+        Raises:
+            OptionError: outputs exist that were made from another file, with other settings or by
+                something else.
+        """
+        if self.overwrite:
+            return None
+        record = self._read(source)
+        files = {} if record is None else record["files"]
+        there = [path for path in outputs if path.exists()]
+        there += [path for name in files if (path := outputs[0].with_name(name)).exists()]
+        if not there:
+            return None
+        if record is None:
+            raise _exists(there[0], f"and is not known to be of {source}")
+        if record["input"] != str(source.resolve()):
+            raise _exists(there[0], f"made from {record['input']}")
+        before = record["settings"]
+        names = sorted(n for n in {**before, **self.settings} if _differ(before, self.settings, n))
+        if names:
+            other = ", ".join(f"`{name}`" for name in names)
+            raise _exists(there[0], f"made with other settings ({other})")
+        for path in there:
+            if path.name not in files or not _unchanged(path, files[path.name]):
+                raise _exists(path, f"and is not what was made from {source}")
+        done = all(path in there and files[path.name] is not None for path in outputs)
+        numbers = record["numbers"]
+        same_input = record["state"] == _state(source)
+        return numbers if done and same_input and isinstance(numbers, dict) else None
+
+    def begin(self, source: Path, outputs: Sequence[Path]) -> None:
+        """Note that outputs are about to be written.
+
+        Raises:
+            DeepDetectError: the folder cannot be written.
+        """
+        self._write(source, dict.fromkeys(path.name for path in outputs), None)
+
+    def finish(self, source: Path, outputs: Sequence[Path], numbers: Mapping[str, Any]) -> None:
+        """Note that the outputs of an input are whole; `find` gives the numbers back.
+
+        Raises:
+            DeepDetectError: the folder cannot be written.
+        """
+        self._write(source, {path.name: _fingerprint(path) for path in outputs}, numbers)
+
+    def _path(self, source: Path) -> Path:
+        return self.folder / f"{source.stem}.json"
+
+    def _read(self, source: Path) -> dict[str, Any] | None:
+        try:
+            record = json.loads(self._path(source).read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            return None
+        kinds = {"input": str, "state": list, "settings": dict, "files": dict}
+        if not isinstance(record, dict) or "numbers" not in record:
+            return None
+        if not all(isinstance(record.get(name), kind) for name, kind in kinds.items()):
+            return None
+        return record if all(Path(name).name == name for name in record["files"]) else None
+
+    def _write(
+        self, source: Path, files: dict[str, Any], numbers: Mapping[str, Any] | None
+    ) -> None:
+        record = {
+            "input": str(source.resolve()),
+            "state": _state(source),
+            "settings": self.settings,
+        }
+        before = self._read(source)
+        if before is not None and all(before[name] == value for name, value in record.items()):
+            files = {**before["files"], **files}  # of another format
+        with atomic_path(self._path(source)) as temporary:
+            text = json.dumps({**record, "files": files, "numbers": numbers}, default=str)
+            temporary.write_text(text, encoding="utf-8")
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _exists(path: Path, what: str) -> OptionError:
+    return OptionError(f"{path} exists already, {what}: {ADVICE}")
+
+
+def _differ(before: Mapping[str, Any], now: Mapping[str, Any], name: str) -> bool:
+    return name not in before or name not in now or before[name] != now[name]
+
+
+def _state(path: Path) -> list[int]:
+    """Return a file's size in bytes and the time of its last change, zeros where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return [0, 0]
+    return [found.st_size, found.st_mtime_ns]
+
+
+def _fingerprint(path: Path) -> dict[str, Any]:
+    return {"state": _state(path), "sha256": file_digest(path)}
+
+
+def _unchanged(path: Path, fingerprint: object) -> bool:
+    """Return whether a file is the one whose fingerprint was taken, or none was taken yet."""
+    if fingerprint is None:
+        return True
+    state = fingerprint.get("state") if isinstance(fingerprint, dict) else None
+    if not isinstance(fingerprint, dict) or not isinstance(state, list):
+        return False
+    # A copy of the folder has other times.
+    now = _state(path)
+    return now == state or (now[:1] == state[:1] and file_digest(path) == fingerprint.get("sha256"))

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from deepdetect import OptionError
+from deepdetect.cli._records import OutputRecords
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(b"pixels")
+    return path
+
+
+def test_another_process_may_do_the_same_at_the_same_time(tmp_path: Path, source: Path) -> None:
+    out = tmp_path / "out"
+    outputs = [out / "photo.npz", out / "photo.png"]
+    one, other = (OutputRecords("detect", out, {"threshold": 0.5}) for _ in range(2))
+    assert one.find(source, outputs) is None
+    one.begin(source, outputs)
+    outputs[0].write_bytes(b"half of the work")
+    assert other.find(source, outputs) is None, "it is being made, or was when it was killed"
+    outputs[1].write_bytes(b"the other half")
+    one.finish(source, outputs, {"keypoints": 3})
+    assert other.find(source, outputs) == {"keypoints": 3}
+    different = OutputRecords("detect", out, {"threshold": 0.6})
+    with pytest.raises(OptionError, match=r"photo\.npz exists .*`threshold`.*--overwrite"):
+        different.find(source, outputs)
+    assert OutputRecords("detect", out, {}, overwrite=True).find(source, outputs) is None
+
+
+def test_commands_do_not_know_each_other_s_outputs(tmp_path: Path, source: Path) -> None:
+    outputs = [tmp_path / "out" / "photo.png"]
+    records = OutputRecords("detect", tmp_path / "out", {})
+    records.begin(source, outputs)
+    outputs[0].write_bytes(b"picture")
+    records.finish(source, outputs, {})
+    with pytest.raises(OptionError, match="is not known to be of"):
+        OutputRecords("another", tmp_path / "out", {}).find(source, outputs)
+
+
+def test_a_lost_output_is_made_again(tmp_path: Path, source: Path) -> None:
+    outputs = [tmp_path / "out" / name for name in ("photo.npz", "photo.png")]
+    records = OutputRecords("detect", tmp_path / "out", {})
+    records.begin(source, outputs)
+    for path in outputs:
+        path.write_bytes(b"whole")
+    records.finish(source, outputs, {"keypoints": 3})
+    outputs[1].unlink()
+    assert records.find(source, outputs) is None
+    assert records.find(source, outputs[:1]) == {"keypoints": 3}

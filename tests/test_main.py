@@ -1,0 +1,51 @@
+"""The program: what ends it before the command line is there to say so."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+# Ctrl-C during an import, which a package may turn into another error.
+INTERRUPTED_IMPORT = """
+import os, signal, time
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(10)
+except KeyboardInterrupt:
+    {reaction}
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+@pytest.mark.parametrize("reaction", ["raise", "raise ImportError('half imported')"])
+@pytest.mark.parametrize(
+    ("package", "command"),
+    [("click", "label"), ("click", "train"), ("numpy", "detect"), ("numpy", "match")],
+)
+def test_ctrl_c_while_packages_are_imported(
+    package: str, command: str, reaction: str, tmp_path: Path
+) -> None:
+    (tmp_path / f"{package}.py").write_text(INTERRUPTED_IMPORT.format(reaction=reaction))
+    arguments = {"match": ["a.png", "b.png"]}.get(command, ["photos", "-o", "out"])
+    result = subprocess.run(
+        [sys.executable, "-m", "deepdetect", command, *arguments],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert result.returncode == 130
+    assert result.stderr.strip() == "deepdetect: stopped; what was written stays"
+
+
+def test_the_command_is_the_module() -> None:
+    """What pip installs as `deepdetect` catches Ctrl-C as `python -m deepdetect` does."""
+    import tomllib
+
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert project["scripts"] == {"deepdetect": "deepdetect.__main__:main"}
