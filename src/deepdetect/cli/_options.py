@@ -39,7 +39,7 @@ class Resolution(click.ParamType):  # type: ignore[type-arg]  # generic in new v
 
 DETECTOR = FieldOptions(
     "detector.detector:DeepDetect",
-    names=("weights", "resolution", "backend", "providers", "threads", "ranker"),
+    names=("weights", "resolution", "backend", "providers", "threads", "tta", "ranker"),
     flags={"providers": "--provider"},
     types={"resolution": Resolution()},
     metavars={"weights": "NAME|FILE", "providers": "NAME", "ranker": "FILE"},

@@ -73,6 +73,8 @@ def detect(
                 )
             except DeepDetectError as error:
                 failures.append(str(error))
+            except MemoryError:
+                failures.append(f"there is not enough memory for {path}: use a smaller image")
             bar.update(1)
     if as_json:
         print_json({"backend": detector.backend, "images": results, "failures": failures})

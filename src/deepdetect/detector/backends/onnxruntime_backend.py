@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError, WeightsError, unknown_name
 from .options import RuntimeOptions
-from .shapes import as_logits, check_network, output_to_read
+from .shapes import as_logits, check_network, lack_of_memory, output_to_read
 from .without_telemetry import import_onnxruntime
 
 
@@ -26,6 +26,8 @@ class OnnxRuntimeNetwork:
         try:
             output = self._session.run([self._output_name], {self._input_name: image})[0]
         except Exception as error:  # its exceptions share no base class
+            if any(words in str(error) for words in ("allocate memory", "bad_alloc")):
+                raise lack_of_memory(image.shape) from None
             height, width = image.shape[2:]
             raise DeepDetectError(
                 f"the network failed on an image of {width}x{height} pixels "
@@ -53,11 +55,14 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
                 f"{', '.join(onnxruntime.get_available_providers())}"
             )
     settings = onnxruntime.SessionOptions()
-    settings.log_severity_level = 3
+    settings.log_severity_level = 4  # what fails is said by the exception, and by us
     if options.threads is not None:
         settings.intra_op_num_threads = options.threads
     try:
-        session = onnxruntime.InferenceSession(str(path), settings, providers=providers)
+        # Falling back to the CPU after a failure, it would print blocks of text.
+        session = onnxruntime.InferenceSession(
+            str(path), settings, providers=providers, enable_fallback=0
+        )
     except Exception as error:  # its exceptions share no base class
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({str(error).splitlines()[0]}): "
