@@ -714,10 +714,10 @@ from deepdetect import DeepDetect, DeepDetectError
 detector = DeepDetect(backend=sys.argv[1], resolution="native", threads=1)
 image = np.random.default_rng(0).integers(0, 256, (1200, 1600, 3), np.uint8)
 expected = detector.heatmap(image[:64, :64])
-with open("/proc/self/statm") as file:
-    used = int(file.read().split()[0]) * resource.getpagesize()
 before = resource.getrlimit(resource.RLIMIT_AS)
-for megabytes in (10, 40, 80, 120):
+for megabytes in (10, 40, 80, 150):
+    with open("/proc/self/statm") as file:
+        used = int(file.read().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + megabytes * 1_000_000, before[1]))
     try:
         detector.detect(image)

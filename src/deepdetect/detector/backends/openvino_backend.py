@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +26,8 @@ class OpenVinoNetwork:
 
     Args:
         model: compiled.
-        compile_model: compiles it again: where memory was short, its next answers are wrong.
+        compile_model: reads and compiles it again: after memory was short, the answers of a model
+            are wrong, and one compiled from the same graph crashes.
         output_name: of the output to read.
         path: the weights file, for messages.
     """
@@ -97,11 +97,14 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     }
     if options.threads is not None:
         settings["INFERENCE_NUM_THREADS"] = options.threads
-    try:
+
+    def compile_model() -> Any:
         # Named, not guessed: guessing tries all formats and prints each one's complaint.
         reader = FrontEndManager().load_by_framework("onnx")
         graph = reader.convert(reader.load(str(path)))
-        compile_model = functools.partial(openvino.Core().compile_model, graph, "CPU", settings)
+        return openvino.Core().compile_model(graph, "CPU", settings)
+
+    try:
         model = compile_model()
     except Exception as error:  # its exceptions share no base class
         reason = str(error).strip().splitlines()[-1]
