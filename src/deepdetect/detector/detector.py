@@ -15,10 +15,21 @@ import numpy as np
 from .._shared.errors import DeepDetectError, OptionError
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
-from ..features.selection import SelectionOptions, check_ignore, select_keypoints
+from ..features.selection import (
+    SelectionOptions,
+    check_ignore,
+    select_by_logits,
+    select_keypoints,
+)
 from ..io.image import load_image, luma
 from .backends import RuntimeOptions, open_network
-from .heatmap import MAX_AUTO_PIXELS, HeatmapOptions, compute_heatmap_and_logits
+from .heatmap import (
+    MAX_AUTO_PIXELS,
+    HeatmapOptions,
+    compute_heatmap_and_logits,
+    compute_native_logits,
+    is_native,
+)
 from .points.detection import PointOptions, detect_points
 from .points.ranker import WEIGHTS as RANKER
 from .points.ranker import Ranker, load_ranker
@@ -50,6 +61,8 @@ class DeepDetect:
         channels: "rgb", or "bgr" as the paper's published code feeds them.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
             times the time.
+        tile_megapixels: images above so many megapixels are run in tiles of this size, which takes
+            less memory and three times the time. "auto": where the memory is too small.
         ranker: npz file of `deepdetect train-points` that ranks points. None: the one inside the
             package.
 
@@ -84,10 +97,11 @@ class DeepDetect:
         threads: int | None = None,
         channels: Literal["rgb", "bgr"] = "rgb",
         tta: Literal["none", "flip"] = "none",
+        tile_megapixels: float | Literal["auto"] = "auto",
         ranker: str | Path | None = None,
     ) -> None:
         self.weights = resolve_weights(weights)
-        self.heatmap_options = HeatmapOptions(resolution, channels, tta)
+        self.heatmap_options = HeatmapOptions(resolution, channels, tta, tile_megapixels)
         self.ranker = RANKER if ranker is None else Path(ranker)
         load_ranker(self.ranker)
         self._runtime = RuntimeOptions(backend, providers, threads)
@@ -143,6 +157,15 @@ class DeepDetect:
         """Compute the heat map and the logits of an image that `load_image` returned."""
         with memory_named(rgb):
             return compute_heatmap_and_logits(rgb, self._network, self.heatmap_options)
+
+    def _dense(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
+        """Find dense keypoints in an image that `load_image` returned."""
+        with memory_named(rgb):
+            if is_native(rgb, self.heatmap_options):
+                logits = compute_native_logits(rgb, self._network, self.heatmap_options)
+                return select_by_logits(logits, options)
+            heatmap, logits = self._run(rgb)
+            return select_keypoints(heatmap, options, logits)
 
     def _points(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
         """Find points in an image that `load_image` returned."""
@@ -242,10 +265,11 @@ class DeepDetect:
         if options.uses_points:
             keypoints = self._points(rgb, options)
             return (keypoints, self._run(rgb)[0]) if return_heatmap else keypoints
+        if not return_heatmap:
+            return self._dense(rgb, options)
         heatmap, logits = self._run(rgb)
         with memory_named(rgb):
-            keypoints = select_keypoints(heatmap, options, logits)
-        return (keypoints, heatmap) if return_heatmap else keypoints
+            return select_keypoints(heatmap, options, logits), heatmap
 
 
 @contextmanager
@@ -318,8 +342,7 @@ def find_keypoints(
     if isinstance(detector, DeepDetect):
         if options.uses_points:
             return detector._points(rgb, options)
-        own_map, own_logits = detector._run(rgb)
-        return select_keypoints(own_map, options, own_logits)
+        return detector._dense(rgb, options)
     if options.mode == "points" or options.spread != "none":
         raise OptionError("only a DeepDetect detector has points: leave out `mode` and `spread`")
     logits = None

@@ -16,11 +16,17 @@ from .without_telemetry import import_onnxruntime
 class OnnxRuntimeNetwork:
     """A network run by ONNX Runtime."""
 
-    def __init__(self, session: Any, input_name: str, output_name: str, path: Path) -> None:
+    bytes_per_pixel = 150
+    """Of memory that a run takes, about."""
+
+    def __init__(
+        self, session: Any, input_name: str, output_name: str, path: Path, threads: int | None
+    ) -> None:
         self._session = session
         self._input_name = input_name
         self._output_name = output_name
-        self._path = path
+        self.onnx_path = path
+        self.threads = threads
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         try:
@@ -33,7 +39,7 @@ class OnnxRuntimeNetwork:
                 f"the network failed on an image of {width}x{height} pixels "
                 f"({str(error).splitlines()[0]}): use a smaller one, or another provider"
             ) from None
-        return as_logits(output, self._output_name, image.shape, self._path)
+        return as_logits(output, self._output_name, image.shape, self.onnx_path)
 
 
 def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
@@ -87,4 +93,4 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
         },
     )
     output = output_to_read([value.name for value in outputs])
-    return OnnxRuntimeNetwork(session, inputs[0].name, output, path)
+    return OnnxRuntimeNetwork(session, inputs[0].name, output, path, options.threads)

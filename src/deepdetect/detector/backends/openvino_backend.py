@@ -29,16 +29,26 @@ class OpenVinoNetwork:
         compile_model: reads and compiles it again: after memory was short, the answers of a model
             are wrong, and one compiled from the same graph crashes.
         output_name: of the output to read.
-        path: the weights file, for messages.
+        path: the weights file.
+        threads: number of threads; None: OpenVINO's choice.
     """
 
+    bytes_per_pixel = 260
+    """Of memory that a run takes, about."""
+
     def __init__(
-        self, model: Any, compile_model: Callable[[], Any], output_name: str, path: Path
+        self,
+        model: Any,
+        compile_model: Callable[[], Any],
+        output_name: str,
+        path: Path,
+        threads: int | None,
     ) -> None:
         self._model = model
         self._compile = compile_model
         self._output_name = output_name
-        self._path = path
+        self.onnx_path = path
+        self.threads = threads
         self._local = threading.local()
         self._lock = threading.Lock()
         self._works = False  # it has given a right answer
@@ -55,7 +65,7 @@ class OpenVinoNetwork:
         if self._works and stale and output.shape[2:] != image.shape[2:]:
             self._discard(model)
             raise lack_of_memory(image.shape)
-        logits = as_logits(output, self._output_name, image.shape, self._path)
+        logits = as_logits(output, self._output_name, image.shape, self.onnx_path)
         self._local.output_shape, self._works = output.shape, True
         return logits
 
@@ -118,7 +128,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         {str(value.get_element_type().to_dtype()) for value in [*model.inputs, *model.outputs]},
     )
     output = output_to_read([value.get_any_name() for value in model.outputs])
-    return OpenVinoNetwork(model, compile_model, output, path)
+    return OpenVinoNetwork(model, compile_model, output, path, options.threads)
 
 
 def _failure(error: Exception, image_shape: tuple[int, ...]) -> DeepDetectError:
