@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from .._shared.errors import DeepDetectError
 from .._shared.progress import progress
 from .backends.onnx_parts import cut_onnx
 from .backends.without_telemetry import import_onnxruntime
@@ -154,7 +155,7 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
     onnxruntime = import_onnxruntime()
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = 4
-    # Every tile has a size of its own to it, and what one held the next need not find.
+    # Kept memory would add up over the parts.
     settings.enable_cpu_mem_arena = False
     settings.enable_mem_pattern = False
     if threads is not None:
@@ -164,7 +165,18 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
         session = onnxruntime.InferenceSession(
             cut_onnx(model, inputs, outputs), settings, providers=["CPUExecutionProvider"]
         )
-        return lambda *given: session.run(None, dict(zip(inputs, given, strict=True)))
+
+        def run(*given: np.ndarray) -> list[np.ndarray]:
+            try:
+                found: list[np.ndarray] = session.run(None, dict(zip(inputs, given, strict=True)))
+            except Exception as error:  # its exceptions share no base class
+                raise DeepDetectError(
+                    f"the network failed on a tile ({str(error).splitlines()[0]}), most likely for "
+                    "lack of memory: use a smaller `tile_megapixels`, or `resolution='auto'`"
+                ) from None
+            return found
+
+        return run
 
     befores = (REDUCED, *STAGES)
     try:
