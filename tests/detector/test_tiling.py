@@ -41,6 +41,17 @@ def test_tiles_give_the_logits_of_the_whole(weights: str, upright: bool, strip: 
     assert np.mean(np.abs(found - expected)) < 1e-5
 
 
+@pytest.mark.parametrize("shift", [8, 16])
+def test_a_shift_by_the_stride_changes_nothing_far_from_the_border(
+    shift: int, detector: DeepDetect, strip: np.ndarray
+) -> None:
+    whole = detector.heatmap_and_logits(strip)[1][:, shift:]
+    shifted = detector.heatmap_and_logits(np.ascontiguousarray(strip[:, shift:]))[1]
+    difference = np.abs(shifted - whole).max(0)
+    assert difference[tiling.REACH_PX :].max() < 1e-4
+    assert difference[:32].max() > 0.1  # the zeros that pad the layers are seen from afar
+
+
 @pytest.mark.parametrize("name", ["START_MARGIN_PX", "BLOCK_MARGIN", "END_MARGIN_PX"])
 def test_tiles_overlap_by_what_is_needed(
     name: str, strip: np.ndarray, monkeypatch: pytest.MonkeyPatch

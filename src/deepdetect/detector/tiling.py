@@ -1,6 +1,6 @@
 """The network on images that are too large for the memory: in parts, and each part in tiles.
 
-A logit depends on pixels up to 1,630 away, most of it through the zeros that pad the layers at an
+A logit depends on pixels up to `REACH_PX` away, most of it through the zeros that pad the layers at an
 eighth of the size, so tiles of the image alone would either differ from the whole at their seams
 or overlap almost entirely. Cut into parts, no layer reaches far: each part runs on tiles that
 overlap by as much as it sees, and the logits are those of the whole image.
@@ -24,6 +24,10 @@ from .backends.onnx_parts import cut_onnx
 from .backends.without_telemetry import import_onnxruntime
 
 STRIDE = 8
+
+REACH_PX = 1632
+"""How far the whole network sees: the farthest pixel that changes a logit at all, measured."""
+
 BLOCKS = 9
 """Pyramids at an eighth of the size."""
 
