@@ -45,7 +45,7 @@ class HeatmapOptions:
 
         tile_megapixels: images above so many megapixels are run in tiles of this size, at their own
             resolution: the logits are those of the whole image to 1e-4, in three times the time and
-            less memory. At least 1.5; "auto": tiles of 3.3 where the image is too large for the
+            less memory. At least 1.5; "auto": tiles of 2.7 where the image is too large for the
             free memory. Only weights of this package's training in ONNX files can be tiled.
 
     Raises:

@@ -50,7 +50,7 @@ BLOCK_MARGIN = 16
 END_MARGIN_PX = 80
 """How far the logits see in what they are computed from: a pyramid of 64 pixels, and kernels."""
 
-DEFAULT_TILE_MEGAPIXELS = 3.3
+DEFAULT_TILE_MEGAPIXELS = 2.7
 
 Part = Callable[..., list[np.ndarray]]
 Span = tuple[slice, slice, slice]
@@ -77,7 +77,7 @@ class TiledNetwork:
 
         Args:
             rgb: (H, W, 3) uint8, of any size; it is padded as `compute_heatmap` does.
-            tile_megapixels: how much of the image is run at a time; None: 3.3.
+            tile_megapixels: how much of the image is run at a time; None: 2.7.
 
         Returns:
             (H, W) float32.
@@ -86,7 +86,8 @@ class TiledNetwork:
         height, width = (-(-length // STRIDE) for length in rgb.shape[:2])
         starts = list(_tiles(height, width, side // STRIDE, START_MARGIN_PX // STRIDE))
         middles = list(_tiles(height, width, side // 2, BLOCK_MARGIN * (BLOCKS + 1)))
-        ends = list(_tiles(height, width, side // STRIDE, END_MARGIN_PX // STRIDE))
+        # Beside the logits there is less room, and these overlap little.
+        ends = list(_tiles(height, width, side // (2 * STRIDE), END_MARGIN_PX // STRIDE))
         total = len(starts) + len(middles) * len(self.blocks) + len(ends)
         with progress(total, "network", "tile", quiet=not sys.stderr.isatty()) as bar:
             reduced, quarter = self._run_start(rgb, height, width, starts, bar)
@@ -114,15 +115,16 @@ class TiledNetwork:
         eighth = np.empty(0)
         for row, column in tiles:
             given = np.ascontiguousarray(reduced[:, :, row[0], column[0]])
-            features = _in_bands(self.blocks[0], given, None)
+            features = _in_bands(self.blocks[0], given)
             for block in self.blocks[1:]:
                 bar.update(1)
-                features = _in_bands(block, features, features)
-            (found,) = self.middle(given, features)
+                _in_bands(block, features, into=features)
+            found = _in_bands(self.middle, given, features)
             if not eighth.size:
                 eighth = np.empty((1, found.shape[1], *reduced.shape[2:]), np.float32)
             _place(eighth, found, row, column, 1)
             bar.update(1)
+            del features, found  # before those of the next tile are made
         return eighth
 
     def _run_end(
@@ -194,18 +196,25 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
         return None
 
 
-def _in_bands(part: Part, given: np.ndarray, into: np.ndarray | None) -> np.ndarray:
-    """Run a pyramid in bands of rows; `into` may be what is given, which is then replaced."""
-    height, rows = given.shape[2], 2 * BLOCK_MARGIN
-    above = given[:, :, :0]
+def _in_bands(part: Part, *given: np.ndarray, into: np.ndarray | None = None) -> np.ndarray:
+    """Run a part at an eighth of the size in bands of rows.
+
+    `into` may be what is given, which is then replaced.
+    """
+    height, rows = given[0].shape[2], 2 * BLOCK_MARGIN
+    above = [each[:, :, :0] for each in given]
     for start in range(0, height, rows):
         stop, seen = min(start + rows, height), min(start + rows + BLOCK_MARGIN, height)
-        band = np.concatenate([above, given[:, :, start:seen]], 2)
-        (found,) = part(band)
+        band = [
+            np.concatenate([before, each[:, :, start:seen]], 2)
+            for before, each in zip(above, given, strict=True)
+        ]
+        (found,) = part(*band)
         if into is None:
-            into = np.empty((1, found.shape[1], *given.shape[2:]), np.float32)
-        first = above.shape[2]
-        above = given[:, :, max(0, stop - BLOCK_MARGIN) : stop].copy()  # before it is replaced
+            into = np.empty((1, found.shape[1], *given[0].shape[2:]), np.float32)
+        first = above[0].shape[2]
+        last = slice(max(0, stop - BLOCK_MARGIN), stop)
+        above = [each[:, :, last].copy() for each in given]  # before it is replaced
         into[:, :, start:stop] = found[:, :, first : first + stop - start]
     assert into is not None
     return into
