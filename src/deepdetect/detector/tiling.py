@@ -1,9 +1,9 @@
 """The network on images that are too large for the memory: in parts, and each part in tiles.
 
-A logit depends on pixels up to `REACH_PX` away, most of it through the zeros that pad the layers at an
-eighth of the size, so tiles of the image alone would either differ from the whole at their seams
-or overlap almost entirely. Cut into parts, no layer reaches far: each part runs on tiles that
-overlap by as much as it sees, and the logits are those of the whole image.
+A logit depends on pixels up to `REACH_PX` away, most of it through the zeros that pad the layers
+at an eighth of the size, so tiles of the image alone would either differ from the whole at their
+seams or overlap almost entirely. Cut into parts, no layer reaches far: each part runs on tiles
+that overlap by as much as it sees, and the logits are those of the whole image.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import DeepDetectError
+from .._shared.parallel import release_freed_memory
 from .._shared.progress import progress
 from .backends.onnx_parts import cut_onnx
 from .backends.without_telemetry import import_onnxruntime
@@ -91,9 +92,14 @@ class TiledNetwork:
         total = len(starts) + len(middles) * len(self.blocks) + len(ends)
         with progress(total, "network", "tile", quiet=not sys.stderr.isatty()) as bar:
             reduced, quarter = self._run_start(rgb, height, width, starts, bar)
+            release_freed_memory()
             eighth = self._run_middle(reduced, middles, bar)
             del reduced
-            return self._run_end(rgb, quarter, eighth, ends, bar)
+            release_freed_memory()
+            logits = self._run_end(rgb, quarter, eighth, ends, bar)
+        del quarter, eighth
+        release_freed_memory()
+        return logits
 
     def _run_start(
         self, rgb: np.ndarray, height: int, width: int, tiles: list[tuple[Span, Span]], bar: Any
@@ -114,17 +120,19 @@ class TiledNetwork:
     ) -> np.ndarray:
         eighth = np.empty(0)
         for row, column in tiles:
-            given = np.ascontiguousarray(reduced[:, :, row[0], column[0]])
+            given = reduced[:, :, row[0], column[0]]
             features = _in_bands(self.blocks[0], given)
             for block in self.blocks[1:]:
                 bar.update(1)
                 _in_bands(block, features, into=features)
+            release_freed_memory()
             found = _in_bands(self.middle, given, features)
             if not eighth.size:
                 eighth = np.empty((1, found.shape[1], *reduced.shape[2:]), np.float32)
             _place(eighth, found, row, column, 1)
             bar.update(1)
             del features, found  # before those of the next tile are made
+            release_freed_memory()
         return eighth
 
     def _run_end(
@@ -201,7 +209,8 @@ def _in_bands(part: Part, *given: np.ndarray, into: np.ndarray | None = None) ->
 
     `into` may be what is given, which is then replaced.
     """
-    height, rows = given[0].shape[2], 2 * BLOCK_MARGIN
+    # With one input it is a pyramid; what joins two has three times as many channels.
+    height, rows = given[0].shape[2], 2 * BLOCK_MARGIN if len(given) == 1 else BLOCK_MARGIN
     above = [each[:, :, :0] for each in given]
     for start in range(0, height, rows):
         stop, seen = min(start + rows, height), min(start + rows + BLOCK_MARGIN, height)

@@ -231,7 +231,8 @@ def _select(
         pixels = np.delete(pixels, np.searchsorted(pixels, np.sort(dropped)))
     xy = np.empty((len(pixels), 2), np.float32)
     scores, logits = np.empty((2, len(pixels)), np.float32)
-    edges = np.searchsorted(pixels, [rows.start * width for rows in bands(ranking.shape)])
+    starts = [rows.start * width for rows in bands(ranking.shape)]
+    edges = np.searchsorted(pixels, np.array(starts, pixels.dtype))  # of one type: no copy
     for rows, start, stop in zip(
         bands(ranking.shape), edges, [*edges[1:], len(pixels)], strict=True
     ):
