@@ -32,6 +32,7 @@ DEFAULT_MEMORY = 4_000_000_000
 
 # M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no mappings, no trimming, room for more.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
+_MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD
 
 
 def processor_count() -> int:
@@ -175,12 +176,13 @@ def disable_malloc_trim() -> bool:
 
 
 def release_freed_memory() -> bool:
-    """Return the memory that this process has freed to the system, where the C library is glibc.
+    """Return freed memory to the system, now and, in blocks of a megabyte, from now on.
 
-    It keeps blocks of up to 32 MB, of which a network leaves hundreds of megabytes.
+    The C library glibc keeps blocks of up to 32 MB otherwise, of which a network leaves hundreds of
+    megabytes. It is a setting of the whole process.
 
     Returns:
-        Whether there was any.
+        Whether it has an effect.
 
     Example:
         >>> release_freed_memory() in (True, False)
@@ -188,7 +190,9 @@ def release_freed_memory() -> bool:
     """
     if platform.libc_ver()[0] != "glibc":
         return False
-    return bool(ctypes.CDLL(None).malloc_trim(0))
+    library = ctypes.CDLL(None)
+    library.malloc_trim(0)
+    return bool(library.mallopt(*_MMAP_THRESHOLD))
 
 
 def _system_memory() -> int:

@@ -62,7 +62,7 @@ class DeepDetect:
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
             times the time.
         tile_megapixels: images above so many megapixels are run in tiles of this size, which takes
-            less memory and three times the time. "auto": where the memory is too small.
+            less memory and four to six times the time. "auto": where the memory is too small.
         ranker: npz file of `deepdetect train-points` that ranks points. None: the one inside the
             package.
 

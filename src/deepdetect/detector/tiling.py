@@ -90,6 +90,7 @@ class TiledNetwork:
         # Beside the logits there is less room, and these overlap little.
         ends = list(_tiles(height, width, side // (2 * STRIDE), END_MARGIN_PX // STRIDE))
         total = len(starts) + len(middles) * len(self.blocks) + len(ends)
+        release_freed_memory()
         with progress(total, "network", "tile", quiet=not sys.stderr.isatty()) as bar:
             reduced, quarter = self._run_start(rgb, height, width, starts, bar)
             release_freed_memory()
