@@ -42,7 +42,6 @@ class HeatmapOptions:
         tta: test-time augmentation. "flip" takes the mean of the logits of the image in its eight
             flips and quarter turns: eight times the time, and a flipped or turned image gives the
             same keypoints. Without it about .94 of them are the same.
-
         tile_megapixels: images above so many megapixels are run in tiles of this size, with
             the logits of the whole image to 1e-4, in four to six times the time and less memory.
             At least 1.5; "auto": tiles of 2.7 where the image is too large for the
