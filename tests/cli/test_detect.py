@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect
+from deepdetect import DeepDetect, DeepDetectError
 from deepdetect.io.tables import load_keypoints
 
 
@@ -98,6 +98,43 @@ def test_several_images_show_progress_on_stderr_only(run, photos: Path) -> None:
     result = run("detect", photos, "--no-pictures", "--json")
     assert "image/s" in result.stderr or "s/image" in result.stderr
     json.loads(result.stdout)
+
+
+@pytest.mark.parametrize("size", ["auto", "1.5"])
+def test_flips_and_tiles(run, photos: Path, size: str) -> None:
+    options = ["--no-pictures", "--tta", "flip", "--tile-megapixels", size]
+    run("detect", photos / "cat.jpg", "-o", "out", *options)
+    expected = DeepDetect(tta="flip").detect(photos / "cat.jpg")
+    np.testing.assert_array_equal(load_keypoints("out/cat.npz").xy, expected.xy)
+
+
+@pytest.mark.parametrize("size", ["0.2", "many"])
+def test_wrong_tiles(run, photos: Path, size: str) -> None:
+    result = run("detect", photos / "cat.jpg", "--tile-megapixels", size)
+    assert result.exit_code == 2
+    assert "--tile-megapixels" in result.output
+
+
+@pytest.mark.parametrize("short", [MemoryError, DeepDetectError("there is not enough memory")])
+def test_an_image_without_memory_for_it_does_not_end_the_others(
+    short: type[BaseException] | BaseException,
+    run,
+    photos: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    detect = DeepDetect.detect
+
+    def detect_small(self: DeepDetect, image: np.ndarray, *args: object, **options: object):
+        if image.shape[0] == 150:
+            raise short
+        return detect(self, image, *args, **options)
+
+    monkeypatch.setattr(DeepDetect, "detect", detect_small)
+    result = run("detect", photos, "-o", "out", "--no-pictures")
+    assert result.exit_code == 2
+    assert "1 of 3 images failed, the others are done" in result.output
+    assert "not enough memory" in result.output
+    assert {path.name for path in Path("out").iterdir()} == {"left.npz", "right.npz"}
 
 
 @pytest.mark.parametrize("resolution", ["native", "240"])

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import io
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -606,7 +608,9 @@ def bad_answer(folder: Path, kind: str) -> Path:
         name: onnx.numpy_helper.from_array(np.array(value, np.float32), name)
         for name, value in (("minus", -1.0), ("five", 5.0))
     }
-    output = "logits" if kind == "logits of nan" else "probability"
+    repeats = np.array([1, 1, 1, 2], np.int64)
+    constant["repeats"] = onnx.numpy_helper.from_array(repeats, "repeats")
+    output = "logits" if "logits" in kind else "probability"
     nodes = {
         "nan": [
             helper.make_node("Mul", ["mean", "minus"], ["negative"]),
@@ -617,6 +621,19 @@ def bad_answer(folder: Path, kind: str) -> Path:
             helper.make_node("AveragePool", ["mean"], [output], kernel_shape=[2, 2], strides=[2, 2])
         ],
         "five": [helper.make_node("Add", ["mean", "five"], [output])],
+        "tile": [
+            helper.make_node("Tile", ["mean", "repeats"], ["repeated"]),
+            helper.make_node("Identity", ["repeated"], [output]),
+        ],
+        "the same logits": [
+            helper.make_node("Sub", ["mean", "mean"], ["nothing"]),
+            helper.make_node("Add", ["nothing", "five"], [output]),
+        ],
+        # Finite on what a network is tried on, which is never black.
+        "nan where it is black": [
+            helper.make_node("Div", ["mean", "mean"], ["one"]),
+            helper.make_node("Mul", ["one", "mean"], [output]),
+        ],
     }
     nodes["logits of nan"] = nodes["nan"]
     graph = helper.make_graph(
@@ -640,20 +657,113 @@ def bad_answer(folder: Path, kind: str) -> Path:
         ("nan", "not finite"),
         ("logits of nan", "not finite"),
         ("half", "map of shape (1, 1, 24, 32) for an image that needs (1, 1, 48, 64)"),
+        ("tile", "map of shape (1, 1, 48, 128) for an image that needs (1, 1, 48, 64)"),
         ("five", "no probabilities"),
+        ("the same logits", "the same value at every pixel"),
     ],
 )
 def test_a_network_that_answers_wrongly(
     kind: str, words: str, backend: str, tmp_path: Path, one_line: OneLine
 ) -> None:
     pytest.importorskip(backend)
-    detector = DeepDetect(bad_answer(tmp_path, kind), backend=backend)
-    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    with pytest.raises(WeightsError) as caught:
+        DeepDetect(bad_answer(tmp_path, kind), backend=backend)
+    message = one_line(caught.value)
+    assert words in message
+    assert "bad.onnx" in message
+    assert "use other weights" in message
+
+
+@needs["onnx"]
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+def test_a_network_that_answers_wrongly_later(
+    backend: str, tmp_path: Path, one_line: OneLine
+) -> None:
+    pytest.importorskip(backend)
+    detector = DeepDetect(bad_answer(tmp_path, "nan where it is black"), backend=backend)
+    image = np.random.default_rng(0).integers(1, 256, (48, 64, 3), np.uint8)
+    assert detector.heatmap(image).shape == (48, 64)
+    image[7, 9] = 0
     for call in (detector.heatmap, detector.detect):
         with pytest.raises(WeightsError) as caught:
             call(image)
-        assert words in one_line(caught.value)
+        assert "not finite" in one_line(caught.value)
         assert "bad.onnx" in str(caught.value)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+def test_damaged_files_print_nothing(
+    backend: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip(backend)
+    for make in (half(".onnx"), text("words.onnx")):
+        with pytest.raises(WeightsError):
+            DeepDetect(make(tmp_path), backend=backend)
+    content = bytearray(pretrained_weights().read_bytes())
+    content[40_000:40_400] = bytes(400)
+    (tmp_path / "zeros.onnx").write_bytes(content)
+    with contextlib.suppress(WeightsError):
+        DeepDetect(tmp_path / "zeros.onnx", backend=backend)
+    printed = capfd.readouterr()
+    assert printed.out == printed.err == ""
+
+
+# Too little memory, and memory that grows.
+
+SHORT_OF_MEMORY = """
+import resource, sys
+import numpy as np
+from deepdetect import DeepDetect, DeepDetectError
+detector = DeepDetect(backend=sys.argv[1], resolution="native", threads=1)
+image = np.random.default_rng(0).integers(0, 256, (1200, 1600, 3), np.uint8)
+expected = detector.heatmap(image[:64, :64])
+before = resource.getrlimit(resource.RLIMIT_AS)
+for megabytes in (10, 40, 80, 150):
+    with open("/proc/self/statm") as file:
+        used = int(file.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + megabytes * 1_000_000, before[1]))
+    try:
+        detector.detect(image)
+        print("whole")
+    except DeepDetectError as error:
+        print(error)
+    resource.setrlimit(resource.RLIMIT_AS, before)  # the next image is not to suffer for it
+    np.testing.assert_array_equal(detector.heatmap(image[:64, :64]), expected)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on memory that holds")
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+def test_too_little_memory_is_one_sentence(backend: str) -> None:
+    pytest.importorskip(backend)
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", SHORT_OF_MEMORY, backend],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) == 4
+    assert all("not enough memory" in line and "1600x1200" in line for line in lines)
+
+
+@pytest.mark.slow
+@needs["openvino"]
+def test_openvino_keeps_few_sizes() -> None:
+    psutil = pytest.importorskip("psutil")
+    detector = DeepDetect(backend="openvino", threads=1)
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (400, 400, 3), np.uint8)
+    used = []
+    for _ in range(150):
+        height, width = rng.integers(200, 401, 2)
+        detector.heatmap(image[:height, :width])
+        used.append(psutil.Process().memory_info().rss / 1e6)
+    # The first images fill what is kept; without a limit the others add 200 MB.
+    assert max(used[50:]) - used[49] < 60
 
 
 @pytest.mark.parametrize(

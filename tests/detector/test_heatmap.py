@@ -173,6 +173,7 @@ def test_the_image_is_left_as_it_was() -> None:
         ({"resolution": 100}, "a multiple of 8 from 16 on, not 100"),
         ({"channels": "brg"}, "unknown channel order 'brg': did you mean"),
         ({"channels": "gray"}, "(known: rgb, bgr)"),
+        ({"tta": "flips"}, "unknown tta 'flips': did you mean 'flip'?"),
     ],
 )
 def test_wrong_options(options: dict[str, object], words: str) -> None:
@@ -184,3 +185,47 @@ def test_wrong_options(options: dict[str, object], words: str) -> None:
 @pytest.mark.parametrize("resolution", ["auto", "native", 16, 480, np.int64(640)])
 def test_right_resolutions(resolution: str | int) -> None:
     assert HeatmapOptions(resolution).resolution == resolution
+
+
+# Test-time augmentation.
+
+
+def uneven(planes: np.ndarray) -> np.ndarray:
+    """Answer differently at the left and the top than at the right and the bottom."""
+    logits = 4 * planes.mean(1, keepdims=True) - 2
+    logits[..., 1:, :] += planes[:, :1, :-1]
+    logits[..., 1:] -= 2 * planes[:, 1:2, :, :-1]
+    return logits.astype(np.float32)
+
+
+def test_flips_take_the_mean_of_eight_copies() -> None:
+    rgb = RGB[:48, :64]
+    shown = Recorder()
+    logits = compute_heatmap_and_logits(rgb, shown, HeatmapOptions(tta="flip"))[1]
+    assert len({planes.tobytes() for planes in shown.shown}) == len(shown.shown) == 8
+    assert sorted(planes.shape[2:] for planes in shown.shown) == [(48, 64)] * 4 + [(64, 48)] * 4
+    expected = compute_heatmap_and_logits(rgb, answer)[1]  # which no flip changes
+    np.testing.assert_allclose(logits, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("turns", range(4))
+@pytest.mark.parametrize("flipped", [False, True])
+def test_a_turned_image_gives_the_turned_map(turns: int, flipped: bool) -> None:
+    def turn(map_: np.ndarray) -> np.ndarray:
+        turned = np.rot90(map_, turns)
+        return np.ascontiguousarray(turned[:, ::-1] if flipped else turned)
+
+    rgb = RGB[:48, :64]
+    options = HeatmapOptions(tta="flip")
+    for wanted in (0, 1):
+        map_ = compute_heatmap_and_logits(rgb, uneven, options)[wanted]
+        of_turned = compute_heatmap_and_logits(turn(rgb), uneven, options)[wanted]
+        np.testing.assert_allclose(of_turned, turn(map_), atol=1e-5)
+    without = compute_heatmap(turn(rgb), uneven) - turn(compute_heatmap(rgb, uneven))
+    assert (np.abs(without).max() > 0.01) == (turns > 0 or flipped)
+
+
+def test_flips_of_a_squashed_image() -> None:
+    options = HeatmapOptions(40, tta="flip")
+    once = compute_heatmap(RGB, answer, HeatmapOptions(40))
+    np.testing.assert_allclose(compute_heatmap(RGB, answer, options), once, atol=1e-4)

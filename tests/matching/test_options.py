@@ -116,6 +116,8 @@ def test_a_preset_like_no_other_brings_the_whole_list() -> None:
         ("seed", 3, "geometry.seed"),
         ("resolution", 240, "heatmap.resolution"),
         ("channels", "rgb", "heatmap.channels"),
+        ("tta", "flip", "heatmap.tta"),
+        ("tile_megapixels", 2.0, "heatmap.tile_megapixels"),
     ],
 )
 def test_a_single_option_finds_its_place_and_leaves_the_others(

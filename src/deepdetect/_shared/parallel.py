@@ -41,6 +41,7 @@ DEFAULT_MEMORY = 4_000_000_000
 
 # M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no mappings, no trimming, room for more.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
+_MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD
 
 
 def processor_count() -> int:
@@ -242,6 +243,26 @@ def disable_malloc_trim() -> bool:
         return False
     mallopt = ctypes.CDLL(None).mallopt
     return all(mallopt(option, value) for option, value in _MALLOPT)
+
+
+def release_freed_memory() -> bool:
+    """Return freed memory to the system, now and, in blocks of a megabyte, from now on.
+
+    The C library glibc keeps blocks of up to 32 MB otherwise, of which a network leaves hundreds of
+    megabytes. It is a setting of the whole process.
+
+    Returns:
+        Whether it has an effect.
+
+    Example:
+        >>> release_freed_memory() in (True, False)
+        True
+    """
+    if platform.libc_ver()[0] != "glibc":
+        return False
+    library = ctypes.CDLL(None)
+    library.malloc_trim(0)
+    return bool(library.mallopt(*_MMAP_THRESHOLD))
 
 
 def _system_memory() -> int:

@@ -36,11 +36,34 @@ class Resolution(click.ParamType):  # type: ignore[type-arg]  # generic in new v
             self.fail(message, param, context)
 
 
+class TileSize(click.ParamType):  # type: ignore[type-arg]  # as above
+    """The word "auto", or a number of megapixels."""
+
+    name = "auto|MEGAPIXELS"
+
+    def convert(self, value: Any, param: Any, context: Any) -> str | float:
+        if value == "auto" or isinstance(value, float):
+            return value
+        try:
+            return float(value)
+        except ValueError:
+            self.fail(f"{value!r} is neither 'auto' nor a number of megapixels", param, context)
+
+
 DETECTOR = FieldOptions(
     "detector.detector:DeepDetect",
-    names=("weights", "resolution", "backend", "providers", "threads", "ranker"),
+    names=(
+        "weights",
+        "resolution",
+        "backend",
+        "providers",
+        "threads",
+        "tta",
+        "tile_megapixels",
+        "ranker",
+    ),
     flags={"providers": "--provider"},
-    types={"resolution": Resolution()},
+    types={"resolution": Resolution(), "tile_megapixels": TileSize()},
     metavars={"weights": "NAME|FILE", "providers": "NAME", "ranker": "FILE"},
     defaults={"threads": "the backend's choice"},
 )

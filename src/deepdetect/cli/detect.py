@@ -86,6 +86,7 @@ def detect(
         "weights": file_digest(detector.weights),
         "ranker": file_digest(detector.ranker),
         "resolution": detector.heatmap_options.resolution,
+        "tta": detector.heatmap_options.tta,
         "backend": detector.backend,
         "version": __version__,
     }
@@ -100,6 +101,8 @@ def detect(
                 results.append(_detect_one(path, detector, selection, files, records))
             except _Failure as failure:
                 failures.append(str(failure))
+            except MemoryError:
+                failures.append(f"{path}: there is not enough memory for it: use a smaller image")
             bar.update(1)
     if as_json:
         print_json({"backend": detector.backend, "images": results, "failures": failures})

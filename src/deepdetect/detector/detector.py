@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, overload
@@ -10,13 +12,24 @@ from typing import Any, Literal, Protocol, overload
 import cv2
 import numpy as np
 
-from .._shared.errors import OptionError
+from .._shared.errors import DeepDetectError, OptionError
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
-from ..features.selection import SelectionOptions, check_ignore, select_keypoints
+from ..features.selection import (
+    SelectionOptions,
+    check_ignore,
+    select_by_logits,
+    select_keypoints,
+)
 from ..io.image import load_image, luma
 from .backends import RuntimeOptions, open_network
-from .heatmap import MAX_AUTO_PIXELS, HeatmapOptions, compute_heatmap_and_logits
+from .heatmap import (
+    MAX_AUTO_PIXELS,
+    HeatmapOptions,
+    compute_heatmap_and_logits,
+    compute_native_logits,
+    is_native,
+)
 from .points.detection import PointOptions, detect_points
 from .points.ranker import WEIGHTS as RANKER
 from .points.ranker import Ranker, load_ranker
@@ -46,12 +59,16 @@ class DeepDetect:
             preferred one first.
         threads: number of threads. None: the backend's choice.
         channels: "rgb", or "bgr" as the paper's published code feeds them.
+        tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
+            times the time.
+        tile_megapixels: images above so many megapixels are run in tiles of this size, which takes
+            less memory and four to six times the time. "auto": where the memory is too small.
         ranker: npz file of `deepdetect train-points` that ranks points. None: the one inside the
             package.
 
     Attributes:
         backend: name of the backend that runs.
-        heatmap_options: the resolution and the order of the channels.
+        heatmap_options: how images are shown to the network.
 
     Raises:
         WeightsError: the weights or the ranker are missing, damaged or do not fit.
@@ -79,10 +96,12 @@ class DeepDetect:
         providers: tuple[str, ...] = (),
         threads: int | None = None,
         channels: Literal["rgb", "bgr"] = "rgb",
+        tta: Literal["none", "flip"] = "none",
+        tile_megapixels: float | Literal["auto"] = "auto",
         ranker: str | Path | None = None,
     ) -> None:
         self.weights = resolve_weights(weights)
-        self.heatmap_options = HeatmapOptions(resolution, channels)
+        self.heatmap_options = HeatmapOptions(resolution, channels, tta, tile_megapixels)
         self.ranker = RANKER if ranker is None else Path(ranker)
         load_ranker(self.ranker)
         self._runtime = RuntimeOptions(backend, providers, threads)
@@ -136,11 +155,22 @@ class DeepDetect:
 
     def _run(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of an image that `load_image` returned."""
-        return compute_heatmap_and_logits(rgb, self._network, self.heatmap_options)
+        with memory_named(rgb):
+            return compute_heatmap_and_logits(rgb, self._network, self.heatmap_options)
+
+    def _dense(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
+        """Find dense keypoints in an image that `load_image` returned."""
+        with memory_named(rgb):
+            if is_native(rgb, self.heatmap_options):
+                logits = compute_native_logits(rgb, self._network, self.heatmap_options)
+                return select_by_logits(logits, options)
+            heatmap, logits = self._run(rgb)
+            return select_keypoints(heatmap, options, logits)
 
     def _points(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
         """Find points in an image that `load_image` returned."""
-        return find_points(rgb, options, self.heatmap_options, load_ranker(self.ranker))
+        with memory_named(rgb):
+            return find_points(rgb, options, self.heatmap_options, load_ranker(self.ranker))
 
     def __repr__(self) -> str:
         shown = self.heatmap_options
@@ -235,9 +265,29 @@ class DeepDetect:
         if options.uses_points:
             keypoints = self._points(rgb, options)
             return (keypoints, self._run(rgb)[0]) if return_heatmap else keypoints
+        if not return_heatmap:
+            return self._dense(rgb, options)
         heatmap, logits = self._run(rgb)
-        keypoints = select_keypoints(heatmap, options, logits)
-        return (keypoints, heatmap) if return_heatmap else keypoints
+        with memory_named(rgb):
+            return select_keypoints(heatmap, options, logits), heatmap
+
+
+@contextmanager
+def memory_named(rgb: np.ndarray) -> Iterator[None]:
+    """Make lack of memory, in work on a loaded image, an error of one sentence."""
+    try:
+        yield
+        return
+    except MemoryError:
+        pass
+    except cv2.error as error:
+        if error.code != cv2.Error.StsNoMem:
+            raise
+    height, width = rgb.shape[:2]
+    raise DeepDetectError(
+        f"there is not enough memory for an image of {width}x{height} pixels: "
+        "use `resolution='auto'`, fewer keypoints, or a smaller image"
+    )
 
 
 def find_points(
@@ -292,8 +342,7 @@ def find_keypoints(
     if isinstance(detector, DeepDetect):
         if options.uses_points:
             return detector._points(rgb, options)
-        own_map, own_logits = detector._run(rgb)
-        return select_keypoints(own_map, options, own_logits)
+        return detector._dense(rgb, options)
     if options.mode == "points" or options.spread != "none":
         raise OptionError("only a DeepDetect detector has points: leave out `mode` and `spread`")
     logits = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,13 +11,20 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import check_ranges
+from .._shared.parallel import available_memory
+from ..features.selection import bands, sigmoid
 from .backends import Network
+from .tiling import TiledNetwork, open_tiled
 
 STRIDE = 8
 """The network halves an image three times, so its sides must be multiples of 8."""
 
 MAX_AUTO_PIXELS = 2_000_000
 """Of an image that the resolution "auto" takes as it is."""
+
+MIN_TILE_MEGAPIXELS = 1.5
+"""Of smaller tiles most would be overlap."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +39,13 @@ class HeatmapOptions:
             paper does with 480.
         channels: order of the colours that the network sees. "bgr" is what the paper's
             published code feeds, though the weights were trained on RGB.
+        tta: test-time augmentation. "flip" takes the mean of the logits of the image in its eight
+            flips and quarter turns: eight times the time, and a flipped or turned image gives the
+            same keypoints. Without it about .94 of them are the same.
+        tile_megapixels: images above so many megapixels are run in tiles of this size, with
+            the logits of the whole image to 1e-4, in four to six times the time and less memory.
+            At least 1.5; "auto": tiles of 2.7 where the image is too large for the
+            free memory. Only weights of this package's training in ONNX files can be tiled.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -37,6 +53,8 @@ class HeatmapOptions:
 
     resolution: Literal["auto", "native"] | int = "auto"
     channels: Literal["rgb", "bgr"] = "rgb"
+    tta: Literal["none", "flip"] = "none"
+    tile_megapixels: float | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
         if isinstance(self.resolution, str):
@@ -54,6 +72,10 @@ class HeatmapOptions:
             )
         if self.channels not in ("rgb", "bgr"):
             raise unknown_name("channel order", self.channels, ["rgb", "bgr"])
+        if self.tta not in ("none", "flip"):
+            raise unknown_name("tta", self.tta, ["none", "flip"])
+        if self.tile_megapixels != "auto":
+            check_ranges(self, between={"tile_megapixels": (MIN_TILE_MEGAPIXELS, math.inf)})
 
 
 def compute_heatmap(
@@ -83,13 +105,12 @@ def compute_heatmap_and_logits(
         highest probabilities to 1; logits still distinguish them, so keypoints are ranked by them.
     """
     height, width = rgb.shape[:2]
-    if (rgb == rgb[0, 0]).all():
+    if is_native(rgb, options):
+        logits = compute_native_logits(rgb, network, options)
+        return probabilities(logits), logits
+    if _is_constant(rgb):
         return np.zeros((height, width), np.float32), np.full((height, width), -np.inf, np.float32)
     shown = rgb if options.channels == "rgb" else rgb[:, :, ::-1]
-    whole = height * width <= MAX_AUTO_PIXELS
-    if options.resolution == "native" or (options.resolution == "auto" and whole):
-        logits = np.ascontiguousarray(_run(network, _pad(shown))[:height, :width])
-        return _sigmoid(logits), logits
     shown = np.ascontiguousarray(shown)
     if options.resolution == "auto":
         scale = (MAX_AUTO_PIXELS / (height * width)) ** 0.5
@@ -98,18 +119,64 @@ def compute_heatmap_and_logits(
     else:
         side = int(options.resolution)
         small = cv2.resize(shown, (side, side), interpolation=cv2.INTER_CUBIC)
-    logits = _run(network, small)
+    logits = _run(network, small, options)
     heatmap, enlarged = (
         cv2.resize(map_, (width, height), interpolation=cv2.INTER_CUBIC)
-        for map_ in (_sigmoid(logits), logits)
+        for map_ in (sigmoid(logits), logits)
     )
     return np.clip(heatmap, 0, 1, out=heatmap), enlarged
 
 
-def _sigmoid(logits: np.ndarray) -> np.ndarray:
-    """Return the probabilities; the exponent is never positive, so that nothing overflows."""
-    decay = np.exp(-np.abs(logits))
-    return np.where(logits >= 0, np.float32(1), decay) / (1 + decay)
+def is_native(rgb: np.ndarray, options: HeatmapOptions) -> bool:
+    """Return whether the network sees an image at its own size."""
+    whole = rgb.shape[0] * rgb.shape[1] <= MAX_AUTO_PIXELS
+    return options.resolution == "native" or (options.resolution == "auto" and whole)
+
+
+def compute_native_logits(rgb: np.ndarray, network: Network, options: HeatmapOptions) -> np.ndarray:
+    """Run the network on an image at its own size, in tiles where it is too large for the memory.
+
+    Args:
+        rgb: (H, W, 3) uint8 RGB.
+        network: the loaded network.
+        options: the order of the channels, tiles and flips.
+
+    Returns:
+        (H, W) float32 logits.
+    """
+    height, width = rgb.shape[:2]
+    if _is_constant(rgb):
+        return np.full((height, width), -np.inf, np.float32)
+    shown = rgb if options.channels == "rgb" else rgb[:, :, ::-1]
+    tiled = _tiled(network, height * width, options)
+    if tiled is None:
+        return np.ascontiguousarray(_run(network, _pad(shown), options)[:height, :width])
+    area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
+    return _mean_of_flips(lambda turned: tiled(turned, area), shown, options)
+
+
+def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwork | None:
+    """Return the network for tiles, or None for an image that is run whole."""
+    path = getattr(network, "onnx_path", None)  # torch and networks of others run whole
+    if path is None:
+        return None
+    if options.tile_megapixels == "auto":
+        large = pixels * network.bytes_per_pixel > available_memory()  # type: ignore[attr-defined]
+    else:
+        large = pixels > options.tile_megapixels * 1e6
+    return open_tiled(path, network.threads) if large else None  # type: ignore[attr-defined]
+
+
+def _is_constant(rgb: np.ndarray) -> bool:
+    return all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape))
+
+
+def probabilities(logits: np.ndarray) -> np.ndarray:
+    """Return the heat map of logits."""
+    heatmap = np.empty_like(logits)
+    for rows in bands(logits.shape):
+        heatmap[rows] = sigmoid(logits[rows])
+    return heatmap
 
 
 def _pad(rgb: np.ndarray) -> np.ndarray:
@@ -120,7 +187,27 @@ def _pad(rgb: np.ndarray) -> np.ndarray:
     return np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
 
 
-def _run(network: Network, rgb: np.ndarray) -> np.ndarray:
-    planes = np.empty((1, 3, *rgb.shape[:2]), np.float32)
-    np.multiply(rgb.transpose(2, 0, 1), np.float32(1 / 255), out=planes[0])
-    return network(planes)[0, 0]
+def _run(network: Network, rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
+    """Return the (H, W) logits of an image whose sides are multiples of 8."""
+
+    def run(turned: np.ndarray) -> np.ndarray:
+        planes = np.empty((1, 3, *turned.shape[:2]), np.float32)
+        np.multiply(turned.transpose(2, 0, 1), np.float32(1 / 255), out=planes[0])
+        return network(planes)[0, 0]
+
+    return _mean_of_flips(run, rgb, options)
+
+
+def _mean_of_flips(
+    run: Callable[[np.ndarray], np.ndarray], rgb: np.ndarray, options: HeatmapOptions
+) -> np.ndarray:
+    """Return the logits of an image, with `tta` the mean of those of its flips and turns."""
+    if options.tta == "none":
+        return run(rgb)
+    total = np.zeros(rgb.shape[:2], np.float32)
+    for turns in range(4):
+        turned = np.rot90(rgb, turns)
+        for step in (1, -1):
+            total += np.rot90(run(turned[:, ::step])[:, ::step], -turns)
+    total /= 8
+    return total

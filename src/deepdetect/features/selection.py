@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import cv2
@@ -14,6 +15,9 @@ from .keypoints import Keypoints, bayer_order
 
 MODES = ("auto", "dense", "points")
 SPREADS = ("none", "grid", "anms")
+
+BAND_PIXELS = 4_000_000
+"""Of a map that are looked at at a time."""
 
 MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined keypoint is still the one that it was found at."""
@@ -146,33 +150,111 @@ def select_keypoints(
         >>> select_keypoints(heatmap).xy.tolist()
         [[9.0, 4.0]]
     """
-    height, width = heatmap.shape
     ranking = heatmap if logits is None else logits
     if ranking.shape != heatmap.shape:
         raise OptionError(
             f"the logits have shape {ranking.shape}, the heat map {heatmap.shape}: "
             "they must be equal"
         )
+    found = _select(lambda rows: heatmap[rows], ranking, options)
+    return found if logits is not None else replace(found, logits=None)
+
+
+def select_by_logits(logits: np.ndarray, options: SelectionOptions) -> Keypoints:
+    """Select the keypoints of a heat map that is the sigmoid of logits, and is never held whole.
+
+    Args:
+        logits: (H, W) float32.
+        options: as of `select_keypoints`, which gives the same.
+    """
+    return _select(lambda rows: sigmoid(logits[rows]), logits, options)
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Return the probabilities of logits; the exponent is never positive: nothing overflows."""
+    decay = np.exp(-np.abs(logits))
+    return np.where(logits >= 0, np.float32(1), decay) / (1 + decay)
+
+
+def bands(shape: tuple[int, ...]) -> Iterator[slice]:
+    """Yield rows of a map in bands, to bound the memory of what is made of them."""
+    rows = max(1, BAND_PIXELS // max(1, shape[1]))
+    for start in range(0, shape[0], rows):
+        yield slice(start, min(start + rows, shape[0]))
+
+
+def _select(
+    heatmap: Callable[[slice], np.ndarray], ranking: np.ndarray, options: SelectionOptions
+) -> Keypoints:
+    """Select keypoints; the heat map is asked for by rows. Their logits are their ranks."""
+    height, width = ranking.shape
+    ignore = None if options.ignore is None else check_ignore(options.ignore, ranking.shape)
     # With a density, all pixels but the impossible ones may be needed.
-    wanted = heatmap > (options.threshold if options.density is None else 0.0)
-    if options.ignore is not None:
-        wanted &= ~check_ignore(options.ignore, heatmap.shape)
-    pixels = np.flatnonzero(wanted)
+    threshold = options.threshold if options.density is None else 0.0
+    radius = options.suppression_radius
+    count = _wanted_count(options, ranking.size)
+    lowest = np.float32(-np.inf)
+
+    def wanted(rows: slice) -> np.ndarray:
+        """Return the pixels of a band that pass all but the limit on their number."""
+        # What is nearby decides which are suppressed.
+        seen = slice(max(0, rows.start - radius), min(height, rows.stop + radius))
+        passing = heatmap(seen) > threshold
+        if ignore is not None:
+            passing &= ~ignore[seen]
+        pixels = np.flatnonzero(passing)
+        if radius and len(pixels):
+            ranks = ranking[seen].ravel()[pixels]
+            pixels = pixels[_suppress(pixels, ranks, passing.shape, radius, seen.start, height)]
+        pixels += seen.start * width
+        return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
+
     ranks = ranking.ravel()
-    if options.suppression_radius and len(pixels):
-        pixels = pixels[_suppress(pixels, ranks[pixels], heatmap.shape, options.suppression_radius)]
-    count = _wanted_count(options, heatmap.size)
+    if count is not None:
+        parts = (ranks[wanted(rows)] for rows in bands(ranking.shape))
+        lowest = _least_of_the_best(parts, count, ranking.dtype)
+    kept, tied = [], []
+    for rows in bands(ranking.shape):
+        found = wanted(rows)
+        if count is not None:
+            found = found[ranks[found] >= lowest]
+            tied.append(found[ranks[found] == lowest])
+        kept.append(found.astype(np.uint32 if ranking.size < 2**32 else np.int64))
+    pixels = np.concatenate(kept)
+    del kept
     if count is not None and len(pixels) > count:
-        scores = ranks[pixels]
-        # Only the best are sorted, and those that tie with the last of them.
-        pixels = pixels[scores >= np.partition(scores, len(scores) - count)[len(scores) - count]]
-        pixels = pixels[np.sort(_ranked(pixels, ranks[pixels], heatmap.shape)[:count])]
-    row, column = np.divmod(pixels, width)
-    xy = np.stack([column, row], 1).astype(np.float32)
-    if options.refines:
-        xy += np.stack([_peak_offset(ranking, row, column, axis) for axis in (1, 0)], 1)
-    found = None if logits is None else ranks[pixels]
-    return Keypoints(xy, heatmap.ravel()[pixels], (width, height), found)
+        last = np.concatenate(tied)
+        row, column = np.divmod(last, width)
+        spread = bayer_order(np.column_stack([column, row]), (width, height))
+        spare = len(pixels) - count
+        dropped = last[np.argsort(spread, kind="stable")[len(last) - spare :]]
+        pixels = np.delete(pixels, np.searchsorted(pixels, np.sort(dropped)))
+    xy = np.empty((len(pixels), 2), np.float32)
+    scores, logits = np.empty((2, len(pixels)), np.float32)
+    starts = [rows.start * width for rows in bands(ranking.shape)]
+    edges = np.searchsorted(pixels, np.array(starts, pixels.dtype))  # of one type: no copy
+    for rows, start, stop in zip(
+        bands(ranking.shape), edges, [*edges[1:], len(pixels)], strict=True
+    ):
+        own = pixels[start:stop].astype(np.int64)
+        row, column = np.divmod(own, width)
+        xy[start:stop, 0], xy[start:stop, 1] = column, row
+        scores[start:stop] = heatmap(rows).ravel()[own - rows.start * width]
+        logits[start:stop] = ranks[own]
+        if options.refines:
+            for k, axis in ((0, 1), (1, 0)):
+                xy[start:stop, k] += _peak_offset(ranking, row, column, axis)
+    return Keypoints(xy, scores, (width, height), logits)
+
+
+def _least_of_the_best(parts: Iterable[np.ndarray], count: int, kind: np.dtype) -> np.floating:
+    """Return the rank of the last of the best of all parts; -infinity where they are fewer."""
+    best = np.empty(0, kind)
+    for part in parts:
+        best = np.concatenate([best, part])
+        if len(best) > count:
+            best = np.partition(best, len(best) - count)[len(best) - count :]
+    return best.min() if len(best) >= count > 0 else kind.type(-np.inf)
 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -211,13 +293,6 @@ def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis:
     return np.clip(offset, -MAX_OFFSET_PX, MAX_OFFSET_PX).astype(np.float32)
 
 
-def _ranked(pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the rows from best to worst; ties are spread evenly over the image."""
-    row, column = np.divmod(pixels, shape[1])
-    spread = bayer_order(np.column_stack([column, row]), (shape[1], shape[0]))
-    return np.lexsort((spread, -scores))
-
-
 def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
     counts = []
     if options.density is not None:
@@ -228,9 +303,16 @@ def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
 
 
 def _suppress(
-    pixels: np.ndarray, scores: np.ndarray, shape: tuple[int, ...], radius: int
+    pixels: np.ndarray,
+    scores: np.ndarray,
+    shape: tuple[int, ...],
+    radius: int,
+    first_row: int,
+    height: int,
 ) -> np.ndarray:
-    """Return which pixels rank highest in the window around them.
+    """Return which pixels of a band rank highest in the window around them.
+
+    The band has this shape, and begins with this row of an image of this height.
 
     Of equal scores the one that comes first in `bayer_order` ranks higher: one pixel of a plateau
     is kept.
@@ -250,9 +332,9 @@ def _suppress(
         tied = np.flatnonzero(padded[row + y, column + x] == own)
         if not len(tied) or (down, across) == (0, 0):
             continue
-        here = np.column_stack([column[tied], row[tied]])
+        here = np.column_stack([column[tied], row[tied] + first_row])
         first, second = (
-            bayer_order(xy, (shape[1], shape[0])) for xy in (here, here + (across, down))
+            bayer_order(xy, (shape[1], height)) for xy in (here, here + (across, down))
         )
         before = second <= first if (down, across) < (0, 0) else second < first
         kept[rows[tied[before]]] = False

@@ -9,29 +9,37 @@ import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError, WeightsError, unknown_name
 from .options import RuntimeOptions
-from .shapes import as_logits, check_network, output_to_read
+from .shapes import as_logits, check_network, lack_of_memory, output_to_read
 from .without_telemetry import import_onnxruntime
 
 
 class OnnxRuntimeNetwork:
     """A network run by ONNX Runtime."""
 
-    def __init__(self, session: Any, input_name: str, output_name: str, path: Path) -> None:
+    bytes_per_pixel = 150
+    """Of memory that a run takes, about."""
+
+    def __init__(
+        self, session: Any, input_name: str, output_name: str, path: Path, threads: int | None
+    ) -> None:
         self._session = session
         self._input_name = input_name
         self._output_name = output_name
-        self._path = path
+        self.onnx_path = path
+        self.threads = threads
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         try:
             output = self._session.run([self._output_name], {self._input_name: image})[0]
         except Exception as error:  # its exceptions share no base class
+            if any(words in str(error) for words in ("allocate memory", "bad_alloc")):
+                raise lack_of_memory(image.shape) from None
             height, width = image.shape[2:]
             raise DeepDetectError(
                 f"the network failed on an image of {width}x{height} pixels "
                 f"({str(error).splitlines()[0]}): use a smaller one, or another provider"
             ) from None
-        return as_logits(output, self._output_name, image.shape, self._path)
+        return as_logits(output, self._output_name, image.shape, self.onnx_path)
 
 
 def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
@@ -53,11 +61,14 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
                 f"{', '.join(onnxruntime.get_available_providers())}"
             )
     settings = onnxruntime.SessionOptions()
-    settings.log_severity_level = 3
+    settings.log_severity_level = 4  # what fails is said by the exception, and by us
     if options.threads is not None:
         settings.intra_op_num_threads = options.threads
     try:
-        session = onnxruntime.InferenceSession(str(path), settings, providers=providers)
+        # Falling back to the CPU after a failure, it would print blocks of text.
+        session = onnxruntime.InferenceSession(
+            str(path), settings, providers=providers, enable_fallback=0
+        )
     except Exception as error:  # its exceptions share no base class
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({str(error).splitlines()[0]}): "
@@ -82,4 +93,4 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
         },
     )
     output = output_to_read([value.name for value in outputs])
-    return OnnxRuntimeNetwork(session, inputs[0].name, output, path)
+    return OnnxRuntimeNetwork(session, inputs[0].name, output, path, options.threads)

@@ -3,32 +3,92 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import WeightsError
+from ..._shared.errors import DeepDetectError, WeightsError
 from .options import RuntimeOptions
-from .shapes import as_logits, check_network, output_to_read
+from .shapes import as_logits, check_network, lack_of_memory, output_to_read
 from .without_telemetry import import_openvino
+
+COMPILED_LAYERS = 100
+"""Layers compiled for one size of image that are kept, the least recently used are dropped first.
+
+OpenVINO's own limit is 5000, which images of ever new sizes fill with half a gigabyte.
+"""
 
 
 class OpenVinoNetwork:
-    """A network run by OpenVINO on the CPU."""
+    """A network run by OpenVINO on the CPU.
 
-    def __init__(self, model: Any, output_name: str, path: Path) -> None:
+    Args:
+        model: compiled.
+        compile_model: reads and compiles it again: after memory was short, the answers of a model
+            are wrong, and one compiled from the same graph crashes.
+        output_name: of the output to read.
+        path: the weights file.
+        threads: number of threads; None: OpenVINO's choice.
+    """
+
+    bytes_per_pixel = 260
+    """Of memory that a run takes, about."""
+
+    def __init__(
+        self,
+        model: Any,
+        compile_model: Callable[[], Any],
+        output_name: str,
+        path: Path,
+        threads: int | None,
+    ) -> None:
         self._model = model
+        self._compile = compile_model
         self._output_name = output_name
-        self._path = path
+        self.onnx_path = path
+        self.threads = threads
         self._local = threading.local()
+        self._lock = threading.Lock()
+        self._works = False  # it has given a right answer
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        # A request holds one image at a time, so each thread gets its own.
-        if not hasattr(self._local, "request"):
-            self._local.request = self._model.create_infer_request()
-        outputs = self._local.request.infer([image], share_inputs=True)
-        return as_logits(outputs[self._output_name], self._output_name, image.shape, self._path)
+        model, request = self._request(image.shape)
+        try:
+            output = request.infer([image], share_inputs=True)[self._output_name]
+        except Exception as error:  # its exceptions share no base class
+            self._discard(model)
+            raise _failure(error, image.shape) from None
+        # Where memory is short it may also answer with nothing, or with the map of the last image.
+        stale = not output.size or output.shape == self._local.output_shape
+        if self._works and stale and output.shape[2:] != image.shape[2:]:
+            self._discard(model)
+            raise lack_of_memory(image.shape)
+        logits = as_logits(output, self._output_name, image.shape, self.onnx_path)
+        self._local.output_shape, self._works = output.shape, True
+        return logits
+
+    def _request(self, image_shape: tuple[int, ...]) -> tuple[Any, Any]:
+        """Return the model and this thread's request: one holds an image at a time."""
+        try:
+            with self._lock:
+                if self._model is None:
+                    self._model = self._compile()
+                model = self._model
+            if getattr(self._local, "model", None) is not model:
+                self._local.request = model.create_infer_request()
+                self._local.model, self._local.output_shape = model, None
+        except Exception as error:  # as above
+            raise _failure(error, image_shape) from None
+        return model, self._local.request
+
+    def _discard(self, model: Any) -> None:
+        """Let the next call compile the model again."""
+        self._local.model = self._local.request = None
+        with self._lock:
+            if self._model is model:
+                self._model = None
 
 
 def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
@@ -41,15 +101,21 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     from openvino.frontend import FrontEndManager
 
     # Its default on newer CPUs is bfloat16, which moves keypoints.
-    settings: dict[str, object] = {"INFERENCE_PRECISION_HINT": "f32"}
+    settings: dict[str, object] = {
+        "INFERENCE_PRECISION_HINT": "f32",
+        "CPU_RUNTIME_CACHE_CAPACITY": COMPILED_LAYERS,
+    }
     if options.threads is not None:
         settings["INFERENCE_NUM_THREADS"] = options.threads
-    try:
+
+    def compile_model() -> Any:
         # Named, not guessed: guessing tries all formats and prints each one's complaint.
         reader = FrontEndManager().load_by_framework("onnx")
-        model = openvino.Core().compile_model(
-            reader.convert(reader.load(str(path))), "CPU", settings
-        )
+        graph = reader.convert(reader.load(str(path)))
+        return openvino.Core().compile_model(graph, "CPU", settings)
+
+    try:
+        model = compile_model()
     except Exception as error:  # its exceptions share no base class
         reason = str(error).strip().splitlines()[-1]
         raise WeightsError(
@@ -62,7 +128,21 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         {str(value.get_element_type().to_dtype()) for value in [*model.inputs, *model.outputs]},
     )
     output = output_to_read([value.get_any_name() for value in model.outputs])
-    return OpenVinoNetwork(model, output, path)
+    return OpenVinoNetwork(model, compile_model, output, path, options.threads)
+
+
+def _failure(error: Exception, image_shape: tuple[int, ...]) -> DeepDetectError:
+    """Return the error of a run that failed."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    if isinstance(error, MemoryError) or any(
+        words in str(error) for words in ("allocate", "bad_alloc")
+    ):
+        return lack_of_memory(image_shape)
+    height, width = image_shape[2:]
+    return DeepDetectError(
+        f"the network failed on an image of {width}x{height} pixels ({lines[-1]}): "
+        "use a smaller one, or the backend onnxruntime"
+    )
 
 
 def _shape(value: Any) -> list[int | str]:

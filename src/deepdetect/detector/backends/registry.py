@@ -16,6 +16,7 @@ from ..._shared.errors import MissingExtraError, OptionError, WeightsError
 from .onnxruntime_backend import open_onnxruntime
 from .openvino_backend import open_openvino
 from .options import Network, RuntimeOptions
+from .shapes import check_answer
 from .torch_backend import open_torch
 
 
@@ -76,7 +77,9 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
 @functools.lru_cache(maxsize=4)
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
     """Load a file; one whose state has changed since is loaded again."""
-    return _BACKENDS[backend].open(path, options)
+    network = _BACKENDS[backend].open(path, options)
+    check_answer(network, path)
+    return network
 
 
 def _choose(path: Path, options: RuntimeOptions) -> str:

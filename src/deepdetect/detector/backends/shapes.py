@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from ..._shared.errors import WeightsError
+from ..._shared.errors import DeepDetectError, WeightsError
 
 Shape = Sequence[int | str | None]
 
 LOGITS = "logits"
 """Name of the output that holds logits; an output of another name holds probabilities."""
+
+PROBE_SHAPE = (48, 64)
+"""Height and width of the image that a network is tried on."""
 
 
 def check_network(
@@ -75,20 +78,46 @@ def as_logits(
             f"{path} gives a map of shape {output.shape} for an image that needs {wanted}: "
             "use other weights"
         )
-    if not np.isfinite(output).all():
+    low, high = float(output.min()), float(output.max())  # NaN where there is one
+    if not (np.isfinite(low) and np.isfinite(high)):
         raise WeightsError(
             f"{path} gives values that are not finite: it is damaged, or its training diverged; "
             "use other weights"
         )
     if name == LOGITS:
         return output
-    if output.min() < 0 or output.max() > 1:
+    if low < 0 or high > 1:
         raise WeightsError(
-            f"{path} gives values from {output.min():g} to {output.max():g}, which are no "
+            f"{path} gives values from {low:g} to {high:g}, which are no "
             f"probabilities: name the output {LOGITS!r} if it holds logits, or use other weights"
         )
     probability = np.clip(output.astype(np.float64), 1e-38, 1 - 2.0**-25)
     return np.log(probability / (1 - probability)).astype(np.float32)
+
+
+def check_answer(network: Callable[[np.ndarray], np.ndarray], path: Path) -> None:
+    """Run a network on a small image of noise, so that a damaged one is refused when it is loaded.
+
+    Raises:
+        WeightsError: it gives a map of another size, values that are not finite or no
+            probabilities, or the same value everywhere.
+    """
+    noise = np.random.default_rng(0).random((1, 3, *PROBE_SHAPE), np.float32)
+    logits = network(noise)
+    if logits.min() == logits.max():
+        raise WeightsError(
+            f"{path} gives the same value at every pixel of an image of noise: it is damaged, or "
+            "was never trained; use other weights"
+        )
+
+
+def lack_of_memory(image_shape: tuple[int, ...]) -> DeepDetectError:
+    """Return the error for an image, (1, 3, H, W), that the network lacks memory for."""
+    height, width = image_shape[2:]
+    return DeepDetectError(
+        f"there is not enough memory to run the network on {width}x{height} pixels: "
+        "use `resolution='auto'`, or a smaller image"
+    )
 
 
 def _like(shape: Shape, channels: int) -> bool:

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, HeatmapOptions
+from deepdetect._shared.errors import OptionError
+from deepdetect.detector import heatmap, tiling
+from deepdetect.detector.pretrained import pretrained_weights
+from deepdetect.detector.tiling import TiledNetwork, open_tiled
+
+
+@pytest.fixture(scope="module")
+def strip(photo: np.ndarray) -> np.ndarray:
+    """A long image, in which no tile sees all, whose sides are no multiples of 8."""
+    return np.ascontiguousarray(np.tile(photo[:75], (1, 10, 1))[:, :2551])
+
+
+@pytest.fixture(scope="module")
+def detector() -> DeepDetect:
+    return DeepDetect(backend="onnxruntime", resolution="native", threads=1)
+
+
+def open_bundled(weights: str = "default") -> TiledNetwork:
+    network = open_tiled(pretrained_weights(weights), threads=1)
+    assert network is not None
+    return network
+
+
+@pytest.mark.parametrize("weights", ["default", "dense"])
+@pytest.mark.parametrize("upright", [False, True])
+def test_tiles_give_the_logits_of_the_whole(weights: str, upright: bool, strip: np.ndarray) -> None:
+    rgb = np.ascontiguousarray(strip.swapaxes(0, 1)) if upright else strip
+    whole = DeepDetect(weights, backend="onnxruntime", resolution="native", threads=1)
+    expected = whole.heatmap_and_logits(rgb)[1]
+    found = open_bundled(weights)(rgb, tile_megapixels=0.05)
+    assert found.shape == expected.shape
+    assert np.abs(found - expected).max() < 1e-3
+    assert np.mean(np.abs(found - expected)) < 1e-5
+
+
+@pytest.mark.parametrize("shift", [8, 16])
+def test_a_shift_by_the_stride_changes_nothing_far_from_the_border(
+    shift: int, detector: DeepDetect, strip: np.ndarray
+) -> None:
+    whole = detector.heatmap_and_logits(strip)[1][:, shift:]
+    shifted = detector.heatmap_and_logits(np.ascontiguousarray(strip[:, shift:]))[1]
+    difference = np.abs(shifted - whole).max(0)
+    assert difference[tiling.REACH_PX :].max() < 1e-4
+    assert difference[:32].max() > 0.1  # the zeros that pad the layers are seen from afar
+
+
+@pytest.mark.parametrize("name", ["START_MARGIN_PX", "BLOCK_MARGIN", "END_MARGIN_PX"])
+def test_tiles_overlap_by_what_is_needed(
+    name: str, strip: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = open_bundled()(strip, tile_megapixels=0.05)
+    monkeypatch.setattr(tiling, name, getattr(tiling, name) // 4)
+    found = open_bundled()(strip, tile_megapixels=0.05)
+    assert np.abs(found - expected).max() > 0.01
+
+
+def test_each_length_is_written_once_and_seen_with_its_margins() -> None:
+    for length, side, margin in [(319, 50, 20), (40, 50, 20), (319, 223, 160), (7, 2, 3)]:
+        spans = tiling._spans(length, side, margin)
+        written = np.concatenate([np.arange(length)[inner] for _, inner, _ in spans])
+        np.testing.assert_array_equal(written, np.arange(length))
+        for seen, inner, place in spans:
+            np.testing.assert_array_equal(np.arange(length)[seen][place], np.arange(length)[inner])
+            assert seen.start == max(0, inner.start - margin)
+            assert seen.stop == min(length, inner.stop + margin)
+
+
+def test_the_bar_ends_at_the_end(strip: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    bars = []
+
+    class Bar:
+        def __init__(self, total: int, *_: object, **__: object) -> None:
+            self.total, self.done = total, 0
+            bars.append(self)
+
+        def __enter__(self) -> Bar:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            pass
+
+        def update(self, count: int) -> None:
+            self.done += count
+
+    monkeypatch.setattr(tiling, "progress", Bar)
+    open_bundled()(strip, tile_megapixels=0.05)
+    (bar,) = bars
+    assert bar.done == bar.total > 20
+
+
+@pytest.mark.parametrize("options", [{}, {"density": 0.1}, {"nms_radius": 2}])
+def test_images_larger_than_the_memory_are_tiled(
+    options: dict[str, float],
+    detector: DeepDetect,
+    strip: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    expected, expected_map = detector.detect(strip, **options, return_heatmap=True)
+    monkeypatch.setattr(heatmap, "available_memory", lambda: strip[..., 0].size * 140)
+    monkeypatch.setattr(tiling, "DEFAULT_TILE_MEGAPIXELS", 0.05)
+    monkeypatch.setattr(detector._network, "_session", None)  # so that it cannot be run whole
+    found = detector.detect(strip, **options)
+    assert np.mean(np.isin(found.xy @ [1, 10_000], expected.xy @ [1, 10_000])) > 0.999
+    assert abs(len(found) - len(expected)) < 0.001 * len(expected)
+    map_ = detector.heatmap(strip)
+    np.testing.assert_allclose(map_, expected_map, atol=1e-4)
+
+
+def test_tiles_of_a_given_size(
+    detector: DeepDetect, strip: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    areas = []
+
+    class Tiled:
+        def __call__(self, rgb: np.ndarray, area: float | None) -> np.ndarray:
+            areas.append(area)
+            return np.zeros(rgb.shape[:2], np.float32)
+
+    monkeypatch.setattr(heatmap, "MIN_TILE_MEGAPIXELS", 0.01)
+    monkeypatch.setattr(heatmap, "open_tiled", lambda path, threads: Tiled())
+    for size, expected in ((0.1, [0.1]), (1.0, [])):
+        areas.clear()
+        options = HeatmapOptions("native", tile_megapixels=size)
+        detector.configured(options).heatmap(strip)
+        assert areas == expected
+
+
+def test_other_networks_are_not_tiled(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("onnx")
+    helper = onnx.helper
+    sides = ("n", "h", "w")
+    graph = helper.make_graph(
+        [helper.make_node("ReduceMean", ["image"], ["map"], axes=[1], keepdims=1)],
+        "graph",
+        [helper.make_tensor_value_info("image", 1, (sides[0], 3, *sides[1:]))],
+        [helper.make_tensor_value_info("map", 1, (sides[0], 1, *sides[1:]))],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    onnx.save(model, str(tmp_path / "mean.onnx"))
+    assert open_tiled(tmp_path / "mean.onnx") is None
+
+
+@pytest.mark.parametrize("size", [0.5, 0, -1, float("nan"), "all"])
+def test_tiles_too_small(size: object) -> None:
+    with pytest.raises(OptionError, match=r"`tile_megapixels` must be at least 1\.5"):
+        HeatmapOptions(tile_megapixels=size)
