@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -38,6 +39,7 @@ def test_ctrl_c_while_packages_are_imported(
         capture_output=True,
         text=True,
         timeout=100,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     assert result.returncode == 130
     assert result.stderr.strip() == "deepdetect: stopped; what was written stays"

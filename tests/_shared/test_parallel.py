@@ -144,6 +144,7 @@ def test_ctrl_c_ends_all_processes_without_a_word_of_theirs(moment: str, tmp_pat
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
     found = "import*" if starting else "at*"
     _wait_until(lambda: len(list(tmp_path.glob(found))) == 2)

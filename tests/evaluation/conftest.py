@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect
+from deepdetect import DeepDetect, Keypoints, SelectionOptions, select_keypoints
 from deepdetect.detector.backends import RuntimeOptions
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
@@ -36,6 +36,10 @@ class EdgeDetector(DeepDetect):
         gray = luma(rgb).astype(np.float32)
         strength = np.hypot(cv2.Sobel(gray, -1, 1, 0), cv2.Sobel(gray, -1, 0, 1))
         return 1 - np.exp(-strength / 150), strength
+
+    def _dense(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
+        heatmap, logits = self._run(rgb)
+        return select_keypoints(heatmap, options, logits)
 
 
 @pytest.fixture(scope="session")
