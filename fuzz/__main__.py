@@ -1,6 +1,6 @@
 """Try wrong input and kills, and print the table of `docs/reliability.md`.
 
-    python -m fuzz                       # everything: about half an hour on two cores
+    python -m fuzz                       # everything: about a quarter of an hour on two cores
     python -m fuzz --seconds 600         # what can be done in ten minutes, of all targets
     python -m fuzz --only png --show 3   # one target; print the first defects
     python -m fuzz --only png --input 71 # one input once more, with its traceback
