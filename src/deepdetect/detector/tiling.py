@@ -193,11 +193,11 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
 
         return run
 
-    befores = (REDUCED, *STAGES)
+    chain = (REDUCED, *STAGES)
     try:
         return TiledNetwork(
             part(("image",), (REDUCED, QUARTER)),
-            tuple(part((a,), (b,)) for a, b in zip(befores[:-1], STAGES, strict=True)),
+            tuple(part((a,), (b,)) for a, b in zip(chain[:-1], STAGES, strict=True)),
             part((REDUCED, STAGES[-1]), (EIGHTH,)),
             part(("image", QUARTER, EIGHTH), ("logits",)),
         )
