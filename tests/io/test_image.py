@@ -151,6 +151,26 @@ def test_file_formats(suffix: str, exact: bool, photo: np.ndarray, tmp_path: Pat
     assert difference.max() == 0 if exact else difference.mean() < 6
 
 
+def test_lack_of_memory_is_no_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_line
+) -> None:
+    Image.fromarray(RGB).save(tmp_path / "photo.png")
+
+    def load(self: object, *arguments: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("PIL.ImageFile.ImageFile.load", load)
+    with pytest.raises(ImageError, match="not enough memory to read") as caught:
+        load_image(tmp_path / "photo.png")
+    one_line(caught.value)
+
+
+def test_a_path_through_a_file_is_no_damage(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ImageError, match="cannot be read"):
+        load_image(tmp_path / "file" / "photo.png")
+
+
 def test_half_precision_is_rounded_like_any_other() -> None:
     steps = np.linspace(0, 1, 4096).astype(np.float16).reshape(64, 64)
     expected = np.rint(steps.astype(np.float64) * 255)

@@ -61,7 +61,8 @@ class DeepDetect:
         channels: "rgb", or "bgr" as the paper's published code feeds them.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
             times the time.
-        tile_megapixels: images above so many megapixels are run in tiles of this size, which takes
+        tile_megapixels: with `resolution="native"`, images above so many megapixels are run in
+            tiles of this size, which takes
             less memory and four to six times the time. "auto": where the memory is too small.
         ranker: npz file of `deepdetect train-points` that ranks points. None: the one inside the
             package.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import cv2
@@ -42,8 +43,9 @@ class HeatmapOptions:
         tta: test-time augmentation. "flip" takes the mean of the logits of the image in its eight
             flips and quarter turns: eight times the time, and a flipped or turned image gives the
             same keypoints. Without it about .94 of them are the same.
-        tile_megapixels: images above so many megapixels are run in tiles of this size, with
-            the logits of the whole image to 1e-4, in four to six times the time and less memory.
+        tile_megapixels: with `resolution="native"`, images above so many megapixels are run in
+            tiles of this size, with the logits of the whole image to 1e-4, in four to six times the
+            time and less memory.
             At least 1.5; "auto": tiles of 2.7 where the image is too large for the
             free memory. Only weights of this package's training in ONNX files can be tiled.
 
@@ -108,6 +110,8 @@ def compute_heatmap_and_logits(
     if is_native(rgb, options):
         logits = compute_native_logits(rgb, network, options)
         return probabilities(logits), logits
+    if options.tile_megapixels != "auto":
+        raise OptionError("`tile_megapixels` needs `resolution='native'`: scaled images are small")
     if _is_constant(rgb):
         return np.zeros((height, width), np.float32), np.full((height, width), -np.inf, np.float32)
     shown = rgb if options.channels == "rgb" else rgb[:, :, ::-1]
@@ -119,7 +123,7 @@ def compute_heatmap_and_logits(
     else:
         side = int(options.resolution)
         small = cv2.resize(shown, (side, side), interpolation=cv2.INTER_CUBIC)
-    logits = _run(network, small, options)
+    logits = _mean_of_flips(partial(_run, network), small, options)
     heatmap, enlarged = (
         cv2.resize(map_, (width, height), interpolation=cv2.INTER_CUBIC)
         for map_ in (sigmoid(logits), logits)
@@ -144,13 +148,12 @@ def compute_native_logits(rgb: np.ndarray, network: Network, options: HeatmapOpt
     Returns:
         (H, W) float32 logits.
     """
-    height, width = rgb.shape[:2]
     if _is_constant(rgb):
-        return np.full((height, width), -np.inf, np.float32)
+        return np.full(rgb.shape[:2], -np.inf, np.float32)
     shown = rgb if options.channels == "rgb" else rgb[:, :, ::-1]
-    tiled = _tiled(network, height * width, options)
+    tiled = _tiled(network, shown.shape[0] * shown.shape[1], options)
     if tiled is None:
-        return np.ascontiguousarray(_run(network, _pad(shown), options)[:height, :width])
+        return np.ascontiguousarray(_mean_of_flips(partial(_run, network), shown, options))
     area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
     return _mean_of_flips(lambda turned: tiled(turned, area), shown, options)
 
@@ -158,13 +161,19 @@ def compute_native_logits(rgb: np.ndarray, network: Network, options: HeatmapOpt
 def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwork | None:
     """Return the network for tiles, or None for an image that is run whole."""
     path = getattr(network, "onnx_path", None)  # torch and networks of others run whole
-    if path is None:
-        return None
     if options.tile_megapixels == "auto":
-        large = pixels * network.bytes_per_pixel > available_memory()  # type: ignore[attr-defined]
-    else:
-        large = pixels > options.tile_megapixels * 1e6
-    return open_tiled(path, network.threads) if large else None  # type: ignore[attr-defined]
+        if path is None or pixels * network.bytes_per_pixel <= available_memory():  # type: ignore[attr-defined]
+            return None
+        return open_tiled(path, network.threads)  # type: ignore[attr-defined]
+    if pixels <= options.tile_megapixels * 1e6:
+        return None
+    tiled = None if path is None else open_tiled(path, network.threads)  # type: ignore[attr-defined]
+    if tiled is None:
+        raise OptionError(
+            "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights "
+            "that deepdetect has trained"
+        )
+    return tiled
 
 
 def _is_constant(rgb: np.ndarray) -> bool:
@@ -187,15 +196,12 @@ def _pad(rgb: np.ndarray) -> np.ndarray:
     return np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
 
 
-def _run(network: Network, rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
-    """Return the (H, W) logits of an image whose sides are multiples of 8."""
-
-    def run(turned: np.ndarray) -> np.ndarray:
-        planes = np.empty((1, 3, *turned.shape[:2]), np.float32)
-        np.multiply(turned.transpose(2, 0, 1), np.float32(1 / 255), out=planes[0])
-        return network(planes)[0, 0]
-
-    return _mean_of_flips(run, rgb, options)
+def _run(network: Network, rgb: np.ndarray) -> np.ndarray:
+    """Return the (H, W) logits of an image, each flip of which is padded by itself."""
+    padded = _pad(rgb)
+    planes = np.empty((1, 3, *padded.shape[:2]), np.float32)
+    np.multiply(padded.transpose(2, 0, 1), np.float32(1 / 255), out=planes[0])
+    return network(planes)[0, 0, : rgb.shape[0], : rgb.shape[1]]
 
 
 def _mean_of_flips(

@@ -35,8 +35,10 @@ class Guide:
         """Return the geometry from the second image to the first."""
         if self.matrix is None:
             return self
-        inverse = np.linalg.inv if self.model == "homography" else np.transpose
-        return replace(self, matrix=inverse(self.matrix))
+        if self.model != "homography":
+            return replace(self, matrix=self.matrix.T)
+        inverse = np.linalg.inv(self.matrix)
+        return replace(self, matrix=inverse / inverse[2, 2])
 
 
 @dataclass(frozen=True, eq=False)

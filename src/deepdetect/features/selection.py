@@ -210,12 +210,14 @@ def _select(
         return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
 
     ranks = ranking.ravel()
+    in_bands = list(bands(ranking.shape))
+    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # looked for once
     if count is not None:
-        parts = (ranks[wanted(rows)] for rows in bands(ranking.shape))
+        parts = (ranks[wanted(rows) if only is None else only] for rows in in_bands)
         lowest = _least_of_the_best(parts, count, ranking.dtype)
     kept, tied = [], []
-    for rows in bands(ranking.shape):
-        found = wanted(rows)
+    for rows in in_bands:
+        found = wanted(rows) if only is None else only
         if count is not None:
             found = found[ranks[found] >= lowest]
             tied.append(found[ranks[found] == lowest])
@@ -296,9 +298,9 @@ def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis:
 def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
     counts = []
     if options.density is not None:
-        counts.append(round(options.density * pixels))
+        counts.append(max(1, round(options.density * pixels)))
     if options.max_keypoints is not None:
-        counts.append(options.max_keypoints)
+        counts.append(int(options.max_keypoints))
     return min(counts) if counts else None
 
 

@@ -51,7 +51,7 @@ def open_image(
             too large or no image.
         OptionError: `max_megapixels` is not above 0.
     """
-    if not max_megapixels > 0:
+    if not (isinstance(max_megapixels, (int, float)) and max_megapixels > 0):
         raise OptionError(f"`max_megapixels` must be above 0, not {max_megapixels}")
     name = file_name(source, what)
     try:
@@ -68,6 +68,10 @@ def open_image(
         raise ImageError(f"{name} may not be read: check its rights") from None
     except (ImageError, OptionError):
         raise
+    except OSError as error:  # of the file system; Pillow's have no number
+        if error.errno is None:
+            raise damaged_image(name, error) from None
+        raise ImageError(f"{name} cannot be read ({error.strerror}): check the path") from None
     except Exception as error:  # Pillow's decoders raise many kinds
         raise damaged_image(name, error) from None
 
@@ -100,6 +104,8 @@ def damaged_image(name: str, error: Exception | str) -> ImageError:
             f"{name} is over {limit:.0f} megapixels, the most that Pillow reads of its format: "
             "save it as PNG or JPEG, or raise PIL.Image.MAX_IMAGE_PIXELS"
         )
+    if isinstance(error, MemoryError):
+        return ImageError(f"there is not enough memory to read {name}: use a smaller image")
     reason = (str(error).splitlines() or [type(error).__name__])[0]
     return ImageError(f"{name} is damaged or truncated ({reason}): get it again")
 

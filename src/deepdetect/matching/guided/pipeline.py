@@ -106,7 +106,7 @@ def _initial_geometry(
         if matches is not None:
             found = estimate_initial_geometry(matches, model, seed, chosen, simulate_views=False)
             if len(found.points0) >= chosen.min_first_inliers:
-                return replace(found, initial=matches)
+                return found
     return find_initial_geometry(gray0, gray1, model, seed, chosen, initial)
 
 
