@@ -125,7 +125,7 @@ def test_the_density_is_exact(density: float) -> None:
 def test_the_smallest_density_leaves_one() -> None:
     heatmap = np.linspace(0.1, 0.9, 400, dtype=np.float32).reshape(20, 20)
     assert select_keypoints(heatmap, SelectionOptions(density=1e-9)).xy.tolist() == [[19, 19]]
-    whole = SelectionOptions(max_keypoints=5.0, mode="dense", threshold=0.0)  # type: ignore[arg-type]
+    whole = SelectionOptions(max_keypoints=5.0, threshold=0.0, nms_radius=0)  # type: ignore[arg-type]
     assert len(select_keypoints(heatmap, whole)) == 5
 
 
