@@ -212,6 +212,28 @@ def test_an_image_that_has_changed_is_done_again(run, photos: Path) -> None:
     )
 
 
+def test_outputs_of_a_changed_image_stay_known_when_some_are_made_again(run, photos: Path) -> None:
+    image = copies(photos, Path("in"), 1) / "0.jpg"
+    detect(run, image, "--pictures")
+    shutil.copy(photos / "left.png", image)
+    assert not detect(run, image, "--format", "csv")[0]["skipped"]
+    assert not detect(run, image, "--pictures")[0]["skipped"]
+    expected = DeepDetect().detect(photos / "left.png").xy
+    np.testing.assert_array_equal(load_keypoints("out/0.npz").xy, expected)
+    assert detect(run, image, "--format", "csv")[0]["skipped"]
+
+
+def test_an_edited_output_of_a_changed_image_is_not_replaced(run, photos: Path) -> None:
+    image = copies(photos, Path("in"), 1) / "0.jpg"
+    detect(run, image)
+    Path("out/0.npz").write_bytes(b"edited")
+    shutil.copy(photos / "left.png", image)
+    detect(run, image, "--format", "csv", "--overwrite")
+    result = run("detect", image, "-o", "out", "--no-pictures")
+    assert result.exit_code == 2
+    assert Path("out/0.npz").read_bytes() == b"edited"
+
+
 @pytest.mark.parametrize(
     ("more", "told"),
     [
