@@ -305,6 +305,37 @@ def test_outputs_of_something_else_are_never_replaced_silently(
     detect(run, Path("in"), "--overwrite")
 
 
+@pytest.mark.parametrize("numbers", [{}, {"keypoints": 3}, "words", None, 3])
+def test_an_image_whose_recorded_numbers_are_damaged_is_done_again(
+    run, photos: Path, numbers: object
+) -> None:
+    first = detect(run, photos / "cat.jpg")[0]
+    path = Path("out/.deepdetect/detect/cat.json")
+    record = json.loads(path.read_text())
+    if numbers == "words":
+        numbers = dict.fromkeys(record["numbers"], "many")
+    path.write_text(json.dumps({**record, "numbers": numbers}))
+    result = run("detect", photos / "cat.jpg", "-o", "out", "--no-pictures")
+    assert result.exit_code == 0, result.output
+    assert "already done" not in result.stdout
+    again = detect(run, photos / "cat.jpg")[0]
+    assert again["skipped"]
+    assert again["keypoints"] == first["keypoints"]
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../0.npz", "in/0.npz"])
+def test_a_record_with_a_name_that_is_none_is_not_believed(run, photos: Path, name: str) -> None:
+    detect(run, photos / "cat.jpg")
+    path = Path("out/.deepdetect/detect/cat.json")
+    record = json.loads(path.read_text())
+    record["files"][name] = None
+    path.write_text(json.dumps(record))
+    result = run("detect", photos / "cat.jpg", "-o", "out", "--no-pictures")
+    assert result.exit_code == 2
+    assert "is not known to be of" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
 def test_an_input_is_never_written_over(run, photos: Path) -> None:
     shutil.copy(photos / "left.png", "a.png")
     shutil.copy(photos / "right.png", "a_heatmap.png")
