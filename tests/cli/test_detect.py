@@ -336,6 +336,25 @@ def test_a_record_with_a_name_that_is_none_is_not_believed(run, photos: Path, na
     assert len(result.stderr.splitlines()) == 1
 
 
+@pytest.mark.parametrize("output", ["in", "link"])
+def test_pictures_of_an_earlier_run_are_no_inputs(run, photos: Path, output: str) -> None:
+    folder = copies(photos, Path("in"))
+    Path("link").symlink_to("in")
+    for skipped in (False, True):
+        result = run("detect", folder, "-o", output, "--json")
+        assert result.exit_code == 0, result.output
+        images = json.loads(result.stdout)["images"]
+        assert [Path(image["image"]).name for image in images] == ["0.jpg", "1.jpg"]
+        assert [image["skipped"] for image in images] == [skipped] * 2
+    other = json.loads(run("detect", folder, "-o", "other", "--json").stdout)["images"]
+    assert len(other) == 6, "elsewhere they are images as any"
+    for image in folder.glob("*.jpg"):
+        image.unlink()
+    result = run("detect", folder, "-o", output)
+    assert result.exit_code == 2
+    assert "results of earlier runs" in result.stderr
+
+
 def test_an_input_is_never_written_over(run, photos: Path) -> None:
     shutil.copy(photos / "left.png", "a.png")
     shutil.copy(photos / "right.png", "a_heatmap.png")
