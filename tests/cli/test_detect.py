@@ -212,6 +212,28 @@ def test_an_image_that_has_changed_is_done_again(run, photos: Path) -> None:
     )
 
 
+def test_outputs_of_a_changed_image_stay_known_when_some_are_made_again(run, photos: Path) -> None:
+    image = copies(photos, Path("in"), 1) / "0.jpg"
+    detect(run, image, "--pictures")
+    shutil.copy(photos / "left.png", image)
+    assert not detect(run, image, "--format", "csv")[0]["skipped"]
+    assert not detect(run, image, "--pictures")[0]["skipped"]
+    expected = DeepDetect().detect(photos / "left.png").xy
+    np.testing.assert_array_equal(load_keypoints("out/0.npz").xy, expected)
+    assert detect(run, image, "--format", "csv")[0]["skipped"]
+
+
+def test_an_edited_output_of_a_changed_image_is_not_replaced(run, photos: Path) -> None:
+    image = copies(photos, Path("in"), 1) / "0.jpg"
+    detect(run, image)
+    Path("out/0.npz").write_bytes(b"edited")
+    shutil.copy(photos / "left.png", image)
+    detect(run, image, "--format", "csv", "--overwrite")
+    result = run("detect", image, "-o", "out", "--no-pictures")
+    assert result.exit_code == 2
+    assert Path("out/0.npz").read_bytes() == b"edited"
+
+
 @pytest.mark.parametrize(
     ("more", "told"),
     [
@@ -281,6 +303,56 @@ def test_outputs_of_something_else_are_never_replaced_silently(
     assert len(result.stderr.splitlines()) == 1
     assert contents(Path("out")) == before
     detect(run, Path("in"), "--overwrite")
+
+
+@pytest.mark.parametrize("numbers", [{}, {"keypoints": 3}, "words", None, 3])
+def test_an_image_whose_recorded_numbers_are_damaged_is_done_again(
+    run, photos: Path, numbers: object
+) -> None:
+    first = detect(run, photos / "cat.jpg")[0]
+    path = Path("out/.deepdetect/detect/cat.json")
+    record = json.loads(path.read_text())
+    if numbers == "words":
+        numbers = dict.fromkeys(record["numbers"], "many")
+    path.write_text(json.dumps({**record, "numbers": numbers}))
+    result = run("detect", photos / "cat.jpg", "-o", "out", "--no-pictures")
+    assert result.exit_code == 0, result.output
+    assert "already done" not in result.stdout
+    again = detect(run, photos / "cat.jpg")[0]
+    assert again["skipped"]
+    assert again["keypoints"] == first["keypoints"]
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../0.npz", "in/0.npz"])
+def test_a_record_with_a_name_that_is_none_is_not_believed(run, photos: Path, name: str) -> None:
+    detect(run, photos / "cat.jpg")
+    path = Path("out/.deepdetect/detect/cat.json")
+    record = json.loads(path.read_text())
+    record["files"][name] = None
+    path.write_text(json.dumps(record))
+    result = run("detect", photos / "cat.jpg", "-o", "out", "--no-pictures")
+    assert result.exit_code == 2
+    assert "is not known to be of" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("output", ["in", "link"])
+def test_pictures_of_an_earlier_run_are_no_inputs(run, photos: Path, output: str) -> None:
+    folder = copies(photos, Path("in"))
+    Path("link").symlink_to("in")
+    for skipped in (False, True):
+        result = run("detect", folder, "-o", output, "--json")
+        assert result.exit_code == 0, result.output
+        images = json.loads(result.stdout)["images"]
+        assert [Path(image["image"]).name for image in images] == ["0.jpg", "1.jpg"]
+        assert [image["skipped"] for image in images] == [skipped] * 2
+    other = json.loads(run("detect", folder, "-o", "other", "--json").stdout)["images"]
+    assert len(other) == 6, "elsewhere they are images as any"
+    for image in folder.glob("*.jpg"):
+        image.unlink()
+    result = run("detect", folder, "-o", output)
+    assert result.exit_code == 2
+    assert "results of earlier runs" in result.stderr
 
 
 def test_an_input_is_never_written_over(run, photos: Path) -> None:

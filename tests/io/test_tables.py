@@ -15,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from deepdetect import DeepDetectError, Keypoints, Matches, OptionError
 from deepdetect.features.matches import Guide
+from deepdetect.io import tables
 from deepdetect.io.tables import load_keypoints, load_matches, save_keypoints, save_matches
 
 
@@ -178,6 +179,7 @@ DAMAGED = {
     "a negative size": zipped(WHOLE | {"scores.npy": npy(SCORES, shape=(-4,))}),
     "one number as size": zipped(WHOLE | {"image_size.npy": npy(np.array([9]))}),
     "no size": zipped(WHOLE | {"image_size.npy": npy(np.array(9))}),
+    "an infinite size": zipped(WHOLE | {"image_size.npy": npy(np.array([np.inf, 9]))}),
     "words as scores": zipped(WHOLE | {"scores.npy": npy(np.array(["a"] * 4))}),
     "a cut header": zipped(WHOLE | {"scores.npy": npy(SCORES)[:30]}),
     "a broken header": zipped(WHOLE | {"scores.npy": npy(SCORES).replace(b"{", b"'")}),
@@ -208,6 +210,50 @@ def test_damaged_files_are_one_sentence(
     finally:
         tracemalloc.stop()
     assert f"{path} holds no keypoints (" in one_line(caught.value)
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "k.npz"
+    path.write_bytes(zipped({n: c for n, c in WHOLE.items() if n != "scores.npy"}))
+    with pytest.raises(DeepDetectError, match=r"no keypoints \(it has no array 'scores'\)"):
+        load_keypoints(path)
+
+
+@pytest.mark.parametrize("error", [AttributeError, AssertionError, IndexError])
+def test_errors_of_ours_are_not_taken_for_damage(
+    error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error("ours")
+
+    save_keypoints(keypoints(3), tmp_path / "k.npz")
+    monkeypatch.setattr(tables, "Keypoints", fail)
+    with pytest.raises(error, match="ours"):
+        load_keypoints(tmp_path / "k.npz")
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [(MemoryError, "not enough memory to read"), (PermissionError, "may not be read")],
+)
+def test_a_whole_file_that_cannot_be_read_is_not_called_damaged(
+    error: type[Exception],
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    one_line: Callable[[BaseException], str],
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    path = tmp_path / "k.npz"
+    save_keypoints(keypoints(3), path)
+    monkeypatch.setattr(tables, "_check_npz", fail)
+    with pytest.raises(DeepDetectError, match=told) as caught:
+        load_keypoints(path)
+    text = one_line(caught.value)
+    assert str(path) in text
+    assert "holds no" not in text
 
 
 def test_every_flipped_bit_is_one_sentence_or_harmless(

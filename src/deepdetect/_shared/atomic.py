@@ -9,6 +9,7 @@ import platform
 import re
 import secrets
 import time
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -24,6 +25,8 @@ STEM_LENGTH = 40
 
 # Stem, machine, process, a random number, "part" and the suffix of the final file.
 _TEMPORARY = re.compile(r"\..*\.(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}\.part(\..*)?")
+
+_HOST_FILES = (Path("/proc/sys/kernel/random/boot_id"), Path("/etc/machine-id"))
 
 _cleared: set[Path] = set()
 """Folders in which this process has looked for what others left behind."""
@@ -116,7 +119,18 @@ def _machine() -> str:
         namespace = os.readlink("/proc/self/ns/pid")  # containers may share a name and a folder
     except OSError:
         namespace = ""
-    return hashlib.sha256(f"{platform.node()} {namespace}".encode()).hexdigest()[:8]
+    # Machines that share a folder may share a name, and their first namespaces have one number.
+    owner = f"{platform.node()} {_host()} {namespace}"
+    return hashlib.sha256(owner.encode()).hexdigest()[:8]
+
+
+def _host() -> str:
+    """Return what tells this machine from others of its name."""
+    for path in _HOST_FILES:
+        with contextlib.suppress(OSError, ValueError):
+            if text := path.read_text(encoding="ascii").strip():
+                return text
+    return str(uuid.getnode())
 
 
 @lru_cache(maxsize=1)

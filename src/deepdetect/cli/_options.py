@@ -196,13 +196,16 @@ def make_detector(values: dict[str, Any], weights: str = "default") -> DeepDetec
 def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
     """Replace folders by the images below them, and check that results will not collide.
 
-    The folder of the results is left out when it lies in one of the folders.
-    """
-    from ..io.image import find_images
+    The folder of the results is left out when it lies in one of the folders; where it is one of
+    them, what earlier runs made in it.
 
+    Raises:
+        ImageError: a folder holds no image.
+        OptionError: two images have one name, or a folder holds only what earlier runs made.
+    """
     images: list[Path] = []
     for path in paths:
-        images += find_images(path, [output]) if path.is_dir() else [path]
+        images += _images_below(path, output) if path.is_dir() else [path]
     seen: dict[str, Path] = {}
     for image in dict.fromkeys(images):
         if image.stem in seen:
@@ -212,6 +215,23 @@ def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
             )
         seen[image.stem] = image
     return list(seen.values())
+
+
+def _images_below(folder: Path, output: Path) -> list[Path]:
+    """List the images below a folder that no earlier run has made."""
+    from ..io.image import find_images
+    from ._records import recorded_outputs
+
+    images = find_images(folder, [output])
+    if folder.resolve() != output.resolve():
+        return images
+    made = recorded_outputs(output)
+    left = [image for image in images if image.resolve() not in made]
+    if not left:
+        raise OptionError(
+            f"all images in {folder} are results of earlier runs: choose another folder with -o"
+        )
+    return left
 
 
 def check_inputs_survive(outputs: Iterable[Path], inputs: Sequence[Path], advice: str) -> None:

@@ -31,6 +31,7 @@ class OutputRecords:
     def __init__(
         self, command: str, folder: Path, settings: Mapping[str, Any], overwrite: bool = False
     ) -> None:
+        self.outputs = folder
         self.folder = folder / FOLDER / command
         self.settings = dict(settings)
         self.overwrite = overwrite
@@ -45,7 +46,7 @@ class OutputRecords:
         """
         if self.overwrite:
             return None
-        record = self._read(source)
+        record = _read(self._path(source))
         files = {} if record is None else record["files"]
         there = [path for path in outputs if path.exists()]
         there += [path for name in files if (path := outputs[0].with_name(name)).exists()]
@@ -87,18 +88,6 @@ class OutputRecords:
     def _path(self, source: Path) -> Path:
         return self.folder / f"{source.stem}.json"
 
-    def _read(self, source: Path) -> dict[str, Any] | None:
-        try:
-            record = json.loads(self._path(source).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
-            return None
-        kinds = {"input": str, "state": list, "settings": dict, "files": dict}
-        if not isinstance(record, dict) or "numbers" not in record:
-            return None
-        if not all(isinstance(record.get(name), kind) for name, kind in kinds.items()):
-            return None
-        return record if all(Path(name).name == name for name in record["files"]) else None
-
     def _write(
         self, source: Path, files: dict[str, Any], numbers: Mapping[str, Any] | None
     ) -> None:
@@ -107,18 +96,49 @@ class OutputRecords:
             "state": _state(source),
             "settings": self.settings,
         }
-        before = self._read(source)
-        if before is not None and all(before[name] == value for name, value in record.items()):
-            files = {**before["files"], **files}  # of another format
+        before = _read(self._path(source))
+        same = () if before is None else [n for n, value in record.items() if before[n] == value]
+        if before is not None and {"input", "settings"} <= {*same}:
+            # Outputs of another format stay known; those of the input as it was are to be remade,
+            # unless somebody has changed them.
+            others = before["files"]
+            if "state" not in same:
+                others = {n: None for n, f in others.items() if _unchanged(self.outputs / n, f)}
+            files = {**others, **files}
         with atomic_path(self._path(source)) as temporary:
             text = json.dumps({**record, "files": files, "numbers": numbers}, default=str)
             temporary.write_text(text, encoding="utf-8")
+
+
+def recorded_outputs(folder: Path) -> set[Path]:
+    """Return the resolved paths of what commands made in a folder, or were about to make."""
+    records = (_read(path) for path in folder.glob(f"{FOLDER}/*/*.json"))
+    names = {name for record in records if record is not None for name in record["files"]}
+    return {folder.resolve() / name for name in names}
 
 
 def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """Read a record, None where there is none or it is damaged."""
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None
+    kinds = {"input": str, "state": list, "settings": dict, "files": dict}
+    if not isinstance(record, dict) or "numbers" not in record:
+        return None
+    if not all(isinstance(record.get(name), kind) for name, kind in kinds.items()):
+        return None
+    return record if all(_is_file_name(name) for name in record["files"]) else None
+
+
+def _is_file_name(name: str) -> bool:
+    return name not in ("", "..") and Path(name).name == name
 
 
 def _exists(path: Path, what: str) -> OptionError:
@@ -147,7 +167,7 @@ def _unchanged(path: Path, fingerprint: object) -> bool:
     if fingerprint is None:
         return True
     state = fingerprint.get("state") if isinstance(fingerprint, dict) else None
-    if not isinstance(fingerprint, dict) or not isinstance(state, list):
+    if not isinstance(fingerprint, dict) or not isinstance(state, list) or not path.is_file():
         return False
     # A copy of the folder has other times.
     now = _state(path)

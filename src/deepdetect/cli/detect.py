@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from ..detector.detector import DeepDetect
     from ._records import OutputRecords
 
+NUMBERS = ("width", "height", "keypoints", "density", "seconds")
+"""What is told of each image, and recorded."""
+
 
 @generated_command(SELECTION, DETECTOR, short_help="Keypoints of photographs.")
 @click.argument("images", type=PATH, nargs=-1, required=True)
@@ -148,8 +151,8 @@ def _detect_one(
     try:
         # Another command may have done it meanwhile.
         done = records.find(path, paths)
-        if done is not None:
-            return {"image": path, **done, **shown, "skipped": True}
+        if done is not None and all(isinstance(done.get(n), int | float) for n in NUMBERS):
+            return {"image": path, **{n: done[n] for n in NUMBERS}, **shown, "skipped": True}
         rgb = load_image(path)
         started = time.perf_counter()
         if drawn:

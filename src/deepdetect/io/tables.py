@@ -69,11 +69,12 @@ def load_keypoints(path: str | Path) -> Keypoints:
         >>> load_keypoints(path)
         Keypoints(1 keypoints in 20x10 pixels, scores 0.9 to 0.9)
     """
-    with _reading(path, "keypoints") as arrays:
+    arrays = _load_npz(path, "keypoints")
+    with _building(path, "keypoints"):
         return Keypoints(
             arrays["keypoints"],
             arrays["scores"],
-            tuple(arrays["image_size"]),
+            _size(arrays["image_size"]),
             arrays.get("logits"),
             arrays.get("sizes"),
             arrays.get("angles"),
@@ -122,12 +123,13 @@ def load_matches(path: str | Path) -> Matches:
     Raises:
         DeepDetectError: the file is missing or is no such file.
     """
-    with _reading(path, "matches") as arrays:
+    arrays = _load_npz(path, "matches")
+    with _building(path, "matches"):
         keypoints = [
             Keypoints(
                 arrays[f"keypoints{side}"],
                 arrays[f"keypoint_scores{side}"],
-                tuple(arrays[f"image_size{side}"]),
+                _size(arrays[f"image_size{side}"]),
             )
             for side in (0, 1)
         ]
@@ -136,10 +138,10 @@ def load_matches(path: str | Path) -> Matches:
             guide = Guide(
                 str(arrays["guide_model"]),
                 _or_none(arrays["guide_matrix"]),
-                int(arrays["guide_sparse_matches"]),
-                int(arrays["guide_sparse_inliers"]),
+                _integer(arrays["guide_sparse_matches"]),
+                _integer(arrays["guide_sparse_inliers"]),
                 float(arrays["guide_log10_nfa"]),
-                int(arrays["guide_simulated_views"]),
+                _integer(arrays["guide_simulated_views"]),
             )
         return Matches(
             arrays["points0"],
@@ -155,21 +157,52 @@ def load_matches(path: str | Path) -> Matches:
         )
 
 
-@contextmanager
-def _reading(path: str | Path, content: str) -> Iterator[Any]:
-    """Open an npz file; errors of reading it, and of what it lacks, say so."""
+def _load_npz(path: str | Path, content: str) -> dict[str, np.ndarray]:
+    """Read all arrays of a npz file; errors say which file and what it should hold."""
     try:
         with Path(path).open("rb") as file:
             _check_npz(file)
             with np.load(file, allow_pickle=False) as arrays:
-                yield arrays
+                return dict(arrays)
     except FileNotFoundError:
         raise DeepDetectError(f"there is no file {path}: check the path") from None
+    except PermissionError:
+        raise DeepDetectError(f"{path} may not be read: check its rights") from None
+    except MemoryError:
+        raise DeepDetectError(
+            f"there is not enough memory to read {path}: close other programs"
+        ) from None
     except Exception as error:  # zip, its compressions and NumPy raise many kinds
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise DeepDetectError(
-            f"{path} holds no {content} ({reason}): write the file again"
-        ) from None
+        raise _holds_none(path, content, reason) from None
+
+
+@contextmanager
+def _building(path: str | Path, content: str) -> Iterator[None]:
+    """Say of which file the arrays are that do not make the object."""
+    try:
+        yield
+    except KeyError as error:
+        raise _holds_none(path, content, f"it has no array {error}") from error
+    except (ValueError, TypeError, OptionError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise _holds_none(path, content, reason) from error
+
+
+def _holds_none(path: str | Path, content: str, reason: str) -> DeepDetectError:
+    return DeepDetectError(f"{path} holds no {content} ({reason}): write the file again")
+
+
+def _size(array: np.ndarray) -> tuple[int, int]:
+    if array.shape != (2,):
+        raise ValueError(f"an image size has two numbers, not shape {array.shape}")
+    return _integer(array[0]), _integer(array[1])
+
+
+def _integer(array: np.ndarray) -> int:
+    if not np.isfinite(array).all():
+        raise ValueError(f"a whole number is {array}")
+    return int(array)
 
 
 def _check_npz(file: BinaryIO) -> None:
