@@ -474,3 +474,36 @@ def test_names_are_looked_up() -> None:
             assert file.checksum is not None or entry.known_contents()
             assert file.checksum is None or file.checksum.startswith(("md5:", "sha256:"))
             assert all(url.startswith("http") for url in file.urls)
+
+
+@pytest.mark.parametrize("has_filter", [True, False])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("../outside.txt", tarfile.REGTYPE), ("/outside.txt", tarfile.REGTYPE)]
+    + [("link", tarfile.SYMTYPE), ("device", tarfile.CHRTYPE)],
+)
+def test_no_member_leads_outside_also_before_python_had_a_filter(
+    name: str, kind: bytes, has_filter: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not has_filter:
+        monkeypatch.delattr(tarfile, "data_filter", raising=False)
+    elif not hasattr(tarfile, "data_filter"):
+        pytest.skip("this Python has no filter")
+    archive, target = tmp_path / "archive.tar", tmp_path / "data" / "target"
+    with tarfile.open(archive, "w") as tar:
+        good = tarfile.TarInfo("folder/image.txt")
+        good.size = 3
+        tar.addfile(good, io.BytesIO(b"yes"))
+        member = tarfile.TarInfo(name)
+        member.type, member.linkname = kind, "/etc/passwd"
+        tar.addfile(member)
+    try:
+        download._unpack(RemoteFile(("https://example.org/a.tar",), 1), archive, target, True)
+    except DeepDetectError:
+        pass
+    else:
+        assert name.startswith("/")  # the filter makes it relative
+    assert (target / "folder" / "image.txt").read_bytes() == b"yes"
+    assert not (target / "link").is_symlink()
+    assert not list(tmp_path.glob("outside*"))
+    assert not Path("/outside.txt").exists()

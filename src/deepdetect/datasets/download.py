@@ -351,7 +351,7 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
             _check_gzip(archive)
             with tarfile.open(archive) as tar:
                 members = tar.getmembers()
-                _extract(members, lambda one: tar.extract(one, target, filter="data"), quiet)
+                _extract(members, lambda one: _extract_member(tar, one, target), quiet)
     except Exception as error:  # zip, tar and their compressions raise many kinds
         if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
             raise
@@ -363,6 +363,18 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
         for entry in sorted((target / file.inside).iterdir()):
             entry.rename(target / entry.name)
         (target / file.inside).rmdir()
+
+
+def _extract_member(tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
+    """Extract a member that stays below the folder; Python before 3.11.4 has no filter for it."""
+    if hasattr(tarfile, "data_filter"):
+        tar.extract(member, target, filter="data")
+        return
+    inside = (target / member.name).resolve().is_relative_to(target.resolve())
+    if not inside or not (member.isreg() or member.isdir()):
+        raise tarfile.TarError(f"{member.name!r} leads outside, or is no file and no folder")
+    member.mode = 0o755 if member.isdir() else 0o644
+    tar.extract(member, target)
 
 
 def _check_gzip(archive: Path) -> None:
