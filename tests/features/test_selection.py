@@ -122,9 +122,10 @@ def test_the_density_is_exact(density: float) -> None:
     assert keypoints.scores.min() == np.sort(heatmap.ravel())[-count]
 
 
-def test_the_smallest_density_leaves_one() -> None:
+def test_a_density_of_less_than_half_a_pixel_leaves_none() -> None:
     heatmap = np.linspace(0.1, 0.9, 400, dtype=np.float32).reshape(20, 20)
-    assert select_keypoints(heatmap, SelectionOptions(density=1e-9)).xy.tolist() == [[19, 19]]
+    assert len(select_keypoints(heatmap, SelectionOptions(density=1e-9))) == 0
+    assert select_keypoints(heatmap, SelectionOptions(density=0.002)).xy.tolist() == [[19, 19]]
     whole = SelectionOptions(max_keypoints=5.0, threshold=0.0, nms_radius=0)  # type: ignore[arg-type]
     assert len(select_keypoints(heatmap, whole)) == 5
 

@@ -251,12 +251,14 @@ def _select(
 
 def _least_of_the_best(parts: Iterable[np.ndarray], count: int, kind: np.dtype) -> np.floating:
     """Return the rank of the last of the best of all parts; -infinity where they are fewer."""
+    if count == 0:  # of a density that is less than half a pixel
+        return kind.type(np.inf)
     best = np.empty(0, kind)
     for part in parts:
         best = np.concatenate([best, part])
         if len(best) > count:
             best = np.partition(best, len(best) - count)[len(best) - count :]
-    return best.min() if len(best) >= count > 0 else kind.type(-np.inf)
+    return best.min() if len(best) >= count else kind.type(-np.inf)
 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -298,7 +300,7 @@ def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis:
 def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
     counts = []
     if options.density is not None:
-        counts.append(max(1, round(options.density * pixels)))
+        counts.append(round(options.density * pixels))
     if options.max_keypoints is not None:
         counts.append(int(options.max_keypoints))
     return min(counts) if counts else None
