@@ -20,11 +20,10 @@ from deepdetect.geometry import Geometry, GeometryOptions, estimate_geometry
 from deepdetect.geometry.camera import Calibration, Camera, calibration_from_focal
 from deepdetect.geometry.relative_pose import RelativePose, estimate_relative_pose
 from deepdetect.io.image import load_image, luma
+from deepdetect.reconstruction.calibration_checks import check_focal, check_pose
 from deepdetect.reconstruction.checks import (
-    check_focal,
     check_images,
     check_matches,
-    check_pose,
     has_foreground,
     is_planar,
 )

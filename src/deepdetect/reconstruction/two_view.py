@@ -21,7 +21,8 @@ from ..geometry import epipolar_errors
 from ..geometry.camera import Calibration
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
 from ..geometry.triangulation import fundamental_matrix, triangulate
-from .checks import CheckOptions, check_focal, check_images, check_matches, check_pose
+from .calibration_checks import check_focal, check_pose
+from .checks import CheckOptions, check_images, check_matches
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import SubpixelOptions, refine_matches, spread_corners
 

@@ -15,6 +15,7 @@ from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided.initial_geometry import (
     InitialGeometry,
     estimate_initial_geometry,
+    find_initial_geometry,
     initial_matches,
 )
 from deepdetect.matching.guided.options import InitialGeometryOptions
@@ -259,6 +260,25 @@ def test_a_scene_with_depth_has_a_fundamental_matrix(art: tuple) -> None:
     assert np.quantile(errors, 0.95) < 1
     # In the rows of the rectified pair, whatever the matrix.
     assert np.median(np.abs(found.points0[:, 1] - found.points1[:, 1])) < 0.5
+
+
+def test_clear_depth_is_decided_on_small_copies(art: tuple) -> None:
+    left, right, points0, points1 = art
+    small = replace(OPTIONS, first_side_px=400, min_first_depth_inliers=50)
+    found = find_initial_geometry(left, right, options=small)
+    assert found.model == "fundamental"
+    assert found.initial is None  # larger copies were not looked at
+    errors = epipolar_errors(points0, points1, found.matrix)
+    assert np.quantile(errors, 0.95) < 1.5
+    limit = OPTIONS.fundamental_threshold_px * left.shape[1] / 400
+    assert epipolar_errors(found.points0, found.points1, found.matrix).max() < limit
+
+
+def test_depth_that_few_matches_show_is_decided_on_larger_copies(art: tuple) -> None:
+    options = replace(OPTIONS, first_side_px=400, min_first_depth_inliers=10_000)
+    found = find_initial_geometry(*art[:2], options=options)
+    assert found.model == "fundamental"
+    assert found.initial is not None
 
 
 def test_the_homography_of_a_scene_with_depth_is_given_when_asked_for(art: tuple) -> None:

@@ -93,7 +93,7 @@ def find_initial_geometry(
         small = _scaled_down(options, first_side, options.first_max_keypoints)
         look = initial_matches(gray0, gray1, options=small)
         found = estimate_initial_geometry(look, model, seed, small, simulate_views=False)
-        if _is_clearly_a_plane(found, options):
+        if _is_clearly_a_plane(found, options) or _is_clearly_depth(found, options):
             return found
     if initial is None:
         initial = initial_matches(gray0, gray1, options=options)
@@ -220,6 +220,12 @@ def _is_clearly_a_plane(found: InitialGeometry, options: InitialGeometryOptions)
     if parallax is None or not parallax.is_seen(options.model_selection):
         return True
     return parallax.agreeing <= options.max_first_parallax * parallax.on_plane
+
+
+def _is_clearly_depth(found: InitialGeometry, options: InitialGeometryOptions) -> bool:
+    """Whether most matches, and many, agree with a fundamental matrix."""
+    needed = max(options.min_first_depth_inliers, options.min_first_fraction * found.num_matches)
+    return found.model == "fundamental" and len(found.points0) >= needed
 
 
 def _nothing(num_matches: int) -> InitialGeometry:

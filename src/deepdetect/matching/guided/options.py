@@ -67,6 +67,7 @@ class InitialGeometryOptions:
     first_max_keypoints: int = 2000
     min_first_inliers: int = 50
     min_first_fraction: float = 0.5
+    min_first_depth_inliers: int = 200
     max_first_parallax: float = 0.1
     max_side_px: int = 1200
     simulated_side_px: int = 320
@@ -91,6 +92,7 @@ class InitialGeometryOptions:
             self,
             positive=(
                 *("first_side_px", "max_side_px", "simulated_side_px", "min_first_inliers"),
+                "min_first_depth_inliers",
                 *("min_separation_px", "tilts", "rotation_step_deg"),
                 *("homography_threshold_px", "fundamental_threshold_px", "first_max_keypoints"),
                 *("simulated_max_keypoints", "min_points"),
@@ -232,6 +234,9 @@ class RectifiedMatchingOptions:
         max_track_px: a track that moves further than this from its match is wrong.
         min_tracks: that a matrix is estimated from; where fewer corners can be tracked to where
             they are matched, no match counts.
+        max_disagreement_px: by which the disparity of a right sparse match, found in images of
+            another scale, may differ.
+        min_agreement: this fraction of the sparse matches must lie where the disparities say.
 
     Raises:
         OptionError: a value is out of its range.
@@ -263,6 +268,7 @@ class RectifiedMatchingOptions:
     max_round_trip_px: float = 0.3
     max_track_px: float = 4.0
     min_tracks: int = 50
+    max_disagreement_px: float = 3.0
     min_agreement: float = 0.75
 
     def __post_init__(self) -> None:
@@ -271,6 +277,7 @@ class RectifiedMatchingOptions:
             positive=(
                 *("max_volume", "margin_px", "max_row_error_px", "refit_corners"),
                 *("max_round_trip_px", "max_track_px", "correlation_sigma_px", "min_sigma_px"),
+                "max_disagreement_px",
             ),
             not_negative=("max_refits", "margin_fraction"),
             fractions=(

@@ -35,9 +35,6 @@ from .options import RectifiedMatchingOptions
 
 Range = tuple[int, int]
 
-AGREEMENT_PX = 3.0
-"""By which the disparity of a right sparse match, found in images of another scale, may differ."""
-
 
 @dataclass(frozen=True, eq=False)
 class RectifiedView:
@@ -105,20 +102,21 @@ def match_by_rectification(
     if view is None or tracks is None:
         return None
     fundamental = _refine(fundamental, sparse, tracks, sizes, options)
-    settled = _are_near(tracks, fundamental, options) and not _is_range_too_wide(view, options)
+    near = _are_near(tracks, fundamental, options)
+    wide = _is_range_too_wide(view, options)
     for _ in range(options.max_refits):
-        if settled:
+        if near and not wide:
             break
         again = _rectify(gray0, gray1, *tracks.positions, fundamental, options)
         found = None if again is None else _track(again, options)
         if again is None or found is None or _matched(again) < _matched(view):
             break
-        view, tracks, settled = again, found, True
+        view, tracks, near, wide = again, found, True, False
         fundamental = _refine(fundamental, sparse, tracks, sizes, options)
-    if _agreement(view, sparse) < options.min_agreement:
+    if _agreement(view, sparse, options.max_disagreement_px) < options.min_agreement:
         return None
     # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
-    disparity = view.kept if settled else view.disparities.disparity
+    disparity = view.kept if near else view.disparities.disparity
     rows, places, scores = _sample(view, disparity, xy0)
     places = _moved_to_lines(xy0[rows], places, fundamental)
     height, width = gray1.shape
@@ -145,7 +143,9 @@ def _refine(
     )
 
 
-def _agreement(view: RectifiedView, sparse: tuple[np.ndarray, np.ndarray]) -> float:
+def _agreement(
+    view: RectifiedView, sparse: tuple[np.ndarray, np.ndarray], max_disagreement_px: float
+) -> float:
     """Return the fraction of the sparse matches with a disparity that lie where it says.
 
     They know nothing of each other: where most contradict, what looks alike on the rows is another
@@ -162,7 +162,7 @@ def _agreement(view: RectifiedView, sparse: tuple[np.ndarray, np.ndarray]) -> fl
     column, row = nearest[inside].T
     errors = places[0][inside, 0] - places[1][inside, 0] - disparity[row, column]
     errors = np.abs(errors[np.isfinite(errors)])
-    return float((errors < AGREEMENT_PX).mean()) if len(errors) else 0.0
+    return float((errors < max_disagreement_px).mean()) if len(errors) else 0.0
 
 
 def _are_near(tracks: Tracks, fundamental: np.ndarray, options: RectifiedMatchingOptions) -> bool:
