@@ -20,7 +20,8 @@ Result = TypeVar("Result")
 def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Decorate a function so that an unknown keyword is an error with the nearest right one.
 
-    The function keeps its signature, so that editors and type checkers see it.
+    It keeps its signature, so that editors and type checkers see it. A class is decorated above
+    `dataclass`; it stays the same class.
 
     Raises:
         OptionError: from the function, when called with an unknown keyword.
@@ -35,7 +36,12 @@ def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Paramet
         deepdetect.OptionError: unknown option 'max_keypoint': did you mean \
 'max_keypoints'? (known: image, max_keypoints)
     """
-    names = [name for name in inspect.signature(function).parameters if name != "self"]
+    if isinstance(function, type):
+        kind: Any = function
+        kind.__init__ = suggest_keywords(kind.__init__)
+        return function
+    parameters = inspect.signature(function).parameters
+    names = [name for name in parameters if name not in ("self", "cls")]
 
     @functools.wraps(function)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:

@@ -58,7 +58,8 @@ class DeepDetect:
         providers: ONNX Runtime's execution providers by name, as "CUDAExecutionProvider", the
             preferred one first.
         threads: number of threads. None: the backend's choice.
-        channels: "rgb", or "bgr" as the paper's published code feeds them.
+        network_channels: "rgb", or "bgr" as the paper's published code feeds the network. For
+            images of OpenCV leave it, and give the methods `channels="bgr"`.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
             times the time.
         tile_megapixels: with `resolution="native"`, images above so many megapixels are run in
@@ -96,13 +97,13 @@ class DeepDetect:
         backend: str = "auto",
         providers: tuple[str, ...] = (),
         threads: int | None = None,
-        channels: Literal["rgb", "bgr"] = "rgb",
+        network_channels: Channels = "rgb",
         tta: Literal["none", "flip"] = "none",
         tile_megapixels: float | Literal["auto"] = "auto",
         ranker: str | Path | None = None,
     ) -> None:
         self.weights = resolve_weights(weights)
-        self.heatmap_options = HeatmapOptions(resolution, channels, tta, tile_megapixels)
+        self.heatmap_options = HeatmapOptions(resolution, network_channels, tta, tile_megapixels)
         self.ranker = RANKER if ranker is None else Path(ranker)
         load_ranker(self.ranker)
         self._runtime = RuntimeOptions(backend, providers, threads)
@@ -177,7 +178,7 @@ class DeepDetect:
         shown = self.heatmap_options
         return (
             f"DeepDetect({self.weights.name}, resolution={shown.resolution!r}, "
-            f"channels={shown.channels!r}, backend={self.backend!r})"
+            f"network_channels={shown.network_channels!r}, backend={self.backend!r})"
         )
 
     @overload

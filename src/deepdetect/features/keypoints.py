@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
 
 MAX_COORDINATE_BITS = 12
 """Of a position in `bayer_order`: float32 holds the order exactly up to this many."""
@@ -22,6 +23,7 @@ _OPTIONAL: dict[str, Any] = {
 }
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Keypoints:
     """Keypoints of one image.

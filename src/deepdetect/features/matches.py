@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
 from .keypoints import Keypoints
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class Guide:
     """The geometry that guided the matching of two images.
@@ -78,6 +80,7 @@ class GuidedMatches:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Matches:
     """Matched keypoints of two images.

@@ -29,6 +29,7 @@ def check_max_keypoints(count: int | None) -> None:
         raise OptionError(f"`max_keypoints` must be a whole number from 1 on, not {count}")
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class SelectionOptions:
     """Which pixels of a heat map become keypoints.

@@ -13,7 +13,8 @@ from typing import BinaryIO
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import DeepDetectError, InvalidFileError, MissingFileError, OptionError
+from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.matches import Guide, Matches
 
@@ -23,6 +24,7 @@ MAX_DEFLATE_RATIO = 1032
 """By how much zip's usual compression can shrink at most (https://zlib.net/zlib_tech.html)."""
 
 
+@suggest_keywords
 def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
     """Write keypoints, whole or not at all.
 
@@ -56,6 +58,7 @@ def _optional(keypoints: Keypoints) -> list[tuple[str, np.ndarray | None]]:
     return [(name, getattr(keypoints, name)) for name in ("logits", "sizes", "angles")]
 
 
+@suggest_keywords
 def load_keypoints(path: str | Path) -> Keypoints:
     """Read keypoints from the npz file that `save_keypoints` wrote.
 
@@ -81,6 +84,7 @@ def load_keypoints(path: str | Path) -> Keypoints:
         )
 
 
+@suggest_keywords
 def save_matches(matches: Matches, path: str | Path) -> None:
     """Write matches, whole or not at all.
 
@@ -114,6 +118,7 @@ def save_matches(matches: Matches, path: str | Path) -> None:
     _save_npz(path, **{name: np.asarray(value) for name, value in arrays.items()})
 
 
+@suggest_keywords
 def load_matches(path: str | Path) -> Matches:
     """Read matches from the npz file that `save_matches` wrote.
 
@@ -165,7 +170,7 @@ def _load_npz(path: str | Path, content: str) -> dict[str, np.ndarray]:
             with np.load(file, allow_pickle=False) as arrays:
                 return dict(arrays)
     except FileNotFoundError:
-        raise DeepDetectError(f"there is no file {path}: check the path") from None
+        raise MissingFileError(f"there is no file {path}: check the path") from None
     except PermissionError:
         raise DeepDetectError(f"{path} may not be read: check its rights") from None
     except MemoryError:
@@ -189,8 +194,8 @@ def _building(path: str | Path, content: str) -> Iterator[None]:
         raise _holds_none(path, content, reason) from error
 
 
-def _holds_none(path: str | Path, content: str, reason: str) -> DeepDetectError:
-    return DeepDetectError(f"{path} holds no {content} ({reason}): write the file again")
+def _holds_none(path: str | Path, content: str, reason: str) -> InvalidFileError:
+    return InvalidFileError(f"{path} holds no {content} ({reason}): write the file again")
 
 
 def _size(array: np.ndarray) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.image_array import Channels
 from .._shared.options import replace_options, suggest_keywords
 from .._shared.parallel import available_memory
 from .._shared.timing import StageTimer
@@ -35,6 +36,7 @@ def match_images(
     image1: Any,
     detector: HeatmapDetector | None = None,
     *,
+    channels: Channels = "rgb",
     preset: str = "default",
     options: MatchingOptions | None = None,
     initial: InitialMatches | None = None,
@@ -52,7 +54,7 @@ def match_images(
     mode: Literal["auto", "dense", "points"] | None = None,
     spread: Literal["none", "grid", "anms"] | None = None,
     resolution: Literal["auto", "native"] | int | None = None,
-    channels: Literal["rgb", "bgr"] | None = None,
+    network_channels: Channels | None = None,
     descriptor: str | None = None,
     keypoint_size: float | None = None,
     angle: float | None = None,
@@ -75,9 +77,11 @@ def match_images(
     Args:
         image0, image1: anything `load_image` takes.
         detector: a `DeepDetect`, or anything with its `heatmap` method; default `DeepDetect()`.
+        channels: order of the colours in images that are arrays, as of `load_image`: "bgr" for
+            those of OpenCV.
         preset: name of the options to start from: "default", or "published" for exactly
             what the paper's published code does, whatever the detector's own resolution
-            and channels.
+            and order of the colours.
         options: all options at once, instead of a preset.
         initial: sparse matches of the pair, where `initial_matches` has made them already.
         seeds: sparse matches of any other matcher (LightGlue, LoFTR, a person's clicks), two (K, 2)
@@ -95,7 +99,7 @@ def match_images(
         threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread: which pixels
             or points become keypoints (`SelectionOptions`). With `max_keypoints` alone they are
             the best ones of all scales, which need no network.
-        resolution, channels: how the network sees the images (`HeatmapOptions`).
+        resolution, network_channels: how the network sees the images (`HeatmapOptions`).
         descriptor, keypoint_size, angle, matcher, ratio: of matches by descriptors alone; they do
             not apply to guided ones (`MatchingOptions`).
         estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations, seed:
@@ -118,7 +122,7 @@ def match_images(
         True
     """
     chosen = options if options is not None else get_preset(preset)
-    if chosen.heatmap is None and not (resolution is None and channels is None):
+    if chosen.heatmap is None and not (resolution is None and network_channels is None):
         own = getattr(detector, "heatmap_options", HeatmapOptions())
         chosen = dataclasses.replace(chosen, heatmap=own)
     given = {
@@ -135,7 +139,7 @@ def match_images(
         "mode": mode,
         "spread": spread,
         "resolution": resolution,
-        "channels": channels,
+        "network_channels": network_channels,
         "descriptor": descriptor,
         "keypoint_size": keypoint_size,
         "angle": angle,
@@ -157,7 +161,7 @@ def match_images(
     if seeds is not None and not chosen.guided:
         raise OptionError("seeds guide the matching: leave them out, or guided=False")
     timer = StageTimer()
-    rgb = load_image(image0), load_image(image1)
+    rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
     detector = _configured(detector, chosen.heatmap)
     with timer.stage("keypoints"):
         keypoints = [find_keypoints(detector, image, chosen.selection) for image in rgb]

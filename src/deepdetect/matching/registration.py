@@ -8,7 +8,8 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from .._shared.errors import DeepDetectError
+from .._shared.errors import RegistrationError
+from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
 from ..detector.detector import HeatmapDetector
 from ..geometry.zncc import median_local_zncc, warp_to_reference
@@ -20,6 +21,7 @@ SQUARES = 8
 """Squares of the checkerboard along the shorter side."""
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Registration:
     """A second image in the frame of a first.
@@ -67,6 +69,7 @@ def register(
     image1: Any,
     detector: HeatmapDetector | None = None,
     *,
+    channels: Channels = "rgb",
     threshold: float | None = None,
     density: float | None = None,
     max_keypoints: int | None = None,
@@ -76,7 +79,7 @@ def register(
     mode: Literal["auto", "dense", "points"] | None = None,
     spread: Literal["none", "grid", "anms"] | None = None,
     resolution: Literal["auto", "native"] | int | None = None,
-    channels: Literal["rgb", "bgr"] | None = None,
+    network_channels: Channels | None = None,
     mutual: bool | None = None,
     seed: int | None = None,
     guided_options: GuidedOptions | None = None,
@@ -89,13 +92,13 @@ def register(
     Args:
         image0, image1: anything `load_image` takes.
         detector: as for `match_images`.
-        threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread, resolution,
-            channels, mutual, seed, guided_options: as for `match_images`.
+        channels, threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread,
+            resolution, network_channels, mutual, seed, guided_options: as for `match_images`.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
-        DeepDetectError: no homography between the images can be trusted.
+        RegistrationError: no homography between the images can be trusted.
 
     Example:
         >>> from deepdetect.evaluation.baselines.random import RandomDetector
@@ -106,7 +109,7 @@ def register(
         >>> found.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
-    first, second = load_image(image0), load_image(image1)
+    first, second = load_image(image0, channels=channels), load_image(image1, channels=channels)
     found = match_images(
         first,
         second,
@@ -121,13 +124,13 @@ def register(
         mode=mode,
         spread=spread,
         resolution=resolution,
-        channels=channels,
+        network_channels=network_channels,
         mutual=mutual,
         seed=seed,
         guided_options=guided_options,
     )
     if not found.guided or found.matrix is None:
-        raise DeepDetectError(
+        raise RegistrationError(
             "no homography can be trusted between these images: they must overlap, and show a "
             "plane or be taken from one place"
         )

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..._shared.errors import WeightsError
+from ..._shared.errors import MissingWeightsError, WeightsError
 from .candidate_features import FEATURES
 
 WEIGHTS = Path(__file__).parent / "ranker.npz"
@@ -74,7 +74,7 @@ def load_ranker(path: Path = WEIGHTS) -> Ranker:
     try:
         state = path.stat().st_mtime_ns
     except OSError:
-        raise WeightsError(f"there is no weights file {path}: check the path") from None
+        raise MissingWeightsError(f"there is no weights file {path}: check the path") from None
     return _load(path.absolute(), state)
 
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from ..._shared.errors import ImageError, OptionError
+from ..._shared.image_array import Channels
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
 from ...io.image import load_image, luma
@@ -61,6 +62,7 @@ class RangeSearchOptions:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class DisparityOptions:
     """How the disparities of a rectified pair are found, and which of them are kept.
@@ -151,6 +153,7 @@ class RectifiedMatches:
         return len(self.indices)
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class DisparityMap:
     """The disparity of each pixel of the left view of a rectified pair.
@@ -191,7 +194,11 @@ class DisparityMap:
 
 @suggest_keywords
 def disparity_map(
-    left: Any, right: Any, options: DisparityOptions = DisparityOptions()
+    left: Any,
+    right: Any,
+    options: DisparityOptions = DisparityOptions(),
+    *,
+    channels: Channels = "rgb",
 ) -> DisparityMap:
     """Find the disparity of every pixel of the left view of a rectified pair.
 
@@ -221,7 +228,8 @@ def disparity_map(
         >>> found.at(np.array([[40, 20], [60, 30], [2, 30]])).indices.tolist()
         [0, 1]
     """
-    return compute_disparity(luma(load_image(left)), luma(load_image(right)), options)
+    grays = [luma(load_image(image, channels=channels)) for image in (left, right)]
+    return compute_disparity(grays[0], grays[1], options)
 
 
 def match_rectified(
