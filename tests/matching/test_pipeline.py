@@ -412,7 +412,7 @@ def test_a_preset_without_its_heatmap_options_takes_a_stand_in(photo: np.ndarray
 
 
 def test_a_detector_keeps_its_own_resolution(photo: np.ndarray) -> None:
-    squashing = DeepDetect(resolution=64, channels="bgr")
+    squashing = DeepDetect(resolution=64, network_channels="bgr")
     chosen = {"max_keypoints": 100, "mode": "dense"}
     matches = match_images(photo, photo, squashing, **chosen)
     np.testing.assert_array_equal(matches.keypoints0.xy, squashing.detect(photo, **chosen).xy)
@@ -463,9 +463,9 @@ def test_heatmap_options_reach_the_network_and_leave_the_detector(
 ) -> None:
     before = network.heatmap_options
     chosen = {"max_keypoints": 100, "mode": "dense"}
-    matches = match_images(photo, photo, network, resolution=64, channels="bgr", **chosen)
+    matches = match_images(photo, photo, network, resolution=64, network_channels="bgr", **chosen)
     assert network.heatmap_options == before
-    expected = DeepDetect(resolution=64, channels="bgr").detect(photo, **chosen)
+    expected = DeepDetect(resolution=64, network_channels="bgr").detect(photo, **chosen)
     np.testing.assert_array_equal(matches.keypoints0.xy, expected.xy)
     native = network.detect(photo, **chosen)
     assert not np.array_equal(matches.keypoints0.xy, native.xy)

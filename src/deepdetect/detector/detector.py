@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import DeepDetectError, OptionError
+from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.selection import (
@@ -30,6 +31,7 @@ from .heatmap import (
     compute_native_logits,
     is_native,
 )
+from .image_lists import Images, for_each_image, ignore_masks, image_list
 from .points.detection import PointOptions, detect_points
 from .points.ranker import WEIGHTS as RANKER
 from .points.ranker import Ranker, load_ranker
@@ -126,26 +128,46 @@ class DeepDetect:
         other._network, other.backend = open_network(other.weights, self._runtime)
         return other
 
-    def heatmap(self, image: Any) -> np.ndarray:
+    @overload
+    def heatmap(self, image: Images, *, channels: Channels = ...) -> list[np.ndarray]: ...
+
+    @overload
+    def heatmap(self, image: Any, *, channels: Channels = ...) -> np.ndarray: ...
+
+    @suggest_keywords
+    def heatmap(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray | list[np.ndarray]:
         """Compute the probability of a keypoint at each pixel.
 
         Args:
-            image: a path, a PIL image, or an array: uint8, uint16 or float in [0, 1];
-                grey, RGB or RGBA.
+            image: a path, a PIL image, or an array or PyTorch tensor: uint8, uint16 or float in
+                [0, 1]; grey, RGB or RGBA; channels last or first. Or several of them, in a list, a
+                tuple or a batch of four dimensions; their sizes may differ.
+            channels: the order of the colours in arrays and tensors: "bgr" for the images of
+                `cv2.imread`.
 
         Returns:
-            (H, W) float32 in [0, 1], at the image's own size.
+            (H, W) float32 in [0, 1], at the image's own size; of several images a list, in their
+            order.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
+            ImageError: an image cannot be read or is not fit.
         """
-        return self.heatmap_and_logits(image)[0]
+        return for_each_image(
+            image, lambda one, _: self.heatmap_and_logits(one, channels=channels)[0]
+        )
 
-    def heatmap_and_logits(self, image: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the heat map and the logits of its probabilities; argument as of `heatmap`.
+    @suggest_keywords
+    def heatmap_and_logits(
+        self, image: Any, *, channels: Channels = "rgb"
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the heat map and the logits of its probabilities, of one image.
 
         Float32 rounds the highest probabilities to 1. The logits still distinguish these pixels, so
-        keypoints are ranked by them.
+        keypoints are ranked by them. Both together are all that `select_keypoints` needs to select
+        again, with other options, what `detect` would find.
+
+        Args:
+            image, channels: as of `heatmap`.
 
         Returns:
             The heat map and the logits, (H, W) float32 both.
@@ -153,7 +175,7 @@ class DeepDetect:
         Raises:
             ImageError: the image cannot be read or is not fit.
         """
-        return self._run(load_image(image))
+        return self._run(load_image(image, channels=channels))
 
     def _run(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of an image that `load_image` returned."""
@@ -184,6 +206,40 @@ class DeepDetect:
     @overload
     def detect(
         self,
+        image: Images,
+        threshold: float = ...,
+        *,
+        density: float | None = ...,
+        max_keypoints: int | None = ...,
+        nms_radius: int | None = ...,
+        subpixel: bool | None = ...,
+        ignore: np.ndarray | Images | None = ...,
+        mode: Literal["auto", "dense", "points"] = ...,
+        spread: Literal["none", "grid", "anms"] = ...,
+        channels: Channels = ...,
+        return_heatmap: Literal[False] = ...,
+    ) -> list[Keypoints]: ...
+
+    @overload
+    def detect(
+        self,
+        image: Images,
+        threshold: float = ...,
+        *,
+        density: float | None = ...,
+        max_keypoints: int | None = ...,
+        nms_radius: int | None = ...,
+        subpixel: bool | None = ...,
+        ignore: np.ndarray | Images | None = ...,
+        mode: Literal["auto", "dense", "points"] = ...,
+        spread: Literal["none", "grid", "anms"] = ...,
+        channels: Channels = ...,
+        return_heatmap: Literal[True],
+    ) -> tuple[list[Keypoints], list[np.ndarray]]: ...
+
+    @overload
+    def detect(
+        self,
         image: Any,
         threshold: float = ...,
         *,
@@ -194,6 +250,7 @@ class DeepDetect:
         ignore: np.ndarray | None = ...,
         mode: Literal["auto", "dense", "points"] = ...,
         spread: Literal["none", "grid", "anms"] = ...,
+        channels: Channels = ...,
         return_heatmap: Literal[False] = ...,
     ) -> Keypoints: ...
 
@@ -210,6 +267,7 @@ class DeepDetect:
         ignore: np.ndarray | None = ...,
         mode: Literal["auto", "dense", "points"] = ...,
         spread: Literal["none", "grid", "anms"] = ...,
+        channels: Channels = ...,
         return_heatmap: Literal[True],
     ) -> tuple[Keypoints, np.ndarray]: ...
 
@@ -223,11 +281,12 @@ class DeepDetect:
         max_keypoints: int | None = None,
         nms_radius: int | None = None,
         subpixel: bool | None = None,
-        ignore: np.ndarray | None = None,
+        ignore: np.ndarray | Images | None = None,
         mode: Literal["auto", "dense", "points"] = "auto",
         spread: Literal["none", "grid", "anms"] = "none",
+        channels: Channels = "rgb",
         return_heatmap: bool = False,
-    ) -> Keypoints | tuple[Keypoints, np.ndarray]:
+    ) -> Any:
         """Detect keypoints.
 
         Without `max_keypoints` they are dense: all pixels with a probability over the threshold.
@@ -235,7 +294,7 @@ class DeepDetect:
         another photograph; the network is not run for them.
 
         Args:
-            image: as for `heatmap`.
+            image: as for `heatmap`: one, or several in a list, a tuple or a batch.
             threshold: tau: pixels with a probability above it.
             density: wanted keypoints per pixel, in (0, 1], instead of the threshold. This many
                 are returned even where there is little to detect.
@@ -244,15 +303,20 @@ class DeepDetect:
                 with `max_keypoints`, else 0.
             subpixel: of dense keypoints: refine positions to a fraction of a pixel. None: with
                 `max_keypoints` only.
-            ignore: (H, W) array, true where no keypoint is wanted.
+            ignore: (H, W) array, true where no keypoint is wanted. Of several images one for each,
+                or None, in a list or a tuple; or one array for all.
             mode: "dense", "points", or "auto": points with `max_keypoints` where none of
                 threshold, density, nms_radius and subpixel is given, else dense.
             spread: of points: "none", "grid" (in turn the best of each cell), or "anms" (as far
                 from each other as their number allows).
+            channels: the order of the colours in arrays and tensors, as of `heatmap`.
             return_heatmap: return the heat map, too.
 
         Returns:
-            The keypoints; with `return_heatmap`, the keypoints and the (H, W) float32 heat map.
+            The keypoints; with `return_heatmap`, the keypoints and the (H, W) float32 heat map. Of
+            several images a list in their order, with `return_heatmap` two lists: the same as one
+            by one. The network sees one image at a time: a batch is no faster on a processor, and
+            takes the memory of all.
             Dense keypoints come in the order of rows and columns, on pixel centres unless
             `subpixel`; points come best first, with sub-pixel positions and sizes.
 
@@ -261,14 +325,32 @@ class DeepDetect:
             OptionError: an option is out of its range, or options do not fit together.
         """
         options = SelectionOptions(
-            threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread
+            threshold, density, max_keypoints, nms_radius, subpixel, None, mode, spread
         )
-        rgb = load_image(image)
+        images = image_list(image)
+        masks = ignore_masks(ignore, None if images is None else len(images))
+
+        def find(one: Any, number: int) -> tuple[Keypoints, np.ndarray | None]:
+            chosen = replace(options, ignore=masks[number])
+            return self._find(load_image(one, channels=channels), chosen, return_heatmap)
+
+        if images is None:
+            keypoints, heatmap = find(image, 0)
+            return (keypoints, heatmap) if return_heatmap else keypoints
+        found = for_each_image(images, find)
+        all_keypoints = [keypoints for keypoints, _ in found]
+        return (
+            (all_keypoints, [heatmap for _, heatmap in found]) if return_heatmap else all_keypoints
+        )
+
+    def _find(
+        self, rgb: np.ndarray, options: SelectionOptions, return_heatmap: bool
+    ) -> tuple[Keypoints, np.ndarray | None]:
+        """Find the keypoints of a loaded image, and its heat map where it is asked for."""
         if options.uses_points:
-            keypoints = self._points(rgb, options)
-            return (keypoints, self._run(rgb)[0]) if return_heatmap else keypoints
+            return self._points(rgb, options), self._run(rgb)[0] if return_heatmap else None
         if not return_heatmap:
-            return self._dense(rgb, options)
+            return self._dense(rgb, options), None
         heatmap, logits = self._run(rgb)
         with memory_named(rgb):
             return select_keypoints(heatmap, options, logits), heatmap

@@ -91,9 +91,9 @@ def save_matches(matches: Matches, path: str | Path) -> None:
     Args:
         matches: the matches.
         path: ending in .npz (arrays named as the attributes of `Matches`: `points0` and `points1`
-            (M, 2) float32, `scores` (M,) float32, `inliers` (M,) bool, `model` a string, `matrix`
-            (3, 3), or (0, 0) without one; `guided` and `subpixel` bool; `keypoints0` (N, 2)
-            float32, `keypoint_scores0` (N,) float32 and `image_size0` (width, height), and the same
+            (M, 2) float32, `indices0` and `indices1` (M,) int32 rows of the keypoints, `scores`
+            (M,) float32, `inliers` (M,) bool, `model` a string, `matrix` (3, 3), or (0, 0) without
+            one; `guided` and `subpixel` bool; `keypoints0` (N, 2) float32, `keypoint_scores0` (N,) float32 and `image_size0` (width, height), and the same
             of the second image; and of a `Guide` its attributes, as `guide_model`) or .csv (columns
             x0, y0, x1, y1, score, inlier).
 
@@ -105,7 +105,8 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         columns = [matches.points0, matches.points1, matches.scores, matches.inliers]
         _save_csv(path, "x0,y0,x1,y1,score,inlier", np.column_stack(columns))
         return
-    arrays = {name: getattr(matches, name) for name in ("points0", "points1", "scores", "inliers")}
+    names = ("points0", "points1", "scores", "inliers", "indices0", "indices1")
+    arrays = {name: getattr(matches, name) for name in names}
     arrays |= {"model": matches.model, "matrix": _or_empty(matches.matrix)}
     arrays |= {"guided": matches.guided, "subpixel": matches.subpixel}
     for side, keypoints in enumerate((matches.keypoints0, matches.keypoints1)):
@@ -123,7 +124,8 @@ def load_matches(path: str | Path) -> Matches:
     """Read matches from the npz file that `save_matches` wrote.
 
     Returns:
-        The matches. Their `seconds` are empty, and their keypoints have no logits.
+        The matches. Their `seconds` are empty, and their keypoints have no logits. Files of earlier
+        versions hold no indices: the nearest keypoints are looked up.
 
     Raises:
         DeepDetectError: the file is missing or is no such file.
@@ -159,6 +161,8 @@ def load_matches(path: str | Path) -> Matches:
             keypoints[1],
             guide=guide,
             subpixel="subpixel" in arrays and bool(arrays["subpixel"]),
+            indices0=arrays.get("indices0"),  # type: ignore[arg-type]  # older files have none
+            indices1=arrays.get("indices1"),  # type: ignore[arg-type]
         )
 
 

@@ -167,9 +167,10 @@ def match_images(
         keypoints = [find_keypoints(detector, image, chosen.selection) for image in rgb]
     grays = luma(rgb[0]), luma(rgb[1])
     found_guide, guided_pair = None, None
+    rows: tuple[Any, Any]  # of the keypoints, None where they are looked up
     if chosen.guided:
         with timer.stage("guided matching"):
-            found_guide, guided_pair, positions = _match_guided(
+            found_guide, guided_pair, positions, rows = _match_guided(
                 grays, keypoints, chosen, initial, seeds
             )
         points0, points1, scores = positions
@@ -177,6 +178,7 @@ def match_images(
         found = unguided_matches(grays, keypoints, chosen, timer)
         points0, points1 = keypoints[0].xy[found.rows0], keypoints[1].xy[found.rows1]
         scores = np.clip(1 - found.ratios, 0, 1)
+        rows = found.rows0, found.rows1
     with timer.stage("geometry"):
         geometry = _final_geometry(points0, points1, chosen.geometry, found_guide)
     return Matches(
@@ -191,6 +193,7 @@ def match_images(
         timer.seconds,
         found_guide,
         guided_pair is not None and guided_pair.subpixel,
+        *rows,
     )
 
 
@@ -200,8 +203,13 @@ def _match_guided(
     options: MatchingOptions,
     initial: InitialMatches | None,
     seeds: tuple[np.ndarray, np.ndarray] | None,
-) -> tuple[Guide, GuidedMatches | None, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return what guided, the matches, and their positions in both images with their scores."""
+) -> tuple[
+    Guide,
+    GuidedMatches | None,
+    tuple[np.ndarray, np.ndarray, np.ndarray],
+    tuple[np.ndarray | None, np.ndarray | None],
+]:
+    """Return what guided, the matches, their positions with their scores, and their keypoints."""
     first, second = keypoints
     swapped = options.mutual and _comes_after(grays[0], grays[1])
     if swapped:
@@ -220,10 +228,13 @@ def _match_guided(
         seeds,
         (first, second),
     )
-    points0, points1, scores = _guided_points(found, (first, second), options.mutual)
+    if found is not None and options.mutual:
+        found = found.unique()
+    points0, points1, scores = _guided_points(found, (first, second))
+    rows0, rows1 = (None, None) if found is None else (found.rows0, found.rows1)
     if swapped:
-        return guide.swapped(), found, (points1, points0, scores)
-    return guide, found, (points0, points1, scores)
+        return guide.swapped(), found, (points1, points0, scores), (rows1, rows0)
+    return guide, found, (points0, points1, scores), (rows0, rows1)
 
 
 def _comes_after(gray0: np.ndarray, gray1: np.ndarray) -> bool:
@@ -233,14 +244,12 @@ def _comes_after(gray0: np.ndarray, gray1: np.ndarray) -> bool:
 
 
 def _guided_points(
-    found: GuidedMatches | None, keypoints: Sequence[Keypoints], mutual: bool
+    found: GuidedMatches | None, keypoints: Sequence[Keypoints]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions in both images and scores; none where no geometry could be trusted."""
     if found is None:
         nowhere = np.empty((0, 2), np.float32)
         return nowhere, nowhere, np.empty(0, np.float32)
-    if mutual:
-        found = found.unique()
     points0 = keypoints[0].xy[found.rows0]
     if found.rows1 is not None:
         return points0, keypoints[1].xy[found.rows1], found.scores

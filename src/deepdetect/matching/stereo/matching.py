@@ -211,6 +211,7 @@ def disparity_map(
     Args:
         left, right: images of the same size, anything `load_image` takes; only their luma is used.
         options: what is matched and kept; `DENSE` gives as many pixels as possible.
+        channels: order of the colours in images that are arrays, as of `load_image`.
 
     Returns:
         The disparities, the same for any number of threads.
@@ -237,13 +238,15 @@ def match_rectified(
     right: Any,
     keypoints: Keypoints | np.ndarray,
     options: DisparityOptions = DisparityOptions(),
+    *,
+    channels: Channels = "rgb",
 ) -> RectifiedMatches:
     """Find the disparities of keypoints of the left view: `disparity_map`, sampled at them.
 
     Raises:
         ImageError, OptionError: as of `disparity_map` and `DisparityMap.at`.
     """
-    return disparity_map(left, right, options).at(keypoints)
+    return disparity_map(left, right, options, channels=channels).at(keypoints)
 
 
 def compute_disparity(
