@@ -93,9 +93,10 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         path: ending in .npz (arrays named as the attributes of `Matches`: `points0` and `points1`
             (M, 2) float32, `indices0` and `indices1` (M,) int32 rows of the keypoints, `scores`
             (M,) float32, `inliers` (M,) bool, `model` a string, `matrix` (3, 3), or (0, 0) without
-            one; `guided` and `subpixel` bool; `keypoints0` (N, 2) float32, `keypoint_scores0` (N,) float32 and `image_size0` (width, height), and the same
-            of the second image; and of a `Guide` its attributes, as `guide_model`) or .csv (columns
-            x0, y0, x1, y1, score, inlier).
+            one; `guided` and `subpixel` bool; `keypoints0` (N, 2) float32, `keypoint_scores0` (N,)
+            float32 and `image_size0` (width, height), and the same of the second image; and of a
+            `Guide` its attributes, as `guide_model`) or .csv (columns x0, y0, x1, y1, score,
+            inlier).
 
     Raises:
         OptionError: the file's ending is another.

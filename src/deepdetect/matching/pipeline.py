@@ -207,7 +207,7 @@ def _match_guided(
     Guide,
     GuidedMatches | None,
     tuple[np.ndarray, np.ndarray, np.ndarray],
-    tuple[np.ndarray | None, np.ndarray | None],
+    tuple[Any, Any],
 ]:
     """Return what guided, the matches, their positions with their scores, and their keypoints."""
     first, second = keypoints
