@@ -840,9 +840,9 @@ def test_images_are_read_once(photo_path: Path, monkeypatch: pytest.MonkeyPatch)
 
     read: list[Any] = []
 
-    def counted(source: Any) -> np.ndarray:
+    def counted(source: Any, **options: Any) -> np.ndarray:
         read.append(source)
-        return load_image(source)
+        return load_image(source, **options)
 
     monkeypatch.setattr(module, "load_image", counted)
     monkeypatch.setattr(pipeline, "load_image", counted)

@@ -17,11 +17,17 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
-def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+def suggest_keywords(
+    function: Callable[Parameters, Result], elsewhere: Mapping[str, str] = {}
+) -> Callable[Parameters, Result]:
     """Decorate a function so that an unknown keyword is an error with the nearest right one.
 
     It keeps its signature, so that editors and type checkers see it. A class is decorated above
     `dataclass`; it stays the same class.
+
+    Args:
+        function: to be decorated.
+        elsewhere: what to do instead, by keywords that belong to other functions.
 
     Raises:
         OptionError: from the function, when called with an unknown keyword.
@@ -46,6 +52,8 @@ def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Paramet
     @functools.wraps(function)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         for name in kwargs:
+            if name in elsewhere:
+                raise OptionError(f"unknown option {name!r}: {elsewhere[name]}")
             if name not in names:
                 raise unknown_name("option", name, names)
         return function(*args, **kwargs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -36,6 +37,11 @@ from .points.detection import PointOptions, detect_points
 from .points.ranker import WEIGHTS as RANKER
 from .points.ranker import Ranker, load_ranker
 from .pretrained import resolve_weights
+
+CHANNELS_OF_IMAGES = (
+    "give it with each image, as detect(image, channels='bgr'); what the network itself is fed is "
+    "`network_channels`"
+)
 
 
 class HeatmapDetector(Protocol):
@@ -90,7 +96,7 @@ class DeepDetect:
         10
     """
 
-    @suggest_keywords
+    @functools.partial(suggest_keywords, elsewhere={"channels": CHANNELS_OF_IMAGES})
     def __init__(
         self,
         weights: str | Path = "default",
@@ -111,12 +117,14 @@ class DeepDetect:
         self._runtime = RuntimeOptions(backend, providers, threads)
         self._network, self.backend = open_network(self.weights, self._runtime)
 
+    @suggest_keywords
     def configured(self, heatmap_options: HeatmapOptions) -> DeepDetect:
         """Return a detector with the same loaded network and other heat map options."""
         other = copy.copy(self)
         other.heatmap_options = heatmap_options
         return other
 
+    @suggest_keywords
     def with_weights(self, weights: str | Path) -> DeepDetect:
         """Return a detector with other weights, and all other options as they are.
 

@@ -100,6 +100,7 @@ class Keypoints:
             object.__setattr__(self, "descriptors", descriptors)
 
     @classmethod
+    @suggest_keywords
     def empty(cls, image_size: tuple[int, int]) -> Keypoints:
         """Return a set without keypoints."""
         return cls(np.empty((0, 2), np.float32), np.empty(0, np.float32), image_size)
@@ -234,6 +235,7 @@ class Keypoints:
         width, height = self.image_size
         return len(self) / (width * height)
 
+    @suggest_keywords
     def best(self, count: int) -> Keypoints:
         """Return the keypoints with the highest logits (or scores), in the order they have here.
 
