@@ -323,8 +323,8 @@ class DeepDetect:
         Returns:
             The keypoints; with `return_heatmap`, the keypoints and the (H, W) float32 heat map. Of
             several images a list in their order, with `return_heatmap` two lists: the same as one
-            by one. The network sees one image at a time: a batch is no faster on a processor, and
-            takes the memory of all.
+            by one. The network sees one image at a time: a batch of photographs is no faster on a
+            processor, takes the memory of all, and its last bits may differ.
             Dense keypoints come in the order of rows and columns, on pixel centres unless
             `subpixel`; points come best first, with sub-pixel positions and sizes.
 
