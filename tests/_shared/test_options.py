@@ -234,3 +234,9 @@ def test_an_unknown_keyword_of_anything_public_is_an_option_error(name: str) -> 
     assert "did you mean" in str(caught.value)
     for each in known:
         assert each in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", OPTIONS, ids=lambda kind: kind.__name__)
+def test_an_unknown_field_of_any_options_is_an_option_error(kind: type) -> None:
+    with pytest.raises(OptionError, match=r"unknown option 'seeed'.*\(known: "):
+        kind(seeed=1)

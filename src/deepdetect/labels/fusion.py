@@ -112,6 +112,7 @@ def _luma(image: Any, channels: Channels) -> np.ndarray:
     return luma(load_image(image, channels=channels))
 
 
+@suggest_keywords
 def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
     """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
 

@@ -213,6 +213,7 @@ class TrainingOptions:
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class DeviceOptions:
     """How the network is run, which does not change the recipe.
@@ -304,6 +305,7 @@ PRESETS: dict[str, TrainingOptions] = {
 }
 
 
+@suggest_keywords
 def training_preset(name: str) -> TrainingOptions:
     """Look a recipe up by its name.
 

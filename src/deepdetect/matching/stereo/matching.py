@@ -26,6 +26,7 @@ from .refinement import DisparityRefinementOptions, refine_disparity
 from .sgm import DisparityRange, SGMOptions, is_textured, semi_global_matching
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RangeSearchOptions:
     """How the range of disparities is found, on a small copy of the pair.
