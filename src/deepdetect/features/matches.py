@@ -118,9 +118,9 @@ class Matches:
         indices0, indices1: (M,) int32 rows of `keypoints0` and `keypoints1`: the keypoints that are
             matched. Exactly they, unguided and where a homography guided. Where a fundamental
             matrix guided, the first is the keypoint on whose pixel the match lies, and the second
-            the one nearest to it, up to a pixel away: -1 where there is none, so `m[m.indices1 >=
-            0]` are the matches of keypoints (with `mutual` it may be the other way round). None:
-            the nearest ones are looked up.
+            the one nearest to it, up to a pixel away: -1 where there is none, and
+            `m[m.indices1 >= 0]` are the others (with `mutual` it may be the other way round).
+            None: the nearest ones are looked up.
 
     A detector finds the same keypoints in an image whatever it is matched with, so for the same
     options the same index is the same keypoint in all pairs of an image: tracks chain by them.
