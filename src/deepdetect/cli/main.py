@@ -17,6 +17,7 @@ from .demo import demo
 from .detect import detect
 from .evaluate import evaluate
 from .evaluate_stereo import evaluate_stereo
+from .export import export
 from .label import label
 from .match import match
 from .reconstruct import reconstruct
@@ -113,6 +114,7 @@ for command in (
     train,
     train_points,
     average,
+    export,
     datasets,
     evaluate,
     evaluate_stereo,
