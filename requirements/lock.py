@@ -56,7 +56,7 @@ LOCK_FILES = (
     LockFile(
         "opencv4.txt",
         groups=("build", "test"),
-        extras=("benchmark", "demo"),
+        extras=("benchmark", "demo", "onnx"),
         overrides="requirements/opencv4.in",
     ),
     LockFile("lowest.txt", groups=("build", "test"), extras=ALL_EXTRAS, lowest=True),
