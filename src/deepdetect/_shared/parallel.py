@@ -26,7 +26,7 @@ from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from .errors import DeepDetectError, OptionError
 
@@ -39,9 +39,28 @@ PARTS_PER_THREAD = 4
 DEFAULT_MEMORY = 4_000_000_000
 """Bytes assumed where the system does not say."""
 
+_THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""What libraries take the number of their threads from when they are loaded."""
+
+_max_threads: int | None = None
+"""Of this process, in `parallel_for`; None: one per processor."""
+
 # M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no mappings, no trimming, room for more.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
 _MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD
+
+
+class TaskMap(Protocol):
+    """Applies a function to many tasks: `map_in_processes`, or what does the same on a cluster."""
+
+    def __call__(
+        self,
+        function: Callable[[Task], Outcome],
+        tasks: Sequence[Task],
+        workers: int | None = None,
+    ) -> Iterator[Outcome]:
+        """Yield the outcome of each task once, in the order in which they are ready."""
+        ...
 
 
 def processor_count() -> int:
@@ -57,7 +76,7 @@ def map_in_processes(
     """Apply a function to every task in several processes.
 
     Args:
-        function: a module-level function; it runs with one OpenCV thread.
+        function: a module-level function; it runs on one thread.
         tasks: its arguments, which are pickled for the workers.
         workers: number of processes; default one per processor. With 1 the work is done in this
             process.
@@ -85,7 +104,7 @@ def map_in_processes(
     remaining = iter(tasks)
 
     def submit(places: Iterable[object]) -> set[Future[Outcome]]:
-        with _interrupts_held():  # processes are started, which inherit it
+        with _interrupts_held(), _one_thread_inherited():  # by the processes that are started
             return {
                 pool.submit(_run_task, function, task)
                 for _, task in zip(places, remaining, strict=False)
@@ -125,6 +144,18 @@ def _interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@contextmanager
+def _one_thread_inherited() -> Iterator[None]:
+    """Let libraries in processes that are started take one thread, unless the user says more."""
+    unset = [name for name in _THREAD_VARIABLES if name not in os.environ]
+    os.environ.update(dict.fromkeys(unset, "1"))
+    try:
+        yield
+    finally:
+        for name in unset:
+            os.environ.pop(name, None)
+
+
 class _Interrupts:
     """What Ctrl-C, which all processes of a terminal get, does to a worker: it ends its task."""
 
@@ -157,17 +188,23 @@ def _run_task(function: Callable[[Task], Outcome], task: Task) -> Outcome:
 
 
 def _start_worker(ended: Any) -> None:
-    """Prepare a worker: one OpenCV thread, freed memory is kept, and it ends with the parent."""
+    """Prepare a worker: one thread, freed memory is kept, and it ends with the parent."""
     _interrupts.ended = ended
     signal.signal(signal.SIGINT, _interrupts.handle)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+    use_one_thread()
+    disable_malloc_trim()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
+
+def use_one_thread() -> None:
+    """Let OpenCV and `parallel_for` use one thread from now on: this process is one of many."""
+    global _max_threads
     import cv2
 
     cv2.setNumThreads(1)
-    disable_malloc_trim()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _max_threads = 1
 
 
 def _end_with_parent() -> None:
@@ -192,6 +229,8 @@ def _one_opencv_thread() -> Iterator[None]:
 def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> None:
     """Call a function for parts of a range, in as many threads as there are processors.
 
+    In a worker of `map_in_processes` it is one thread.
+
     Args:
         count: length of the range.
         work: called with (start, stop, *arguments) for each part. It should release the GIL, and
@@ -204,7 +243,7 @@ def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> No
         >>> sorted(done) == list(range(10))
         True
     """
-    threads = min(processor_count(), count)
+    threads = min(_max_threads or processor_count(), count)
     if threads <= 1:
         work(0, count, *arguments)
         return

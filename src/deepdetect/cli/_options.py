@@ -104,6 +104,18 @@ workers_option = click.option(
     type=click.IntRange(min=1),
     help="Processes that make labels.  [default: one a processor]",
 )
+processes_option = click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    help="Processes at work.  [default: one per processor of the machine or cluster]",
+)
+engine_option = click.option(
+    "--engine",
+    metavar="NAME",
+    default="processes",
+    show_default=True,
+    help="What does the work: processes of this machine, or ray for a cluster (RAY_ADDRESS).",
+)
 label_settings_option = click.option(
     "--label-settings",
     metavar="NAME|FILE.toml",

@@ -12,6 +12,7 @@ from .._shared.errors import OptionError
 from ._options import (
     PATH,
     chosen_label_settings,
+    engine_option,
     expand_images,
     json_option,
     label_settings_option,
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 )
 @click.option("--visualize", is_flag=True, help="Also write STEM_labels.png, the paper's Figure 4.")
 @overwrite_option
+@engine_option
 @workers_option
 @json_option
 def label(
@@ -54,6 +56,7 @@ def label(
     visibility: VisibilityChoice,
     visualize: bool,
     overwrite: bool,
+    engine: str,
     workers: int | None,
     as_json: bool,
 ) -> None:
@@ -69,6 +72,7 @@ def label(
     deepdetect label photo.jpg -o masks --detectors fast,sobel --visualize
     """
     from .._shared.progress import progress
+    from ..batch.engines import get_engine
     from ..labels import LabelOptions
     from ..labels.batch import (
         LabelTarget,
@@ -90,7 +94,7 @@ def label(
     _check_outputs(tasks, overwrite)
     left = tasks if overwrite else unfinished_tasks(tasks)
     with progress(len(left), "labelling", "image") as bar:
-        reports = label_files(left, workers, lambda _: bar.update(1))
+        reports = label_files(left, workers, lambda _: bar.update(1), get_engine(engine))
     done = [report for report in reports if report.error is None]
     failures = [report.error for report in reports if report.error is not None]
     mean = sum(report.density for report in done) / len(done) if done else None

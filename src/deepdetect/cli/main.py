@@ -18,8 +18,10 @@ from .detect import detect
 from .evaluate import evaluate
 from .evaluate_stereo import evaluate_stereo
 from .export import export
+from .extract import extract
 from .label import label
 from .match import match
+from .match_many import match_many
 from .reconstruct import reconstruct
 from .register import register
 from .shards import shards
@@ -109,6 +111,8 @@ for command in (
     register,
     stitch,
     reconstruct,
+    extract,
+    match_many,
     label,
     shards,
     train,

@@ -12,6 +12,7 @@ from ._options import (
     PATH,
     SHARDS,
     chosen_recipe,
+    engine_option,
     json_option,
     print_result,
     recipe_options,
@@ -25,6 +26,7 @@ WRITING = FieldOptions("training.shards:write_shards", names=("shard_size",))
 @click.argument("images", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="Folder for the shards.")
 @recipe_options
+@engine_option
 @workers_option
 @json_option
 def shards(
@@ -33,6 +35,7 @@ def shards(
     preset: str,
     detectors: str | None,
     label_settings: str | None,
+    engine: str,
     workers: int | None,
     as_json: bool,
     **values: Any,
@@ -47,13 +50,22 @@ def shards(
     deepdetect shards --preset paper data/coco -o data/shards
     deepdetect train --preset paper data/shards -o run
     """
+    from ..batch.engines import get_engine
     from ..training import Stage, write_shards
 
     # Shards are for any stages: one that fits every size stands for them.
     values["stages"] = (Stage(16, 1, 1),)
     chosen = given_only({name: values.pop(name) for name in WRITING.names})
     options = chosen_recipe(preset, detectors, label_settings, values)
-    made = write_shards(images, output, options, workers=workers, quiet=as_json, **chosen)
+    made = write_shards(
+        images,
+        output,
+        options,
+        workers=workers,
+        quiet=as_json,
+        map_tasks=get_engine(engine),
+        **chosen,
+    )
     counts = {
         kind: sum(count for _, count in files)
         for kind, files in (("training", made.training), ("validation", made.validation))

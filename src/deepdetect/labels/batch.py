@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import DeepDetectError
-from .._shared.parallel import map_in_processes
+from .._shared.parallel import TaskMap, map_in_processes
 from ..io.image import load_image, luma
 from ..io.masks import load_mask_settings, save_mask
 from ..viz.draw import save_picture
@@ -122,6 +122,7 @@ def label_files(
     tasks: Sequence[LabelTask],
     workers: int | None = None,
     callback: Callable[[LabelReport], None] | None = None,
+    map_tasks: TaskMap = map_in_processes,
 ) -> list[LabelReport]:
     """Label image files, in parallel over processes.
 
@@ -132,6 +133,7 @@ def label_files(
         tasks: the images and their masks.
         workers: number of processes; default one per processor.
         callback: called after each mask.
+        map_tasks: what runs them, where it is not the processes of this machine.
 
     Returns:
         One report per mask, in order of completion.
@@ -141,7 +143,7 @@ def label_files(
         DeepDetectError: a worker process died, or a mask cannot be written.
     """
     reports = []
-    for made in map_in_processes(label_file, tasks, workers):
+    for made in map_tasks(label_file, tasks, workers):
         for report in made:
             if callback is not None:
                 callback(report)

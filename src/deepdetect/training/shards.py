@@ -25,7 +25,7 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, ImageError, OptionError
 from .._shared.options import suggest_keywords
-from .._shared.parallel import map_in_processes
+from .._shared.parallel import TaskMap, map_in_processes
 from .._shared.progress import progress
 from .._shared.text_files import read_json
 from ..io.image import load_image
@@ -142,6 +142,7 @@ def write_shards(
     shard_size: int = 256,
     workers: int | None = None,
     quiet: bool = True,
+    map_tasks: TaskMap = map_in_processes,
 ) -> Shards:
     """Write images with their labels into shards, in parallel over processes.
 
@@ -155,6 +156,7 @@ def write_shards(
         shard_size: about this many images go into a shard.
         workers: number of processes; default one per processor.
         quiet: show no progress bar.
+        map_tasks: what runs the work, where it is not the processes of this machine.
 
     Raises:
         ImageError: the folder is missing, or has too few images.
@@ -188,7 +190,7 @@ def write_shards(
     failures: list[str] = []
     total = sum(len(task.images) for _, task in tasks)
     with progress(total, "shards", "image", quiet) as bar:
-        for count, unread in map_in_processes(_write_shard, tasks, workers):
+        for count, unread in map_tasks(_write_shard, tasks, workers):
             bar.update(count)
             failures += unread
     if failures:

@@ -1,0 +1,297 @@
+"""Features of all photographs below a folder, in a file of hloc's layout.
+
+https://github.com/cvg/Hierarchical-Localization stores them so; its pixels are ours.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from .._shared.errors import (
+    BatchError,
+    DeepDetectError,
+    MissingExtraError,
+    OptionError,
+    WeightsError,
+)
+from .._shared.options import suggest_keywords
+from .._shared.parallel import TaskMap
+from .._shared.progress import progress
+from .._shared.registry import is_path
+from ..detector.detector import DeepDetect
+from ..detector.heatmap import MAX_AUTO_PIXELS
+from ..features.keypoints import Keypoints
+from ..features.selection import SelectionOptions
+from ..features.sift import described_at_own_size, root_sift_descriptors
+from ..io.image import find_images, load_image, luma
+from .engines import get_engine
+from .parted_file import Group, PartedFile, write_groups
+
+MAX_KEYPOINTS = 2048
+"""Of an image, where nothing else is asked for."""
+
+IMAGES_PER_PART = 16
+"""At most: what a killed worker loses, against the number of files."""
+
+MIN_PARTS = 256
+"""Of a collection that has as many images, so that all workers have something to do."""
+
+DESCRIPTOR = "rootsift"
+
+
+@dataclass(frozen=True)
+class ExtractionReport:
+    """What was extracted.
+
+    Attributes:
+        path: the file.
+        images: names of the images whose features were extracted now.
+        skipped: number of images that had been done before.
+        keypoints: of the images that were done now, together.
+        failures: a sentence on each image that could not be worked on.
+    """
+
+    path: Path
+    images: tuple[str, ...]
+    skipped: int
+    keypoints: int
+    failures: tuple[str, ...]
+
+    def check(self) -> None:
+        """Raise a BatchError where images failed."""
+        if self.failures:
+            total = len(self.images) + self.skipped + len(self.failures)
+            raise BatchError(
+                f"{len(self.failures)} of {total} images failed, the others are done", self.failures
+            )
+
+
+@suggest_keywords
+def extract_features(
+    folder: str | Path,
+    path: str | Path,
+    *,
+    selection: SelectionOptions = SelectionOptions(max_keypoints=MAX_KEYPOINTS),
+    detector: Mapping[str, Any] | None = None,
+    engine: str = "processes",
+    workers: int | None = None,
+    overwrite: bool = False,
+    quiet: bool = True,
+) -> ExtractionReport:
+    """Extract the features of all images below a folder into an HDF5 file of hloc's layout.
+
+    Each image has a group with its path below the folder as name, as "db/1.jpg". In it are
+    `keypoints` (N, 2) float32, x right and y down in pixels, centre of the first pixel (0, 0), with
+    the attribute `uncertainty` in pixels; `descriptors` (128, N) float32, RootSIFT of length 1;
+    `scores` (N,) float32, the higher the better; `image_size` (width, height) int32; and of
+    keypoints with sizes and angles `scales` (N,) float32, sigma in pixels (half the size), and
+    `oris` (N,) float32 in degrees.
+
+    A call that is interrupted or killed goes on when it is made again; images that are done and
+    have not changed are skipped, new ones are added. A script must call this under
+    `if __name__ == "__main__":`, since processes are started.
+
+    Args:
+        folder: of the images.
+        path: the file.
+        selection: which keypoints.
+        detector: arguments of `DeepDetect`. Its threads are 1 unless they are given.
+        engine: "processes" of this machine, or "ray" for a cluster.
+        workers: number of processes; default one per processor.
+        overwrite: replace the file.
+        quiet: show no progress bar.
+
+    Returns:
+        What was done. An image that cannot be read does not stop the others: see `failures`.
+
+    Raises:
+        ImageError: the folder is missing, or holds no image.
+        OptionError: an option is unknown; or the file exists, made with other settings.
+        MissingExtraError: h5py, or what the engine needs, is not installed.
+        DeepDetectError: the file cannot be written.
+
+    Example:
+        >>> if __name__ == "__main__":  # doctest: +SKIP
+        ...     extract_features("photos", "features.h5").check()
+    """
+    map_tasks: TaskMap = get_engine(engine)
+    if selection.ignore is not None:
+        raise OptionError("one mask does not fit many images: leave out `ignore`")
+    arguments = _portable({"threads": 1, **(detector or {})})
+    root, target = Path(folder).absolute(), Path(path).absolute()
+    names = [image.relative_to(root).as_posix() for image in find_images(root)]
+    failures = [f"{name}: its name is not UTF-8: rename it" for name in names if not _is_utf8(name)]
+    states = {name: _state(root / name) for name in names if _is_utf8(name)}
+    file = PartedFile(target, _settings(selection, arguments), overwrite)
+    work = partial(_extract_part, root=root, selection=selection, detector=tuple(arguments.items()))
+    done_now: list[str] = []
+    keypoints = 0
+    with file.opened():
+        done = file.done(states.items())
+        left = [name for name in states if name not in done]
+        tasks = [
+            (file.part(part), tuple((name, states[name]) for name in part))
+            for part in parts_of(left, IMAGES_PER_PART)
+        ]
+        with progress(len(states), "extracting", "image", quiet, len(done)) as bar:
+            for counts, failed in map_tasks(work, tasks, workers):
+                bar.update(len(counts) + len(failed))
+                done_now += counts
+                keypoints += sum(counts.values())
+                failures += failed
+        file.merge(quiet)
+    return ExtractionReport(
+        Path(path), tuple(sorted(done_now)), len(done), keypoints, tuple(sorted(failures))
+    )
+
+
+def parts_of(names: Sequence[Any], most: int) -> list[Sequence[Any]]:
+    """Divide what is to be done into parts of at most so many, and of fewer where it is little."""
+    size = min(most, max(1, len(names) // MIN_PARTS))
+    return [names[k : k + size] for k in range(0, len(names), size)]
+
+
+def _portable(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Make paths in the arguments of a detector absolute; names are the same on all machines."""
+    return {
+        name: str(Path(value).absolute())
+        if name in ("weights", "ranker") and value is not None and is_path(value)
+        else value
+        for name, value in arguments.items()
+    }
+
+
+def _settings(selection: SelectionOptions, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what features depend on besides the images; wrong arguments are an error here."""
+    detector = DeepDetect(**arguments)
+    options = {name: value for name, value in vars(selection).items() if name != "ignore"}
+    return {
+        **options,
+        "descriptor": DESCRIPTOR,
+        "weights": _digest(detector.weights),
+        "ranker": _digest(detector.ranker),
+        "resolution": detector.heatmap_options.resolution,
+        "tta": detector.heatmap_options.tta,
+        "backend": detector.backend,
+        "version": __version__,
+    }
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _is_utf8(name: str) -> bool:
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    """Return an image's size in bytes and the time of its last change."""
+    try:
+        found = path.stat()
+    except OSError:  # removed meanwhile; reading it will say so
+        return (0, 0)
+    return (found.st_size, found.st_mtime_ns)
+
+
+Task = tuple[Path, tuple[tuple[str, tuple[int, ...]], ...]]
+
+
+def _extract_part(
+    task: Task, root: Path, selection: SelectionOptions, detector: tuple[tuple[str, Any], ...]
+) -> tuple[dict[str, int], list[str]]:
+    """Write a part; return the number of keypoints by image, and what could not be done."""
+    path, images = task
+    counts: dict[str, int] = {}
+    failures: list[str] = []
+
+    def groups() -> Iterator[Group]:
+        for name, state in images:
+            try:
+                keypoints, uncertainty = _features_of(root / name, selection, _detector(detector))
+            except (MissingExtraError, WeightsError):  # concern all images
+                raise
+            except DeepDetectError as error:
+                failures.append(str(error) if name in str(error) else f"{name}: {error}")
+                continue
+            except MemoryError:
+                failures.append(f"{name}: there is not enough memory for it: use a smaller image")
+                continue
+            yield feature_group(name, keypoints, state, uncertainty)
+            counts[name] = len(keypoints)
+
+    write_groups(path, groups())
+    return counts, failures
+
+
+@lru_cache(maxsize=1)
+def _detector(arguments: tuple[tuple[str, Any], ...]) -> DeepDetect:
+    return DeepDetect(**dict(arguments))
+
+
+def _features_of(
+    path: Path, selection: SelectionOptions, detector: DeepDetect
+) -> tuple[Keypoints, float]:
+    """Return described keypoints of an image file, and the size of a pixel that they were found on.
+
+    Raises:
+        DeepDetectError: the image cannot be worked on.
+    """
+    rgb = load_image(path)
+    options = {name: value for name, value in vars(selection).items() if name != "ignore"}
+    keypoints = detector.detect(rgb, **options)
+    gray = luma(rgb)
+    scaled = detector.heatmap_options.resolution != "native" and gray.size > MAX_AUTO_PIXELS
+    uncertainty = math.sqrt(gray.size / MAX_AUTO_PIXELS) if scaled else 1.0
+    if keypoints.sizes is not None and keypoints.angles is not None:
+        return described_at_own_size(gray, keypoints), uncertainty
+    found = root_sift_descriptors(gray, keypoints.xy)
+    return replace(keypoints, descriptors=found), uncertainty
+
+
+def feature_group(
+    name: str, keypoints: Keypoints, state: tuple[int, ...] = (), uncertainty: float = 1.0
+) -> Group:
+    """Return hloc's group of an image.
+
+    Args:
+        name: of the image.
+        keypoints: with descriptors.
+        state: of the image.
+        uncertainty: of the positions in pixels.
+
+    Example:
+        >>> keypoints = Keypoints([[3, 4]], [0.9], (8, 6), descriptors=np.full((1, 128), 45, "u1"))
+        >>> group = feature_group("a.jpg", keypoints)
+        >>> group.arrays["descriptors"].shape, float(np.linalg.norm(group.arrays["descriptors"]))
+        ((128, 1), 1.0)
+    """
+    found = keypoints.descriptors
+    if found is None:
+        raise OptionError("features need keypoints with descriptors: describe them first")
+    descriptors = found.astype(np.float32)
+    norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
+    descriptors /= np.where(norms > 0, norms, 1)
+    arrays = {
+        "keypoints": keypoints.xy,
+        "descriptors": np.ascontiguousarray(descriptors.T),
+        "scores": keypoints.scores,
+        "image_size": np.array(keypoints.image_size, np.int32),
+    }
+    if keypoints.sizes is not None and keypoints.angles is not None:
+        arrays |= {"scales": keypoints.sizes / 2, "oris": keypoints.angles}
+    return Group(name, arrays, state, {"keypoints": {"uncertainty": np.float32(uncertainty)}})

@@ -1,0 +1,331 @@
+"""Matches of many pairs of images, in a file of hloc's layout."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import __version__
+from .._shared.errors import BatchError, DeepDetectError, OptionError
+from .._shared.options import check_ranges, suggest_keywords
+from .._shared.parallel import TaskMap
+from .._shared.progress import progress
+from ..features.matchers import get_matcher, match_descriptors
+from ..geometry import GeometryOptions, estimate_geometry
+from .engines import get_engine
+from .extraction import DESCRIPTOR, parts_of
+from .parted_file import SETTINGS, Group, PartedFile, open_hdf5, state_of, write_groups
+
+PAIRS_PER_PART = 64
+"""At most."""
+
+ROOT_SIFT_NORM = 512
+"""Length of RootSIFT descriptors as bytes."""
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class PairMatchingOptions:
+    """How the features of two images are matched.
+
+    Attributes:
+        ratio: of the ratio test: the best distance must be below this share of the second-best.
+        mutual: keep only mutual nearest neighbours.
+        matcher: name of the matcher: "auto", "exact", "patchmatch", "flann" or "faiss".
+        verify: keep only the matches that agree with a geometry that is estimated from them:
+            "fundamental", "homography", "auto" (one of both), or "none" for all matches.
+        inlier_threshold: of this geometry, in pixels.
+        seed: of the estimation, and of matchers that are random.
+
+    Raises:
+        OptionError: a value is unknown or out of its range.
+    """
+
+    ratio: float = 0.85
+    mutual: bool = True
+    matcher: str = "auto"
+    verify: str = "none"
+    inlier_threshold: float = GeometryOptions.inlier_threshold
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self, positive=("inlier_threshold",), not_negative=("seed",), fractions=("ratio",)
+        )
+        get_matcher(self.matcher)
+        if self.verify == "essential":
+            raise OptionError("`verify` knows no cameras: use fundamental, homography or auto")
+        self.geometry()
+
+    def geometry(self) -> GeometryOptions:
+        """Return the options of the verifying geometry."""
+        return GeometryOptions(
+            model=self.verify, inlier_threshold=self.inlier_threshold, seed=self.seed
+        )
+
+
+@dataclass(frozen=True)
+class PairMatchingReport:
+    """What was matched.
+
+    Attributes:
+        path: the file.
+        matches: number of matches of each pair that was matched now.
+        skipped: number of pairs that had been done before.
+        failures: a sentence on each pair that could not be matched.
+    """
+
+    path: Path
+    matches: dict[Pair, int] = field(repr=False)
+    skipped: int
+    failures: tuple[str, ...]
+
+    def check(self) -> None:
+        """Raise a BatchError where pairs failed."""
+        if self.failures:
+            total = len(self.matches) + self.skipped + len(self.failures)
+            raise BatchError(
+                f"{len(self.failures)} of {total} pairs failed, the others are done", self.failures
+            )
+
+
+def pair_name(name0: str, name1: str) -> str:
+    """Return the path of a pair's group in a file of matches, as hloc makes it.
+
+    Example:
+        >>> pair_name("db/1.jpg", "query/2.jpg")
+        'db-1.jpg/query-2.jpg'
+    """
+    return "/".join(name.replace("/", "-") for name in (name0, name1))
+
+
+def read_pairs(path: str | Path) -> list[Pair]:
+    """Read a list of pairs: two names of images on each line, with a blank or a tab between.
+
+    A pair that is there twice, or also the other way round, is taken once, as it is there first.
+
+    Raises:
+        DeepDetectError: the file is missing or empty, or a line is something else.
+    """
+    pairs: dict[Pair, None] = {}
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DeepDetectError(f"{path} cannot be read ({error}): check the file") from None
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip():
+            continue
+        names = line.strip().split("\t") if "\t" in line.strip() else line.split()
+        if len(names) != 2 or names[0] == names[1]:
+            raise DeepDetectError(
+                f"line {number} of {path} is no pair: give the names of two images, with a blank "
+                "between, or a tab where they have blanks themselves"
+            )
+        pair = (names[0], names[1])
+        if pair[::-1] not in pairs:
+            pairs[pair] = None
+    if not pairs:
+        raise DeepDetectError(f"{path} has no pairs: give the names of two images on each line")
+    return list(pairs)
+
+
+@suggest_keywords
+def match_pairs(
+    features: str | Path,
+    pairs: str | Path | Sequence[Pair],
+    path: str | Path,
+    *,
+    options: PairMatchingOptions = PairMatchingOptions(),
+    engine: str = "processes",
+    workers: int | None = None,
+    overwrite: bool = False,
+    quiet: bool = True,
+) -> PairMatchingReport:
+    """Match the features of pairs of images, into an HDF5 file of hloc's layout.
+
+    Each pair has a group NAME0/NAME1, with "-" for each "/" in the names. In it are
+    `matches0` (N0,) int32, for each keypoint of the first image its match in the second, -1 where
+    it has none; and `matching_scores0` (N0,) float32 in [0, 1], 1 - Lowe's ratio.
+
+    A call that is interrupted or killed goes on when it is made again; pairs that are done and
+    whose features have not changed are skipped, new ones are added. A script must call this under
+    `if __name__ == "__main__":`, since processes are started.
+
+    Args:
+        features: file of `extract_features`, or of hloc.
+        pairs: of names, or a text file with one on each line.
+        path: the file.
+        options: how they are matched.
+        engine: "processes" of this machine, or "ray" for a cluster.
+        workers: number of processes; default one per processor.
+        overwrite: replace the file.
+        quiet: show no progress bar.
+
+    Returns:
+        What was done. A pair without features does not stop the others: see `failures`.
+
+    Raises:
+        OptionError: an option is unknown; or the file exists, made with other settings.
+        MissingExtraError: h5py, or what the engine needs, is not installed.
+        DeepDetectError: a file cannot be read or written.
+
+    Example:
+        >>> if __name__ == "__main__":  # doctest: +SKIP
+        ...     match_pairs("features.h5", "pairs.txt", "matches.h5").check()
+    """
+    map_tasks: TaskMap = get_engine(engine)
+    listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else list(pairs)
+    source, target = Path(features).absolute(), Path(path).absolute()
+    if source == target:
+        raise OptionError(f"{path} holds the features: give the matches another file with -o")
+    wanted = _find_pairs(source, listed)
+    settings = {**vars(options), "features": wanted.settings, "version": __version__}
+    file = PartedFile(target, settings, overwrite)
+    work = partial(_match_part, features=source, options=options)
+    matches: dict[Pair, int] = {}
+    with file.opened():
+        done = file.done((pair_name(*pair), sum(states, ())) for pair, states in wanted.found)
+        done |= file.done(
+            (pair_name(*pair[::-1]), sum(states[::-1], ())) for pair, states in wanted.found
+        )
+        left = [
+            (pair, sum(states, ()))
+            for pair, states in wanted.found
+            if not {pair_name(*pair), pair_name(*pair[::-1])} & done
+        ]
+        tasks = [
+            (file.part([pair_name(*pair) for pair, _ in part]), tuple(part))
+            for part in parts_of(sorted(left), PAIRS_PER_PART)
+        ]
+        skipped = len(wanted.found) - len(left)
+        with progress(len(wanted.found), "matching", "pair", quiet, skipped) as bar:
+            for counts in map_tasks(work, tasks, workers):
+                bar.update(len(counts))
+                matches |= counts
+        file.merge(quiet)
+    return PairMatchingReport(Path(path), matches, skipped, wanted.failures)
+
+
+States = tuple[tuple[int, ...], tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """Pairs that can be matched, with the states of their features; and what others lack."""
+
+    settings: str
+    found: tuple[tuple[Pair, States], ...]
+    failures: tuple[str, ...]
+
+
+def _find_pairs(features: Path, pairs: Sequence[Pair]) -> _Wanted:
+    """Look for the features of pairs."""
+    known: dict[str, tuple[int, ...] | None] = {}
+    found: list[tuple[Pair, States]] = []
+    failures: list[str] = []
+    taken: dict[str, Pair] = {}
+    with open_hdf5(features) as file:
+        settings = hashlib.sha256(str(file.attrs.get(SETTINGS)).encode()).hexdigest()[:16]
+        for pair in pairs:
+            for name in pair:
+                if name not in known:
+                    known[name] = _state(file, name)
+            states = known[pair[0]], known[pair[1]]
+            name = pair_name(*pair)
+            if states[0] is None or states[1] is None:
+                lacking = pair[0] if states[0] is None else pair[1]
+                failures.append(f"{' '.join(pair)}: {features.name} has no features of {lacking}")
+            elif taken.setdefault(name, pair) != pair:
+                failures.append(
+                    f"{' '.join(pair)}: its group {name} is that of {' '.join(taken[name])}, too: "
+                    "rename an image"
+                )
+            else:
+                found.append((pair, (states[0], states[1])))
+    return _Wanted(settings, tuple(found), tuple(failures))
+
+
+def _state(file: Any, name: str) -> tuple[int, ...] | None:
+    """Return what changes when the features of an image do, None where there are none."""
+    if name not in file or not {"keypoints", "descriptors"} <= set(file[name]):
+        return None
+    return state_of(file[name]) or (len(file[name]["keypoints"]),)
+
+
+Task = tuple[Path, tuple[tuple[Pair, tuple[int, ...]], ...]]
+
+
+def _match_part(task: Task, features: Path, options: PairMatchingOptions) -> dict[Pair, int]:
+    """Write a part; return the number of matches of each pair."""
+    path, pairs = task
+    counts: dict[Pair, int] = {}
+
+    def groups() -> Iterator[Group]:
+        with open_hdf5(features) as file:
+            held: tuple[str, Features] | None = None  # pairs are sorted by their first image
+            for (name0, name1), state in pairs:
+                if held is None or held[0] != name0:
+                    held = name0, _read_features(file, name0)
+                matches, scores = match_features(held[1], _read_features(file, name1), options)
+                counts[name0, name1] = int(np.count_nonzero(matches >= 0))
+                arrays = {"matches0": matches, "matching_scores0": scores}
+                yield Group(pair_name(name0, name1), arrays, state)
+
+    write_groups(path, groups())
+    return counts
+
+
+Features = tuple[np.ndarray, np.ndarray]
+
+
+def _read_features(file: Any, name: str) -> Features:
+    """Return positions (N, 2) and descriptors (N, D), as bytes where that is what they were."""
+    group = file[name]
+    descriptors = np.ascontiguousarray(group["descriptors"][()].T, np.float32)
+    if DESCRIPTOR in str(file.attrs.get(SETTINGS, "")):
+        descriptors = np.rint(descriptors * ROOT_SIFT_NORM).clip(0, 255).astype(np.uint8)
+    return group["keypoints"][()].astype(np.float32), descriptors
+
+
+def match_features(
+    features0: Features, features1: Features, options: PairMatchingOptions = PairMatchingOptions()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Match the features of two images.
+
+    Args:
+        features0, features1: positions (N, 2) in pixels, and descriptors (N, D) uint8 or float32.
+        options: how.
+
+    Returns:
+        (N0,) int32 rows of the second image, -1 where there is no match, and (N0,) float32 scores.
+
+    Example:
+        >>> features = np.array([[1, 2], [3, 4], [5, 6]], np.float32), np.eye(3, dtype=np.float32)
+        >>> match_features(features, (features[0], features[1][::-1]))[0].tolist()
+        [2, 1, 0]
+    """
+    found = match_descriptors(
+        features0[1],
+        features1[1],
+        get_matcher(options.matcher),
+        ratio=options.ratio,
+        mutual=options.mutual,
+        seed=options.seed,
+        positions=(np.rint(features0[0]), np.rint(features1[0])),
+    )
+    rows0, rows1, ratios = found.rows0, found.rows1, found.ratios
+    if options.verify != "none":
+        points0, points1 = features0[0][rows0], features1[0][rows1]
+        kept = estimate_geometry(points0, points1, options.geometry()).inliers
+        rows0, rows1, ratios = rows0[kept], rows1[kept], ratios[kept]
+    matches = np.full(len(features0[0]), -1, np.int32)
+    scores = np.zeros(len(features0[0]), np.float32)
+    matches[rows0], scores[rows0] = rows1, 1 - ratios
+    return matches, scores

@@ -1,0 +1,290 @@
+"""HDF5 files that many processes fill, and that survive being killed.
+
+HDF5 has one writer, and a file whose writer is killed may be lost. So each task writes a small
+file of its own, a part, under a temporary name that becomes final when the part is whole. At the
+end one process merges the parts into a copy of the file, which takes the file's place when it is
+whole, and removes them. Whatever is killed, what is in parts or in the file stays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import DeepDetectError, MissingExtraError, OptionError
+from .._shared.progress import progress
+
+SETTINGS = "deepdetect"
+"""Attribute of the file: what its content depends on besides the inputs, as JSON."""
+
+STATE = "source_state"
+"""Attribute of a group: whole numbers that change when its input does."""
+
+FORMAT = ("v110", "v110")
+"""Of the files: read by HDF5 1.10 (2016) and later; groups of a million members stay fast."""
+
+SETTINGS_FILE = "settings.json"
+LOCK_FILE = "lock"
+
+
+@dataclass(frozen=True)
+class Group:
+    """A group of an HDF5 file.
+
+    Attributes:
+        name: its path in the file.
+        arrays: its datasets by name.
+        state: of its input.
+        attributes: of datasets, by the name of the dataset.
+    """
+
+    name: str
+    arrays: Mapping[str, np.ndarray]
+    state: tuple[int, ...] = ()
+    attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+def import_h5py() -> Any:
+    """Import h5py.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        import h5py
+    except ImportError:
+        raise MissingExtraError(
+            "files of features and matches need h5py: pip install 'deepdetect[hdf5]'"
+        ) from None
+    return h5py
+
+
+@contextmanager
+def open_hdf5(path: Path) -> Iterator[Any]:
+    """Open an HDF5 file to read it.
+
+    Raises:
+        DeepDetectError: it is missing or damaged.
+        MissingExtraError: h5py is not installed.
+    """
+    h5py = import_h5py()
+    if not path.is_file():
+        raise DeepDetectError(f"there is no file {path}: check the path")
+    try:
+        # Nobody writes to a file under its final name, and network folders may know no locks.
+        file = h5py.File(path, "r", locking=False)
+    except OSError as error:
+        raise DeepDetectError(
+            f"{path} is no HDF5 file, or is damaged ({str(error).splitlines()[0]}): write it again"
+        ) from error
+    with file:
+        yield file
+
+
+def write_groups(path: Path, groups: Iterable[Group]) -> int:
+    """Write a file of groups, whole or not at all; return how many there are.
+
+    They are written one by one: an iterator needs the memory of one. Without any there is no file.
+
+    Raises:
+        DeepDetectError: it cannot be written.
+    """
+    h5py = import_h5py()
+    count = 0
+    with _unless_empty(), atomic_path(path) as temporary:
+        with h5py.File(temporary, "w", libver=FORMAT) as file:
+            for group in groups:
+                _write_group(file, group)
+                count += 1
+        if not count:
+            raise _Empty
+    return count
+
+
+class _Empty(Exception):
+    """There is nothing to be written."""
+
+
+@contextmanager
+def _unless_empty() -> Iterator[None]:
+    with contextlib.suppress(_Empty):
+        yield
+
+
+def _write_group(file: Any, group: Group) -> None:
+    made = file.create_group(group.name)
+    made.attrs[STATE] = np.array(group.state, np.int64)
+    for name, array in group.arrays.items():
+        dataset = made.create_dataset(name, data=array)
+        dataset.attrs.update(group.attributes.get(name, {}))
+
+
+def state_of(group: Any) -> tuple[int, ...]:
+    """Return the state of a group's input; empty where another program has written it."""
+    return tuple(int(number) for number in group.attrs.get(STATE, ()))
+
+
+class PartedFile:
+    """An HDF5 file, and the folder of parts that will be merged into it.
+
+    Args:
+        path: the file; the parts are in PATH.parts beside it.
+        settings: all that the content depends on besides the inputs, as JSON would give it back.
+        overwrite: replace whatever there is.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any], overwrite: bool = False) -> None:
+        self.path = path
+        self.parts = path.with_name(path.name + ".parts")
+        self.settings = json.loads(json.dumps(settings, default=str))
+        self.overwrite = overwrite
+        self._in_parts: dict[str, tuple[int, ...]] = {}
+
+    @contextmanager
+    def opened(self) -> Iterator[PartedFile]:
+        """Hold the file for this process: read which parts there are.
+
+        Raises:
+            OptionError: the file or its parts were made with other settings, by another program,
+                or are being made by another process.
+            DeepDetectError: the folder cannot be written, or the file is damaged.
+        """
+        import_h5py()
+        if self.path.exists() and not self.overwrite:
+            with open_hdf5(self.path) as file:
+                self._check(self.path, file.attrs.get(SETTINGS))
+        try:
+            self.parts.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DeepDetectError(
+                f"cannot write {self.parts} ({error.strerror}): choose another place with -o"
+            ) from error
+        with _locked(self.parts / LOCK_FILE, self.path):
+            noted = self.parts / SETTINGS_FILE
+            if self.overwrite:
+                for part in [noted, *self._part_files()]:
+                    part.unlink(missing_ok=True)
+            if noted.exists():
+                self._check(self.parts, noted.read_text(encoding="utf-8"))
+            else:
+                with atomic_path(noted) as temporary:
+                    temporary.write_text(json.dumps(self.settings), encoding="utf-8")
+            self._in_parts = {}
+            for part in self._part_files():
+                with open_hdf5(part) as file:
+                    for name, group in _leaves(file):
+                        self._in_parts[name] = state_of(group)
+            yield self
+
+    def done(self, wanted: Iterable[tuple[str, tuple[int, ...]]]) -> set[str]:
+        """Return which of the names are in the file or in parts with these states."""
+        wanted = list(wanted)
+        found = {name for name, state in wanted if self._in_parts.get(name) == state}
+        if not self.overwrite and self.path.exists():
+            with open_hdf5(self.path) as file:
+                for name, state in wanted:
+                    if name not in found and name in file and state_of(file[name]) == state:
+                        found.add(name)
+        return found
+
+    def part(self, names: Sequence[str]) -> Path:
+        """Return the file for the part with these groups: the same names give the same file."""
+        digest = hashlib.sha256("\n".join(names).encode("utf-8", "surrogateescape")).hexdigest()
+        return self.parts / f"{digest[:32]}.h5"
+
+    def merge(self, quiet: bool = True) -> None:
+        """Merge all parts into the file, and remove them.
+
+        Args:
+            quiet: show no progress bar.
+
+        Raises:
+            DeepDetectError: the file cannot be written; the parts stay.
+        """
+        h5py = import_h5py()
+        parts = self._part_files()
+        if parts:
+            with atomic_path(self.path) as temporary:
+                keep = self.path.exists() and not self.overwrite
+                if keep:
+                    shutil.copyfile(self.path, temporary)
+                with (
+                    progress(len(parts), "merging", "part", quiet) as bar,
+                    h5py.File(temporary, "r+" if keep else "w", libver=FORMAT) as merged,
+                ):
+                    merged.attrs[SETTINGS] = json.dumps(self.settings)
+                    for part in parts:
+                        _copy_groups(part, merged)
+                        bar.update(1)
+        with contextlib.suppress(OSError):  # what stays is merged again, to no effect
+            shutil.rmtree(self.parts)
+
+    def _part_files(self) -> list[Path]:
+        """List the parts, older ones first: newer ones replace what they hold."""
+        parts = [path for path in self.parts.glob("*.h5") if not path.name.startswith(".")]
+        return sorted(parts, key=lambda path: (path.stat().st_mtime_ns, path.name))
+
+    def _check(self, place: Path, noted: object) -> None:
+        try:
+            before = json.loads(str(noted))
+        except (ValueError, RecursionError):
+            before = None
+        advice = "choose another file with -o, or replace it with --overwrite"
+        if not isinstance(before, dict):
+            raise OptionError(f"{place} exists already, written by something else: {advice}")
+        names = {*before, *self.settings}
+        other = sorted(n for n in names if before.get(n, ...) != self.settings.get(n, ...))
+        if other:
+            listed = ", ".join(f"`{name}`" for name in other)
+            raise OptionError(
+                f"{place} exists already, made with other settings ({listed}): {advice}"
+            )
+
+
+def _copy_groups(part: Path, merged: Any) -> None:
+    """Copy the groups of a part, in the place of those of the same name."""
+    with open_hdf5(part) as file:
+        for name, group in _leaves(file):
+            if name in merged:
+                del merged[name]
+            file.copy(group, merged, name=name)
+
+
+def _leaves(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the groups that this package has written, with their paths."""
+    for name, member in group.items():
+        if STATE in member.attrs:
+            yield prefix + name, member
+        elif hasattr(member, "items"):
+            yield from _leaves(member, f"{prefix}{name}/")
+
+
+@contextmanager
+def _locked(path: Path, final: Path) -> Iterator[None]:
+    """Let one process at a time write a file; the system unlocks it when that ends."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OptionError(
+                f"{final} is being written by another process: wait for it, or choose another file "
+                "with -o"
+            ) from None
+        except OSError:  # a network folder without locks
+            pass
+        yield

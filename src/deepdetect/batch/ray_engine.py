@@ -1,0 +1,163 @@
+"""Tasks on a cluster, by Ray Data with a pool of actors.
+
+A worker that dies is started again, and its tasks are repeated: each outcome arrives once, but a
+function may run twice. So a function must write files under temporary names, and rename them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+from .._shared.errors import DeepDetectError, MissingExtraError, OptionError
+from .._shared.parallel import (
+    Outcome,
+    Task,
+    disable_malloc_trim,
+    processor_count,
+    use_one_thread,
+)
+
+MAX_BLOCKS = 4096
+"""Parts of the work that Ray schedules: each costs a few milliseconds, and is repeated as a whole
+where its worker dies."""
+
+MAX_RETRIES = 5
+"""Repetitions of a task whose worker died: an image that kills each of them ends the work."""
+
+OBJECT_STORE_BYTES = 200_000_000
+"""Shared memory of a cluster that is started here: outcomes are small, results go to files."""
+
+SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_BACKEND_LOG_LEVEL": "fatal",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else it warns
+}
+
+
+def map_on_ray(
+    function: Callable[[Task], Outcome], tasks: Sequence[Task], workers: int | None = None
+) -> Iterator[Outcome]:
+    """Apply a function to every task on a Ray cluster, in workers of one processor each.
+
+    The cluster is the one to which this process is connected, else the one that RAY_ADDRESS names
+    or that runs on this machine (`ray start`), else one that is started here and ends with the
+    work. All its machines need this package, and the files under the same paths.
+
+    Args:
+        function: a module-level function, which may run twice for a task; it runs on one thread.
+        tasks: its arguments, which are pickled for the workers.
+        workers: number of workers; default one per processor of the cluster.
+
+    Yields:
+        The outcomes, in the order in which they are ready.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        OptionError: `workers` is below 1.
+        DeepDetectError: the cluster failed, or is what the function raised.
+    """
+    if workers is not None and workers < 1:
+        raise OptionError(f"workers must be at least 1, not {workers}")
+    ray = _import_ray()
+    if not len(tasks):
+        return
+    with _connected(ray, workers):
+        count = min(workers or int(ray.cluster_resources().get("CPU", 1)), len(tasks))
+        rows = ray.data.from_items(
+            [{"task": pickle.dumps(task)} for task in tasks],
+            override_num_blocks=min(len(tasks), MAX_BLOCKS),
+        )
+        outcomes = rows.map(
+            _Worker,
+            fn_constructor_args=(function, os.getcwd()),
+            compute=ray.data.ActorPoolStrategy(size=count),
+            num_cpus=1,
+            ray_remote_args_fn=partial(dict, max_task_retries=MAX_RETRIES),
+        )
+        try:
+            for row in outcomes.iter_rows():
+                outcome = pickle.loads(row["outcome"])
+                if isinstance(outcome, DeepDetectError):
+                    raise outcome
+                yield outcome
+        except (ray.exceptions.RayActorError, ray.exceptions.RaySystemError) as error:
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise DeepDetectError(
+                f"workers of the Ray cluster died again and again ({reason}): look at their "
+                "memory, then run this again"
+            ) from error
+
+
+class _Worker:
+    """An actor, which does tasks one by one."""
+
+    def __init__(self, function: Callable[[Any], Any], folder: str) -> None:
+        self.function = function
+        with contextlib.suppress(OSError):  # relative paths mean what they mean to the caller
+            os.chdir(folder)
+        use_one_thread()
+        disable_malloc_trim()
+
+    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+        try:
+            outcome = self.function(pickle.loads(row["task"]))
+        except DeepDetectError as error:  # Ray would wrap it in a traceback
+            outcome = error
+        return {"outcome": pickle.dumps(outcome)}
+
+
+def _import_ray() -> Any:
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray
+        import ray.data
+        import ray.exceptions
+    except ImportError:
+        raise MissingExtraError(
+            "the engine ray needs Ray: pip install 'deepdetect[ray]', or use the engine processes"
+        ) from None
+    return ray
+
+
+@contextmanager
+def _connected(ray: Any, workers: int | None) -> Iterator[None]:
+    """Connect to a cluster unless this process is, or start one; and make Ray Data quiet."""
+    before = ray.is_initialized()
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if not before:
+        try:
+            ray.init(address="auto", **quiet)
+        except ConnectionError as error:
+            if "RAY_ADDRESS" in os.environ:
+                raise DeepDetectError(
+                    f"there is no Ray cluster at {os.environ['RAY_ADDRESS']}: start it, or unset "
+                    "RAY_ADDRESS"
+                ) from error
+            ray.init(
+                address="local",
+                num_cpus=workers or processor_count(),
+                include_dashboard=False,
+                object_store_memory=OBJECT_STORE_BYTES,
+                **quiet,
+            )
+    context = ray.data.DataContext.get_current()
+    shown = context.enable_progress_bars, context.print_on_execution_start
+    context.enable_progress_bars = context.print_on_execution_start = False
+    logger = logging.getLogger("ray.data")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+        context.enable_progress_bars, context.print_on_execution_start = shown
+        if not before:
+            ray.shutdown()
