@@ -43,6 +43,22 @@ def test_workers_are_other_processes_with_one_thread() -> None:
     assert {threads for _, threads in found} == {1}
 
 
+THREADS = (
+    "[__import__('os').environ['OPENBLAS_NUM_THREADS'], "
+    "__import__('deepdetect._shared.parallel', fromlist=['x'])._max_threads]"
+)
+
+
+def test_libraries_in_workers_use_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    assert list(map_in_processes(eval, [THREADS] * 2, workers=2)) == [["1", 1]] * 2
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+    assert parallel._max_threads is None
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
+    assert list(map_in_processes(eval, [THREADS] * 2, workers=2)) == [["3", 1]] * 2
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "3"
+
+
 @pytest.mark.parametrize(("tasks", "workers"), [([PROBE] * 3, 1), ([PROBE], 4), ([PROBE], None)])
 def test_one_worker_or_one_task_stays_in_this_process(
     tasks: list[str], workers: int | None

@@ -127,6 +127,23 @@ def _import_ray() -> Any:
     return ray
 
 
+def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
+    try:
+        ray.init(
+            address="local",
+            num_cpus=processors,
+            include_dashboard=False,
+            object_store_memory=OBJECT_STORE_BYTES,
+            **quiet,
+        )
+    except Exception as error:  # it waits half a minute for its parts, and raises many kinds
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise DeepDetectError(
+            f"Ray does not start ({reason}): wait until the machine is less busy, or use the engine "
+            "processes"
+        ) from error
+
+
 @contextmanager
 def _connected(ray: Any, workers: int | None) -> Iterator[None]:
     """Connect to a cluster unless this process is, or start one; and make Ray Data quiet."""
@@ -141,13 +158,7 @@ def _connected(ray: Any, workers: int | None) -> Iterator[None]:
                     f"there is no Ray cluster at {os.environ['RAY_ADDRESS']}: start it, or unset "
                     "RAY_ADDRESS"
                 ) from error
-            ray.init(
-                address="local",
-                num_cpus=workers or processor_count(),
-                include_dashboard=False,
-                object_store_memory=OBJECT_STORE_BYTES,
-                **quiet,
-            )
+            _start_cluster(ray, workers or processor_count(), quiet)
     context = ray.data.DataContext.get_current()
     shown = context.enable_progress_bars, context.print_on_execution_start
     context.enable_progress_bars = context.print_on_execution_start = False

@@ -82,6 +82,7 @@ def label(
         unfinished_tasks,
     )
 
+    map_tasks = get_engine(engine)
     settings = chosen_label_settings(detectors, label_settings)
     options = LabelOptions(settings.detectors, visibility, settings.changes)
     tasks = []
@@ -94,7 +95,7 @@ def label(
     _check_outputs(tasks, overwrite)
     left = tasks if overwrite else unfinished_tasks(tasks)
     with progress(len(left), "labelling", "image") as bar:
-        reports = label_files(left, workers, lambda _: bar.update(1), get_engine(engine))
+        reports = label_files(left, workers, lambda _: bar.update(1), map_tasks)
     done = [report for report in reports if report.error is None]
     failures = [report.error for report in reports if report.error is not None]
     mean = sum(report.density for report in done) / len(done) if done else None

@@ -1,0 +1,216 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, OptionError, SelectionOptions, load_image
+from deepdetect.batch import extract_features
+from deepdetect.batch.extraction import IMAGES_PER_PART, parts_of
+from deepdetect.features.sift import described_at_own_size, root_sift_descriptors
+from deepdetect.io.image import luma
+
+FEW = SelectionOptions(max_keypoints=50)
+
+
+@pytest.fixture(autouse=True)
+def _h5py() -> None:
+    pytest.importorskip("h5py", reason="needs h5py (the extra hdf5)")
+
+
+def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: Path) -> None:
+    """As hloc's `extract_features`, `get_keypoints` and `list_h5_names` write and read them."""
+    import h5py
+
+    folder = collection(3)
+    report = extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=1)
+    assert report.images == ("a/00.png", "a/02.png", "b/01.png")
+    assert (report.skipped, report.keypoints, report.failures) == (0, 150, ())
+    names = []
+
+    def visit(_: str, member: object) -> None:
+        if isinstance(member, h5py.Dataset):
+            names.append(member.parent.name.strip("/"))
+
+    with h5py.File(tmp_path / "f.h5", "r", libver="latest") as file:
+        file.visititems(visit)
+        assert set(names) == set(report.images)
+        stored = file["b/01.png"]
+        found = {name: value[()] for name, value in stored.items()}
+        assert stored["keypoints"].attrs["uncertainty"] == 1
+    expected = DeepDetect().detect(folder / "b/01.png", max_keypoints=50)
+    described = described_at_own_size(luma(load_image(folder / "b/01.png")), expected)
+    assert {name: (value.shape, value.dtype.name) for name, value in found.items()} == {
+        "keypoints": ((50, 2), "float32"),
+        "descriptors": ((128, 50), "float32"),
+        "scores": ((50,), "float32"),
+        "scales": ((50,), "float32"),
+        "oris": ((50,), "float32"),
+        "image_size": ((2,), "int32"),
+    }
+    np.testing.assert_array_equal(found["keypoints"], expected.xy)
+    np.testing.assert_array_equal(found["scores"], expected.scores)
+    np.testing.assert_array_equal(found["scales"], expected.sizes / 2)
+    np.testing.assert_array_equal(found["oris"], expected.angles)
+    np.testing.assert_array_equal(found["image_size"], [128, 128])
+    np.testing.assert_allclose(np.linalg.norm(found["descriptors"], axis=0), 1, rtol=1e-6)
+    cosines = np.sum(found["descriptors"].T * described.descriptors, 1)
+    lengths = np.linalg.norm(described.descriptors.astype(float), axis=1)
+    np.testing.assert_allclose(cosines, lengths, rtol=1e-6)
+
+
+def test_dense_keypoints(collection: Callable[..., Path], tmp_path: Path) -> None:
+    import h5py
+
+    folder = collection(1)
+    dense = SelectionOptions(mode="dense")
+    extract_features(folder, tmp_path / "f.h5", selection=dense, workers=1)
+    expected = DeepDetect(threads=1).detect(folder / "a/00.png")
+    gray = luma(load_image(folder / "a/00.png"))
+    descriptors = root_sift_descriptors(gray, expected.xy).astype(np.float32)
+    with h5py.File(tmp_path / "f.h5") as file:
+        np.testing.assert_array_equal(file["a/00.png/keypoints"], expected.xy)
+        assert "oris" not in file["a/00.png"]
+        lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
+        np.testing.assert_allclose(
+            file["a/00.png/descriptors"][()].T, descriptors / np.maximum(lengths, 1), atol=1e-6
+        )
+
+
+def test_an_image_without_keypoints(tmp_path: Path) -> None:
+    import h5py
+    from PIL import Image
+
+    (tmp_path / "photos").mkdir()
+    Image.new("RGB", (64, 48)).save(tmp_path / "photos/black.png")
+    report = extract_features(tmp_path / "photos", tmp_path / "f.h5", workers=1)
+    assert (report.images, report.keypoints) == (("black.png",), 0)
+    with h5py.File(tmp_path / "f.h5") as file:
+        assert file["black.png/descriptors"].shape == (128, 0)
+        assert file["black.png/keypoints"].shape == (0, 2)
+
+
+def test_what_is_done_is_skipped_and_what_has_changed_is_not(
+    collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
+) -> None:
+    path = tmp_path / "f.h5"
+    folder = collection(2)
+    extract_features(folder, path, selection=FEW, workers=1)
+    before = path.stat().st_mtime_ns
+    report = extract_features(folder, path, selection=FEW, workers=1)
+    assert (report.images, report.skipped) == ((), 2)
+    assert path.stat().st_mtime_ns == before
+    (folder / "c.png").write_bytes((folder / "a/00.png").read_bytes())
+    (folder / "a/00.png").write_bytes((folder / "b/01.png").read_bytes())
+    report = extract_features(folder, path, selection=FEW, workers=1)
+    assert (report.images, report.skipped) == (("a/00.png", "c.png"), 1)
+    extract_features(folder, tmp_path / "new.h5", selection=FEW, workers=1)
+    assert same_content(path, tmp_path / "new.h5")
+    with pytest.raises(OptionError, match=r"other settings \(`max_keypoints`\)"):
+        extract_features(folder, path, workers=1)
+    report = extract_features(folder, path, workers=1, overwrite=True)
+    assert len(report.images) == 3
+
+
+def test_bad_images_do_not_stop_the_others(
+    collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
+) -> None:
+    folder = collection(3)
+    extract_features(folder, tmp_path / "good.h5", selection=FEW, workers=1)
+    (folder / "bad.png").write_bytes(b"not a photograph")
+    (folder / os.fsdecode(b"\xff.png")).write_bytes((folder / "a/00.png").read_bytes())
+    for expected in ((3, 0), (0, 3)):
+        report = extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=2)
+        assert (len(report.images), report.skipped) == expected
+        first, second = report.failures
+        assert "bad.png is not an image" in first + second
+        assert "not UTF-8" in first + second
+    assert same_content(tmp_path / "f.h5", tmp_path / "good.h5")
+    (folder / "bad.png").write_bytes((folder / "a/00.png").read_bytes())
+    assert extract_features(folder, tmp_path / "f.h5", selection=FEW).images == ("bad.png",)
+
+
+def test_several_processes_give_the_same(
+    collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
+) -> None:
+    folder = collection(6)
+    for workers in (1, 2):
+        extract_features(folder, tmp_path / f"{workers}.h5", selection=FEW, workers=workers)
+    assert same_content(tmp_path / "1.h5", tmp_path / "2.h5")
+
+
+@pytest.mark.parametrize("count", [0, 1, 255, 256, 600, 5000])
+def test_parts(count: int) -> None:
+    parts = parts_of(range(count), IMAGES_PER_PART)
+    assert [number for part in parts for number in part] == list(range(count))
+    assert all(1 <= len(part) <= IMAGES_PER_PART for part in parts)
+    assert len(parts) >= min(count, 256)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs process groups")
+@pytest.mark.slow
+def test_a_killed_run_goes_on(
+    collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
+) -> None:
+    folder = collection(60)
+    command = [sys.executable, "-m", "deepdetect", "extract", str(folder), "--workers", "2"]
+    command += ["--max-keypoints", "500", "--json", "-o", str(tmp_path / "f.h5")]
+    process = subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL)
+    parts = tmp_path / "f.h5.parts"
+    deadline = time.monotonic() + 120
+    while len(list(parts.glob("[0-9a-f]*.h5"))) < 20:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    kept = len(list(parts.glob("[0-9a-f]*.h5")))
+    assert 20 <= kept < 60
+    assert not (tmp_path / "f.h5").exists()
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    report = json.loads(done.stdout)
+    assert report["skipped"] == kept
+    assert len(report["images"]) == 60 - kept
+    assert not parts.exists()
+    whole = SelectionOptions(max_keypoints=500)
+    extract_features(folder, tmp_path / "whole.h5", selection=whole, workers=2)
+    assert same_content(tmp_path / "f.h5", tmp_path / "whole.h5")
+
+
+MEMORY = """
+import sys
+from pathlib import Path
+from deepdetect import SelectionOptions
+from deepdetect.batch import extract_features
+
+def peak():
+    status = Path("/proc/self/status").read_text()
+    return int(status.split("VmHWM:")[1].split()[0])
+
+few = SelectionOptions(max_keypoints=500)
+for folder in sys.argv[1:]:
+    extract_features(folder, folder + ".h5", selection=few, workers=1)
+    print(peak())
+"""
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_number_of_images(
+    collection: Callable[..., Path], tmp_path: Path
+) -> None:
+    if not Path("/proc/self/status").exists():
+        pytest.skip("needs /proc to see the memory")
+    folders = [str(collection(count, name=f"of{count}")) for count in (100, 400)]
+    code = subprocess.run(
+        [sys.executable, "-c", MEMORY, *folders], capture_output=True, text=True, check=True
+    )
+    few, many = map(int, code.stdout.split())
+    assert many < 1.1 * few

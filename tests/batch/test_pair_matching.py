@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetectError, OptionError, SelectionOptions
+from deepdetect.batch import PairMatchingOptions, extract_features, match_pairs
+from deepdetect.batch.pair_matching import match_features, pair_name, read_pairs
+
+PAIR = ("a/00.png", "b/01.png")
+
+
+@pytest.fixture(autouse=True)
+def _h5py() -> None:
+    pytest.importorskip("h5py", reason="needs h5py (the extra hdf5)")
+
+
+@pytest.fixture
+def features(collection: Callable[..., Path], tmp_path: Path) -> Path:
+    """Features of five crops, 8 px from one to the next."""
+    path = tmp_path / "features.h5"
+    few = SelectionOptions(max_keypoints=300)
+    extract_features(collection(5), path, selection=few, workers=1)
+    return path
+
+
+def find_pair(file, name0: str, name1: str) -> tuple[str, bool]:
+    """Look a pair up as hloc does (hloc/utils/io.py)."""
+    for names, reverse in (((name0, name1), False), ((name1, name0), True)):
+        pair = "/".join(name.replace("/", "-") for name in names)
+        if pair in file:
+            return pair, reverse
+    raise ValueError(f"could not find pair {(name0, name1)}")
+
+
+def test_the_layout_is_that_of_hloc(features: Path, tmp_path: Path) -> None:
+    import h5py
+
+    report = match_pairs(features, [PAIR], tmp_path / "m.h5", workers=1)
+    with h5py.File(features) as file:
+        points0, points1 = (file[name]["keypoints"][()] for name in PAIR)
+    with h5py.File(tmp_path / "m.h5", "r", libver="latest") as file:
+        assert find_pair(file, *PAIR) == ("a-00.png/b-01.png", False)
+        assert find_pair(file, *PAIR[::-1]) == ("a-00.png/b-01.png", True)
+        stored = file["a-00.png/b-01.png"]
+        matches, scores = stored["matches0"][()], stored["matching_scores0"][()]
+    assert (matches.shape, matches.dtype) == ((len(points0),), np.int32)
+    assert (scores.shape, scores.dtype) == ((len(points0),), np.float32)
+    rows = np.flatnonzero(matches != -1)
+    assert report.matches == {PAIR: len(rows)}
+    assert (scores[rows] > 0).all()
+    assert (scores[matches == -1] == 0).all()
+    assert len(set(matches[rows])) == len(rows)
+    # The second crop begins 8 px further right.
+    errors = np.linalg.norm(points0[rows] - points1[matches[rows]] - [8, 0], axis=1)
+    assert len(rows) > 100
+    assert (errors < 1).mean() > 0.9
+
+
+def test_what_is_done_is_skipped(features: Path, tmp_path: Path) -> None:
+    path = tmp_path / "m.h5"
+    assert match_pairs(features, [PAIR], path, workers=1).skipped == 0
+    more = [PAIR[::-1], ("b/01.png", "a/02.png")]
+    report = match_pairs(features, more, path, workers=1)
+    assert (list(report.matches), report.skipped) == ([more[1]], 1)
+    with pytest.raises(OptionError, match=r"other settings \(`ratio`\)"):
+        match_pairs(features, more, path, options=PairMatchingOptions(ratio=0.7))
+    report = match_pairs(features, more, path, workers=1, overwrite=True)
+    assert len(report.matches) == 2
+
+
+def test_features_that_have_changed_are_matched_again(
+    collection: Callable[..., Path], features: Path, tmp_path: Path
+) -> None:
+    path, pairs = tmp_path / "m.h5", [PAIR, ("b/01.png", "a/02.png")]
+    match_pairs(features, pairs, path, workers=1)
+    folder = tmp_path / "photos"
+    (folder / "a/00.png").write_bytes((folder / "a/04.png").read_bytes())
+    extract_features(folder, features, selection=SelectionOptions(max_keypoints=300), workers=1)
+    report = match_pairs(features, pairs, path, workers=1)
+    assert (list(report.matches), report.skipped) == ([PAIR], 1)
+    fewer = SelectionOptions(max_keypoints=100)
+    extract_features(folder, features, selection=fewer, workers=1, overwrite=True)
+    with pytest.raises(OptionError, match="`features`"):
+        match_pairs(features, pairs, path, workers=1)
+
+
+def test_pairs_without_features_do_not_stop_the_others(features: Path, tmp_path: Path) -> None:
+    pairs = [("a/00.png", "no.png"), PAIR, ("a-00.png", "no.png")]
+    report = match_pairs(features, pairs, tmp_path / "m.h5", workers=1)
+    assert list(report.matches) == [PAIR]
+    assert [failure.split(": ")[1] for failure in report.failures] == [
+        "features.h5 has no features of no.png",
+        "features.h5 has no features of a-00.png",
+    ]
+
+
+def test_two_pairs_of_one_name_are_not_mixed_up(features: Path, tmp_path: Path) -> None:
+    import h5py
+
+    with h5py.File(features, "r+") as file:
+        file.copy("a/00.png", file, name="a-00.png")
+    pairs = [PAIR, ("a-00.png", "b/01.png")]
+    report = match_pairs(features, pairs, tmp_path / "m.h5", workers=1)
+    assert list(report.matches) == [PAIR]
+    assert "is that of a/00.png b/01.png, too" in report.failures[0]
+
+
+def test_several_processes_give_the_same(
+    features: Path, tmp_path: Path, same_content: Callable[..., bool]
+) -> None:
+    names = ["a/00.png", "b/01.png", "a/02.png", "b/03.png", "a/04.png"]
+    pairs = [(a, b) for a in names for b in names if a < b]
+    for workers in (1, 2):
+        match_pairs(features, pairs, tmp_path / f"{workers}.h5", workers=workers)
+    assert same_content(tmp_path / "1.h5", tmp_path / "2.h5")
+
+
+def test_features_of_other_programs(tmp_path: Path) -> None:
+    """As SuperPoint's: float16, negative numbers, 256 of them, and no attributes of ours."""
+    import h5py
+
+    generator = np.random.default_rng(0)
+    descriptors = generator.normal(size=(256, 40))
+    descriptors /= np.linalg.norm(descriptors, axis=0)
+    order = generator.permutation(40)
+    with h5py.File(tmp_path / "f.h5", "w") as file:
+        for name, chosen in (("x.jpg", np.arange(40)), ("y.jpg", order)):
+            group = file.create_group(name)
+            group["keypoints"] = generator.uniform(0, 99, (40, 2)).astype(np.float16)
+            group["descriptors"] = descriptors[:, chosen].astype(np.float16)
+    match_pairs(tmp_path / "f.h5", [("x.jpg", "y.jpg")], tmp_path / "m.h5", workers=1)
+    with h5py.File(tmp_path / "m.h5") as file:
+        np.testing.assert_array_equal(order[file["x.jpg/y.jpg/matches0"][()]], np.arange(40))
+
+
+def test_verification_keeps_what_agrees(features: Path, tmp_path: Path) -> None:
+    import h5py
+
+    loose = PairMatchingOptions(ratio=1, mutual=False)
+    verified = PairMatchingOptions(ratio=1, mutual=False, verify="homography")
+    found = {}
+    for name, options in (("all", loose), ("kept", verified)):
+        match_pairs(features, [PAIR], tmp_path / f"{name}.h5", options=options, workers=1)
+        with h5py.File(tmp_path / f"{name}.h5") as file:
+            found[name] = file[pair_name(*PAIR)]["matches0"][()]
+    kept = found["kept"] >= 0
+    np.testing.assert_array_equal(found["kept"][kept], found["all"][kept])
+    assert 50 < kept.sum() < (found["all"] >= 0).sum()
+    with h5py.File(features) as file:
+        points0, points1 = (file[name]["keypoints"][()] for name in PAIR)
+    moved = points0[kept] - points1[found["kept"][kept]] - [8, 0]
+    assert (np.linalg.norm(moved, axis=1) < 2).all()
+
+
+def test_more_keypoints_than_int16_holds() -> None:
+    """hloc's own int16 would end at 32,767."""
+    generator = np.random.default_rng(0)
+    many = generator.integers(0, 256, (40_000, 16), np.uint8)
+    positions = generator.uniform(0, 500, (40_000, 2)).astype(np.float32)
+    last = np.array([39_999, 39_998])
+    matches, scores = match_features(
+        (positions[last], many[last]),
+        (positions, many),
+        PairMatchingOptions(matcher="exact"),
+    )
+    assert matches.tolist() == last.tolist()
+    assert scores.tolist() == [1, 1]
+
+
+def test_lists_of_pairs(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+    path.write_text("a.jpg b.jpg\n\nb.jpg a.jpg\na.jpg b.jpg\nwith blank.jpg\tc d.jpg\n")
+    assert read_pairs(path) == [("a.jpg", "b.jpg"), ("with blank.jpg", "c d.jpg")]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a.jpg b.jpg\na.jpg\n", "line 2 of .* is no pair"),
+        ("a.jpg b.jpg c.jpg\n", "line 1 of .* is no pair"),
+        ("a.jpg a.jpg\n", "line 1 of .* is no pair"),
+        ("\n", "has no pairs"),
+        (None, "cannot be read"),
+    ],
+)
+def test_wrong_lists_of_pairs(text: str | None, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(DeepDetectError, match=message):
+        read_pairs(path)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"ratio": 1.5}, "`ratio` must lie in"),
+        ({"matcher": "exakt"}, "did you mean 'exact'"),
+        ({"verify": "fundamentle"}, "did you mean 'fundamental'"),
+        ({"verify": "essential"}, "knows no cameras"),
+    ],
+)
+def test_wrong_options(values: dict, message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        PairMatchingOptions(**values)

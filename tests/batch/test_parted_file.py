@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetectError, MissingExtraError, OptionError
+from deepdetect.batch import parted_file
+from deepdetect.batch.parted_file import Group, PartedFile, open_hdf5, state_of, write_groups
+
+
+def group(name: str, value: int, state: int = 1) -> Group:
+    return Group(name, {"numbers": np.full(3, value, np.int32)}, (state,))
+
+
+def values(path: Path) -> dict[str, int]:
+    """Return the number in each group of a file, which has nothing else."""
+    with open_hdf5(path) as file:
+        return {name: int(each["numbers"][0]) for name, each in parted_file._leaves(file)}
+
+
+@pytest.fixture(autouse=True)
+def _h5py() -> None:
+    pytest.importorskip("h5py", reason="needs h5py (the extra hdf5)")
+
+
+def test_parts_become_one_file(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    with PartedFile(path, {"a": 1}).opened() as file:
+        write_groups(file.part(["x/1"]), [group("x/1", 1)])
+        write_groups(file.part(["y", "x/2"]), [group("y", 2), group("x/2", 3)])
+        assert not path.exists()
+        file.merge()
+    assert values(path) == {"x/1": 1, "x/2": 3, "y": 2}
+    assert list(tmp_path.iterdir()) == [path]
+    with open_hdf5(path) as file:
+        assert state_of(file["x/2"]) == (1,)
+        assert file.attrs["deepdetect"] == '{"a": 1}'
+
+
+def test_what_is_done_is_known_by_its_state(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    wanted = [("x", (1,)), ("y", (1,)), ("z", (1,))]
+    with PartedFile(path, {}).opened() as file:
+        assert file.done(wanted) == set()
+        write_groups(file.part(["x"]), [group("x", 1)])
+        file.merge()
+    with PartedFile(path, {}).opened() as file:
+        write_groups(file.part(["y"]), [group("y", 1)])
+    with PartedFile(path, {}).opened() as file:  # as after a kill
+        assert file.done(wanted) == {"x", "y"}
+        assert file.done([("x", (2,)), ("y", (2,))]) == set()
+
+
+def test_newer_groups_take_the_place_of_older_ones(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    for value in (1, 2):
+        with PartedFile(path, {}).opened() as file:
+            write_groups(file.part(["x"]), [group("x", value, value)])
+            file.merge()
+    with PartedFile(path, {}).opened() as file:
+        for value, names in ((3, ["x"]), (4, ["x", "y"]), (5, ["a", "x"])):
+            write_groups(file.part(names), [group("x", value, value)])
+        file.merge()
+    assert values(path) == {"x": 5}
+
+
+def test_a_merge_that_fails_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "out.h5"
+    with PartedFile(path, {}).opened() as file:
+        write_groups(file.part(["old"]), [group("old", 0)])
+        file.merge()
+    before = path.read_bytes()
+    copy = parted_file._copy_groups
+    calls: list[Path] = []
+
+    def fail_at_the_second(part: Path, merged: object) -> None:
+        calls.append(part)
+        if len(calls) == 2:
+            raise OSError(28, "No space left on device")
+        copy(part, merged)
+
+    monkeypatch.setattr(parted_file, "_copy_groups", fail_at_the_second)
+    with PartedFile(path, {}).opened() as file:
+        for name in "xyz":
+            write_groups(file.part([name]), [group(name, ord(name))])
+        with pytest.raises(DeepDetectError, match="No space left on device"):
+            file.merge()
+    assert path.read_bytes() == before
+    with PartedFile(path, {}).opened() as file:
+        assert file.done((name, (1,)) for name in "xyz") == {"x", "y", "z"}
+        file.merge()
+    assert values(path) == {"old": 0, "x": 120, "y": 121, "z": 122}
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_part_is_whole_or_not_there(tmp_path: Path) -> None:
+    def groups():
+        yield group("x", 1)
+        raise DeepDetectError("no")
+
+    with pytest.raises(DeepDetectError, match="no"):
+        write_groups(tmp_path / "part.h5", groups())
+    assert write_groups(tmp_path / "part.h5", []) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("place", ["file", "parts"])
+def test_other_settings_are_refused(place: str, tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    with PartedFile(path, {"ratio": 0.8, "same": [1]}).opened() as file:
+        write_groups(file.part(["x"]), [group("x", 1)])
+        if place == "file":
+            file.merge()
+    other = {"ratio": 0.9, "same": (1,)}
+    with (
+        pytest.raises(OptionError, match=r"other settings \(`ratio`\).*--overwrite"),
+        PartedFile(path, other).opened(),
+    ):
+        pass
+    with PartedFile(path, other, overwrite=True).opened() as file:
+        assert file.done([("x", (1,))]) == set()
+        write_groups(file.part(["y"]), [group("y", 2)])
+        file.merge()
+    assert values(path) == {"y": 2}
+
+
+def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
+    import h5py
+
+    path = tmp_path / "out.h5"
+    with h5py.File(path, "w") as file:
+        file.create_group("x")
+    with (
+        pytest.raises(OptionError, match="written by something else"),
+        PartedFile(path, {}).opened(),
+    ):
+        pass
+    path.write_bytes(b"no HDF5")
+    with pytest.raises(DeepDetectError, match="is no HDF5 file"), PartedFile(path, {}).opened():
+        pass
+    with pytest.raises(DeepDetectError, match="there is no file"), open_hdf5(tmp_path / "no.h5"):
+        pass
+
+
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+    pytest.importorskip("fcntl")
+    path = tmp_path / "out.h5"
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from deepdetect.batch.parted_file import PartedFile\n"
+        "with PartedFile(Path(sys.argv[1]), {}).opened(): print('opened')\n"
+    )
+    command = [sys.executable, "-c", code, str(path)]
+    with PartedFile(path, {}).opened():
+        other = subprocess.run(command, capture_output=True, text=True)
+        assert "is being written by another process" in other.stderr
+    assert subprocess.run(command, capture_output=True, text=True).stdout == "opened\n"
+
+
+def test_without_h5py(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with (
+        pytest.raises(MissingExtraError, match=r"deepdetect\[hdf5\]"),
+        PartedFile(tmp_path / "out.h5", {}).opened(),
+    ):
+        pass
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from deepdetect import ImageError, MissingExtraError, OptionError, SelectionOptions, load_image
+from deepdetect.batch import ENGINES, extract_features, get_engine
+from deepdetect.batch.ray_engine import map_on_ray
+
+
+def test_the_engines() -> None:
+    assert set(ENGINES) == {"processes", "ray"}
+    assert get_engine("ray") is map_on_ray
+    with pytest.raises(OptionError, match="did you mean 'processes'"):
+        get_engine("process")
+
+
+def test_too_few_workers() -> None:
+    with pytest.raises(OptionError, match="workers must be at least 1, not 0"):
+        list(map_on_ray(math.sqrt, [1.0], 0))
+
+
+def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(MissingExtraError, match=r"deepdetect\[ray\]"):
+        list(map_on_ray(math.sqrt, [1.0]))
+
+
+@pytest.fixture
+def _ray() -> None:
+    pytest.importorskip("ray", reason="needs Ray (the extra ray)")
+    pytest.importorskip("h5py", reason="needs h5py (the extra hdf5)")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_ray")
+@pytest.mark.filterwarnings("ignore")
+def test_outcomes_and_errors() -> None:
+    assert list(map_on_ray(math.factorial, [])) == []
+    tasks = list(range(50))
+    assert sorted(map_on_ray(math.factorial, tasks, 2)) == [math.factorial(n) for n in tasks]
+    with pytest.raises(ImageError, match="there is no file"):
+        list(map_on_ray(load_image, ["none.png"], 1))
+
+
+def start(folder: Path, output: Path, **variables: str) -> subprocess.Popen[str]:
+    """Start an extraction on Ray."""
+    command = [sys.executable, "-m", "deepdetect", "extract", str(folder), "-o", str(output)]
+    command += ["--engine", "ray", "--workers", "2", "--max-keypoints", "500", "--json"]
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env={**os.environ, **variables},
+    )
+
+
+def wait_for_parts(output: Path, count: int, process: subprocess.Popen[str]) -> None:
+    """Wait until so many parts are written."""
+    deadline = time.monotonic() + 240
+    while len(list(output.with_name(output.name + ".parts").glob("[0-9a-f]*.h5"))) < count:
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def processes() -> Iterator[tuple[int, int, str]]:
+    """Yield number, parent's number and command line of each process."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            parent = int((folder / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            yield (
+                int(folder.name),
+                parent,
+                (folder / "cmdline").read_bytes().decode(errors="replace"),
+            )
+        except OSError:
+            continue
+
+
+def descendants(ancestor: int, word: str) -> list[int]:
+    """Return the processes below one whose command line has a word."""
+    found = {number: (parent, command) for number, parent, command in processes()}
+
+    def is_below(number: int) -> bool:
+        while number in found:
+            number = found[number][0]
+            if number == ancestor:
+                return True
+        return False
+
+    return [n for n, (_, command) in found.items() if word in command and is_below(n)]
+
+
+def check(
+    process: subprocess.Popen[str],
+    folder: Path,
+    output: Path,
+    same_content: Callable[..., bool],
+    skipped: int = 0,
+) -> None:
+    """Check that nothing is lost, nothing double, and all as without a cluster."""
+    told, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    report = json.loads(told)
+    names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.png"))]
+    assert len(report["images"]) + report["skipped"] == len(names)
+    assert report["skipped"] == skipped
+    assert len(set(report["images"])) == len(report["images"])
+    assert set(report["images"]) <= set(names)
+    whole = SelectionOptions(max_keypoints=500)
+    extract_features(folder, output.with_name("whole.h5"), selection=whole, workers=2)
+    assert same_content(output, output.with_name("whole.h5"))
+    assert sorted(path.name for path in output.parent.glob("*.h5*")) == ["f.h5", "whole.h5"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to find the worker")
+@pytest.mark.usefixtures("_ray")
+def test_a_worker_is_killed_half_way(
+    collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
+) -> None:
+    folder, output = collection(60), tmp_path / "f.h5"
+    process = start(folder, output)
+    try:
+        wait_for_parts(output, 30, process)
+        workers = descendants(process.pid, "ray::MapWorker")
+        assert len(workers) == 2
+        os.kill(workers[0], signal.SIGKILL)
+        check(process, folder, output, same_content)
+    finally:
+        process.kill()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_ray")
+def test_the_driver_is_killed_half_way(
+    collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
+) -> None:
+    folder, output = collection(60), tmp_path / "f.h5"
+    process = start(folder, output)
+    wait_for_parts(output, 30, process)
+    process.kill()
+    process.wait()
+    deadline = time.monotonic() + 60
+    while any(str(tmp_path) in command for _, _, command in processes()):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    time.sleep(5)  # for the workers, which have other command lines
+    kept = len(list(output.with_name("f.h5.parts").glob("[0-9a-f]*.h5")))
+    assert kept >= 30
+    process = start(folder, output)
+    try:
+        check(process, folder, output, same_content, kept)
+    finally:
+        process.kill()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_ray")
+@pytest.mark.filterwarnings("ignore")
+def test_a_machine_of_a_cluster_is_lost_half_way(
+    collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
+) -> None:
+    """Two machines of one processor each, here two raylets; the second one is killed."""
+    from ray.cluster_utils import Cluster
+
+    folder, output = collection(60), tmp_path / "f.h5"
+    memory = 100_000_000
+    cluster = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": memory}
+    )
+    try:
+        second = cluster.add_node(num_cpus=1, object_store_memory=memory)
+        process = start(folder, output, RAY_ADDRESS=cluster.address)
+        try:
+            wait_for_parts(output, 30, process)
+            cluster.remove_node(second, allow_graceful=False)
+            check(process, folder, output, same_content)
+        finally:
+            process.kill()
+    finally:
+        cluster.shutdown()

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _h5py() -> None:
+    pytest.importorskip("h5py", reason="needs h5py (the extra hdf5)")
+
+
+def shapes(path: str) -> dict[str, tuple[int, ...]]:
+    import h5py
+
+    with h5py.File(path) as file:
+        return {name: group["descriptors"].shape for name, group in file.items()}
+
+
+def test_extract_and_match(run, photos: Path) -> None:
+    result = run("extract", photos, "-o", "f.h5", "--max-keypoints", 200, "--workers", 1)
+    assert result.exit_code == 0, result.output
+    assert "3 images with 600 keypoints, 0 already done -> f.h5" in result.stdout
+    assert shapes("f.h5") == dict.fromkeys(("cat.jpg", "left.png", "right.png"), (128, 200))
+    again = json.loads(
+        run("extract", photos, "-o", "f.h5", "--max-keypoints", 200, "--json").stdout
+    )
+    assert (again["images"], again["skipped"]) == ([], 3)
+    Path("pairs.txt").write_text("left.png right.png\nleft.png cat.jpg\n")
+    result = run("match-many", "f.h5", "--pairs", "pairs.txt", "--workers", 1, "--json")
+    assert result.exit_code == 0, result.output
+    matches = {tuple(m["pair"]): m["matches"] for m in json.loads(result.stdout)["matches"]}
+    assert matches["left.png", "right.png"] > 3 * matches["left.png", "cat.jpg"]
+    result = run("match-many", "f.h5", "--pairs", "pairs.txt")
+    assert "0 pairs with 0 matches, 2 already done -> matches.h5" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("flags", "least", "most"),
+    [
+        ((), 500, 2048),
+        (("--mode", "dense"), 5000, 32_000),
+        (("--mode", "dense", "--max-keypoints", 99), 99, 99),
+    ],
+)
+def test_how_many_keypoints(run, photos: Path, flags: tuple, least: int, most: int) -> None:
+    Path("in").mkdir()
+    Path("in/left.png").write_bytes((photos / "left.png").read_bytes())
+    assert run("extract", "in", *flags, "--workers", 1).exit_code == 0
+    assert least <= shapes("features.h5")["left.png"][1] <= most
+
+
+def test_a_bad_image_is_listed_at_the_end(run, photos: Path) -> None:
+    Path("in").mkdir()
+    Path("in/bad.jpg").write_bytes(b"not a photograph")
+    Path("in/good.png").write_bytes((photos / "left.png").read_bytes())
+    result = run("extract", "in", "--max-keypoints", 9, "--workers", 1)
+    assert result.exit_code == 1
+    *_, told, failure = result.stderr.splitlines()
+    assert told == "deepdetect: 1 of 2 images failed, the others are done:"
+    assert "bad.jpg" in failure
+    Path("pairs.txt").write_text("good.png bad.jpg\n")
+    result = run("match-many", "features.h5", "--pairs", "pairs.txt")
+    assert result.exit_code == 1
+    *_, told, failure = result.stderr.splitlines()
+    assert told == "deepdetect: 1 of 1 pairs failed, the others are done:"
+    assert failure.strip() == "good.png bad.jpg: features.h5 has no features of bad.jpg"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("extract", "nowhere"), "there is no folder"),
+        (("extract", "PHOTOS", "--engine", "rai"), "did you mean 'ray'"),
+        (("match-many", "no.h5", "--pairs", "no.txt"), "cannot be read"),
+        (("label", "PHOTOS", "-o", "masks", "--engine", "rai"), "did you mean 'ray'"),
+    ],
+)
+def test_errors_are_one_sentence(run, photos: Path, arguments: tuple, message: str) -> None:
+    result = run(*(photos if argument == "PHOTOS" else argument for argument in arguments))
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert list(Path().iterdir()) == []
