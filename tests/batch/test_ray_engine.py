@@ -44,7 +44,8 @@ def _ray() -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("_ray")
 @pytest.mark.filterwarnings("ignore")
-def test_outcomes_and_errors() -> None:
+def test_outcomes_and_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "local")
     assert list(map_on_ray(math.factorial, [])) == []
     tasks = list(range(50))
     assert sorted(map_on_ray(math.factorial, tasks, 2)) == [math.factorial(n) for n in tasks]
@@ -52,7 +53,7 @@ def test_outcomes_and_errors() -> None:
         list(map_on_ray(load_image, ["none.png"], 1))
 
 
-def start(folder: Path, output: Path, **variables: str) -> subprocess.Popen[str]:
+def start(folder: Path, output: Path, address: str = "local") -> subprocess.Popen[str]:
     """Start an extraction on Ray."""
     command = [sys.executable, "-m", "deepdetect", "extract", str(folder), "-o", str(output)]
     command += ["--engine", "ray", "--workers", "2", "--max-keypoints", "500", "--json"]
@@ -62,7 +63,7 @@ def start(folder: Path, output: Path, **variables: str) -> subprocess.Popen[str]
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        env={**os.environ, **variables},
+        env={**os.environ, "RAY_ADDRESS": address},
     )
 
 
@@ -183,7 +184,7 @@ def test_a_machine_of_a_cluster_is_lost_half_way(
     )
     try:
         second = cluster.add_node(num_cpus=1, object_store_memory=memory)
-        process = start(folder, output, RAY_ADDRESS=cluster.address)
+        process = start(folder, output, cluster.address)
         try:
             wait_for_parts(output, 30, process)
             cluster.remove_node(second, allow_graceful=False)

@@ -12,7 +12,6 @@ import os
 import pickle
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Any
 
 from .._shared.errors import DeepDetectError, MissingExtraError, OptionError
@@ -28,8 +27,12 @@ MAX_BLOCKS = 4096
 """Parts of the work that Ray schedules: each costs a few milliseconds, and is repeated as a whole
 where its worker dies."""
 
-MAX_RETRIES = 5
-"""Repetitions of a task whose worker died: an image that kills each of them ends the work."""
+PROCESSORS_PER_WORKER = 0.5
+"""That are reserved. A worker uses one; when half of the machines are lost, those that are left
+have room for all workers. (Tasks wait for their worker, and would wait for ever.)"""
+
+START_TRIES = 3
+"""Of a cluster that is started here."""
 
 OBJECT_STORE_BYTES = 200_000_000
 """Shared memory of a cluster that is started here: outcomes are small, results go to files."""
@@ -40,6 +43,12 @@ SETTINGS = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else it warns
 }
 
+DATA_SETTINGS = {
+    "enable_progress_bars": False,
+    "print_on_execution_start": False,
+    "scheduling_strategy": "DEFAULT",  # half of each machine is taken first
+}
+
 
 def map_on_ray(
     function: Callable[[Task], Outcome], tasks: Sequence[Task], workers: int | None = None
@@ -47,8 +56,9 @@ def map_on_ray(
     """Apply a function to every task on a Ray cluster, in workers of one processor each.
 
     The cluster is the one to which this process is connected, else the one that RAY_ADDRESS names
-    or that runs on this machine (`ray start`), else one that is started here and ends with the
-    work. All its machines need this package, and the files under the same paths.
+    or that runs on this machine (`ray start`), else, or with RAY_ADDRESS=local, one that is started
+    here and ends with the work. All its machines need this package, and the files under the same
+    paths.
 
     Args:
         function: a module-level function, which may run twice for a task; it runs on one thread.
@@ -78,8 +88,7 @@ def map_on_ray(
             _Worker,
             fn_constructor_args=(function, os.getcwd()),
             compute=ray.data.ActorPoolStrategy(size=count),
-            num_cpus=1,
-            ray_remote_args_fn=partial(dict, max_task_retries=MAX_RETRIES),
+            num_cpus=PROCESSORS_PER_WORKER,
         )
         try:
             for row in outcomes.iter_rows():
@@ -90,8 +99,7 @@ def map_on_ray(
         except (ray.exceptions.RayActorError, ray.exceptions.RaySystemError) as error:
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
             raise DeepDetectError(
-                f"workers of the Ray cluster died again and again ({reason}): look at their "
-                "memory, then run this again"
+                f"the Ray cluster failed ({reason}): look at its machines, then run this again"
             ) from error
 
 
@@ -128,20 +136,25 @@ def _import_ray() -> Any:
 
 
 def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
-    try:
-        ray.init(
-            address="local",
-            num_cpus=processors,
-            include_dashboard=False,
-            object_store_memory=OBJECT_STORE_BYTES,
-            **quiet,
-        )
-    except Exception as error:  # it waits half a minute for its parts, and raises many kinds
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise DeepDetectError(
-            f"Ray does not start ({reason}): wait until the machine is less busy, or use the engine "
-            "processes"
-        ) from error
+    for left in reversed(range(START_TRIES)):
+        try:
+            ray.init(
+                address="local",
+                num_cpus=processors,
+                include_dashboard=False,
+                object_store_memory=OBJECT_STORE_BYTES,
+                **quiet,
+            )
+            return
+        except Exception as error:  # it waits half a minute for its parts, and raises many kinds
+            ray.shutdown()
+            if left:
+                continue
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise DeepDetectError(
+                f"Ray does not start ({reason}): wait until the machine is less busy, or use the "
+                "engine processes"
+            ) from error
 
 
 @contextmanager
@@ -150,18 +163,21 @@ def _connected(ray: Any, workers: int | None) -> Iterator[None]:
     before = ray.is_initialized()
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     if not before:
+        address = os.environ.get("RAY_ADDRESS")
         try:
+            if address == "local":
+                raise ConnectionError
             ray.init(address="auto", **quiet)
         except ConnectionError as error:
-            if "RAY_ADDRESS" in os.environ:
+            if address not in (None, "local"):
                 raise DeepDetectError(
-                    f"there is no Ray cluster at {os.environ['RAY_ADDRESS']}: start it, or unset "
-                    "RAY_ADDRESS"
+                    f"there is no Ray cluster at {address}: start it, or unset RAY_ADDRESS"
                 ) from error
             _start_cluster(ray, workers or processor_count(), quiet)
     context = ray.data.DataContext.get_current()
-    shown = context.enable_progress_bars, context.print_on_execution_start
-    context.enable_progress_bars = context.print_on_execution_start = False
+    usual = {name: getattr(context, name) for name in DATA_SETTINGS}
+    for name, value in DATA_SETTINGS.items():
+        setattr(context, name, value)
     logger = logging.getLogger("ray.data")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -169,6 +185,7 @@ def _connected(ray: Any, workers: int | None) -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
-        context.enable_progress_bars, context.print_on_execution_start = shown
+        for name, value in usual.items():
+            setattr(context, name, value)
         if not before:
             ray.shutdown()
