@@ -10,6 +10,7 @@ import contextlib
 import logging
 import os
 import pickle
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -43,11 +44,7 @@ SETTINGS = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else it warns
 }
 
-DATA_SETTINGS = {
-    "enable_progress_bars": False,
-    "print_on_execution_start": False,
-    "scheduling_strategy": "DEFAULT",  # half of each machine is taken first
-}
+DATA_SETTINGS = {"enable_progress_bars": False, "print_on_execution_start": False}
 
 
 def map_on_ray(
@@ -182,7 +179,9 @@ def _connected(ray: Any, workers: int | None) -> Iterator[None]:
     level = logger.level
     logger.setLevel(logging.CRITICAL)
     try:
-        yield
+        # Ray prints what befalls its workers: standard output is for results.
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
     finally:
         logger.setLevel(level)
         for name, value in usual.items():
