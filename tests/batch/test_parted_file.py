@@ -97,6 +97,26 @@ def test_a_merge_that_fails_loses_nothing(tmp_path: Path, monkeypatch: pytest.Mo
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_full_disk_is_one_sentence(tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource")
+    path = tmp_path / "out.h5"
+    large = [Group(name, {"numbers": np.zeros(20_000)}, (1,)) for name in "abc"]
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with PartedFile(path, {}).opened() as file:
+        for each in large:
+            write_groups(file.part([each.name]), [each])
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, limits[1]))
+        try:
+            with pytest.raises(DeepDetectError, match=r"cannot write .*out.h5 \(File too large\)"):
+                file.merge()
+            with pytest.raises(DeepDetectError, match=r"\(File too large\): free some space"):
+                write_groups(file.part(["all"]), large)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert len(file._part_files()) == 3
+    assert [each.name for each in tmp_path.iterdir()] == ["out.h5.parts"]
+
+
 def test_a_part_is_whole_or_not_there(tmp_path: Path) -> None:
     def groups():
         yield group("x", 1)

@@ -11,6 +11,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -91,6 +93,20 @@ def open_hdf5(path: Path) -> Iterator[Any]:
         yield file
 
 
+@contextmanager
+def _written(path: Path, mode: str) -> Iterator[Any]:
+    """Open a temporary file to write it; what the system refuses is an OSError with its number."""
+    h5py = import_h5py()
+    try:
+        with h5py.File(path, mode, libver=FORMAT) as file:
+            yield file
+    except (OSError, RuntimeError) as error:  # HDF5 raises both, with pages of text
+        number = re.search(r"errno = (\d+)", str(error))
+        if number is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1]))) from error
+
+
 def write_groups(path: Path, groups: Iterable[Group]) -> int:
     """Write a file of groups, whole or not at all; return how many there are.
 
@@ -99,10 +115,10 @@ def write_groups(path: Path, groups: Iterable[Group]) -> int:
     Raises:
         DeepDetectError: it cannot be written.
     """
-    h5py = import_h5py()
+    import_h5py()
     count = 0
     with _unless_empty(), atomic_path(path) as temporary:
-        with h5py.File(temporary, "w", libver=FORMAT) as file:
+        with _written(temporary, "w") as file:
             for group in groups:
                 _write_group(file, group)
                 count += 1
@@ -211,7 +227,6 @@ class PartedFile:
         Raises:
             DeepDetectError: the file cannot be written; the parts stay.
         """
-        h5py = import_h5py()
         parts = self._part_files()
         if parts:
             with atomic_path(self.path) as temporary:
@@ -220,7 +235,7 @@ class PartedFile:
                     shutil.copyfile(self.path, temporary)
                 with (
                     progress(len(parts), "merging", "part", quiet) as bar,
-                    h5py.File(temporary, "r+" if keep else "w", libver=FORMAT) as merged,
+                    _written(temporary, "r+" if keep else "w") as merged,
                 ):
                     merged.attrs[SETTINGS] = json.dumps(self.settings)
                     for part in parts:
