@@ -1,4 +1,4 @@
-"""Rates of `deepdetect extract`: one process, all processes, Ray; interleaved, ratios of the same round.
+"""Rates of `deepdetect extract`: one process, all processes, Ray; in turn, ratios of each round.
 
     python benchmarks/collection_rates.py photos/ --images 2000 --rounds 3
 

@@ -153,7 +153,7 @@ def test_the_driver_is_killed_half_way(
     process = start(folder, output)
     wait_for_parts(output, 30, process)
     process.kill()
-    process.wait()
+    process.communicate()
     deadline = time.monotonic() + 60
     while any(str(tmp_path) in command for _, _, command in processes()):
         assert time.monotonic() < deadline

@@ -75,7 +75,8 @@ def map_on_ray(
     ray = _import_ray()
     if not len(tasks):
         return
-    with _connected(ray, workers):
+    # Ray prints what befalls its workers, up to its end: standard output is for results.
+    with contextlib.redirect_stdout(sys.stderr), _connected(ray, workers):
         count = min(workers or int(ray.cluster_resources().get("CPU", 1)), len(tasks))
         rows = ray.data.from_items(
             [{"task": pickle.dumps(task)} for task in tasks],
@@ -179,9 +180,7 @@ def _connected(ray: Any, workers: int | None) -> Iterator[None]:
     level = logger.level
     logger.setLevel(logging.CRITICAL)
     try:
-        # Ray prints what befalls its workers: standard output is for results.
-        with contextlib.redirect_stdout(sys.stderr):
-            yield
+        yield
     finally:
         logger.setLevel(level)
         for name, value in usual.items():
