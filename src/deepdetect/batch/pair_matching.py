@@ -31,6 +31,7 @@ ROOT_SIFT_NORM = 512
 Pair = tuple[str, str]
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class PairMatchingOptions:
     """How the features of two images are matched.
