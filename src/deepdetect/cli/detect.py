@@ -153,12 +153,13 @@ def _detect_one(
         done = records.find(path, paths)
         if done is not None and all(isinstance(done.get(n), int | float) for n in NUMBERS):
             return {"image": path, **{n: done[n] for n in NUMBERS}, **shown, "skipped": True}
-        rgb = load_image(path)
         started = time.perf_counter()
         if drawn:
+            rgb = load_image(path)
             keypoints, heatmap = detector.detect(rgb, **selection, return_heatmap=True)
         else:
-            keypoints = detector.detect(rgb, **selection)
+            # Nobody holds the image while keypoints are selected and written.
+            keypoints = detector.detect(path, **selection)
         seconds = time.perf_counter() - started
     except (MissingExtraError, WeightsError):  # concern all images
         raise
@@ -173,8 +174,8 @@ def _detect_one(
         save_picture(picture, drawn["keypoints"])
         save_picture(draw_heatmap(heatmap), drawn["heatmap"])
     numbers = {
-        "width": rgb.shape[1],
-        "height": rgb.shape[0],
+        "width": keypoints.image_size[0],
+        "height": keypoints.image_size[1],
         "keypoints": len(keypoints),
         "density": round(keypoints.density, 6),
         "seconds": round(seconds, 4),

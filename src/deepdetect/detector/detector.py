@@ -18,9 +18,10 @@ from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.selection import (
+    Maps,
     SelectionOptions,
     check_ignore,
-    select_by_logits,
+    select_from_maps,
     select_keypoints,
 )
 from ..io.image import load_image, luma
@@ -29,8 +30,7 @@ from .heatmap import (
     MAX_AUTO_PIXELS,
     HeatmapOptions,
     compute_heatmap_and_logits,
-    compute_native_logits,
-    is_native,
+    compute_maps,
 )
 from .image_lists import Images, for_each_image, ignore_masks, image_list
 from .points.detection import PointOptions, detect_points
@@ -187,21 +187,21 @@ class DeepDetect:
 
     def _run(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of an image that `load_image` returned."""
-        with memory_named(rgb):
+        with memory_named(rgb.shape):
             return compute_heatmap_and_logits(rgb, self._network, self.heatmap_options)
 
     def _dense(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
         """Find dense keypoints in an image that `load_image` returned."""
-        with memory_named(rgb):
-            if is_native(rgb, self.heatmap_options):
-                logits = compute_native_logits(rgb, self._network, self.heatmap_options)
-                return select_by_logits(logits, options)
-            heatmap, logits = self._run(rgb)
-            return select_keypoints(heatmap, options, logits)
+        with memory_named(rgb.shape):
+            return select_from_maps(self._maps(rgb), options)
+
+    def _maps(self, rgb: np.ndarray) -> Maps:
+        """Run the network on an image that `load_image` returned."""
+        return compute_maps(rgb, self._network, self.heatmap_options)
 
     def _points(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
         """Find points in an image that `load_image` returned."""
-        with memory_named(rgb):
+        with memory_named(rgb.shape):
             return find_points(rgb, options, self.heatmap_options, load_ranker(self.ranker))
 
     def __repr__(self) -> str:
@@ -357,16 +357,18 @@ class DeepDetect:
         """Find the keypoints of a loaded image, and its heat map where it is asked for."""
         if options.uses_points:
             return self._points(rgb, options), self._run(rgb)[0] if return_heatmap else None
-        if not return_heatmap:
-            return self._dense(rgb, options), None
-        heatmap, logits = self._run(rgb)
-        with memory_named(rgb):
-            return select_keypoints(heatmap, options, logits), heatmap
+        with memory_named(rgb.shape):
+            if return_heatmap:
+                heatmap, logits = self._run(rgb)
+                return select_keypoints(heatmap, options, logits), heatmap
+            maps = self._maps(rgb)
+            del rgb  # the keypoints need the room
+            return select_from_maps(maps, options), None
 
 
 @contextmanager
-def memory_named(rgb: np.ndarray) -> Iterator[None]:
-    """Make lack of memory, in work on a loaded image, an error of one sentence."""
+def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
+    """Make lack of memory, in work on an image of this shape, an error of one sentence."""
     try:
         yield
         return
@@ -375,7 +377,7 @@ def memory_named(rgb: np.ndarray) -> Iterator[None]:
     except cv2.error as error:
         if error.code != cv2.Error.StsNoMem:
             raise
-    height, width = rgb.shape[:2]
+    height, width = shape[:2]
     raise DeepDetectError(
         f"there is not enough memory for an image of {width}x{height} pixels: "
         "use `resolution='auto'`, fewer keypoints, or a smaller image"

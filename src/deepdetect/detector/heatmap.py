@@ -14,8 +14,8 @@ import numpy as np
 from .._shared.errors import OptionError, unknown_name
 from .._shared.image_array import Channels, check_channels
 from .._shared.options import check_ranges, suggest_keywords
-from .._shared.parallel import available_memory
-from ..features.selection import bands, sigmoid
+from .._shared.parallel import available_memory, release_freed_memory
+from ..features.selection import Maps, Rows, bands, sigmoid
 from .backends import Network
 from .tiling import TiledNetwork, open_tiled
 
@@ -24,6 +24,9 @@ STRIDE = 8
 
 MAX_AUTO_PIXELS = 2_000_000
 """Of an image that the resolution "auto" takes as it is."""
+
+RELEASE_PIXELS = 20_000_000
+"""Of an image whose maps need the memory that the network keeps: less would not be worth it."""
 
 MIN_TILE_MEGAPIXELS = 1.5
 """Of smaller tiles most would be overlap."""
@@ -108,14 +111,30 @@ def compute_heatmap_and_logits(
         The heat map, and the (H, W) float32 logits of its probabilities. Float32 rounds the
         highest probabilities to 1; logits still distinguish them, so keypoints are ranked by them.
     """
+    maps = compute_maps(rgb, network, options)
+    heatmap, rows_of = np.empty(maps.shape, np.float32), maps.heatmap()
+    for rows in bands(maps.shape):
+        heatmap[rows] = rows_of(rows)
+    del rows_of  # it may hold another map
+    return heatmap, maps.logits()
+
+
+def compute_maps(
+    rgb: np.ndarray, network: Network, options: HeatmapOptions = HeatmapOptions()
+) -> Maps:
+    """Run the network on an image; arguments as of `compute_heatmap`.
+
+    Returns:
+        The heat map and its logits. Where the network sees a smaller image, only what it
+        says of that is kept, and enlarged when a map is asked for.
+    """
     height, width = rgb.shape[:2]
-    if is_native(rgb, options):
-        logits = compute_native_logits(rgb, network, options)
-        return probabilities(logits), logits
+    if _is_native(rgb, options):
+        return Maps.of_logits(_native_logits(rgb, network, options))
     if options.tile_megapixels != "auto":
         raise OptionError("`tile_megapixels` needs `resolution='native'`: scaled images are small")
     if _is_constant(rgb):
-        return np.zeros((height, width), np.float32), np.full((height, width), -np.inf, np.float32)
+        return Maps.of_logits(np.full((height, width), -np.inf, np.float32))
     shown = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
     shown = np.ascontiguousarray(shown)
     if options.resolution == "auto":
@@ -126,20 +145,27 @@ def compute_heatmap_and_logits(
         side = int(options.resolution)
         small = cv2.resize(shown, (side, side), interpolation=cv2.INTER_CUBIC)
     logits = _mean_of_flips(partial(_run, network), small, options)
-    heatmap, enlarged = (
-        cv2.resize(map_, (width, height), interpolation=cv2.INTER_CUBIC)
-        for map_ in (sigmoid(logits), logits)
-    )
-    return np.clip(heatmap, 0, 1, out=heatmap), enlarged
+    if height * width > RELEASE_PIXELS and hasattr(network, "release_memory"):
+        network.release_memory()
+        release_freed_memory()
+
+    def enlarged(map_: np.ndarray) -> np.ndarray:
+        return cv2.resize(map_, (width, height), interpolation=cv2.INTER_CUBIC)
+
+    def heatmap() -> Rows:
+        map_ = enlarged(sigmoid(logits))
+        return lambda rows: np.clip(map_[rows], 0, 1)
+
+    return Maps((height, width), heatmap, lambda: enlarged(logits))
 
 
-def is_native(rgb: np.ndarray, options: HeatmapOptions) -> bool:
+def _is_native(rgb: np.ndarray, options: HeatmapOptions) -> bool:
     """Return whether the network sees an image at its own size."""
     whole = rgb.shape[0] * rgb.shape[1] <= MAX_AUTO_PIXELS
     return options.resolution == "native" or (options.resolution == "auto" and whole)
 
 
-def compute_native_logits(rgb: np.ndarray, network: Network, options: HeatmapOptions) -> np.ndarray:
+def _native_logits(rgb: np.ndarray, network: Network, options: HeatmapOptions) -> np.ndarray:
     """Run the network on an image at its own size, in tiles where it is too large for the memory.
 
     Args:
@@ -180,14 +206,6 @@ def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwo
 
 def _is_constant(rgb: np.ndarray) -> bool:
     return all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape))
-
-
-def probabilities(logits: np.ndarray) -> np.ndarray:
-    """Return the heat map of logits."""
-    heatmap = np.empty_like(logits)
-    for rows in bands(logits.shape):
-        heatmap[rows] = sigmoid(logits[rows])
-    return heatmap
 
 
 def _pad(rgb: np.ndarray) -> np.ndarray:

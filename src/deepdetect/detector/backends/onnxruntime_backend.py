@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError, WeightsError, unknown_name
 from .options import RuntimeOptions
-from .shapes import as_logits, check_network, lack_of_memory, output_to_read
+from .shapes import PROBE_SHAPE, as_logits, check_network, lack_of_memory, output_to_read
 from .without_telemetry import import_onnxruntime
 
 
@@ -40,6 +41,15 @@ class OnnxRuntimeNetwork:
                 f"({str(error).splitlines()[0]}): use a smaller one, or another provider"
             ) from None
         return as_logits(output, self._output_name, image.shape, self.onnx_path)
+
+    def release_memory(self) -> None:
+        """Give back what is kept from one run for the next: 150 bytes a pixel."""
+        settings = import_onnxruntime().RunOptions()
+        settings.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
+        smallest = np.zeros((1, 3, *PROBE_SHAPE), np.float32)
+        # Where there is nothing of the processor's to be given back, it raises an error.
+        with contextlib.suppress(Exception):
+            self._session.run([self._output_name], {self._input_name: smallest}, settings)
 
 
 def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
