@@ -231,7 +231,7 @@ def test_flips_of_a_squashed_image() -> None:
     np.testing.assert_allclose(compute_heatmap(RGB, answer, options), once, atol=1e-4)
 
 
-@pytest.mark.parametrize("side, expected", [(64, 0), (80, 1)])
+@pytest.mark.parametrize(("side", "expected"), [(64, 0), (80, 1)])
 def test_the_network_of_a_large_image_gives_its_memory_back(
     side: int, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -255,12 +255,12 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def report_failures(failures: Sequence[str], total: int) -> None:
+def report_failures(failures: Sequence[str], total: int, what: str = "images") -> None:
     """Raise a BatchError when some of several images failed; of a single one, its error."""
     if failures and total == 1:
         raise DeepDetectError(failures[0])
     if failures:
-        raise BatchError(f"{len(failures)} of {total} images failed, the others are done", failures)
+        raise BatchError(f"{len(failures)} of {total} {what} failed, the others are done", failures)
 
 
 def print_json(value: Any) -> None:
