@@ -418,3 +418,15 @@ def test_a_killed_run_goes_on_where_it_stopped(run, photos: Path) -> None:
     assert 0 < skipped + 1 <= done + 1 <= 30
     assert sorted(contents(Path("out"))) == sorted(f"{k}.npz" for k in range(30))
     assert len({*contents(Path("out")).values()}) == 1
+
+
+def test_photographs_over_a_limit_are_refused_and_it_can_be_raised(run, photos: Path) -> None:
+    photo, megapixels = photos / "left.png", 200 * 160 / 1e6
+    words = ("detect", photo, "-o", "limited", "--no-pictures", "--max-megapixels")
+    refused = run(*words, megapixels * 0.99)
+    assert refused.exit_code == 2, refused.output
+    assert "make it smaller, or allow more by --max-megapixels" in refused.stderr
+    assert run(*words, megapixels * 1.01).exit_code == 0
+    wrong = run(*words, 0)
+    assert wrong.exit_code == 2
+    assert "--max-megapixels must be above 0, not 0" in wrong.stderr

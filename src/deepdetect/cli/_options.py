@@ -85,6 +85,22 @@ output_option = click.option(
     show_default=True,
     help="Folder for the results.",
 )
+
+
+def _limit_megapixels(context: click.Context, _: click.Parameter, value: float | None) -> None:
+    if value is not None:
+        from ..io.image_file import limit_megapixels
+
+        context.with_resource(limit_megapixels(value))
+
+
+max_megapixels_option = click.option(
+    "--max-megapixels",
+    type=float,
+    callback=_limit_megapixels,
+    expose_value=False,
+    help="Refuse larger photographs before they are decoded.  [default: 200]",
+)
 format_option = click.option(
     "--format",
     "file_format",

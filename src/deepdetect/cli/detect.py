@@ -19,6 +19,7 @@ from ._options import (
     format_option,
     json_option,
     make_detector,
+    max_megapixels_option,
     output_option,
     overwrite_option,
     pictures_option,
@@ -45,6 +46,7 @@ NUMBERS = ("width", "height", "keypoints", "density", "seconds")
 @format_option
 @pictures_option
 @overwrite_option
+@max_megapixels_option
 @json_option
 def detect(
     images: tuple[Path, ...],

@@ -69,9 +69,10 @@ class Commands(click.Group):
                 raise
             raise click.UsageError(f"{error.message} Did you mean '{new}'?", error.ctx) from None
         except BatchError as error:
+            command = self.get_command(context, context.invoked_subcommand or "")
             click.echo(f"deepdetect: {error.summary}:", err=True)
             for failure in error.failures:
-                click.echo(f"  {failure}", err=True)
+                click.echo(f"  {with_flags(failure, command)}", err=True)
             context.exit(1)
         except DeepDetectError as error:
             command = self.get_command(context, context.invoked_subcommand or "")

@@ -16,6 +16,7 @@ from ._options import (
     format_option,
     json_option,
     make_detector,
+    max_megapixels_option,
     output_option,
     pictures_option,
     print_result,
@@ -53,6 +54,7 @@ GEOMETRY = FieldOptions(
 @click.option("--camera1", type=PATH, help="The same of the second image.  [default: camera0]")
 @format_option
 @pictures_option
+@max_megapixels_option
 @json_option
 def match(
     image0: Path,

@@ -18,6 +18,7 @@ from ._options import (
     check_inputs_survive,
     json_option,
     make_detector,
+    max_megapixels_option,
     print_result,
     seconds_rows,
 )
@@ -57,6 +58,7 @@ STAGES = 8
     show_default=True,
     help="The model, .ply, .glb or .html; the other files get its name and stand beside it.",
 )
+@max_megapixels_option
 @json_option
 def reconstruct(
     left: Path,

@@ -14,6 +14,7 @@ from ._options import (
     SELECTION,
     json_option,
     make_detector,
+    max_megapixels_option,
     output_option,
     print_result,
 )
@@ -23,6 +24,7 @@ from ._options import (
 @click.argument("image0", type=PATH)
 @click.argument("image1", type=PATH)
 @output_option
+@max_megapixels_option
 @json_option
 def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: Any) -> None:
     """Register IMAGE1 to IMAGE0: for planes, and for photographs from one place.

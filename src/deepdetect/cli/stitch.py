@@ -16,6 +16,7 @@ from ._options import (
     check_inputs_survive,
     json_option,
     make_detector,
+    max_megapixels_option,
     print_result,
     report_failures,
     seconds_rows,
@@ -45,6 +46,7 @@ PANORAMA = FieldOptions(
     type=PATH,
     help="The one of IMAGES that is not distorted.  [default: the one in the middle]",
 )
+@max_megapixels_option
 @json_option
 def stitch(
     images: tuple[Path, ...],
