@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, DeepDetectError
+from deepdetect.io.image import load_image
 from deepdetect.io.tables import load_keypoints
 
 
@@ -124,8 +125,8 @@ def test_an_image_without_memory_for_it_does_not_end_the_others(
 ) -> None:
     detect = DeepDetect.detect
 
-    def detect_small(self: DeepDetect, image: np.ndarray, *args: object, **options: object):
-        if image.shape[0] == 150:
+    def detect_small(self: DeepDetect, image: Path, *args: object, **options: object):
+        if load_image(image).shape[0] == 150:
             raise short
         return detect(self, image, *args, **options)
 
