@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, overload
+from typing import TYPE_CHECKING, Any, Literal, Protocol, overload
 
-import cv2
 import numpy as np
 
 from .._shared.errors import DeepDetectError, OptionError
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.selection import (
@@ -30,10 +30,10 @@ from .heatmap import (
     compute_native_logits,
     is_native,
 )
-from .points.detection import PointOptions, detect_points
-from .points.ranker import WEIGHTS as RANKER
-from .points.ranker import Ranker, load_ranker
-from .pretrained import resolve_weights
+from .pretrained import RANKER, resolve_weights
+
+if TYPE_CHECKING:
+    from .points.ranker import Ranker
 
 
 class HeatmapDetector(Protocol):
@@ -104,7 +104,10 @@ class DeepDetect:
         self.weights = resolve_weights(weights)
         self.heatmap_options = HeatmapOptions(resolution, channels, tta, tile_megapixels)
         self.ranker = RANKER if ranker is None else Path(ranker)
-        load_ranker(self.ranker)
+        if ranker is not None:  # what may be wrong with it is said now
+            from .points.ranker import load_ranker
+
+            load_ranker(self.ranker)
         self._runtime = RuntimeOptions(backend, providers, threads)
         self._network, self.backend = open_network(self.weights, self._runtime)
 
@@ -170,6 +173,8 @@ class DeepDetect:
 
     def _points(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
         """Find points in an image that `load_image` returned."""
+        from .points.ranker import load_ranker
+
         with memory_named(rgb):
             return find_points(rgb, options, self.heatmap_options, load_ranker(self.ranker))
 
@@ -306,6 +311,8 @@ def find_points(
             resolution is "native".
         ranker: None: the one inside the package.
     """
+    from .points.detection import PointOptions, detect_points
+
     gray = luma(rgb)
     height, width = gray.shape
     ignore = None if options.ignore is None else check_ignore(options.ignore, gray.shape)

@@ -7,10 +7,10 @@ result equals OpenCV's but for rounding.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .keypoints import on_pixels
 

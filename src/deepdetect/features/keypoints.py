@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.opencv import cv2
 
 MAX_COORDINATE_BITS = 12
 """Of a position in `bayer_order`: float32 holds the order exactly up to this many."""

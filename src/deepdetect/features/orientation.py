@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .scale_space import SIZE_PER_SIGMA, gaussian_layers, nearest_layers
 

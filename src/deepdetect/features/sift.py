@@ -9,10 +9,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
 from .dense_sift import MAX_SIZE_PX, MIN_SIZE_PX, dense_sift

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from .._shared.errors import DeepDetectError
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.detector import HeatmapDetector
 from ..geometry.zncc import median_local_zncc, warp_to_reference

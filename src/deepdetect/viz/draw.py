@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError
+from .._shared.opencv import cv2
 from ..features.keypoints import Keypoints
 
 MAX_CIRCLES = 5000

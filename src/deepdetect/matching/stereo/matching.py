@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ..._shared.errors import ImageError, OptionError
+from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
 from ...io.image import load_image, luma
