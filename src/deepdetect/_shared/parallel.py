@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -108,12 +109,10 @@ def map_in_processes(
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
     """Let Ctrl-C wait while processes are started, and in these until `_start_worker`."""
-    import signal
-    from multiprocessing import resource_tracker
-
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
+    from multiprocessing import resource_tracker
 
     # Or the first process starts it, and it ends the mask.
     resource_tracker.ensure_running()
@@ -159,8 +158,6 @@ def _run_task(function: Callable[[Task], Outcome], task: Task) -> Outcome:
 
 def _start_worker(ended: Any) -> None:
     """Prepare a worker: one OpenCV thread, freed memory is kept, and it ends with the parent."""
-    import signal
-
     _interrupts.ended = ended
     signal.signal(signal.SIGINT, _interrupts.handle)
     if hasattr(signal, "pthread_sigmask"):

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.kernels import require_compiler
 from .._shared.options import replace_options, suggest_keywords
 from .._shared.parallel import available_memory
 from .._shared.timing import StageTimer
@@ -109,6 +110,7 @@ def match_images(
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
+        MissingExtraError: guided matching needs numba, and it is not installed.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -156,6 +158,8 @@ def match_images(
     )
     if seeds is not None and not chosen.guided:
         raise OptionError("seeds guide the matching: leave them out, or guided=False")
+    if chosen.guided:
+        require_compiler("guided matching", ", or match by descriptors alone with `guided=False`")
     timer = StageTimer()
     rgb = load_image(image0), load_image(image1)
     detector = _configured(detector, chosen.heatmap)

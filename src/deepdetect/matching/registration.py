@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .._shared.errors import DeepDetectError
+from .._shared.kernels import require_compiler
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.detector import HeatmapDetector
@@ -95,6 +96,7 @@ def register(
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
+        MissingExtraError: numba is not installed.
         DeepDetectError: no homography between the images can be trusted.
 
     Example:
@@ -106,6 +108,7 @@ def register(
         >>> found.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
+    require_compiler("registration")
     first, second = load_image(image0), load_image(image1)
     found = match_images(
         first,
