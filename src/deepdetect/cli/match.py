@@ -106,7 +106,7 @@ def match(
     save_matches(matches, file)
     picture = None
     if pictures:
-        picture = output / f"{stem}.png"
+        picture = output / f"{stem}.jpg"
         _draw(rgb0, rgb1, matches, picture)
     numbers = {
         "image0": image0,
@@ -177,11 +177,14 @@ def _guide_numbers(matches: Any) -> dict[str, Any] | None:
 def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
     from ..viz.draw import add_caption, draw_matches, save_picture
 
-    picture = draw_matches(rgb0, rgb1, matches.points0, matches.points1, matches.inliers)
+    points = matches.points0, matches.points1
+    picture = draw_matches(rgb0, rgb1, *points, matches.inliers, by_position=True)
+    others = len(matches) - int(matches.inliers.sum())
     caption = (
-        f"{len(matches):,} matches, {int(matches.inliers.sum()):,} of them inliers "
-        f"({matches.model}); a random sample is drawn: green inliers, red others"
+        f"{len(matches):,} matches ({matches.model}), of equal colour where they belong together"
     )
+    if others:
+        caption += f"; {others:,} that do not fit it: red"
     save_picture(add_caption(picture, caption), path)
 
 
