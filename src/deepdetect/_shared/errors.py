@@ -28,6 +28,13 @@ class ReconstructionError(DeepDetectError):
     """Two images give no depth; the message says which of the usual reasons it is."""
 
 
+class NothingFoundError(DeepDetectError):
+    """Images hold nothing of what was looked for that can be trusted: they may not belong together.
+
+    The command line ends with exit code 3.
+    """
+
+
 class MissingExtraError(DeepDetectError):
     """An optional package is needed for what was asked and is not installed."""
 

@@ -7,6 +7,7 @@ container, it is cached in a folder of this user in the temporary directory, or 
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import stat
@@ -19,6 +20,28 @@ from typing import Any
 from .errors import MissingExtraError
 
 _lock = threading.Lock()
+_announcement: list[Callable[[], object]] = []
+
+
+def announce_compilation(tell: Callable[[], object]) -> None:
+    """Have a function called once, before the first kernel is compiled that no cache holds."""
+    _announcement[:] = [tell]
+
+
+@functools.cache
+def _listen() -> None:
+    """Wait for the first compilation, which numba tells of when it finds nothing in its cache."""
+    from numba.core import event as events
+
+    class Listener(events.Listener):
+        def on_start(self, event: Any) -> None:
+            if _announcement:
+                _announcement.pop()()
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    events.register("numba:compile", Listener())  # type: ignore[no-untyped-call]
 
 
 def has_compiler() -> bool:
@@ -61,6 +84,8 @@ def _import_numba() -> Any:
     except ImportError as error:  # it takes some versions of NumPy only
         reason = (str(error).splitlines() or ["no reason given"])[0]
         raise _missing("this", reason=f"cannot be imported ({reason})") from None
+    if _announcement:
+        _listen()
     return numba
 
 

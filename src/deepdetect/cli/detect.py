@@ -82,7 +82,8 @@ def detect(
     from ._records import OutputRecords, file_digest
 
     paths = expand_images(images, output)
-    chosen = SelectionOptions(**given_only(values))
+    selecting = {name: value for name, value in values.items() if name not in DETECTOR.names}
+    chosen = SelectionOptions(**given_only(selecting))
     shown = (PICTURES if chosen.uses_points else DENSE_PICTURES) if pictures else ()
     outputs = {path: _outputs(path, output, file_format, shown) for path in paths}
     written = [file for files in outputs.values() for file in files.values()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -68,6 +68,7 @@ def match_images(
     iterations: int | None = None,
     seed: int | None = None,
     guided_options: GuidedOptions | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> Matches:
     """Detect and match the keypoints of two images.
 
@@ -102,6 +103,7 @@ def match_images(
         estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations, seed:
             how the geometry is estimated (`GeometryOptions`).
         guided_options: all tuned numbers of guided matching.
+        progress: called with the name of each stage when it ends.
 
     Returns:
         The matches, the geometry, and which agree with it. Where guided matching can trust no
@@ -160,7 +162,7 @@ def match_images(
         raise OptionError("seeds guide the matching: leave them out, or guided=False")
     if chosen.guided:
         require_compiler("guided matching", ", or match by descriptors alone with `guided=False`")
-    timer = StageTimer()
+    timer = StageTimer(progress)
     rgb = load_image(image0), load_image(image1)
     detector = _configured(detector, chosen.heatmap)
     with timer.stage("keypoints"):

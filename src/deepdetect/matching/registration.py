@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError
+from .._shared.errors import NothingFoundError
 from .._shared.kernels import require_compiler
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
@@ -81,6 +82,7 @@ def register(
     mutual: bool | None = None,
     seed: int | None = None,
     guided_options: GuidedOptions | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> Registration:
     """Find the homography between two images and warp the second into the frame of the first.
 
@@ -91,13 +93,13 @@ def register(
         image0, image1: anything `load_image` takes.
         detector: as for `match_images`.
         threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread, resolution,
-            channels, mutual, seed, guided_options: as for `match_images`.
+            channels, mutual, seed, guided_options, progress: as for `match_images`.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
         MissingExtraError: numba is not installed.
-        DeepDetectError: no homography between the images can be trusted.
+        NothingFoundError: no homography between the images can be trusted.
 
     Example:
         >>> from deepdetect.evaluation.baselines.random import RandomDetector
@@ -128,9 +130,10 @@ def register(
         mutual=mutual,
         seed=seed,
         guided_options=guided_options,
+        progress=progress,
     )
     if not found.guided or found.matrix is None:
-        raise DeepDetectError(
+        raise NothingFoundError(
             "no homography can be trusted between these images: they must overlap, and show a "
             "plane or be taken from one place"
         )

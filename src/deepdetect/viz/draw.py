@@ -31,8 +31,8 @@ SHOWN_KEYPOINTS = 1000
 SHOWN_PERCENTILE = 99.0
 """Values above it, and below the opposite one, have the last colours: few may be far away."""
 
-LEAST_LEVEL = 0.35
-"""Darker colours of the scale are not seen on a photograph."""
+LEAST_LEVEL, LEAST_DEPTH_LEVEL = 0.35, 0.2
+"""Darker colours of the scale are not seen on a photograph, or look like unknown depth."""
 
 LINES, DOTS = 60, 1500
 
@@ -118,6 +118,28 @@ def draw_logits(logits: np.ndarray) -> np.ndarray:
     levels = np.where(np.isfinite(shown), (known - low) / (high - low), shown > 0)
     words = "logit of a keypoint, 0: probability .5"
     return add_scale(draw_heatmap(levels), words, low, high)
+
+
+def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
+    """Colour a (H, W) depth map, NaN where unknown: yellow is near, dark blue far, black unknown.
+
+    Returns:
+        (H + caption, W, 3) uint8 RGB with a scale; not larger than `fit_picture` makes it.
+    """
+    known = np.isfinite(depth)
+    if not known.any():
+        return add_caption(np.zeros((*depth.shape, 3), np.uint8), "no depth is known")
+    few = 100 - SHOWN_PERCENTILE
+    near, far = (float(v) for v in np.percentile(depth[known], (few, SHOWN_PERCENTILE)))
+    # By inverse depth, as differences are seen.
+    inverse = 1 / np.maximum(np.where(known, depth, far), 1e-9)
+    levels = (inverse - 1 / far) / max(1 / near - 1 / far, 1e-12)
+    colors = draw_heatmap(LEAST_DEPTH_LEVEL + (1 - LEAST_DEPTH_LEVEL) * np.clip(levels, 0, 1))
+    # A point is more than a pixel, so that few of them are seen, too.
+    spread = cv2.dilate(np.where(known[..., None], colors, 0).astype(np.uint8), np.ones((3, 3)))
+    colors = np.where(known[..., None], colors, spread)
+    words = f"depth in {'baselines' if unit == 'baseline' else unit}, black: unknown"
+    return add_scale(fit_picture(colors), words, far, near, LEAST_DEPTH_LEVEL)
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
@@ -335,7 +357,7 @@ def add_scale(
     """
     width, unit = rgb.shape[1], _unit(rgb)
     bar = max(1, width // 5)
-    ends = [f"{value:.3g}" for value in (low, high)]
+    ends = [f"{value:.4g}" for value in (low, high)]
     strip = _caption(f"{text}: {ends[0]}", width - bar - max(1, width // 9), unit)
     gap = len(strip) // 4
     colors = np.zeros((len(strip), bar, 3), np.uint8)
