@@ -28,6 +28,9 @@ READABLE_WIDTH_PX = 800
 
 JPEG_QUALITY = 85
 SHOWN_KEYPOINTS = 1000
+AREA_OF_KEYPOINT_PX = 200
+"""Pixels of a small picture for each keypoint that is drawn, so that all can be told apart."""
+
 SHOWN_PERCENTILE = 99.0
 """Values above it, and below the opposite one, have the last colours: few may be far away."""
 
@@ -145,8 +148,8 @@ def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     """Draw the best keypoints of all parts of an image, coloured by their score.
 
-    At most `SHOWN_KEYPOINTS`: in turn the best of each cell of a grid. They are circles of their
-    size, or all alike where they have none.
+    At most `SHOWN_KEYPOINTS`, fewer on small images: in turn the best of each cell of a grid. They
+    are circles of their size, or all alike where they have none.
 
     Returns:
         (H + caption, W, 3) uint8 RGB with a scale of the scores, or of the logits where there are
@@ -157,10 +160,11 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     canvas = _dimmed(shown)
     values = keypoints.scores if keypoints.logits is None else keypoints.logits
     name = "score" if keypoints.logits is None else "logit"
-    cells = round(SHOWN_KEYPOINTS**0.5 * 1.2)
-    rows = spread_over_grid(
-        keypoints.xy, values, keypoints.image_size, min(SHOWN_KEYPOINTS, len(keypoints)), cells
-    )
+    unit = _unit(canvas)
+    room = int(canvas.shape[0] * canvas.shape[1] / (AREA_OF_KEYPOINT_PX * unit**2))
+    most = max(1, min(SHOWN_KEYPOINTS, room, len(keypoints)))
+    cells = max(1, round(most**0.5 * 1.2))
+    rows = spread_over_grid(keypoints.xy, values, keypoints.image_size, most, cells)
     counted = (
         f"{len(rows):,} of {len(keypoints):,} keypoints"
         if len(rows) < len(keypoints)
@@ -172,7 +176,6 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     low, high = (float(v) for v in np.percentile(values[rows], (few, SHOWN_PERCENTILE)))
     levels = np.clip((values[rows] - low) / max(high - low, 1e-9), 0, 1)
     colors = _viridis(LEAST_LEVEL + (1 - LEAST_LEVEL) * levels).tolist()
-    unit = _unit(canvas)
     radii = np.full(len(rows), 3 * unit)
     if keypoints.sizes is not None:
         radii = np.maximum(keypoints.sizes[rows] * factor / 2, 2 * unit)
