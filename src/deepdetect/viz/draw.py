@@ -163,7 +163,9 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     unit = _unit(canvas)
     room = int(canvas.shape[0] * canvas.shape[1] / (AREA_OF_KEYPOINT_PX * unit**2))
     most = max(1, min(SHOWN_KEYPOINTS, room, len(keypoints)))
-    cells = max(1, round(most**0.5 * 1.2))
+    # No more cells than keypoints, or the dimmest parts would be left out.
+    shorter, longer = sorted(canvas.shape[:2])
+    cells = max(1, int((most * longer / shorter) ** 0.5))
     rows = spread_over_grid(keypoints.xy, values, keypoints.image_size, most, cells)
     counted = (
         f"{len(rows):,} of {len(keypoints):,} keypoints"
