@@ -4,6 +4,7 @@ from ._shared.errors import (
     MissingExtraError as MissingExtraError,
     OptionError as OptionError,
     ReconstructionError as ReconstructionError,
+    RegistrationError as RegistrationError,
     WeightsError as WeightsError,
 )
 from .detector.detector import DeepDetect as DeepDetect

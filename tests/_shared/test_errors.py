@@ -1,15 +1,26 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+import deepdetect
 from deepdetect._shared.errors import (
     BatchError,
     DeepDetectError,
     ImageError,
+    InvalidFileError,
+    MissingCalibrationError,
     MissingExtraError,
+    MissingFileError,
+    MissingImageError,
+    MissingWeightsError,
     OptionError,
+    ReconstructionError,
+    RegistrationError,
     WeightsError,
     unknown_name,
 )
@@ -63,3 +74,58 @@ def test_the_failures_of_many_files_survive_pickling() -> None:
     error = pickle.loads(pickle.dumps(BatchError("2 of 3 failed", ["a.png: b", "c.png: d"])))
     assert str(error) == "2 of 3 failed; the first: a.png: b"
     assert error.failures == ("a.png: b", "c.png: d")
+
+
+@pytest.mark.parametrize(
+    ("kind", "builtin"),
+    [
+        (ImageError, ValueError),
+        (OptionError, ValueError),
+        (WeightsError, ValueError),
+        (ReconstructionError, ValueError),
+        (RegistrationError, ValueError),
+        (InvalidFileError, ValueError),
+        (MissingExtraError, ImportError),
+        (MissingFileError, FileNotFoundError),
+        (MissingImageError, FileNotFoundError),
+        (MissingImageError, ImageError),
+        (MissingWeightsError, FileNotFoundError),
+        (MissingWeightsError, WeightsError),
+        (MissingCalibrationError, FileNotFoundError),
+        (MissingCalibrationError, ReconstructionError),
+    ],
+)
+def test_errors_are_the_built_in_ones_too(
+    kind: type[DeepDetectError], builtin: type[Exception]
+) -> None:
+    error = kind("there is no file x: check the path")
+    assert isinstance(error, builtin)
+    assert str(error) == "there is no file x: check the path"
+    copy = pickle.loads(pickle.dumps(error))
+    assert type(copy) is kind
+    assert str(copy) == str(error)
+
+
+def missing_files() -> dict[str, Callable[[Path], object]]:
+    image = np.zeros((32, 32), np.uint8)
+    return {
+        "image": deepdetect.load_image,
+        "weights": deepdetect.DeepDetect,
+        "torch weights": lambda path: deepdetect.DeepDetect(path.with_suffix(".safetensors")),
+        "ranker": lambda path: deepdetect.DeepDetect(ranker=path),
+        "keypoints": deepdetect.load_keypoints,
+        "matches": deepdetect.load_matches,
+        "match_images": lambda path: deepdetect.match_images(path, path),
+        "fuse": deepdetect.fuse,
+        "disparity_map": lambda path: deepdetect.disparity_map(path, path),
+        "stitch": lambda path: deepdetect.stitch([path, path]),
+        "calibration": lambda path: deepdetect.reconstruct(image, image, calibration=path),
+    }
+
+
+@pytest.mark.parametrize("name", missing_files())
+def test_a_missing_file_is_a_file_not_found_error(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "missing.onnx"
+    with pytest.raises(FileNotFoundError, match="missing") as caught:
+        missing_files()[name](path)
+    assert isinstance(caught.value, DeepDetectError)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import inspect
 import math
 import pkgutil
 import re
@@ -183,3 +184,59 @@ def test_every_number_among_the_options_is_checked(kind: type) -> None:
     for name in numbers:
         with pytest.raises(OptionError, match=name):
             kind(**{name: math.nan})
+
+
+def test_a_decorated_class_stays_the_class_it_is() -> None:
+    @suggest_keywords
+    @dataclass(frozen=True)
+    class Options:
+        threshold: float = 0.5
+
+    assert Options(threshold=0.25) == Options(0.25)
+    assert dataclasses.replace(Options(), threshold=1) == Options(1)
+    with pytest.raises(OptionError, match="unknown option 'treshold': did you mean 'threshold'"):
+        Options(treshold=1)  # type: ignore[call-arg]
+
+
+def test_a_keyword_of_another_function_is_pointed_to_it() -> None:
+    call = suggest_keywords(lambda image=None: image, {"size": "give it to `resize`"})
+    with pytest.raises(OptionError, match="unknown option 'size': give it to `resize`"):
+        call(size=3)
+
+
+def public_callables() -> dict[str, Any]:
+    """Functions, constructors and methods that a user calls with keywords."""
+    found = {}
+    for name in deepdetect.__all__:
+        thing = getattr(deepdetect, name)
+        if isinstance(thing, type) and issubclass(thing, Exception):
+            continue
+        found[name] = thing
+    for kind in (deepdetect.DeepDetect, deepdetect.Keypoints, deepdetect.Matches):
+        for name, method in vars(kind).items():
+            method = getattr(method, "__func__", method)
+            if name.startswith("_") or not inspect.isfunction(method):
+                continue
+            if len(inspect.signature(method).parameters) > 1:
+                found[f"{kind.__name__}.{name}"] = method
+    return found
+
+
+@pytest.mark.parametrize("name", public_callables())
+def test_an_unknown_keyword_of_anything_public_is_an_option_error(name: str) -> None:
+    thing = public_callables()[name]
+    if name == "DeepDetect":
+        thing = thing.__init__
+    known = [n for n in inspect.signature(thing).parameters if n not in ("self", "cls")]
+    wrong = known[-1][:-1] + "_"  # one letter off
+    with pytest.raises(OptionError, match=f"unknown option '{wrong}'") as caught:
+        thing(**{wrong: None})
+    assert "did you mean" in str(caught.value)
+    for each in known:
+        assert each in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", OPTIONS, ids=lambda kind: kind.__name__)
+def test_an_unknown_field_of_any_options_is_an_option_error(kind: type) -> None:
+    with pytest.raises(OptionError, match=r"unknown option 'seeed'.*\(known: "):
+        kind(seeed=1)

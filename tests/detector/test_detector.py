@@ -108,7 +108,7 @@ def test_bgr_is_the_swapped_image(
     resolution: str | int, detector: DeepDetect, image: np.ndarray
 ) -> None:
     rgb = detector.configured(HeatmapOptions(resolution))
-    bgr = DeepDetect(backend="onnxruntime", resolution=resolution, channels="bgr")
+    bgr = DeepDetect(backend="onnxruntime", resolution=resolution, network_channels="bgr")
     np.testing.assert_array_equal(bgr.heatmap(image), rgb.heatmap(image[:, :, ::-1]))
     assert np.abs(bgr.heatmap(image) - rgb.heatmap(image)).max() > 1e-3
 
@@ -116,7 +116,7 @@ def test_bgr_is_the_swapped_image(
 def test_other_options_share_the_network(detector: DeepDetect, image: np.ndarray) -> None:
     options = HeatmapOptions(64, "bgr")
     other = detector.configured(options)
-    fresh = DeepDetect(backend="onnxruntime", resolution=64, channels="bgr")
+    fresh = DeepDetect(backend="onnxruntime", resolution=64, network_channels="bgr")
     assert detector.heatmap_options == HeatmapOptions()
     assert other.heatmap_options == options
     assert other.backend == detector.backend
@@ -427,7 +427,7 @@ def test_torch_without_safetensors(monkeypatch: pytest.MonkeyPatch, one_line: On
         ),
         ({"resolution": "nativ"}, "did you mean 'native'?"),
         ({"resolution": 100}, "multiple of 8"),
-        ({"channels": "grb"}, "unknown channel order 'grb'"),
+        ({"network_channels": "grb"}, "unknown channel order 'grb'"),
     ],
 )
 def test_wrong_options(arguments: dict[str, Any], words: str, one_line: OneLine) -> None:
@@ -812,7 +812,7 @@ def test_the_heat_map_that_keypoints_came_from(detector: DeepDetect, image: np.n
 def test_a_detector_says_what_it_is() -> None:
     detector = DeepDetect("dense", resolution=480, backend="onnxruntime")
     assert repr(detector) == (
-        "DeepDetect(dense.onnx, resolution=480, channels='rgb', backend='onnxruntime')"
+        "DeepDetect(dense.onnx, resolution=480, network_channels='rgb', backend='onnxruntime')"
     )
 
 
@@ -840,9 +840,9 @@ def test_images_are_read_once(photo_path: Path, monkeypatch: pytest.MonkeyPatch)
 
     read: list[Any] = []
 
-    def counted(source: Any) -> np.ndarray:
+    def counted(source: Any, **options: Any) -> np.ndarray:
         read.append(source)
-        return load_image(source)
+        return load_image(source, **options)
 
     monkeypatch.setattr(module, "load_image", counted)
     monkeypatch.setattr(pipeline, "load_image", counted)

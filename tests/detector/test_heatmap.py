@@ -171,8 +171,8 @@ def test_the_image_is_left_as_it_was() -> None:
         ({"resolution": 0}, "a multiple of 8 from 16 on, not 0"),
         ({"resolution": -480}, "a multiple of 8 from 16 on, not -480"),
         ({"resolution": 100}, "a multiple of 8 from 16 on, not 100"),
-        ({"channels": "brg"}, "unknown channel order 'brg': did you mean"),
-        ({"channels": "gray"}, "(known: rgb, bgr)"),
+        ({"network_channels": "brg"}, "unknown channel order 'brg': did you mean"),
+        ({"network_channels": "gray"}, "(known: rgb, bgr)"),
         ({"tta": "flips"}, "unknown tta 'flips': did you mean 'flip'?"),
     ],
 )

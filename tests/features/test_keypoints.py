@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect import OptionError
+from deepdetect import MissingExtraError, OptionError
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.features.keypoints import Keypoints, bayer_order, on_pixels
 from deepdetect.io.image import luma
@@ -277,3 +279,54 @@ def test_whole_pixels_are_told_from_others() -> None:
     assert not on_pixels([[8, 4]], (5, 8))
     assert not on_pixels([[-1, 0]])
     assert not on_pixels([[1.5, 0]])
+
+
+def test_features_for_lightglue() -> None:
+    torch = pytest.importorskip("torch", reason="needs torch for its tensors")
+    points = some([0.25, 0.5, 0.75])
+    found = points.to_lightglue()
+    assert {name: tuple(tensor.shape) for name, tensor in found.items()} == {
+        "keypoints": (1, 3, 2),
+        "keypoint_scores": (1, 3),
+        "scales": (1, 3),
+        "oris": (1, 3),
+        "image_size": (1, 2),
+        "descriptors": (1, 3, 8),
+    }
+    assert all(tensor.dtype == torch.float32 for tensor in found.values())
+    assert found["image_size"].tolist() == [[100, 50]]
+    np.testing.assert_array_equal(found["keypoints"][0], points.xy)
+    np.testing.assert_array_equal(found["keypoint_scores"][0], points.scores)
+    np.testing.assert_allclose(found["oris"][0], np.radians([0, 1, 2]), rtol=1e-6)
+    plain = POINTS.to_lightglue(size=7, angle=90)
+    assert "descriptors" not in plain
+    assert plain["scales"].tolist() == [[7, 7, 7]]
+    np.testing.assert_allclose(plain["oris"][0], np.full(3, np.pi / 2), rtol=1e-6)
+    given = POINTS.to_lightglue(np.eye(3, 128))
+    np.testing.assert_array_equal(given["descriptors"][0], np.eye(3, 128))
+    with pytest.raises(OptionError, match=r"need \(3, D\) descriptors"):
+        POINTS.to_lightglue(np.eye(2, 128))
+
+
+def test_lightglue_takes_them() -> None:
+    """The network of kornia, without its weights: names, shapes and types fit."""
+    kornia = pytest.importorskip("kornia.feature", reason="needs kornia for its LightGlue")
+    torch = pytest.importorskip("torch", reason="needs torch")
+    matcher = kornia.LightGlue(None, input_dim=128, add_scale_ori=True).eval()
+    rng = np.random.default_rng(0)
+    features = [
+        Keypoints(rng.uniform(0, 99, (40, 2)), np.ones(40), (100, 100)).to_lightglue(
+            rng.random((40, 128)).astype(np.float32)
+        )
+        for _ in range(2)
+    ]
+    with torch.inference_mode():
+        found = matcher({"image0": features[0], "image1": features[1]})
+    assert found["matches0"].shape == (1, 40)
+
+
+def test_without_torch_it_is_one_sentence(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MissingExtraError, match="pip install torch") as caught:
+        POINTS.to_lightglue()
+    one_line(caught.value)

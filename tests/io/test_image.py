@@ -571,7 +571,6 @@ BAD_ARRAYS = {
     "4-D": (np.zeros((1, 20, 20, 3), np.uint8), "(1, 20, 20, 3)"),
     "2 channels": (np.zeros((20, 20, 2), np.uint8), "1, 3 or 4 channels"),
     "5 channels": (np.zeros((20, 20, 5), np.uint8), "1, 3 or 4 channels"),
-    "channels first": (np.zeros((3, 20, 20), np.uint8), "1, 3 or 4 channels"),
     "int64": (np.zeros((20, 20), np.int64), "int64"),
     "int8": (np.zeros((20, 20), np.int8), "int8"),
     "complex": (np.zeros((20, 20), complex), "complex"),

@@ -273,3 +273,33 @@ def test_every_flipped_bit_is_one_sentence_or_harmless(
             one_line(error)
             refused += 1
     assert refused > len(content) / 2
+
+
+def test_indices_survive_the_round_trip(tmp_path: Path) -> None:
+    saved = matches_of()
+    saved = Matches(**{**vars(saved), "indices0": [4, 3, 2, 1, 0], "indices1": [0, 1, 2, -1, -1]})
+    save_matches(saved, tmp_path / "m.npz")
+    loaded = load_matches(tmp_path / "m.npz")
+    assert loaded.indices0.tolist() == [4, 3, 2, 1, 0]
+    assert loaded.indices1.tolist() == [0, 1, 2, -1, -1]
+
+
+def test_files_of_earlier_versions_have_no_indices(tmp_path: Path) -> None:
+    saved = matches_of()
+    save_matches(saved, tmp_path / "m.npz")
+    with np.load(tmp_path / "m.npz") as file:
+        arrays = {name: file[name] for name in file if not name.startswith("indices")}
+    np.savez(tmp_path / "old.npz", **arrays)
+    loaded = load_matches(tmp_path / "old.npz")
+    assert loaded.indices0.tolist() == [0, 1, 2, 3, 4]
+    # The last two keypoints are not among those of the second image.
+    assert loaded.indices1.tolist() == [-1, -1, 2, 1, 0]
+
+
+def test_indices_of_no_keypoint_are_damage(tmp_path: Path) -> None:
+    save_matches(matches_of(), tmp_path / "m.npz")
+    with np.load(tmp_path / "m.npz") as file:
+        arrays = dict(file)
+    np.savez(tmp_path / "bad.npz", **{**arrays, "indices1": arrays["indices1"] + 5})
+    with pytest.raises(ValueError, match=r"holds no matches \(indices1 must lie in \[-1, 2\]"):
+        load_matches(tmp_path / "bad.npz")

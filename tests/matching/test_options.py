@@ -49,7 +49,7 @@ def test_the_published_preset_is_what_the_published_code_runs() -> None:
     values = flat(get_preset("published"))
     expected = {
         "heatmap.resolution": 480,
-        "heatmap.channels": "bgr",
+        "heatmap.network_channels": "bgr",
         "selection.threshold": 0.5,
         "selection.density": None,
         "selection.max_keypoints": None,
@@ -115,7 +115,7 @@ def test_a_preset_like_no_other_brings_the_whole_list() -> None:
         ("iterations", 7, "geometry.iterations"),
         ("seed", 3, "geometry.seed"),
         ("resolution", 240, "heatmap.resolution"),
-        ("channels", "rgb", "heatmap.channels"),
+        ("network_channels", "rgb", "heatmap.network_channels"),
         ("tta", "flip", "heatmap.tta"),
         ("tile_megapixels", 2.0, "heatmap.tile_megapixels"),
     ],

@@ -60,12 +60,30 @@ def assert_well_formed(matches: Matches) -> None:
         assert (points.shape, points.dtype) == ((count, 2), np.float32)
         own = set(map(tuple, keypoints.xy.tolist()))
         assert not whole or set(map(tuple, points.tolist())) <= own
+    assert_indices_fit(matches, exact=not by_rows)
     assert (matches.scores.shape, matches.scores.dtype) == ((count,), np.float32)
     assert ((matches.scores >= 0) & (matches.scores <= 1)).all()
     assert (matches.inliers.shape, matches.inliers.dtype) == ((count,), np.bool_)
     assert matches.model in ("homography", "fundamental", "essential", "none")
     if matches.matrix is not None:
         assert (matches.matrix.shape, matches.matrix.dtype) == ((3, 3), np.float64)
+
+
+def assert_indices_fit(matches: Matches, *, exact: bool) -> None:
+    """Indices are of the keypoints that are matched, or of those up to a pixel away."""
+    for side in (0, 1):
+        points, indices = getattr(matches, f"points{side}"), getattr(matches, f"indices{side}")
+        xy = getattr(matches, f"keypoints{side}").xy
+        assert (indices.shape, indices.dtype) == ((len(matches),), np.int32)
+        there = indices >= 0
+        if exact:
+            assert there.all()
+            np.testing.assert_array_equal(xy[indices], points)
+            continue
+        distances = np.linalg.norm(xy[indices[there]] - points[there], axis=1)
+        assert (distances <= 1).all()
+        for point in points[~there]:
+            assert np.linalg.norm(xy - point, axis=1).min() > 1
 
 
 def unguided(*images: Any, **changes: Any) -> Matches:
@@ -412,7 +430,7 @@ def test_a_preset_without_its_heatmap_options_takes_a_stand_in(photo: np.ndarray
 
 
 def test_a_detector_keeps_its_own_resolution(photo: np.ndarray) -> None:
-    squashing = DeepDetect(resolution=64, channels="bgr")
+    squashing = DeepDetect(resolution=64, network_channels="bgr")
     chosen = {"max_keypoints": 100, "mode": "dense"}
     matches = match_images(photo, photo, squashing, **chosen)
     np.testing.assert_array_equal(matches.keypoints0.xy, squashing.detect(photo, **chosen).xy)
@@ -463,9 +481,9 @@ def test_heatmap_options_reach_the_network_and_leave_the_detector(
 ) -> None:
     before = network.heatmap_options
     chosen = {"max_keypoints": 100, "mode": "dense"}
-    matches = match_images(photo, photo, network, resolution=64, channels="bgr", **chosen)
+    matches = match_images(photo, photo, network, resolution=64, network_channels="bgr", **chosen)
     assert network.heatmap_options == before
-    expected = DeepDetect(resolution=64, channels="bgr").detect(photo, **chosen)
+    expected = DeepDetect(resolution=64, network_channels="bgr").detect(photo, **chosen)
     np.testing.assert_array_equal(matches.keypoints0.xy, expected.xy)
     native = network.detect(photo, **chosen)
     assert not np.array_equal(matches.keypoints0.xy, native.xy)
@@ -643,3 +661,84 @@ def test_a_pair_without_a_geometry_has_no_matches() -> None:
     assert not matches.guided
     assert (len(matches), matches.model, matches.matrix) == (0, "none", None)
     assert not match_images(first, second, RandomDetector(), guided=False).lost
+
+
+@pytest.mark.parametrize("mutual", [False, True])
+@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("options", [{}, {"max_keypoints": 600}], ids=["dense", "points"])
+def test_indices_of_a_scene_with_depth(
+    facade: Any, mutual: bool, swapped: bool, options: dict[str, Any]
+) -> None:
+    scene = facade(0.2)
+    images = (scene.right, scene.left) if swapped else (scene.left, scene.right)
+    found = match_images(*images, model="fundamental", mutual=mutual, **options)
+    assert found.subpixel
+    assert len(found) > 100
+    assert_indices_fit(found, exact=False)
+    # One end is at a keypoint, or on the pixel of one that is sub-pixel.
+    ends = [
+        (points, keypoints.xy[indices], indices)
+        for points, keypoints, indices in (
+            (found.points0, found.keypoints0, found.indices0),
+            (found.points1, found.keypoints1, found.indices1),
+        )
+    ]
+    if not mutual:
+        ends = ends[:1]
+    assert any(
+        (indices >= 0).all() and (np.rint(xy) == points).all() for points, xy, indices in ends
+    )
+    share = min((found.indices0 >= 0).mean(), (found.indices1 >= 0).mean())
+    assert share > (0.4 if options else 0.8)
+
+
+@pytest.mark.parametrize("options", [{}, {"max_keypoints": 500}, {"guided": False}], ids=str)
+def test_tracks_chain_by_their_indices(photo: np.ndarray, options: dict[str, Any]) -> None:
+    """A keypoint of the image in the middle has one index, whatever the image is matched with."""
+    there = np.array([[1, 0.02, -6.0], [-0.02, 1, 4], [0, 0, 1]])
+    views = [photo, warped(photo, there), warped(photo, there @ there)]
+    detector = DeepDetect()
+    if "guided" in options:
+        options = {**options, "max_keypoints": 500, "mutual": True}
+    first = match_images(views[0], views[1], detector, model="homography", **options)
+    second = match_images(views[1], views[2], detector, model="homography", **options)
+    middle = first.keypoints1
+    np.testing.assert_array_equal(middle.xy, second.keypoints0.xy)
+    np.testing.assert_array_equal(middle.xy, detector.detect(views[1], **_selection(options)).xy)
+    onward = dict(zip(second.indices0.tolist(), second.indices1.tolist(), strict=True))
+    tracks = [
+        (int(a), onward[int(b)])
+        for a, b in zip(first.indices0, first.indices1, strict=True)
+        if int(b) in onward
+    ]
+    assert len(tracks) > 0.3 * min(len(first), len(second))
+    start = first.keypoints0.xy[[a for a, _ in tracks]].astype(np.float64)
+    end = second.keypoints1.xy[[c for _, c in tracks]]
+    expected = cv2.perspectiveTransform(start[None], there @ there)[0]
+    errors = np.linalg.norm(end - expected, axis=1)
+    assert np.mean(errors < 3) > (0.6 if "guided" in options else 0.9)
+
+
+def _selection(options: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if name == "max_keypoints"}
+
+
+def test_seeds_give_indices_too(photo: np.ndarray) -> None:
+    moved = warped(photo, WARP)
+    seeds = np.random.default_rng(0).uniform(60, 190, (60, 2))
+    there = cv2.perspectiveTransform(seeds[None], WARP)[0]
+    found = match_images(photo, moved, Corners(), seeds=(seeds, there), model="homography")
+    assert len(found) > 100
+    assert_indices_fit(found, exact=True)
+
+
+def test_images_of_opencv_are_matched_as_what_they_show(photo: np.ndarray) -> None:
+    first, second = photo[:160, :160], photo[20:180, 30:190]
+    bgr = [cv2.cvtColor(image, cv2.COLOR_RGB2BGR) for image in (first, second)]
+    expected = match_images(first, second, model="homography")
+    found = match_images(*bgr, channels="bgr", model="homography")
+    np.testing.assert_array_equal(found.points0, expected.points0)
+    np.testing.assert_array_equal(found.points1, expected.points1)
+    np.testing.assert_array_equal(found.keypoints1.scores, expected.keypoints1.scores)
+    with pytest.raises(OptionError, match="unknown channel order 'brg'"):
+        match_images(*bgr, channels="brg")

@@ -69,6 +69,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         yield temporary
         temporary.chmod(0o666 & ~_umask())
         temporary.replace(final)
+    except DeepDetectError:  # of a missing file, which is an OSError
+        raise
     except OSError as error:
         raise DeepDetectError(
             f"cannot write {final} ({error.strerror or error}): "

@@ -8,35 +8,61 @@ from collections.abc import Iterable
 class DeepDetectError(Exception):
     """An error that the user can fix: one sentence says what is wrong and what to do.
 
-    The command line prints it without a traceback and ends with exit code 2.
+    The classes below are also the built-in error that says the same: `ValueError` for what is
+    wrong with an argument or with the content of a file, `FileNotFoundError` for a missing file,
+    `ImportError` for a missing package. The command line prints the sentence without a traceback
+    and ends with exit code 2.
     """
 
 
-class ImageError(DeepDetectError):
-    """An image is missing, unreadable, too small, or has the wrong shape or type."""
+class ImageError(DeepDetectError, ValueError):
+    """An image is missing, unreadable, too small, or has the wrong shape or type.
 
-
-class OptionError(DeepDetectError):
-    """An option has an unknown name or a value out of its range."""
-
-
-class WeightsError(DeepDetectError):
-    """A weights file is missing, damaged, or does not fit the network."""
-
-
-class ReconstructionError(DeepDetectError):
-    """Two images give no depth; the message says which of the usual reasons it is."""
-
-
-class NothingFoundError(DeepDetectError):
-    """Images hold nothing of what was looked for that can be trusted: they may not belong together.
-
-    The command line ends with exit code 3.
+    A `ValueError`; where the file is missing a `FileNotFoundError`, too.
     """
 
 
-class MissingExtraError(DeepDetectError):
-    """An optional package is needed for what was asked and is not installed."""
+class OptionError(DeepDetectError, ValueError):
+    """An option has an unknown name or a value out of its range; a `ValueError`."""
+
+
+class WeightsError(DeepDetectError, ValueError):
+    """A weights file is missing, damaged, or does not fit the network.
+
+    A `ValueError`; where the file is missing a `FileNotFoundError`, too.
+    """
+
+
+class ReconstructionError(DeepDetectError, ValueError):
+    """Two images give no depth; the message says which of the usual reasons. A `ValueError`."""
+
+
+class MissingExtraError(DeepDetectError, ImportError):
+    """An optional package is needed for what was asked and is not installed; an `ImportError`."""
+
+
+class RegistrationError(DeepDetectError, ValueError):
+    """No homography between images can be trusted, or none that they can be drawn by."""
+
+
+class MissingFileError(DeepDetectError, FileNotFoundError):
+    """A file or folder is missing."""
+
+
+class MissingImageError(ImageError, MissingFileError):
+    """An image, or a folder of images, is missing."""
+
+
+class MissingWeightsError(WeightsError, MissingFileError):
+    """A file of weights is missing."""
+
+
+class MissingCalibrationError(ReconstructionError, MissingFileError):
+    """A file of cameras is missing."""
+
+
+class InvalidFileError(DeepDetectError, ValueError):
+    """A file does not hold what it should."""
 
 
 class BatchError(DeepDetectError):
@@ -87,6 +113,7 @@ for _error in (
     MissingExtraError,
     OptionError,
     ReconstructionError,
+    RegistrationError,
     WeightsError,
 ):
     # Where users import them from: tracebacks and `pickle` say so.

@@ -17,10 +17,17 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
-def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+def suggest_keywords(
+    function: Callable[Parameters, Result], elsewhere: Mapping[str, str] = {}
+) -> Callable[Parameters, Result]:
     """Decorate a function so that an unknown keyword is an error with the nearest right one.
 
-    The function keeps its signature, so that editors and type checkers see it.
+    It keeps its signature, so that editors and type checkers see it. A class is decorated above
+    `dataclass`; it stays the same class.
+
+    Args:
+        function: to be decorated.
+        elsewhere: what to do instead, by keywords that belong to other functions.
 
     Raises:
         OptionError: from the function, when called with an unknown keyword.
@@ -35,11 +42,18 @@ def suggest_keywords(function: Callable[Parameters, Result]) -> Callable[Paramet
         deepdetect.OptionError: unknown option 'max_keypoint': did you mean \
 'max_keypoints'? (known: image, max_keypoints)
     """
-    names = [name for name in inspect.signature(function).parameters if name != "self"]
+    if isinstance(function, type):
+        kind: Any = function
+        kind.__init__ = suggest_keywords(kind.__init__)
+        return function
+    parameters = inspect.signature(function).parameters
+    names = [name for name in parameters if name not in ("self", "cls")]
 
     @functools.wraps(function)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         for name in kwargs:
+            if name in elsewhere:
+                raise OptionError(f"unknown option {name!r}: {elsewhere[name]}")
             if name not in names:
                 raise unknown_name("option", name, names)
         return function(*args, **kwargs)

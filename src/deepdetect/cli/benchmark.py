@@ -127,7 +127,7 @@ def benchmark(
         protocols or DEFAULT_PROTOCOLS,
         classical,
         tuple(find_feature(word) for word in words),
-        "rgb" if heatmap is None else heatmap.channels,
+        "rgb" if heatmap is None else heatmap.network_channels,
         geometry_weights,
         PairSelectionOptions(max_pairs),
         degraded_images,

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import ImageError, MissingExtraError
+from .._shared.errors import ImageError, MissingExtraError, MissingImageError
 from .._shared.text_files import read_json
 from ..geometry.camera import MAX_FILE_BYTES, read_calibration
 from ..io.image import load_image
@@ -102,7 +102,7 @@ def load_motorcycle() -> StereoPair:
 def _load_views(folder: str | Path) -> tuple[Path, np.ndarray, np.ndarray]:
     root = Path(folder).resolve()
     if not root.is_dir():
-        raise ImageError(f"there is no folder {folder}: name the folder of a stereo scene")
+        raise MissingImageError(f"there is no folder {folder}: name the folder of a stereo scene")
     left, right = load_image(root / "left.png"), load_image(root / "right.png")
     if left.shape != right.shape:
         raise ImageError(f"left.png and right.png in {root} differ in size: take a rectified pair")

@@ -8,11 +8,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 
 Item = TypeVar("Item")
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class PairSelectionOptions:
     """Which pairs of a scene are chosen; the same ones every time.

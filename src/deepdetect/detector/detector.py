@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, overload
 import numpy as np
 
 from .._shared.errors import DeepDetectError, OptionError
+from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
@@ -30,10 +32,16 @@ from .heatmap import (
     compute_native_logits,
     is_native,
 )
+from .image_lists import Images, for_each_image, ignore_masks, image_list
 from .pretrained import RANKER, resolve_weights
 
 if TYPE_CHECKING:
     from .points.ranker import Ranker
+
+CHANNELS_OF_IMAGES = (
+    "give it with each image, as detect(image, channels='bgr'); what the network itself is fed is "
+    "`network_channels`"
+)
 
 
 class HeatmapDetector(Protocol):
@@ -58,7 +66,8 @@ class DeepDetect:
         providers: ONNX Runtime's execution providers by name, as "CUDAExecutionProvider", the
             preferred one first.
         threads: number of threads. None: the backend's choice.
-        channels: "rgb", or "bgr" as the paper's published code feeds them.
+        network_channels: "rgb", or "bgr" as the paper's published code feeds the network. For
+            images of OpenCV leave it, and give the methods `channels="bgr"`.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
             times the time.
         tile_megapixels: with `resolution="native"`, images above so many megapixels are run in
@@ -87,7 +96,7 @@ class DeepDetect:
         10
     """
 
-    @suggest_keywords
+    @functools.partial(suggest_keywords, elsewhere={"channels": CHANNELS_OF_IMAGES})
     def __init__(
         self,
         weights: str | Path = "default",
@@ -96,13 +105,13 @@ class DeepDetect:
         backend: str = "auto",
         providers: tuple[str, ...] = (),
         threads: int | None = None,
-        channels: Literal["rgb", "bgr"] = "rgb",
+        network_channels: Channels = "rgb",
         tta: Literal["none", "flip"] = "none",
         tile_megapixels: float | Literal["auto"] = "auto",
         ranker: str | Path | None = None,
     ) -> None:
         self.weights = resolve_weights(weights)
-        self.heatmap_options = HeatmapOptions(resolution, channels, tta, tile_megapixels)
+        self.heatmap_options = HeatmapOptions(resolution, network_channels, tta, tile_megapixels)
         self.ranker = RANKER if ranker is None else Path(ranker)
         if ranker is not None:  # what may be wrong with it is said now
             from .points.ranker import load_ranker
@@ -111,12 +120,14 @@ class DeepDetect:
         self._runtime = RuntimeOptions(backend, providers, threads)
         self._network, self.backend = open_network(self.weights, self._runtime)
 
+    @suggest_keywords
     def configured(self, heatmap_options: HeatmapOptions) -> DeepDetect:
         """Return a detector with the same loaded network and other heat map options."""
         other = copy.copy(self)
         other.heatmap_options = heatmap_options
         return other
 
+    @suggest_keywords
     def with_weights(self, weights: str | Path) -> DeepDetect:
         """Return a detector with other weights, and all other options as they are.
 
@@ -128,26 +139,46 @@ class DeepDetect:
         other._network, other.backend = open_network(other.weights, self._runtime)
         return other
 
-    def heatmap(self, image: Any) -> np.ndarray:
+    @overload
+    def heatmap(self, image: Images, *, channels: Channels = ...) -> list[np.ndarray]: ...
+
+    @overload
+    def heatmap(self, image: Any, *, channels: Channels = ...) -> np.ndarray: ...
+
+    @suggest_keywords
+    def heatmap(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray | list[np.ndarray]:
         """Compute the probability of a keypoint at each pixel.
 
         Args:
-            image: a path, a PIL image, or an array: uint8, uint16 or float in [0, 1];
-                grey, RGB or RGBA.
+            image: a path, a PIL image, or an array or PyTorch tensor: uint8, uint16 or float in
+                [0, 1]; grey, RGB or RGBA; channels last or first. Or several of them, in a list, a
+                tuple or a batch of four dimensions; their sizes may differ.
+            channels: the order of the colours in arrays and tensors: "bgr" for the images of
+                `cv2.imread`.
 
         Returns:
-            (H, W) float32 in [0, 1], at the image's own size.
+            (H, W) float32 in [0, 1], at the image's own size; of several images a list, in their
+            order.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
+            ImageError: an image cannot be read or is not fit.
         """
-        return self.heatmap_and_logits(image)[0]
+        return for_each_image(
+            image, lambda one, _: self.heatmap_and_logits(one, channels=channels)[0]
+        )
 
-    def heatmap_and_logits(self, image: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the heat map and the logits of its probabilities; argument as of `heatmap`.
+    @suggest_keywords
+    def heatmap_and_logits(
+        self, image: Any, *, channels: Channels = "rgb"
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Compute the heat map and the logits of its probabilities, of one image.
 
         Float32 rounds the highest probabilities to 1. The logits still distinguish these pixels, so
-        keypoints are ranked by them.
+        keypoints are ranked by them. Both together are all that `select_keypoints` needs to select
+        again, with other options, what `detect` would find.
+
+        Args:
+            image, channels: as of `heatmap`.
 
         Returns:
             The heat map and the logits, (H, W) float32 both.
@@ -155,7 +186,7 @@ class DeepDetect:
         Raises:
             ImageError: the image cannot be read or is not fit.
         """
-        return self._run(load_image(image))
+        return self._run(load_image(image, channels=channels))
 
     def _run(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of an image that `load_image` returned."""
@@ -182,8 +213,42 @@ class DeepDetect:
         shown = self.heatmap_options
         return (
             f"DeepDetect({self.weights.name}, resolution={shown.resolution!r}, "
-            f"channels={shown.channels!r}, backend={self.backend!r})"
+            f"network_channels={shown.network_channels!r}, backend={self.backend!r})"
         )
+
+    @overload
+    def detect(
+        self,
+        image: Images,
+        threshold: float = ...,
+        *,
+        density: float | None = ...,
+        max_keypoints: int | None = ...,
+        nms_radius: int | None = ...,
+        subpixel: bool | None = ...,
+        ignore: np.ndarray | Images | None = ...,
+        mode: Literal["auto", "dense", "points"] = ...,
+        spread: Literal["none", "grid", "anms"] = ...,
+        channels: Channels = ...,
+        return_heatmap: Literal[False] = ...,
+    ) -> list[Keypoints]: ...
+
+    @overload
+    def detect(
+        self,
+        image: Images,
+        threshold: float = ...,
+        *,
+        density: float | None = ...,
+        max_keypoints: int | None = ...,
+        nms_radius: int | None = ...,
+        subpixel: bool | None = ...,
+        ignore: np.ndarray | Images | None = ...,
+        mode: Literal["auto", "dense", "points"] = ...,
+        spread: Literal["none", "grid", "anms"] = ...,
+        channels: Channels = ...,
+        return_heatmap: Literal[True],
+    ) -> tuple[list[Keypoints], list[np.ndarray]]: ...
 
     @overload
     def detect(
@@ -198,6 +263,7 @@ class DeepDetect:
         ignore: np.ndarray | None = ...,
         mode: Literal["auto", "dense", "points"] = ...,
         spread: Literal["none", "grid", "anms"] = ...,
+        channels: Channels = ...,
         return_heatmap: Literal[False] = ...,
     ) -> Keypoints: ...
 
@@ -214,6 +280,7 @@ class DeepDetect:
         ignore: np.ndarray | None = ...,
         mode: Literal["auto", "dense", "points"] = ...,
         spread: Literal["none", "grid", "anms"] = ...,
+        channels: Channels = ...,
         return_heatmap: Literal[True],
     ) -> tuple[Keypoints, np.ndarray]: ...
 
@@ -227,11 +294,12 @@ class DeepDetect:
         max_keypoints: int | None = None,
         nms_radius: int | None = None,
         subpixel: bool | None = None,
-        ignore: np.ndarray | None = None,
+        ignore: np.ndarray | Images | None = None,
         mode: Literal["auto", "dense", "points"] = "auto",
         spread: Literal["none", "grid", "anms"] = "none",
+        channels: Channels = "rgb",
         return_heatmap: bool = False,
-    ) -> Keypoints | tuple[Keypoints, np.ndarray]:
+    ) -> Any:
         """Detect keypoints.
 
         Without `max_keypoints` they are dense: all pixels with a probability over the threshold.
@@ -239,7 +307,7 @@ class DeepDetect:
         another photograph; the network is not run for them.
 
         Args:
-            image: as for `heatmap`.
+            image: as for `heatmap`: one, or several in a list, a tuple or a batch.
             threshold: tau: pixels with a probability above it.
             density: wanted keypoints per pixel, in (0, 1], instead of the threshold. This many
                 are returned even where there is little to detect.
@@ -248,15 +316,20 @@ class DeepDetect:
                 with `max_keypoints`, else 0.
             subpixel: of dense keypoints: refine positions to a fraction of a pixel. None: with
                 `max_keypoints` only.
-            ignore: (H, W) array, true where no keypoint is wanted.
+            ignore: (H, W) array, true where no keypoint is wanted. Of several images one for each,
+                or None, in a list or a tuple; or one array for all.
             mode: "dense", "points", or "auto": points with `max_keypoints` where none of
                 threshold, density, nms_radius and subpixel is given, else dense.
             spread: of points: "none", "grid" (in turn the best of each cell), or "anms" (as far
                 from each other as their number allows).
+            channels: the order of the colours in arrays and tensors, as of `heatmap`.
             return_heatmap: return the heat map, too.
 
         Returns:
-            The keypoints; with `return_heatmap`, the keypoints and the (H, W) float32 heat map.
+            The keypoints; with `return_heatmap`, the keypoints and the (H, W) float32 heat map. Of
+            several images a list in their order, with `return_heatmap` two lists: the same as one
+            by one. The network sees one image at a time: a batch of photographs is no faster on a
+            processor, takes the memory of all, and its last bits may differ.
             Dense keypoints come in the order of rows and columns, on pixel centres unless
             `subpixel`; points come best first, with sub-pixel positions and sizes.
 
@@ -265,14 +338,32 @@ class DeepDetect:
             OptionError: an option is out of its range, or options do not fit together.
         """
         options = SelectionOptions(
-            threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread
+            threshold, density, max_keypoints, nms_radius, subpixel, None, mode, spread
         )
-        rgb = load_image(image)
+        images = image_list(image)
+        masks = ignore_masks(ignore, None if images is None else len(images))
+
+        def find(one: Any, number: int) -> tuple[Keypoints, np.ndarray | None]:
+            chosen = replace(options, ignore=masks[number])
+            return self._find(load_image(one, channels=channels), chosen, return_heatmap)
+
+        if images is None:
+            keypoints, heatmap = find(image, 0)
+            return (keypoints, heatmap) if return_heatmap else keypoints
+        found = for_each_image(images, find)
+        all_keypoints = [keypoints for keypoints, _ in found]
+        return (
+            (all_keypoints, [heatmap for _, heatmap in found]) if return_heatmap else all_keypoints
+        )
+
+    def _find(
+        self, rgb: np.ndarray, options: SelectionOptions, return_heatmap: bool
+    ) -> tuple[Keypoints, np.ndarray | None]:
+        """Find the keypoints of a loaded image, and its heat map where it is asked for."""
         if options.uses_points:
-            keypoints = self._points(rgb, options)
-            return (keypoints, self._run(rgb)[0]) if return_heatmap else keypoints
+            return self._points(rgb, options), self._run(rgb)[0] if return_heatmap else None
         if not return_heatmap:
-            return self._dense(rgb, options)
+            return self._dense(rgb, options), None
         heatmap, logits = self._run(rgb)
         with memory_named(rgb):
             return select_keypoints(heatmap, options, logits), heatmap

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.image_array import Channels, check_channels
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import available_memory
 from ..features.selection import bands, sigmoid
 from .backends import Network
@@ -31,6 +32,7 @@ MIN_TILE_MEGAPIXELS = 1.5
 """Of smaller tiles most would be overlap."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class HeatmapOptions:
     """How an image is shown to the network.
@@ -41,8 +43,9 @@ class HeatmapOptions:
             noise more than structure, and the network needs seconds and gigabytes for them. A
             number of pixels squashes the image to a square of that side and the map back, as the
             paper does with 480.
-        channels: order of the colours that the network sees. "bgr" is what the paper's
-            published code feeds, though the weights were trained on RGB.
+        network_channels: order of the colours that the network sees. "bgr" is what the paper's
+            published code feeds, though the weights were trained on RGB. It says nothing of the
+            images that are given: that is `channels` of each function that takes one.
         tta: test-time augmentation. "flip" takes the mean of the logits of the image in its eight
             flips and quarter turns: eight times the time, and a flipped or turned image gives the
             same keypoints. Without it about .94 of them are the same.
@@ -57,7 +60,7 @@ class HeatmapOptions:
     """
 
     resolution: Literal["auto", "native"] | int = "auto"
-    channels: Literal["rgb", "bgr"] = "rgb"
+    network_channels: Channels = "rgb"
     tta: Literal["none", "flip"] = "none"
     tile_megapixels: float | Literal["auto"] = "auto"
 
@@ -75,8 +78,7 @@ class HeatmapOptions:
                 f"the resolution must be 'auto', 'native' or a multiple of {STRIDE} from 16 on, "
                 f"not {self.resolution}"
             )
-        if self.channels not in ("rgb", "bgr"):
-            raise unknown_name("channel order", self.channels, ["rgb", "bgr"])
+        check_channels(self.network_channels)
         if self.tta not in ("none", "flip"):
             raise unknown_name("tta", self.tta, ["none", "flip"])
         if self.tile_megapixels != "auto":
@@ -117,7 +119,7 @@ def compute_heatmap_and_logits(
         raise OptionError("`tile_megapixels` needs `resolution='native'`: scaled images are small")
     if _is_constant(rgb):
         return np.zeros((height, width), np.float32), np.full((height, width), -np.inf, np.float32)
-    shown = rgb if options.channels == "rgb" else rgb[:, :, ::-1]
+    shown = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
     shown = np.ascontiguousarray(shown)
     if options.resolution == "auto":
         scale = (MAX_AUTO_PIXELS / (height * width)) ** 0.5
@@ -153,7 +155,7 @@ def compute_native_logits(rgb: np.ndarray, network: Network, options: HeatmapOpt
     """
     if _is_constant(rgb):
         return np.full(rgb.shape[:2], -np.inf, np.float32)
-    shown = rgb if options.channels == "rgb" else rgb[:, :, ::-1]
+    shown = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
     tiled = _tiled(network, shown.shape[0] * shown.shape[1], options)
     if tiled is None:
         return np.ascontiguousarray(_mean_of_flips(partial(_run, network), shown, options))

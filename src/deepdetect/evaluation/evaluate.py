@@ -52,6 +52,7 @@ class OxfordScore:
     matches: dict[str, int]
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class Evaluation:
     """How good weights are.

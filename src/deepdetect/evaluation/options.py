@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import suggest_keywords
 from ..datasets.pair_selection import PairSelectionOptions
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
@@ -36,6 +37,7 @@ BASELINES: dict[str, LocalFeature] = {**CLASSICAL, **HESSIAN}
 """The classical baselines by name: the paper's, and those of the standard protocol only."""
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class BenchmarkOptions:
     """What is compared, and how.

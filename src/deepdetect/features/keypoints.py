@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError
+from .._shared.errors import MissingExtraError, OptionError
+from .._shared.image_array import Channels
 from .._shared.opencv import cv2
+from .._shared.options import suggest_keywords
 
 MAX_COORDINATE_BITS = 12
 """Of a position in `bayer_order`: float32 holds the order exactly up to this many."""
@@ -22,6 +24,7 @@ _OPTIONAL: dict[str, Any] = {
 }
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Keypoints:
     """Keypoints of one image.
@@ -97,11 +100,13 @@ class Keypoints:
             object.__setattr__(self, "descriptors", descriptors)
 
     @classmethod
+    @suggest_keywords
     def empty(cls, image_size: tuple[int, int]) -> Keypoints:
         """Return a set without keypoints."""
         return cls(np.empty((0, 2), np.float32), np.empty(0, np.float32), image_size)
 
     @classmethod
+    @suggest_keywords
     def from_opencv(
         cls, keypoints: Sequence[cv2.KeyPoint], image_size: tuple[int, int]
     ) -> Keypoints:
@@ -126,6 +131,7 @@ class Keypoints:
             octaves=np.array([point.octave for point in keypoints], np.int32),
         )
 
+    @suggest_keywords
     def to_opencv(self, size: float = 3.0, angle: float = -1.0) -> list[cv2.KeyPoint]:
         """Convert to OpenCV's keypoints, whose responses are the scores.
 
@@ -148,12 +154,88 @@ class Keypoints:
         )
         return [cv2.KeyPoint(*row) for row in zip(*columns, strict=True)]
 
+    @suggest_keywords
+    def to_lightglue(
+        self, descriptors: np.ndarray | None = None, *, size: float = 3.0, angle: float = 0.0
+    ) -> dict[str, Any]:
+        """Convert to the features of one image that LightGlue takes, as PyTorch tensors.
+
+        `LightGlue(features="sift")` takes RootSIFT descriptors, sizes and angles; up to 4,096
+        keypoints are usual. Its pixels are as ours: the centre of the first is (0, 0).
+
+        Args:
+            descriptors: (N, D) float32; None: those that the keypoints have. Without any the
+                dictionary has none.
+            size: diameter in pixels where the keypoints have no sizes.
+            angle: orientation in degrees where they have no angles.
+
+        Returns:
+            float32 tensors with a batch dimension: "keypoints" (1, N, 2), "keypoint_scores"
+            (1, N), "scales" (1, N) in pixels, "oris" (1, N) in radians, "image_size" (1, 2) as
+            (width, height), and "descriptors" (1, N, D).
+
+        Raises:
+            OptionError: there is not one descriptor for each keypoint.
+            MissingExtraError: torch is not installed.
+        """
+        try:
+            import torch
+        except ImportError:
+            raise MissingExtraError(
+                "features for LightGlue need the package torch, which is not installed: "
+                "run pip install torch"
+            ) from None
+        # Checks the descriptors.
+        described = self if descriptors is None else replace(self, descriptors=descriptors)
+        count = len(self)
+        sizes = np.full(count, size, np.float32) if self.sizes is None else self.sizes
+        angles = np.full(count, angle, np.float32) if self.angles is None else self.angles
+        arrays = {
+            "keypoints": self.xy,
+            "keypoint_scores": self.scores,
+            "scales": sizes,
+            "oris": np.deg2rad(angles),
+            "image_size": np.array(self.image_size),
+        }
+        if described.descriptors is not None:
+            arrays["descriptors"] = described.descriptors
+        return {name: torch.tensor(a, dtype=torch.float32)[None] for name, a in arrays.items()}
+
+    @suggest_keywords
+    def plot(
+        self,
+        image: Any = None,
+        *,
+        axes: Any = None,
+        channels: Channels = "rgb",
+        color: str = "lime",
+    ) -> Any:
+        """Plot the keypoints with matplotlib: as circles of their sizes when they are few.
+
+        Args:
+            image: their image as an array, a PyTorch tensor or a PIL image, drawn below them.
+            axes: matplotlib axes to draw on. None: those of a new figure.
+            channels: order of the colours in an array or a tensor.
+            color: any that matplotlib knows.
+
+        Returns:
+            The axes.
+
+        Raises:
+            ImageError: the image has another size than the keypoints'.
+            MissingExtraError: matplotlib is not installed.
+        """
+        from .display import plot_keypoints
+
+        return plot_keypoints(self.xy, self.image_size, self.sizes, image, axes, channels, color)
+
     @property
     def density(self) -> float:
         """Keypoints per pixel."""
         width, height = self.image_size
         return len(self) / (width * height)
 
+    @suggest_keywords
     def best(self, count: int) -> Keypoints:
         """Return the keypoints with the highest logits (or scores), in the order they have here.
 
@@ -183,6 +265,20 @@ class Keypoints:
 
     def __iter__(self) -> Iterator[np.ndarray]:
         return iter(self.xy)
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: a small table, and where the keypoints are."""
+        from .display import html_summary
+
+        width, height = self.image_size
+        rows = {"image": f"{width}x{height}", "density": f"{self.density:.3f} per pixel"}
+        if len(self):
+            rows["scores"] = f"{self.scores.min():.3g} to {self.scores.max():.3g}"
+        if self.sizes is not None and len(self):
+            rows["sizes"] = f"{self.sizes.min():.3g} to {self.sizes.max():.3g} px"
+        names = (*_OPTIONAL, "descriptors")
+        rows["also"] = ", ".join(n for n in names if getattr(self, n) is not None) or "nothing"
+        return html_summary(f"{len(self):,} keypoints", rows, [(self.xy, self.image_size)])
 
     def __repr__(self) -> str:
         width, height = self.image_size
@@ -217,6 +313,45 @@ def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         order = 4 * order + 2 * ((column ^ row) & 1) + (row & 1)
         column, row = column >> 1, row >> 1
     return (order / 4**bits).astype(np.float32)
+
+
+MAX_KEYPOINT_DISTANCE_PX = 1.0
+"""Of a position from the keypoint that it belongs to."""
+
+
+def nearest_keypoints(places: np.ndarray, keypoints: Keypoints) -> np.ndarray:
+    """Return the keypoint nearest to each position, up to a pixel away.
+
+    Args:
+        places: (M, 2) positions.
+        keypoints: of the same image. Of several on one pixel the first counts.
+
+    Returns:
+        (M,) int32 rows of the keypoints; -1 where none is so near.
+
+    Example:
+        >>> points = Keypoints([[2, 3], [4, 3]], [1, 1], (8, 8))
+        >>> nearest_keypoints(np.array([[3.9, 3.2], [2, 3], [6, 6]]), points).tolist()
+        [1, 0, -1]
+    """
+    width, height = keypoints.image_size
+    pixels = np.floor(keypoints.xy + np.float32(0.5)).astype(np.int64)
+    inside = np.flatnonzero(((pixels >= 0) & (pixels < (width, height))).all(axis=1))
+    grid = np.full((height + 4, width + 4), -1, np.int32)  # a border of two spares the checks
+    # The first of several is written last.
+    grid[pixels[inside[::-1], 1] + 2, pixels[inside[::-1], 0] + 2] = inside[::-1]
+    places = np.asarray(places, np.float64).reshape(-1, 2)
+    column, row = np.clip(np.floor(places + 0.5), -1, (width, height)).astype(np.int64).T + 2
+    nearest = np.full(len(places), -1, np.int32)
+    best = np.full(len(places), np.nextafter(MAX_KEYPOINT_DISTANCE_PX**2, 2))
+    if not len(keypoints):
+        return nearest
+    for down, across in np.ndindex(3, 3):
+        found = grid[row + down - 1, column + across - 1]
+        squared = ((keypoints.xy[found] - places) ** 2).sum(axis=1)
+        nearer = (found >= 0) & (squared < best)
+        nearest[nearer], best[nearer] = found[nearer], squared[nearer]
+    return nearest
 
 
 def on_pixels(xy: np.ndarray, shape: tuple[int, ...] | None = None) -> bool:

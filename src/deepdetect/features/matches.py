@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from .._shared.errors import OptionError
-from .keypoints import Keypoints
+from .._shared.image_array import Channels
+from .._shared.options import suggest_keywords
+from .keypoints import Keypoints, nearest_keypoints
+
+_COLUMNS: dict[str, Any] = {
+    "points0": np.float32,
+    "points1": np.float32,
+    "scores": np.float32,
+    "inliers": np.bool_,
+}
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class Guide:
     """The geometry that guided the matching of two images.
@@ -78,6 +90,7 @@ class GuidedMatches:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Matches:
     """Matched keypoints of two images.
@@ -102,11 +115,29 @@ class Matches:
         guide: the geometry that guided the matching; None when guided matching was not asked for.
         subpixel: whether the matching itself found sub-pixel positions in the second image, by
             rectification: they need no refinement.
+        indices0, indices1: (M,) int32 rows of `keypoints0` and `keypoints1`: the keypoints that are
+            matched. Exactly they, unguided and where a homography guided. Where a fundamental
+            matrix guided, the first is the keypoint on whose pixel the match lies, and the second
+            the one nearest to it, up to a pixel away: -1 where there is none, and
+            `m[m.indices1 >= 0]` are the others (with `mutual` it may be the other way round).
+            None: the nearest ones are looked up.
+
+    A detector finds the same keypoints in an image whatever it is matched with, so for the same
+    options the same index is the same keypoint in all pairs of an image: tracks chain by them.
+
+    `len` and indexing by slices, masks, index arrays and whole numbers work: `m[m.inliers]`.
+
+    Raises:
+        OptionError: the shapes do not fit together, or an index is of no keypoint.
 
     Example:
         >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
-        >>> Matches(points.xy, points.xy, [0.5, 0.2], [True, False], "none", None, points, points)
+        >>> ends = points.xy, points.xy
+        >>> m = Matches(*ends, [0.5, 0.2], [True, False], "none", None, points, points)
+        >>> m
         Matches(2 matches of 2 and 2 keypoints, 1 inliers, model='none', guided=False)
+        >>> m[m.inliers].indices1.tolist()
+        [0]
     """
 
     points0: np.ndarray
@@ -120,6 +151,8 @@ class Matches:
     seconds: dict[str, float] = field(default_factory=dict)
     guide: Guide | None = None
     subpixel: bool = False
+    indices0: np.ndarray = None  # type: ignore[assignment]  # never None once it is made
+    indices1: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         counts = [len(self.points0), len(self.points1), len(self.scores), len(self.inliers)]
@@ -128,6 +161,14 @@ class Matches:
                 "matches need as many points0, points1, scores and inliers, not "
                 f"{', '.join(map(str, counts))}"
             )
+        for name, dtype in _COLUMNS.items():
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype))
+        for side in (0, 1):
+            name = f"indices{side}"
+            indices, keypoints = getattr(self, name), getattr(self, f"keypoints{side}")
+            if indices is None:
+                indices = nearest_keypoints(getattr(self, f"points{side}"), keypoints)
+            object.__setattr__(self, name, _checked_indices(indices, name, len(self), keypoints))
 
     @property
     def guided(self) -> bool:
@@ -139,8 +180,90 @@ class Matches:
         """Whether a geometry was to guide these matches and none could be trusted."""
         return self.guide is not None and self.guide.model == "none"
 
+    def unique(self) -> Matches:
+        """Return one-to-one matches: those that score highest at both of their ends.
+
+        Ends are the same keypoint; where no keypoint is near, the same nearest pixel. Of equal
+        scores the first match counts.
+
+        Example:
+            >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
+            >>> ends = points.xy[[0, 0, 1]], points.xy[[1, 0, 1]]
+            >>> m = Matches(*ends, [0.5, 0.9, 0.3], [True] * 3, "none", None, points, points)
+            >>> m.unique().points1.tolist()
+            [[1.0, 2.0]]
+        """
+        kept = np.ones(len(self), bool)
+        best_first = np.argsort(-self.scores, kind="stable")
+        for side in (0, 1):
+            ends = _ends(getattr(self, f"points{side}"), getattr(self, f"indices{side}"))
+            best = np.unique(ends[best_first], return_index=True)[1]
+            is_best = np.zeros(len(self), bool)
+            is_best[best_first[best]] = True
+            kept &= is_best
+        return self[kept]
+
+    @suggest_keywords
+    def plot(
+        self,
+        image0: Any = None,
+        image1: Any = None,
+        *,
+        axes: Any = None,
+        channels: Channels = "rgb",
+        lines: int = 150,
+    ) -> Any:
+        """Plot matches with matplotlib, on both images side by side: inliers green, others red.
+
+        Args:
+            image0, image1: arrays, PyTorch tensors or PIL images, drawn below the matches.
+            axes: matplotlib axes to draw on. None: those of a new figure.
+            channels: order of the colours in arrays and tensors.
+            lines: at most this many are drawn: a random sample, the same each time.
+
+        Returns:
+            The axes.
+
+        Raises:
+            ImageError: an image has another size than its keypoints'.
+            MissingExtraError: matplotlib is not installed.
+        """
+        from .display import plot_matches
+
+        sizes = self.keypoints0.image_size, self.keypoints1.image_size
+        ends = self.points0, self.points1, self.inliers
+        return plot_matches(*ends, sizes, (image0, image1), axes, channels, lines)
+
     def __len__(self) -> int:
         return len(self.points0)
+
+    def __getitem__(self, index: slice | np.ndarray | Sequence[int] | int) -> Matches:
+        rows = [int(index)] if isinstance(index, (int, np.integer)) else index
+        names = (*_COLUMNS, "indices0", "indices1")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: a small table, and where some of the matches are."""
+        from .display import html_summary
+
+        inliers = np.count_nonzero(self.inliers)
+        guide = self.guide.model if self.guide is not None and self.guided else "nothing"
+        rows = {
+            "inliers": f"{inliers:,} ({self.model})",
+            "guided by": "no geometry that could be trusted" if self.lost else guide,
+        }
+        for side, keypoints in enumerate((self.keypoints0, self.keypoints1)):
+            width, height = keypoints.image_size
+            rows[f"image {side}"] = f"{width}x{height}, {len(keypoints):,} keypoints"
+        if len(self):
+            rows["scores"] = f"{self.scores.min():.3g} to {self.scores.max():.3g}"
+        if self.seconds:
+            rows["seconds"] = f"{sum(self.seconds.values()):.2f}"
+        ends = [self.points0, self.points1]
+        sizes = [self.keypoints0.image_size, self.keypoints1.image_size]
+        lines = np.hstack(ends)[self.inliers if inliers else slice(None)]
+        points = list(zip(ends, sizes, strict=True))
+        return html_summary(f"{len(self):,} matches", rows, points, lines)
 
     def __repr__(self) -> str:
         return (
@@ -148,3 +271,35 @@ class Matches:
             f"keypoints, {np.count_nonzero(self.inliers)} inliers, model={self.model!r}, "
             f"guided={self.guided})"
         )
+
+
+def _checked_indices(
+    indices: np.ndarray, name: str, matches: int, keypoints: Keypoints
+) -> np.ndarray:
+    """Return indices of keypoints as int32.
+
+    Raises:
+        OptionError: they are not one whole number for each match, or of no keypoint.
+    """
+    found = np.asarray(indices)
+    if found.shape != (matches,) or (found.size and found.dtype.kind not in "iu"):
+        raise OptionError(
+            f"matches need one whole number each as {name}, not {found.dtype} numbers of shape "
+            f"{found.shape}"
+        )
+    if found.size and not (found.min() >= -1 and found.max() < len(keypoints)):
+        raise OptionError(
+            f"{name} must lie in [-1, {len(keypoints) - 1}], as there are {len(keypoints)} "
+            f"keypoints, not in [{found.min()}, {found.max()}]"
+        )
+    return found.astype(np.int32)
+
+
+def _ends(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """Number what matches end at: keypoints from 0 on, pixels without one below 0."""
+    ends = indices.astype(np.int64)
+    lost = np.flatnonzero(indices < 0)
+    if len(lost):
+        pixels = np.floor(points[lost] + np.float32(0.5)).astype(np.int64)
+        ends[lost] = -1 - np.unique(pixels, axis=0, return_inverse=True)[1].reshape(-1)
+    return ends

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.opencv import cv2
-from .._shared.options import suggest_keywords
+from .._shared.options import replace_options, suggest_keywords
 from .keypoints import Keypoints, bayer_order
 
 MODES = ("auto", "dense", "points")
@@ -29,6 +29,7 @@ def check_max_keypoints(count: int | None) -> None:
         raise OptionError(f"`max_keypoints` must be a whole number from 1 on, not {count}")
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class SelectionOptions:
     """Which pixels of a heat map become keypoints.
@@ -127,8 +128,20 @@ def select_keypoints(
     heatmap: np.ndarray,
     options: SelectionOptions = SelectionOptions(),
     logits: np.ndarray | None = None,
+    *,
+    threshold: float | None = None,
+    density: float | None = None,
+    max_keypoints: int | None = None,
+    nms_radius: int | None = None,
+    subpixel: bool | None = None,
+    ignore: np.ndarray | None = None,
 ) -> Keypoints:
-    """Select the keypoints of a heat map.
+    """Select the dense keypoints of a heat map.
+
+    With a heat map and logits of `DeepDetect.heatmap_and_logits` they are exactly those that
+    `detect` finds with `mode="dense"` and the same options, without running the network again.
+    Points, which `detect` returns for `max_keypoints` alone, are found in the image, not in a heat
+    map: they need `detect`.
 
     Args:
         heatmap: (H, W) float32 probability.
@@ -137,19 +150,40 @@ def select_keypoints(
         logits: (H, W) float32 logits of the map, by which keypoints are ranked; by default the
             map itself, although float32 rounds its highest probabilities to 1. Ties are broken
             by an order that spreads the keypoints evenly (`bayer_order`).
+        threshold, density, max_keypoints, nms_radius, subpixel, ignore: as of `SelectionOptions`;
+            those that are None are as in `options`.
 
     Returns:
         Keypoints in row-major order, on pixel centres unless `subpixel`.
 
     Raises:
-        OptionError: the ignore mask or the logits differ from the map in size.
+        OptionError: the ignore mask or the logits differ from the map in size, an option is out of
+            its range, or the options ask for points.
 
     Example:
         >>> heatmap = np.zeros((16, 16), np.float32)
         >>> heatmap[4, 9] = 0.9
         >>> select_keypoints(heatmap).xy.tolist()
         [[9.0, 4.0]]
+        >>> len(select_keypoints(heatmap, threshold=0.95))
+        0
     """
+    given = {
+        "threshold": threshold,
+        "density": density,
+        "max_keypoints": max_keypoints,
+        "nms_radius": nms_radius,
+        "subpixel": subpixel,
+        "ignore": ignore,
+    }
+    options = replace_options(
+        options, **{name: value for name, value in given.items() if value is not None}
+    )
+    if options.mode == "points" or options.spread != "none":
+        raise OptionError(
+            "a heat map gives dense keypoints: leave out `mode` and `spread`, or find points in "
+            "the image with `DeepDetect.detect`"
+        )
     ranking = heatmap if logits is None else logits
     if ranking.shape != heatmap.shape:
         raise OptionError(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .keypoints import Keypoints
 from .sift import to_root_sift
 
@@ -15,6 +15,7 @@ OCTAVE_LAYERS = 3
 """Of SIFT (Lowe): the contrast of a keypoint is compared after multiplication by their number."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class SiftOptions:
     """How many SIFT keypoints are detected, and where.

@@ -27,7 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import ReconstructionError
+from .._shared.errors import MissingCalibrationError, ReconstructionError
+from .._shared.options import suggest_keywords
 from .._shared.text_files import read_json
 
 Size = tuple[int, int]
@@ -39,6 +40,7 @@ MAX_FILE_BYTES = 1 << 20
 """Longer calib.json files are refused; usual ones have a few hundred bytes."""
 
 
+@suggest_keywords
 @dataclass(frozen=True, init=False)
 class Camera:
     """A pinhole camera.
@@ -116,6 +118,7 @@ class Camera:
             return points[:, :2] / points[:, 2:] * self.focal_px + self.centre
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class Calibration:
     """Both cameras and, where it is known, their distance.
@@ -215,7 +218,9 @@ def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
         values = read_json(path, MAX_FILE_BYTES)
     except OSError as error:
         reason = error.strerror or type(error).__name__
-        raise ReconstructionError(f"{path} cannot be read ({reason}): check the path") from None
+        missing = isinstance(error, FileNotFoundError)
+        kind = MissingCalibrationError if missing else ReconstructionError
+        raise kind(f"{path} cannot be read ({reason}): check the path") from None
     except ValueError as error:
         raise ReconstructionError(
             f"{path} is not valid JSON ({str(error).splitlines()[0]}): "

@@ -18,12 +18,13 @@ from typing import Protocol
 import numpy as np
 
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .residuals import transform_points
 
 Size = tuple[int, int]
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RectificationFrameOptions:
     """Which frame is taken, and how fine it is.

@@ -18,6 +18,7 @@ ESTIMATORS = ("magsac", "ransac")
 MODEL_NAMES = ("auto", "homography", "fundamental", "essential", "none")
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class GeometryOptions:
     """Which geometry is estimated, and how.
@@ -84,6 +85,7 @@ def _matrix(name: str, value: Any) -> np.ndarray:
     return matrix
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Geometry:
     """An estimated geometry.

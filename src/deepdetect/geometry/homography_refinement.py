@@ -24,7 +24,7 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .residuals import transform_points
 from .zncc import (
     WINDOW_PX,
@@ -37,6 +37,7 @@ from .zncc import (
 )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RefinementOptions:
     """How a homography is refined.
@@ -97,6 +98,7 @@ class RefinementOptions:
             check_ranges(self, positive=("blur_sigmas_px",))
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class IrlsOptions:
     """How a homography is fitted to most of the image.

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .acontrario import MAX_LOG10_NFA, log_binomial
 from .residuals import transfer_errors, transform_points
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class ModelSelectionOptions:
     """When the matches of a scene show depth.

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import suggest_keywords
 
 UNITS = ("mm", "baseline")
 """Millimetres, or the distance of the two cameras where it is not known."""
@@ -19,6 +20,7 @@ MAX_ANGULAR_SPACING = 0.02
 """In radians: no point is drawn wider than this (1 degree)."""
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class PointCloud:
     """Coloured points in the frame of the left camera: x right, y down, z forward.

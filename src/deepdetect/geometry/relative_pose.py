@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .camera import Calibration
 from .estimation import GeometryOptions, estimate_geometry
 from .residuals import epipolar_errors, signed_epipolar_errors
 from .triangulation import fundamental_matrix, triangulate
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class PoseRefinementOptions:
     """How a pose is refined.

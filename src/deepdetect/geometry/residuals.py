@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from .._shared.options import suggest_keywords
 
+
+@suggest_keywords
 def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Map points by a homography.
 
@@ -26,6 +29,7 @@ def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
     return np.where(mapped[:, 2:] == 0, np.inf, result)
 
 
+@suggest_keywords
 def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Return the transfer error of each match under a homography, (N,) float64 in pixels.
 
@@ -34,6 +38,7 @@ def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.nda
     return np.linalg.norm(transform_points(points0, homography) - points1, axis=1)
 
 
+@suggest_keywords
 def epipolar_errors(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> np.ndarray:
@@ -64,6 +69,7 @@ def signed_epipolar_errors(
     return algebraic / np.sqrt(np.maximum(gradient, 1e-300))
 
 
+@suggest_keywords
 def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:
     """Return the distances of a rectified pair's matches from the true disparity.
 

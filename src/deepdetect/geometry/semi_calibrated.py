@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .acontrario import log10_nfa
 from .camera import Calibration, Camera
 from .relative_pose import best_of_four, moved_pose
@@ -38,6 +38,7 @@ MIN_MATCHES = 6
 """One more than give an essential matrix."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class SemiCalibratedOptions:
     """What is assumed of both cameras.

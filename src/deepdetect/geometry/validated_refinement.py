@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .homography_refinement import (
     IrlsOptions,
     RefinementOptions,
@@ -43,6 +43,7 @@ Fit = Callable[[np.ndarray], "np.ndarray | None"]
 """From the (H, W) bool mask of the pixels that may be used to a correction, (3, 3)."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class ValidatedRefinementOptions:
     """How a homography is refined, and when a step is kept.

@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import ImageError
+from .._shared.errors import ImageError, MissingImageError
+from .._shared.image_array import Channels, array_to_rgb, check_channels
 from .._shared.opencv import cv2
+from .._shared.options import suggest_keywords
 from .image_file import MAX_MEGAPIXELS, damaged_image, file_name, is_file, open_image
 
 MINIMUM_SIDE = 16
@@ -39,16 +41,21 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 """What undoes each orientation of EXIF."""
 
 
-def load_image(image: Any, *, max_megapixels: float = MAX_MEGAPIXELS) -> np.ndarray:
+@suggest_keywords
+def load_image(
+    image: Any, *, channels: Channels = "rgb", max_megapixels: float = MAX_MEGAPIXELS
+) -> np.ndarray:
     """Read an image of any usual kind as 8-bit RGB.
 
     Args:
         image: a path; the content of an image file as bytes, or a file opened in binary mode,
-            which is read from its beginning; a PIL image; or an array
-            (H, W), (H, W, 1), (H, W, 3) or (H, W, 4) in the order RGB(A): uint8, uint16 (full
-            range 0..65535) or float in [0, 1]. The alpha channel is dropped. Files, also as
+            which is read from its beginning; a PIL image; or an array or a PyTorch tensor
+            (H, W), (H, W, C) or (C, H, W) of 1, 3 or 4 channels: uint8, uint16 (full range
+            0..65535) or float in [0, 1]. The fourth channel, alpha, is dropped. Files, also as
             bytes, are turned upright by their EXIF tag. Pixels of files and PIL images are
             of these types too, signed and 32-bit integers are refused.
+        channels: the order of the colours in an array or a tensor: "bgr" for the images of
+            `cv2.imread` and `cv2.VideoCapture`. Files and PIL images say theirs themselves.
         max_megapixels: larger files are refused before they are decoded, as a file of few bytes
             can hold billions of pixels. One megapixel takes 3 MB, and up to 7 MB while it is read.
             Of TIFF and WebP, Pillow reads 178 megapixels at most (`PIL.Image.MAX_IMAGE_PIXELS`).
@@ -60,19 +67,20 @@ def load_image(image: Any, *, max_megapixels: float = MAX_MEGAPIXELS) -> np.ndar
         ImageError: the file is missing, truncated, damaged (as far as its format lets one
             see), too large or no image, the array has a wrong shape, type or range or holds
             NaN, or a side is shorter than 16 pixels.
-        OptionError: `max_megapixels` is not above 0.
+        OptionError: `max_megapixels` is not above 0, or the order of the colours is unknown.
 
     Example:
         >>> load_image(np.zeros((20, 30), np.uint16)).shape
         (20, 30, 3)
     """
     name = "the image"
+    check_channels(channels)
     if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
         rgb = _from_pil(image, name)
     elif is_file(image):
         rgb, name = _read_file(image, max_megapixels), file_name(image)
     else:
-        rgb = _from_array(image, name)
+        rgb = array_to_rgb(image, channels, name)
     if min(rgb.shape[:2]) < MINIMUM_SIDE:
         height, width = rgb.shape[:2]
         raise ImageError(
@@ -111,7 +119,7 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     """
     root = Path(folder)
     if not root.is_dir():
-        raise ImageError(f"there is no folder {root}: check the path")
+        raise MissingImageError(f"there is no folder {root}: check the path")
     left_out = [path.resolve() for path in exclude if path.resolve() != root.resolve()]
     found = sorted(
         path
@@ -175,47 +183,7 @@ def _strip_to_rgb(image: Any, name: str) -> np.ndarray:
     if image.mode == "La":
         image = image.convert("LA")  # the only mode that Pillow converts it to
     if image.mode == "I":
-        return _from_array(np.asarray(image).astype(np.uint16), name)
+        return array_to_rgb(np.asarray(image).astype(np.uint16), name=name)
     if image.mode.startswith("I;16") or image.mode == "F":
-        return _from_array(np.asarray(image), name)
+        return array_to_rgb(np.asarray(image), name=name)
     return np.asarray(image.convert("RGB"))
-
-
-def _from_array(image: Any, name: str = "the image") -> np.ndarray:
-    try:
-        array = np.asarray(image)
-    except ValueError:
-        raise ImageError("an image array must have rows of equal length") from None
-    if array.ndim == 3 and array.shape[2] == 1:
-        array = array[:, :, 0]
-    if not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] in (3, 4))):
-        raise ImageError(
-            f"an image array has shape {array.shape}: "
-            "it must be (height, width), or (height, width, channels) with 1, 3 or 4 channels"
-        )
-    values = _to_uint8(array, name)
-    if values.ndim == 2:
-        return np.repeat(values[:, :, None], 3, axis=2)
-    return np.ascontiguousarray(values[:, :, :3])
-
-
-def _to_uint8(array: np.ndarray, name: str) -> np.ndarray:
-    if array.dtype == np.uint8:
-        return array
-    if array.dtype == np.bool_:
-        return array.astype(np.uint8) * 255
-    if array.dtype.kind == "u" and array.dtype.itemsize == 2:  # of either byte order
-        # Divide by 257 with rounding, so that 65535 becomes 255.
-        return ((array.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    if np.issubdtype(array.dtype, np.floating):
-        if not np.isfinite(array).all():
-            raise ImageError(f"{name} holds NaN or infinite values: replace them first")
-        if array.size and (array.min() < 0 or array.max() > 1):
-            raise ImageError(
-                f"a float image must lie in [0, 1], {name} spans "
-                f"[{array.min():g}, {array.max():g}]: scale it first"
-            )
-        return np.rint(array * np.float32(255)).astype(np.uint8)
-    raise ImageError(
-        f"an image array of type {array.dtype} is not understood: use uint8, uint16 or float"
-    )

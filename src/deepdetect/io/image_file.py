@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, BinaryIO
 
-from .._shared.errors import ImageError, OptionError
+from .._shared.errors import ImageError, MissingImageError, OptionError
 
 FORMATS = (
     *("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "AVIF"),
@@ -61,7 +61,7 @@ def open_image(
                 _check_size(image.size, name, max_megapixels)
                 yield image
     except FileNotFoundError:
-        raise ImageError(f"there is no file {name}: check the path") from None
+        raise MissingImageError(f"there is no file {name}: check the path") from None
     except IsADirectoryError:
         raise ImageError(f"{name} is a folder: name an image file") from None
     except PermissionError:

@@ -13,7 +13,8 @@ from typing import BinaryIO
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import DeepDetectError, InvalidFileError, MissingFileError, OptionError
+from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.matches import Guide, Matches
 
@@ -23,6 +24,7 @@ MAX_DEFLATE_RATIO = 1032
 """By how much zip's usual compression can shrink at most (https://zlib.net/zlib_tech.html)."""
 
 
+@suggest_keywords
 def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
     """Write keypoints, whole or not at all.
 
@@ -56,6 +58,7 @@ def _optional(keypoints: Keypoints) -> list[tuple[str, np.ndarray | None]]:
     return [(name, getattr(keypoints, name)) for name in ("logits", "sizes", "angles")]
 
 
+@suggest_keywords
 def load_keypoints(path: str | Path) -> Keypoints:
     """Read keypoints from the npz file that `save_keypoints` wrote.
 
@@ -81,17 +84,19 @@ def load_keypoints(path: str | Path) -> Keypoints:
         )
 
 
+@suggest_keywords
 def save_matches(matches: Matches, path: str | Path) -> None:
     """Write matches, whole or not at all.
 
     Args:
         matches: the matches.
         path: ending in .npz (arrays named as the attributes of `Matches`: `points0` and `points1`
-            (M, 2) float32, `scores` (M,) float32, `inliers` (M,) bool, `model` a string, `matrix`
-            (3, 3), or (0, 0) without one; `guided` and `subpixel` bool; `keypoints0` (N, 2)
-            float32, `keypoint_scores0` (N,) float32 and `image_size0` (width, height), and the same
-            of the second image; and of a `Guide` its attributes, as `guide_model`) or .csv (columns
-            x0, y0, x1, y1, score, inlier).
+            (M, 2) float32, `indices0` and `indices1` (M,) int32 rows of the keypoints, `scores`
+            (M,) float32, `inliers` (M,) bool, `model` a string, `matrix` (3, 3), or (0, 0) without
+            one; `guided` and `subpixel` bool; `keypoints0` (N, 2) float32, `keypoint_scores0` (N,)
+            float32 and `image_size0` (width, height), and the same of the second image; and of a
+            `Guide` its attributes, as `guide_model`) or .csv (columns x0, y0, x1, y1, score,
+            inlier).
 
     Raises:
         OptionError: the file's ending is another.
@@ -101,7 +106,8 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         columns = [matches.points0, matches.points1, matches.scores, matches.inliers]
         _save_csv(path, "x0,y0,x1,y1,score,inlier", np.column_stack(columns))
         return
-    arrays = {name: getattr(matches, name) for name in ("points0", "points1", "scores", "inliers")}
+    names = ("points0", "points1", "scores", "inliers", "indices0", "indices1")
+    arrays = {name: getattr(matches, name) for name in names}
     arrays |= {"model": matches.model, "matrix": _or_empty(matches.matrix)}
     arrays |= {"guided": matches.guided, "subpixel": matches.subpixel}
     for side, keypoints in enumerate((matches.keypoints0, matches.keypoints1)):
@@ -114,11 +120,13 @@ def save_matches(matches: Matches, path: str | Path) -> None:
     _save_npz(path, **{name: np.asarray(value) for name, value in arrays.items()})
 
 
+@suggest_keywords
 def load_matches(path: str | Path) -> Matches:
     """Read matches from the npz file that `save_matches` wrote.
 
     Returns:
-        The matches. Their `seconds` are empty, and their keypoints have no logits.
+        The matches. Their `seconds` are empty, and their keypoints have no logits. Files of earlier
+        versions hold no indices: the nearest keypoints are looked up.
 
     Raises:
         DeepDetectError: the file is missing or is no such file.
@@ -154,6 +162,8 @@ def load_matches(path: str | Path) -> Matches:
             keypoints[1],
             guide=guide,
             subpixel="subpixel" in arrays and bool(arrays["subpixel"]),
+            indices0=arrays.get("indices0"),  # type: ignore[arg-type]  # older files have none
+            indices1=arrays.get("indices1"),  # type: ignore[arg-type]
         )
 
 
@@ -165,7 +175,7 @@ def _load_npz(path: str | Path, content: str) -> dict[str, np.ndarray]:
             with np.load(file, allow_pickle=False) as arrays:
                 return dict(arrays)
     except FileNotFoundError:
-        raise DeepDetectError(f"there is no file {path}: check the path") from None
+        raise MissingFileError(f"there is no file {path}: check the path") from None
     except PermissionError:
         raise DeepDetectError(f"{path} may not be read: check its rights") from None
     except MemoryError:
@@ -189,8 +199,8 @@ def _building(path: str | Path, content: str) -> Iterator[None]:
         raise _holds_none(path, content, reason) from error
 
 
-def _holds_none(path: str | Path, content: str, reason: str) -> DeepDetectError:
-    return DeepDetectError(f"{path} holds no {content} ({reason}): write the file again")
+def _holds_none(path: str | Path, content: str, reason: str) -> InvalidFileError:
+    return InvalidFileError(f"{path} holds no {content} ({reason}): write the file again")
 
 
 def _size(array: np.ndarray) -> tuple[int, int]:

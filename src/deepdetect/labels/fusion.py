@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from .._shared.image_array import Channels, check_channels
 from .._shared.options import suggest_keywords
+from ..io.image import load_image, luma
 from ..viz.draw import draw_masks
 from .detectors import DETECTOR_NAMES, run_detector, select_detectors
 from .settings import SettingChange, settings_for
 from .visibility import Visibility, VisibilityChoice, check_visibility, visibility_of
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class LabelOptions:
     """How a label is made.
@@ -37,6 +41,7 @@ class LabelOptions:
         check_visibility(self.visibility)
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Label:
     """A fusion label.
@@ -67,17 +72,21 @@ class Label:
 
 
 @suggest_keywords
-def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
-    """Run the chosen detectors on a grey image and fuse what they mark.
+def fuse(
+    image: Any, options: LabelOptions = LabelOptions(), *, channels: Channels = "rgb"
+) -> Label:
+    """Run the chosen detectors on the luma of an image and fuse what they mark.
 
     Args:
-        gray: (H, W) uint8 luma.
+        image: (H, W) uint8 luma; or anything `load_image` takes, whose luma is used.
         options: which detectors, and which of their settings.
+        channels: order of the colours in an image that is an array, as of `load_image`.
 
     Returns:
         The label, whose `mask` is the pixelwise OR.
 
     Raises:
+        ImageError: the image cannot be read or is not fit.
         OptionError: OpenCV refuses the settings of a detector for this image.
 
     Example:
@@ -87,6 +96,7 @@ def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
         >>> bool(label.mask[8, 8]), bool(label.mask[0, 0])
         (True, False)
     """
+    gray = _luma(image, channels)
     visibility = visibility_of(gray, options.visibility)
     marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
     for detector in select_detectors(options.detectors):
@@ -95,6 +105,14 @@ def fuse(gray: np.ndarray, options: LabelOptions = LabelOptions()) -> Label:
     return Label(marked["keypoint"], marked["edge"], visibility)
 
 
+def _luma(image: Any, channels: Channels) -> np.ndarray:
+    check_channels(channels)
+    if isinstance(image, np.ndarray) and image.ndim == 2 and image.dtype == np.uint8:
+        return image
+    return luma(load_image(image, channels=channels))
+
+
+@suggest_keywords
 def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
     """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import suggest_keywords
 from .._shared.registry import resolve_name_or_path
 from .._shared.text_files import read_toml
 from .detectors import (
@@ -134,6 +135,7 @@ LABEL_SETTINGS: dict[str, LabelSettings] = {
 }
 
 
+@suggest_keywords
 def find_label_settings(settings: str | Path) -> LabelSettings:
     """Look settings up by name, or read them from a file.
 
@@ -151,6 +153,7 @@ def find_label_settings(settings: str | Path) -> LabelSettings:
     return read_label_settings(found) if isinstance(found, Path) else found
 
 
+@suggest_keywords
 def read_label_settings(path: str | Path) -> LabelSettings:
     """Read detectors and their settings from a TOML file.
 

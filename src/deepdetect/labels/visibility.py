@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from .._shared.errors import unknown_name
+from .._shared.options import suggest_keywords
 
 Visibility = Literal["normal", "low"]
 VisibilityChoice = Literal["auto", "normal", "low"]
@@ -15,6 +16,7 @@ LOW_VISIBILITY_RANGE = 64
 """An image whose luma spans fewer grey levels than this is of low visibility."""
 
 
+@suggest_keywords
 def luma_range(gray: np.ndarray) -> float:
     """Return the span of luma between the 1st and the 99th percentile, in grey levels.
 
@@ -27,6 +29,7 @@ def luma_range(gray: np.ndarray) -> float:
     return float(brightest - darkest)
 
 
+@suggest_keywords
 def visibility_of(gray: np.ndarray, choice: VisibilityChoice = "auto") -> Visibility:
     """Decide which detector settings an image gets.
 

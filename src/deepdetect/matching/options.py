@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import suggest_keywords
 from .._shared.registry import look_up
 from ..detector.heatmap import HeatmapOptions
 from ..features.matchers import get_matcher
@@ -26,6 +27,7 @@ UNGUIDED_ONLY = ("descriptor", "keypoint_size", "angle", "matcher", "ratio")
 """Options of `MatchingOptions` that do not apply to guided matches."""
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class MatchingOptions:
     """How two images are matched.
@@ -106,7 +108,7 @@ PRESETS: dict[str, MatchingOptions] = {
     # What the authors' published code runs: BGR although the weights were trained on
     # RGB, the angle unset, and every match evaluated by the true homography.
     "published": MatchingOptions(
-        heatmap=HeatmapOptions(resolution=480, channels="bgr"),
+        heatmap=HeatmapOptions(resolution=480, network_channels="bgr"),
         selection=SelectionOptions(threshold=0.5, mode="dense"),
         descriptor="sift",
         keypoint_size=3.0,

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.image_array import Channels
 from .._shared.kernels import require_compiler
 from .._shared.options import replace_options, suggest_keywords
 from .._shared.parallel import available_memory
@@ -36,6 +37,7 @@ def match_images(
     image1: Any,
     detector: HeatmapDetector | None = None,
     *,
+    channels: Channels = "rgb",
     preset: str = "default",
     options: MatchingOptions | None = None,
     initial: InitialMatches | None = None,
@@ -53,7 +55,7 @@ def match_images(
     mode: Literal["auto", "dense", "points"] | None = None,
     spread: Literal["none", "grid", "anms"] | None = None,
     resolution: Literal["auto", "native"] | int | None = None,
-    channels: Literal["rgb", "bgr"] | None = None,
+    network_channels: Channels | None = None,
     descriptor: str | None = None,
     keypoint_size: float | None = None,
     angle: float | None = None,
@@ -77,9 +79,11 @@ def match_images(
     Args:
         image0, image1: anything `load_image` takes.
         detector: a `DeepDetect`, or anything with its `heatmap` method; default `DeepDetect()`.
+        channels: order of the colours in images that are arrays, as of `load_image`: "bgr" for
+            those of OpenCV.
         preset: name of the options to start from: "default", or "published" for exactly
             what the paper's published code does, whatever the detector's own resolution
-            and channels.
+            and order of the colours.
         options: all options at once, instead of a preset.
         initial: sparse matches of the pair, where `initial_matches` has made them already.
         seeds: sparse matches of any other matcher (LightGlue, LoFTR, a person's clicks), two (K, 2)
@@ -97,7 +101,7 @@ def match_images(
         threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread: which pixels
             or points become keypoints (`SelectionOptions`). With `max_keypoints` alone they are
             the best ones of all scales, which need no network.
-        resolution, channels: how the network sees the images (`HeatmapOptions`).
+        resolution, network_channels: how the network sees the images (`HeatmapOptions`).
         descriptor, keypoint_size, angle, matcher, ratio: of matches by descriptors alone; they do
             not apply to guided ones (`MatchingOptions`).
         estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations, seed:
@@ -122,7 +126,7 @@ def match_images(
         True
     """
     chosen = options if options is not None else get_preset(preset)
-    if chosen.heatmap is None and not (resolution is None and channels is None):
+    if chosen.heatmap is None and not (resolution is None and network_channels is None):
         own = getattr(detector, "heatmap_options", HeatmapOptions())
         chosen = dataclasses.replace(chosen, heatmap=own)
     given = {
@@ -139,7 +143,7 @@ def match_images(
         "mode": mode,
         "spread": spread,
         "resolution": resolution,
-        "channels": channels,
+        "network_channels": network_channels,
         "descriptor": descriptor,
         "keypoint_size": keypoint_size,
         "angle": angle,
@@ -163,15 +167,16 @@ def match_images(
     if chosen.guided:
         require_compiler("guided matching", ", or match by descriptors alone with `guided=False`")
     timer = StageTimer(progress)
-    rgb = load_image(image0), load_image(image1)
+    rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
     detector = _configured(detector, chosen.heatmap)
     with timer.stage("keypoints"):
         keypoints = [find_keypoints(detector, image, chosen.selection) for image in rgb]
     grays = luma(rgb[0]), luma(rgb[1])
     found_guide, guided_pair = None, None
+    rows: tuple[Any, Any]  # of the keypoints, None where they are looked up
     if chosen.guided:
         with timer.stage("guided matching"):
-            found_guide, guided_pair, positions = _match_guided(
+            found_guide, guided_pair, positions, rows = _match_guided(
                 grays, keypoints, chosen, initial, seeds
             )
         points0, points1, scores = positions
@@ -179,6 +184,7 @@ def match_images(
         found = unguided_matches(grays, keypoints, chosen, timer)
         points0, points1 = keypoints[0].xy[found.rows0], keypoints[1].xy[found.rows1]
         scores = np.clip(1 - found.ratios, 0, 1)
+        rows = found.rows0, found.rows1
     with timer.stage("geometry"):
         geometry = _final_geometry(points0, points1, chosen.geometry, found_guide)
     return Matches(
@@ -193,6 +199,7 @@ def match_images(
         timer.seconds,
         found_guide,
         guided_pair is not None and guided_pair.subpixel,
+        *rows,
     )
 
 
@@ -202,8 +209,13 @@ def _match_guided(
     options: MatchingOptions,
     initial: InitialMatches | None,
     seeds: tuple[np.ndarray, np.ndarray] | None,
-) -> tuple[Guide, GuidedMatches | None, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Return what guided, the matches, and their positions in both images with their scores."""
+) -> tuple[
+    Guide,
+    GuidedMatches | None,
+    tuple[np.ndarray, np.ndarray, np.ndarray],
+    tuple[Any, Any],
+]:
+    """Return what guided, the matches, their positions with their scores, and their keypoints."""
     first, second = keypoints
     swapped = options.mutual and _comes_after(grays[0], grays[1])
     if swapped:
@@ -222,10 +234,13 @@ def _match_guided(
         seeds,
         (first, second),
     )
-    points0, points1, scores = _guided_points(found, (first, second), options.mutual)
+    if found is not None and options.mutual:
+        found = found.unique()
+    points0, points1, scores = _guided_points(found, (first, second))
+    rows0, rows1 = (None, None) if found is None else (found.rows0, found.rows1)
     if swapped:
-        return guide.swapped(), found, (points1, points0, scores)
-    return guide, found, (points0, points1, scores)
+        return guide.swapped(), found, (points1, points0, scores), (rows1, rows0)
+    return guide, found, (points0, points1, scores), (rows0, rows1)
 
 
 def _comes_after(gray0: np.ndarray, gray1: np.ndarray) -> bool:
@@ -235,14 +250,12 @@ def _comes_after(gray0: np.ndarray, gray1: np.ndarray) -> bool:
 
 
 def _guided_points(
-    found: GuidedMatches | None, keypoints: Sequence[Keypoints], mutual: bool
+    found: GuidedMatches | None, keypoints: Sequence[Keypoints]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions in both images and scores; none where no geometry could be trusted."""
     if found is None:
         nowhere = np.empty((0, 2), np.float32)
         return nowhere, nowhere, np.empty(0, np.float32)
-    if mutual:
-        found = found.unique()
     points0 = keypoints[0].xy[found.rows0]
     if found.rows1 is not None:
         return points0, keypoints[1].xy[found.rows1], found.scores

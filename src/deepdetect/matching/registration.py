@@ -8,7 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import NothingFoundError
+from .._shared.errors import RegistrationError
+from .._shared.image_array import Channels
 from .._shared.kernels import require_compiler
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
@@ -22,6 +23,7 @@ SQUARES = 8
 """Squares of the checkerboard along the shorter side."""
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Registration:
     """A second image in the frame of a first.
@@ -69,6 +71,7 @@ def register(
     image1: Any,
     detector: HeatmapDetector | None = None,
     *,
+    channels: Channels = "rgb",
     threshold: float | None = None,
     density: float | None = None,
     max_keypoints: int | None = None,
@@ -78,7 +81,7 @@ def register(
     mode: Literal["auto", "dense", "points"] | None = None,
     spread: Literal["none", "grid", "anms"] | None = None,
     resolution: Literal["auto", "native"] | int | None = None,
-    channels: Literal["rgb", "bgr"] | None = None,
+    network_channels: Channels | None = None,
     mutual: bool | None = None,
     seed: int | None = None,
     guided_options: GuidedOptions | None = None,
@@ -92,14 +95,15 @@ def register(
     Args:
         image0, image1: anything `load_image` takes.
         detector: as for `match_images`.
-        threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread, resolution,
-            channels, mutual, seed, guided_options, progress: as for `match_images`.
+        channels, threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread,
+            resolution, network_channels, mutual, seed, guided_options, progress: as for
+            `match_images`.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
         MissingExtraError: numba is not installed.
-        NothingFoundError: no homography between the images can be trusted.
+        RegistrationError: no homography between the images can be trusted.
 
     Example:
         >>> from deepdetect.evaluation.baselines.random import RandomDetector
@@ -111,7 +115,7 @@ def register(
         [-12.0, 0.0]
     """
     require_compiler("registration")
-    first, second = load_image(image0), load_image(image1)
+    first, second = load_image(image0, channels=channels), load_image(image1, channels=channels)
     found = match_images(
         first,
         second,
@@ -126,14 +130,14 @@ def register(
         mode=mode,
         spread=spread,
         resolution=resolution,
-        channels=channels,
+        network_channels=network_channels,
         mutual=mutual,
         seed=seed,
         guided_options=guided_options,
         progress=progress,
     )
     if not found.guided or found.matrix is None:
-        raise NothingFoundError(
+        raise RegistrationError(
             "no homography can be trusted between these images: they must overlap, and show a "
             "plane or be taken from one place"
         )

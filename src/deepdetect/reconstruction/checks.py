@@ -13,7 +13,7 @@ import numpy as np
 
 from .._shared.errors import ReconstructionError
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import grid_subsample
 from ..geometry import (
     Geometry,
@@ -27,6 +27,7 @@ from ..geometry.camera import Calibration
 from ..geometry.model_selection import ModelSelectionOptions, measure_parallax
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class CopyOptions:
     """When two images are the same picture, perhaps saved again.
@@ -54,6 +55,7 @@ class CopyOptions:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class StaticOptions:
     """When matches show that both images have the same view.
@@ -76,6 +78,7 @@ class StaticOptions:
         check_ranges(self, not_negative=limits, fractions=("quantile",))
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class ForegroundOptions:
     """When a scene that is mostly a plane has something in front of it.
@@ -102,6 +105,7 @@ class ForegroundOptions:
         check_ranges(self, not_negative=("min_distance_px",), fractions=shares)
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class CheckOptions:
     """Thresholds of the checks.

@@ -21,7 +21,7 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from ..geometry.windows import window_sums
 
 FLANN_INDEX_KDTREE_SINGLE = 4
@@ -31,6 +31,7 @@ QUERIES = 200_000
 """Points whose neighbours are looked up at a time, to bound the memory."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class PointFilterOptions:
     """Which triangulated points are kept.

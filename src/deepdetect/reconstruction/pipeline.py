@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .._shared.errors import OptionError, ReconstructionError
+from .._shared.image_array import Channels
 from .._shared.kernels import require_compiler
 from .._shared.options import replace_options, suggest_keywords
 from .._shared.timing import StageTimer
@@ -42,6 +43,7 @@ from .result import Reconstruction
 from .two_view import TwoViewOptions, reconstruct_two_view
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class ReconstructionOptions:
     """How a pair becomes points.
@@ -88,6 +90,7 @@ def reconstruct(
     right: Any,
     detector: HeatmapDetector | None = None,
     *,
+    channels: Channels = "rgb",
     calibration: Calibration | str | Path | None = None,
     focal_px: float | None = None,
     rectified: bool | None = None,
@@ -116,6 +119,7 @@ def reconstruct(
             the first one, whose frame the points are in.
         detector: a `DeepDetect`, or anything with its `heatmap` method; default
             `DeepDetect("dense")`.
+        channels: order of the colours in images that are arrays, as of `load_image`.
         calibration: JSON file of the cameras (docs/reconstruction.md describes its format), or a
             `Calibration`. Without one the focal length is taken from `focal_px`, or from EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
@@ -168,7 +172,7 @@ def reconstruct(
         chosen, **{name: value for name, value in given.items() if value is not None}
     )
     require_compiler("reconstruction")
-    images = load_image(left), load_image(right)
+    images = load_image(left, channels=channels), load_image(right, channels=channels)
     sizes = (images[0].shape[1], images[0].shape[0]), (images[1].shape[1], images[1].shape[0])
     known = _calibration(calibration, focal_px, (left, right), sizes)
     grays = luma(images[0]), luma(images[1])

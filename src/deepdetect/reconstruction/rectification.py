@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import grid_subsample
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
@@ -23,6 +23,7 @@ from ..matching.guided.options import InitialGeometryOptions
 from .checks import StaticOptions, is_planar, is_static
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RectificationOptions:
     """When a pair counts as rectified.

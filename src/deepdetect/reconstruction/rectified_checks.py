@@ -12,12 +12,13 @@ import numpy as np
 
 from .._shared.errors import ReconstructionError
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import SelectionOptions, grid_subsample
 from ..geometry.camera import Calibration
 from .checks import StaticOptions, is_static
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RotationOptions:
     """When disparities are those of a camera that only rotated.
@@ -60,6 +61,7 @@ class RotationOptions:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RectifiedCheckOptions:
     """Thresholds of the checks of rectified pairs.

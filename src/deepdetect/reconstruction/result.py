@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import ReconstructionError
+from .._shared.options import suggest_keywords
 from ..geometry.camera import Calibration, Camera
 from ..geometry.point_cloud import PointCloud
 from ..geometry.relative_pose import RelativePose
@@ -23,6 +24,7 @@ SCALE = {
 }
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction:
     """3D points, and where they come from.

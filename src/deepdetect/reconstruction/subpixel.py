@@ -20,11 +20,12 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import parallel_for
 from ..geometry.windows import window_sums
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class SubpixelOptions:
     """How matches are refined.

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .._shared.errors import ReconstructionError
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .._shared.timing import StageTimer
 from ..geometry import epipolar_errors
 from ..geometry.camera import Calibration
@@ -27,6 +27,7 @@ from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import SubpixelOptions, refine_matches, spread_corners
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class TwoViewOptions:
     """How matches become points.

@@ -9,6 +9,7 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
+from .._shared.options import suggest_keywords
 from ..io.image import luma
 
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
@@ -33,6 +34,7 @@ class Darkening:
                 raise OptionError(f"{name} must be above 0 and at most 1")
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class DarkeningRange:
     """Ranges that the factors of a `Darkening` are drawn from.
@@ -52,6 +54,7 @@ class DarkeningRange:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class AugmentationRanges:
     """Probabilities and ranges of `augment`.

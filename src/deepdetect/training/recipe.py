@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import processor_count
 from .._shared.registry import look_up
 from ..labels import DETECTOR_NAMES, LABEL_SETTINGS, LabelOptions, SettingChange
@@ -70,6 +70,7 @@ class Stage:
         return cls(crop, batch, epochs, chosen)
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class TrainingOptions:
     """Everything that decides which weights come out, given the images.
@@ -212,6 +213,7 @@ class TrainingOptions:
         return json.dumps(dataclasses.asdict(self), sort_keys=True)
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class DeviceOptions:
     """How the network is run, which does not change the recipe.
@@ -303,6 +305,7 @@ PRESETS: dict[str, TrainingOptions] = {
 }
 
 
+@suggest_keywords
 def training_preset(name: str) -> TrainingOptions:
     """Look a recipe up by its name.
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, ImageError, OptionError
+from .._shared.options import suggest_keywords
 from .._shared.parallel import map_in_processes
 from .._shared.progress import progress
 from .._shared.text_files import read_json
@@ -132,6 +133,7 @@ def has_shards(folder: Path) -> bool:
     return False
 
 
+@suggest_keywords
 def write_shards(
     images: str | Path,
     output: str | Path,

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ..._shared.errors import OptionError, unknown_name
+from ..._shared.options import suggest_keywords
 
 BACKENDS = ("onnxruntime", "openvino", "torch")
 
@@ -25,6 +26,7 @@ class Network(Protocol):
         """
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RuntimeOptions:
     """How the network is run.

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..._shared.errors import MissingExtraError, OptionError, WeightsError
+from ..._shared.errors import MissingExtraError, MissingWeightsError, OptionError, WeightsError
 from .onnxruntime_backend import open_onnxruntime
 from .openvino_backend import open_openvino
 from .options import Network, RuntimeOptions
@@ -52,7 +52,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
         OptionError: the backend does not read such files.
     """
     if not path.is_file():
-        raise WeightsError(f"there is no weights file {path}: check the path")
+        raise MissingWeightsError(f"there is no weights file {path}: check the path")
     name = options.backend
     if name == "auto":
         name = _choose(path, options)

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from ..._shared.atomic import atomic_path
-from ..._shared.errors import WeightsError
+from ..._shared.errors import MissingWeightsError, WeightsError
 from .espnet import ESPNet
 
 
@@ -43,7 +43,7 @@ def load_network(path: str | Path) -> ESPNet:
         WeightsError: the file is missing, damaged or does not fit the network.
     """
     if not Path(path).is_file():
-        raise WeightsError(f"there is no weights file {path}: check the path")
+        raise MissingWeightsError(f"there is no weights file {path}: check the path")
     network = ESPNet()
     try:
         with safe_open(path, framework="pt") as file:

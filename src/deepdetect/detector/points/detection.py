@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..._shared.errors import OptionError, unknown_name
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
 from ...features.selection import SPREADS, check_ignore, check_max_keypoints
@@ -24,6 +24,7 @@ from .hessian_scales import (
 from .ranker import Ranker, load_ranker
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class PointOptions:
     """Which candidates become keypoints.

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..._shared.errors import OptionError
 from ..._shared.opencv import cv2
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import available_memory, parallel_for
 
 NMS_RADIUS = 2
@@ -31,6 +31,7 @@ MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined position is still the one that it was found at."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class ScaleSpaceOptions:
     """The scales of a scale space.

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..._shared.errors import WeightsError
+from ..._shared.errors import MissingWeightsError, WeightsError
 from ..pretrained import RANKER
 from .candidate_features import FEATURES
 
@@ -72,7 +72,7 @@ def load_ranker(path: Path = RANKER) -> Ranker:
     try:
         state = path.stat().st_mtime_ns
     except OSError:
-        raise WeightsError(f"there is no weights file {path}: check the path") from None
+        raise MissingWeightsError(f"there is no weights file {path}: check the path") from None
     return _load(path.absolute(), state)
 
 

@@ -15,11 +15,12 @@ import numpy as np
 
 from ..._shared.errors import OptionError
 from ..._shared.kernels import require_compiler
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 from ..keypoints import on_pixels
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class PatchMatchOptions:
     """How neighbours are searched.

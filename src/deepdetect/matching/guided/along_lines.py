@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
 
 BLOCK = 500
 """Keypoints of the first image that are compared at once."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class LineSearchOptions:
     """When two keypoints match, given the epipolar lines.

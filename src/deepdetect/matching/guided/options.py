@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from ...features.sift_detector import SiftOptions
 from ...geometry.acontrario import MAX_LOG10_NFA
 from ...geometry.epipolar_rectification import RectificationFrameOptions
@@ -21,6 +21,7 @@ from ..stereo.matching import DisparityOptions
 from .along_lines import LineSearchOptions
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class InitialGeometryOptions:
     """How a geometry is estimated from sparse matches.
@@ -111,6 +112,7 @@ class InitialGeometryOptions:
         return self.homography_threshold_px if homography else self.fundamental_threshold_px
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class VerificationOptions:
     """When two patches count as the same.
@@ -154,6 +156,7 @@ class VerificationOptions:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class HomographyMatchingOptions:
     """How keypoints are matched by a homography.
@@ -196,6 +199,7 @@ class HomographyMatchingOptions:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RectifiedMatchingOptions:
     """How a pair is rectified by a fundamental matrix and its rows are matched.
@@ -294,6 +298,7 @@ class RectifiedMatchingOptions:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class GuidedOptions:
     """All tuned numbers of guided matching.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import ImageError, OptionError
+from ..._shared.image_array import Channels
 from ..._shared.kernels import require_compiler
 from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
@@ -26,6 +27,7 @@ from .refinement import DisparityRefinementOptions, refine_disparity
 from .sgm import DisparityRange, SGMOptions, is_textured, semi_global_matching
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RangeSearchOptions:
     """How the range of disparities is found, on a small copy of the pair.
@@ -62,6 +64,7 @@ class RangeSearchOptions:
         )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class DisparityOptions:
     """How the disparities of a rectified pair are found, and which of them are kept.
@@ -152,6 +155,7 @@ class RectifiedMatches:
         return len(self.indices)
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class DisparityMap:
     """The disparity of each pixel of the left view of a rectified pair.
@@ -192,7 +196,11 @@ class DisparityMap:
 
 @suggest_keywords
 def disparity_map(
-    left: Any, right: Any, options: DisparityOptions = DisparityOptions()
+    left: Any,
+    right: Any,
+    options: DisparityOptions = DisparityOptions(),
+    *,
+    channels: Channels = "rgb",
 ) -> DisparityMap:
     """Find the disparity of every pixel of the left view of a rectified pair.
 
@@ -205,6 +213,7 @@ def disparity_map(
     Args:
         left, right: images of the same size, anything `load_image` takes; only their luma is used.
         options: what is matched and kept; `DENSE` gives as many pixels as possible.
+        channels: order of the colours in images that are arrays, as of `load_image`.
 
     Returns:
         The disparities, the same for any number of threads.
@@ -223,7 +232,8 @@ def disparity_map(
         >>> found.at(np.array([[40, 20], [60, 30], [2, 30]])).indices.tolist()
         [0, 1]
     """
-    return compute_disparity(luma(load_image(left)), luma(load_image(right)), options)
+    grays = [luma(load_image(image, channels=channels)) for image in (left, right)]
+    return compute_disparity(grays[0], grays[1], options)
 
 
 def match_rectified(
@@ -231,13 +241,15 @@ def match_rectified(
     right: Any,
     keypoints: Keypoints | np.ndarray,
     options: DisparityOptions = DisparityOptions(),
+    *,
+    channels: Channels = "rgb",
 ) -> RectifiedMatches:
     """Find the disparities of keypoints of the left view: `disparity_map`, sampled at them.
 
     Raises:
         ImageError, OptionError: as of `disparity_map` and `DisparityMap.at`.
     """
-    return disparity_map(left, right, options).at(keypoints)
+    return disparity_map(left, right, options, channels=channels).at(keypoints)
 
 
 def compute_disparity(

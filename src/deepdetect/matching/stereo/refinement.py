@@ -18,11 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..._shared.opencv import cv2
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 from .consistency import MAX_DIFFERENCE_PX
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class DisparityRefinementOptions:
     """How disparities are refined to sub-pixel accuracy.

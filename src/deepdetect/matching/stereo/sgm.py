@@ -16,7 +16,7 @@ import numpy as np
 
 from ..._shared.errors import OptionError
 from ..._shared.opencv import cv2
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 
 CENSUS_RADIUS_X = 4
@@ -47,6 +47,7 @@ BAND_OVERLAP_PX = 32
 """Rows above and below a band from which paths enter it."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class SGMOptions:
     """Penalties of semi-global matching.
@@ -88,6 +89,7 @@ class SGMOptions:
             )
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class DisparityRange:
     """The disparities that are tried.

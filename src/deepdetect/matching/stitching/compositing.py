@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError, OptionError
+from ..._shared.errors import OptionError, RegistrationError
 from ..._shared.opencv import cv2
 from ..._shared.parallel import available_memory
 from ...geometry.rescaling import downscale, scaled_homography
@@ -86,7 +86,7 @@ def plan_canvas(
             bound.
 
     Raises:
-        DeepDetectError: an image reaches the horizon of the reference.
+        RegistrationError: an image reaches the horizon of the reference.
         OptionError: the canvas would have too many pixels, or need more memory than there is.
     """
     back = np.linalg.inv(homographies[reference])
@@ -94,7 +94,7 @@ def plan_canvas(
     for number, matrix in placed.items():
         depths = _depths(sizes[number], matrix)
         if depths.min() * max_depth_ratio <= depths.max():
-            raise DeepDetectError(
+            raise RegistrationError(
                 f"images[{number}] is seen too much from the side of images[{reference}] for a "
                 "flat panorama: leave it out, or choose a `reference` between them"
             )

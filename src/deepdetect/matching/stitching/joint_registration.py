@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError
+from ..._shared.errors import RegistrationError
 from ...detector.detector import HeatmapDetector, find_keypoints
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
@@ -94,7 +94,7 @@ def register_jointly(
         seed: of all random choices.
 
     Raises:
-        DeepDetectError: no two images overlap, or the reference with none.
+        RegistrationError: no two images overlap, or the reference with none.
     """
     views = [_prepare(image, detector, max_keypoints, options) for image in images]
     pairs = _registered_pairs(views, options.min_partners, seed)
@@ -107,7 +107,7 @@ def register_jointly(
         what = f"no two of these {len(images)} images overlap"
         if reference is not None:
             what = f"the reference, images[{reference}], overlaps with no other image"
-        raise DeepDetectError(
+        raise RegistrationError(
             f"{what} so that a homography can be trusted: they must show common detail, and be "
             "taken from one place or show a plane"
         )

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from ...features.sift_detector import SiftOptions
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class StitchingOptions:
     """How photographs become a panorama.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..._shared.image_array import Channels
 from ..._shared.kernels import require_compiler
 from ..._shared.options import suggest_keywords
 from ..._shared.timing import StageTimer
@@ -23,6 +24,7 @@ from .joint_registration import register_jointly
 from .options import DEFAULTS, StitchingOptions
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Panorama:
     """Photographs put together.
@@ -63,6 +65,7 @@ class Panorama:
 def stitch(
     images: Sequence[Any],
     *,
+    channels: Channels = "rgb",
     detector: HeatmapDetector | None = None,
     reference: int | None = None,
     scale: float = 1.0,
@@ -81,6 +84,7 @@ def stitch(
     Args:
         images: two or more, in any order; each anything `load_image` takes. Paths are read when
             they are needed, so that only one photograph at its full size is in the memory.
+        channels: order of the colours in images that are arrays, as of `load_image`.
         detector: a `DeepDetect`, or anything with its `heatmap` method; default `DeepDetect()`.
         reference: number of the photograph in whose frame the panorama is; None for the one in
             the middle.
@@ -102,7 +106,7 @@ def stitch(
         OptionError: an option is out of its range, there are fewer than two images, or the
             panorama would be too large.
         MissingExtraError: numba is not installed.
-        DeepDetectError: no two images overlap, or one reaches the horizon of the reference.
+        RegistrationError: no two images overlap, or one reaches the horizon of the reference.
 
     Example:
         >>> from deepdetect.evaluation.baselines.random import RandomDetector
@@ -122,7 +126,7 @@ def stitch(
     sizes: dict[int, tuple[int, int]] = {}
     with timer.stage("reading"):
         for number, image in enumerate(images):
-            rgb = load_image(image)
+            rgb = load_image(image, channels=channels)
             sizes[number] = (rgb.shape[1], rgb.shape[0])
             small[number] = downscale(rgb, registration_side)
         del rgb
@@ -150,7 +154,7 @@ def stitch(
     )
     with timer.stage("compositing"):
         panorama, valid, gains = composite(
-            lambda number: load_image(images[number]), small, canvas, options
+            lambda number: load_image(images[number], channels=channels), small, canvas, options
         )
     return Panorama(
         panorama,

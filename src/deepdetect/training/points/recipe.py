@@ -8,10 +8,11 @@ import math
 from dataclasses import dataclass
 
 from ..._shared.errors import OptionError
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from .views import KINDS
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class PointsTrainingOptions:
     """A training of the ranker.

@@ -1,0 +1,112 @@
+"""Images in arrays and tensors of any usual layout and type, as (H, W, 3) uint8 RGB."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+
+from .errors import ImageError, unknown_name
+
+Channels = Literal["rgb", "bgr"]
+CHANNEL_ORDERS = ("rgb", "bgr")
+CHANNEL_COUNTS = (1, 3, 4)
+
+LAYOUTS = "(height, width), (height, width, channels) or (channels, height, width)"
+
+
+def check_channels(channels: str) -> None:
+    """Check the order of the colours of an image in an array.
+
+    Raises:
+        OptionError: it is unknown.
+    """
+    if channels not in CHANNEL_ORDERS:
+        raise unknown_name("channel order", channels, CHANNEL_ORDERS)
+
+
+def as_array(image: Any) -> np.ndarray:
+    """Return an array-like, or a PyTorch tensor of any device, as an array.
+
+    Raises:
+        ImageError: its rows are of unequal length.
+    """
+    if hasattr(image, "detach") and hasattr(image, "cpu"):  # a tensor
+        image = image.detach().cpu()
+        if image.is_floating_point():
+            image = image.float()  # NumPy has no bfloat16
+    try:
+        return np.asarray(image)
+    except ValueError:
+        raise ImageError("an image array must have rows of equal length") from None
+
+
+def array_to_rgb(image: Any, channels: Channels = "rgb", name: str = "the image") -> np.ndarray:
+    """Convert an image in an array or a PyTorch tensor to 8-bit RGB.
+
+    Args:
+        image: (H, W), (H, W, C) or (C, H, W), C 1, 3 or 4: bool, uint8, uint16 or float in [0, 1].
+            The fourth channel, alpha, is dropped.
+        channels: the order of the first three channels.
+        name: what errors call it.
+
+    Returns:
+        (H, W, 3) uint8.
+
+    Raises:
+        ImageError: it has another shape, type or range, or holds NaN.
+        OptionError: the order is unknown.
+
+    Example:
+        >>> red = np.zeros((3, 20, 30), np.float32)
+        >>> red[0] = 1
+        >>> array_to_rgb(red)[0, 0].tolist(), array_to_rgb(red, "bgr")[0, 0].tolist()
+        ([255, 0, 0], [0, 0, 255])
+    """
+    check_channels(channels)
+    values = _to_uint8(_channels_last(as_array(image)), name)
+    if values.ndim == 2:
+        return np.repeat(values[:, :, None], 3, axis=2)
+    return np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
+
+
+def _channels_last(array: np.ndarray) -> np.ndarray:
+    """Return an array as (H, W), (H, W, 3) or (H, W, 4)."""
+    shape = array.shape
+    if array.ndim == 4:
+        raise ImageError(
+            f"an image array has shape {shape}, which is a batch: give one image of it, as "
+            "batch[0], or the batch to `DeepDetect.detect`"
+        )
+    if array.ndim == 3 and shape[2] not in CHANNEL_COUNTS and shape[0] in CHANNEL_COUNTS:
+        array = np.moveaxis(array, 0, 2)
+    if array.ndim == 3 and array.shape[2] == 1:
+        array = array[:, :, 0]
+    if array.ndim == 2 or (array.ndim == 3 and array.shape[2] in CHANNEL_COUNTS):
+        return array
+    raise ImageError(
+        f"an image array has shape {shape}: it must be {LAYOUTS}, with 1, 3 or 4 channels"
+        + ("; give several grey images as a list" if array.ndim == 3 else "")
+    )
+
+
+def _to_uint8(array: np.ndarray, name: str) -> np.ndarray:
+    if array.dtype == np.uint8:
+        return array
+    if array.dtype == np.bool_:
+        return array.astype(np.uint8) * 255
+    if array.dtype.kind == "u" and array.dtype.itemsize == 2:  # of either byte order
+        # Divide by 257 with rounding, so that 65535 becomes 255.
+        return ((array.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if np.issubdtype(array.dtype, np.floating):
+        if not np.isfinite(array).all():
+            raise ImageError(f"{name} holds NaN or infinite values: replace them first")
+        if array.size and (array.min() < 0 or array.max() > 1):
+            raise ImageError(
+                f"a float image must lie in [0, 1], {name} spans "
+                f"[{array.min():g}, {array.max():g}]: scale it first"
+            )
+        return np.rint(array * np.float32(255)).astype(np.uint8)
+    raise ImageError(
+        f"an image array of type {array.dtype} is not understood: use uint8, uint16 or float"
+    )

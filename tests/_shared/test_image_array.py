@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect._shared.errors import ImageError, OptionError
+from deepdetect._shared.image_array import array_to_rgb, check_channels
+
+
+@pytest.mark.parametrize("side", [(20, 30), (16, 16), (3, 5)])
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_channels_may_come_first(side: tuple[int, int], count: int) -> None:
+    rng = np.random.default_rng(0)
+    last = rng.integers(0, 256, (*side, count), np.uint8)
+    if side == (3, 5):  # 3x5 pixels as channels last, so channels first are not tried
+        np.testing.assert_array_equal(array_to_rgb(last).shape, (3, 5, 3))
+        return
+    np.testing.assert_array_equal(array_to_rgb(np.moveaxis(last, 2, 0)), array_to_rgb(last))
+
+
+def test_bgr_is_what_opencv_calls_it(photo: np.ndarray) -> None:
+    bgr = cv2.cvtColor(photo, cv2.COLOR_RGB2BGR)
+    bgra = cv2.cvtColor(photo, cv2.COLOR_RGB2BGRA)
+    for given in (bgr, bgra, bgr.transpose(2, 0, 1), bgra.transpose(2, 0, 1), bgr / 255):
+        found = array_to_rgb(given, "bgr")
+        np.testing.assert_array_equal(found, photo)
+        assert found.flags.c_contiguous
+    gray = photo[..., 0]
+    np.testing.assert_array_equal(array_to_rgb(gray, "bgr"), array_to_rgb(gray))
+
+
+def test_tensors_of_any_layout_and_type(photo: np.ndarray) -> None:
+    torch = pytest.importorskip("torch", reason="needs torch for its tensors")
+    whole = torch.tensor(photo)
+    first = whole.permute(2, 0, 1)
+    real = (first.float() / 255).requires_grad_()
+    for tensor in (whole, first, real, real.double(), first[:1], whole[..., 0]):
+        expected = photo if tensor.ndim == 3 and 3 in tensor.shape else photo[..., :1]
+        np.testing.assert_array_equal(array_to_rgb(tensor), np.broadcast_to(expected, photo.shape))
+    coarse = array_to_rgb(real.bfloat16()).astype(int)
+    assert np.abs(coarse - photo).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((1, 3, 20, 30), "a batch: give one image of it"),
+        ((5, 20, 30), "give several grey images as a list"),
+        ((20, 30, 2), "1, 3 or 4 channels"),
+        ((20,), "(height, width)"),
+    ],
+)
+def test_what_is_no_image_is_one_sentence(shape: tuple[int, ...], words: str, one_line) -> None:
+    with pytest.raises(ImageError) as caught:
+        array_to_rgb(np.zeros(shape, np.uint8))
+    assert words in one_line(caught.value)
+    assert str(shape) in str(caught.value)
+
+
+def test_an_unknown_order_is_named_before_the_work() -> None:
+    with pytest.raises(OptionError, match="did you mean 'rgb'"):
+        check_channels("brg")
+    with pytest.raises(OptionError, match="unknown channel order 'gray'"):
+        array_to_rgb(np.zeros((20, 20), np.uint8), "gray")  # type: ignore[arg-type]
