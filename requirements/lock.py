@@ -61,7 +61,7 @@ LOCK_FILES = (
     LockFile(
         "opencv4.txt",
         groups=("build", "test"),
-        extras=("benchmark", "demo", "labels", "match"),
+        extras=("benchmark", "demo", "labels", "match", "onnx"),
         overrides="requirements/opencv4.in",
     ),
     LockFile("lowest.txt", groups=("build", "test"), extras=ALL_EXTRAS, lowest=True),

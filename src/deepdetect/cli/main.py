@@ -19,6 +19,7 @@ from .demo import demo
 from .detect import detect
 from .evaluate import evaluate
 from .evaluate_stereo import evaluate_stereo
+from .export import export
 from .label import label
 from .match import match
 from .reconstruct import reconstruct
@@ -118,6 +119,7 @@ for command in (
     train,
     train_points,
     average,
+    export,
     datasets,
     evaluate,
     evaluate_stereo,

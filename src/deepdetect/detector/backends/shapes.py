@@ -15,6 +15,9 @@ Shape = Sequence[int | str | None]
 LOGITS = "logits"
 """Name of the output that holds logits; an output of another name holds probabilities."""
 
+PADDED_IMAGE = "padded_image"
+"""Name of the tensor that holds the image, padded to multiples of 8, in files that pad it."""
+
 PROBE_SHAPE = (24, 32)
 """Height and width of the image that a network is tried on."""
 
