@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import importlib
 import re
+import sys
 from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -25,6 +26,10 @@ DISTRIBUTIONS = (
     "opencv-contrib-python-headless",
 )
 """The packages on PyPI that bring `cv2`."""
+
+
+NO_MEMORY_TO_LOAD = ("failed to map segment from shared object", "Cannot allocate memory")
+"""How glibc's words end where a library does not fit into the memory; it adds other reasons."""
 
 
 class _OpenCV(ModuleType):
@@ -46,6 +51,7 @@ def import_opencv() -> ModuleType:
 
     Raises:
         MissingExtraError: there is none, it cannot be imported, or it is too old.
+        MemoryError: it does not fit into the memory.
     """
     try:
         found = importlib.import_module("cv2")
@@ -58,6 +64,8 @@ def import_opencv() -> ModuleType:
         ) from None
     except ImportError as error:
         reason = (str(error).splitlines() or ["no reason given"])[0]
+        if reason.endswith(NO_MEMORY_TO_LOAD):
+            raise MemoryError(reason) from None
         raise MissingExtraError(
             f"the installed OpenCV cannot be imported ({reason}): repair it, or replace it by "
             "opencv-python-headless, which needs no libraries of a screen"
@@ -76,6 +84,14 @@ def import_opencv() -> ModuleType:
             f"pip install --upgrade {' '.join(installed_distributions()) or 'opencv-python'}"
         )
     return found
+
+
+def is_lack_of_memory(error: Exception) -> bool:
+    """Return whether an exception is OpenCV's for lack of memory; OpenCV is not imported for it."""
+    loaded = sys.modules.get("cv2")
+    if loaded is None or not isinstance(error, getattr(loaded, "error", ())):
+        return False
+    return bool(error.code == loaded.Error.StsNoMem)
 
 
 def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from .._shared.errors import DeepDetectError, OptionError
 from .._shared.image_array import Channels
-from .._shared.opencv import cv2
+from .._shared.opencv import cv2, is_lack_of_memory
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.selection import (
@@ -377,8 +377,8 @@ def memory_named(rgb: np.ndarray) -> Iterator[None]:
         return
     except MemoryError:
         pass
-    except cv2.error as error:
-        if error.code != cv2.Error.StsNoMem:
+    except Exception as error:
+        if not is_lack_of_memory(error):
             raise
     height, width = rgb.shape[:2]
     raise DeepDetectError(
