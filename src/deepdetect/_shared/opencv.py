@@ -91,7 +91,7 @@ def is_lack_of_memory(error: Exception) -> bool:
     loaded = sys.modules.get("cv2")
     if loaded is None or not isinstance(error, getattr(loaded, "error", ())):
         return False
-    return bool(error.code == loaded.Error.StsNoMem)
+    return bool(getattr(error, "code", None) == loaded.Error.StsNoMem)
 
 
 def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
