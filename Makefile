@@ -14,7 +14,8 @@ export OMP_NUM_THREADS ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 # What calls the parts of OpenCV that moved between its versions 4 and 5.
-TESTS_OPENCV4 ?= tests/labels tests/features tests/geometry tests/evaluation/baselines
+TESTS_OPENCV4 ?= tests/labels tests/features tests/geometry tests/evaluation/baselines \
+	tests/detector/network/test_onnx_variants.py
 # A quick part that touches most of the packages that this one depends on.
 TESTS_LOWEST ?= tests/io tests/detector tests/labels tests/features
 
@@ -29,7 +30,7 @@ install_locked = $(call install,$(1)) --no-deps --require-hashes -r $(2)
 install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requirements/torch.txt
 install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
 
-.PHONY: demo test test-all fuzz test-opencv4 test-lowest coverage lint spelling types contracts check \
+.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-lowest coverage lint spelling types contracts check \
 	format lock upgrade check-lock audit sbom dist clean
 
 demo: $(VENV)/.demo
@@ -40,13 +41,19 @@ test: $(VENV)/.test
 	$(VENV)/bin/python $(PYTEST) $(TESTS)
 
 # All tests, and ten minutes of wrong input and kills.
-test-all: $(VENV)/.test test-opencv4
+test-all: $(VENV)/.test test-opencv4 onnxruntime
 	$(VENV)/bin/python $(PYTEST) --runslow
 	$(VENV)/bin/python -m fuzz --seconds 540 --kills 8
 
 # All wrong input and all kills of docs/reliability.md: a quarter of an hour on two cores.
 fuzz: $(VENV)/.test
 	$(VENV)/bin/python -m fuzz
+
+# What the C++ example is built with, for its test: where Debian's archive cannot be reached the test
+# is skipped, and says so.
+onnxruntime: $(VENV)/.test
+	bash examples/onnx_cpp/get_onnxruntime.sh $(VENV)/onnxruntime $(VENV)/bin/python || \
+		echo "ONNX Runtime's headers cannot be fetched: the C++ example is not tested"
 
 test-opencv4: $(VENV_OPENCV4)/.test
 	$(VENV_OPENCV4)/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_OPENCV4)

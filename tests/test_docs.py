@@ -63,6 +63,9 @@ def test_commands_have_these_flags(page: str) -> None:
     for part in code(PRESENT[page]):
         for name, rest in re.findall(r"(?<!from )\bdeepdetect ([a-z][a-z-]+)\b([^#|]*)", part):
             command = main.commands[name]
+            if isinstance(command, click.Group):
+                word = rest.split()[0] if rest.split() else ""
+                command = command.commands.get(word, command)
             flags = {
                 flag
                 for option in command.get_params(click.Context(command))

@@ -17,6 +17,7 @@ from PIL import Image
 from deepdetect import DeepDetect, DeepDetectError
 from deepdetect.io.image import load_image
 from deepdetect.io.tables import load_keypoints
+from deepdetect.viz.draw import CAPTION_HEIGHT
 
 
 def test_writes_keypoints_and_pictures(run, photos: Path) -> None:
@@ -25,15 +26,25 @@ def test_writes_keypoints_and_pictures(run, photos: Path) -> None:
     assert {p.name for p in Path("out").iterdir()} == {
         ".deepdetect",
         "cat.npz",
-        "cat_keypoints.png",
-        "cat_heatmap.png",
+        "cat_keypoints.jpg",
+        "cat_dense.jpg",
+        "cat_heatmap.jpg",
     }
     keypoints = load_keypoints("out/cat.npz")
     expected = DeepDetect().detect(photos / "cat.jpg")
     np.testing.assert_array_equal(keypoints.xy, expected.xy)
     np.testing.assert_array_equal(keypoints.scores, expected.scores)
     assert f"{len(expected):,} keypoints" in result.stdout
-    assert np.asarray(Image.open("out/cat_heatmap.png")).shape == (150, 200, 3)
+    for name in ("keypoints", "dense", "heatmap"):
+        picture = np.asarray(Image.open(f"out/cat_{name}.jpg"))
+        assert picture.shape == (150 + CAPTION_HEIGHT, 200, 3)
+
+
+def test_points_have_no_dense_picture(run, photos: Path) -> None:
+    result = run("detect", photos / "cat.jpg", "-o", "out", "--max-keypoints", 50)
+    assert result.exit_code == 0, result.output
+    names = {p.name for p in Path("out").glob("cat*")}
+    assert names == {"cat.npz", "cat_keypoints.jpg", "cat_heatmap.jpg"}
 
 
 def test_json_has_the_numbers_and_the_pictures(run, photos: Path) -> None:
@@ -190,7 +201,7 @@ def test_pictures_and_other_formats_of_the_same_keypoints_are_added(run, photos:
     kept = contents(Path("out"))
     assert not detect(run, photos / "cat.jpg", "--pictures")[0]["skipped"]
     assert not detect(run, photos / "cat.jpg", "--format", "csv")[0]["skipped"]
-    assert len(contents(Path("out"))) == 4
+    assert len(contents(Path("out"))) == 5
     assert contents(Path("out")).items() >= kept.items()
     assert detect(run, photos / "cat.jpg", "--pictures")[0]["skipped"]
 
@@ -348,9 +359,9 @@ def test_pictures_of_an_earlier_run_are_no_inputs(run, photos: Path, output: str
         assert [Path(image["image"]).name for image in images] == ["0.jpg", "1.jpg"]
         assert [image["skipped"] for image in images] == [skipped] * 2
     other = json.loads(run("detect", folder, "-o", "other", "--json").stdout)["images"]
-    assert len(other) == 6, "elsewhere they are images as any"
-    for image in folder.glob("*.jpg"):
-        image.unlink()
+    assert len(other) == 8, "elsewhere they are images as any"
+    for name in ("0.jpg", "1.jpg"):
+        (folder / name).unlink()
     result = run("detect", folder, "-o", output)
     assert result.exit_code == 2
     assert "results of earlier runs" in result.stderr
@@ -358,9 +369,9 @@ def test_pictures_of_an_earlier_run_are_no_inputs(run, photos: Path, output: str
 
 def test_an_input_is_never_written_over(run, photos: Path) -> None:
     shutil.copy(photos / "left.png", "a.png")
-    shutil.copy(photos / "right.png", "a_heatmap.png")
+    shutil.copy(photos / "cat.jpg", "a_heatmap.jpg")
     before = contents(Path())
-    result = run("detect", "a.png", "a_heatmap.png", "-o", ".", "--overwrite")
+    result = run("detect", "a.png", "a_heatmap.jpg", "-o", ".", "--overwrite")
     assert result.exit_code == 2
     assert "is an input" in result.stderr
     assert contents(Path()) == before

@@ -110,7 +110,7 @@ format_option = click.option(
     help="Format of the data files.",
 )
 pictures_option = click.option(
-    "--pictures/--no-pictures", default=True, show_default=True, help="Write pictures as PNG."
+    "--pictures/--no-pictures", default=True, show_default=True, help="Write pictures, too."
 )
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace what exists already, and do all of it again."

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, overload
+from typing import TYPE_CHECKING, Any, Literal, Protocol, overload
 
-import cv2
 import numpy as np
 
 from .._shared.errors import DeepDetectError, OptionError
 from .._shared.image_array import Channels
+from .._shared.opencv import cv2, is_lack_of_memory
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.selection import (
@@ -33,10 +33,10 @@ from .heatmap import (
     compute_maps,
 )
 from .image_lists import Images, for_each_image, ignore_masks, image_list
-from .points.detection import PointOptions, detect_points
-from .points.ranker import WEIGHTS as RANKER
-from .points.ranker import Ranker, load_ranker
-from .pretrained import resolve_weights
+from .pretrained import RANKER, resolve_weights
+
+if TYPE_CHECKING:
+    from .points.ranker import Ranker
 
 CHANNELS_OF_IMAGES = (
     "give it with each image, as detect(image, channels='bgr'); what the network itself is fed is "
@@ -113,7 +113,10 @@ class DeepDetect:
         self.weights = resolve_weights(weights)
         self.heatmap_options = HeatmapOptions(resolution, network_channels, tta, tile_megapixels)
         self.ranker = RANKER if ranker is None else Path(ranker)
-        load_ranker(self.ranker)
+        if ranker is not None:  # what may be wrong with it is said now
+            from .points.ranker import load_ranker
+
+            load_ranker(self.ranker)
         self._runtime = RuntimeOptions(backend, providers, threads)
         self._network, self.backend = open_network(self.weights, self._runtime)
 
@@ -201,6 +204,8 @@ class DeepDetect:
 
     def _points(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
         """Find points in an image that `load_image` returned."""
+        from .points.ranker import load_ranker
+
         with memory_named(rgb.shape):
             return find_points(rgb, options, self.heatmap_options, load_ranker(self.ranker))
 
@@ -374,8 +379,8 @@ def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
         return
     except MemoryError:
         pass
-    except cv2.error as error:
-        if error.code != cv2.Error.StsNoMem:
+    except Exception as error:
+        if not is_lack_of_memory(error):
             raise
     height, width = shape[:2]
     raise DeepDetectError(
@@ -399,6 +404,8 @@ def find_points(
             resolution is "native".
         ranker: None: the one inside the package.
     """
+    from .points.detection import PointOptions, detect_points
+
     gray = luma(rgb)
     height, width = gray.shape
     ignore = None if options.ignore is None else check_ignore(options.ignore, gray.shape)

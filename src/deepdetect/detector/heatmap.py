@@ -6,18 +6,21 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.image_array import Channels, check_channels
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import available_memory, release_freed_memory
 from ..features.selection import Maps, Rows, bands, sigmoid
 from .backends import Network
-from .tiling import TiledNetwork, open_tiled
+
+if TYPE_CHECKING:
+    from .tiling import TiledNetwork
 
 STRIDE = 8
 """The network halves an image three times, so its sides must be multiples of 8."""
@@ -192,16 +195,22 @@ def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwo
     if options.tile_megapixels == "auto":
         if path is None or pixels * network.bytes_per_pixel <= available_memory():  # type: ignore[attr-defined]
             return None
-        return open_tiled(path, network.threads)  # type: ignore[attr-defined]
+        return _open_tiled(path, network)
     if pixels <= options.tile_megapixels * 1e6:
         return None
-    tiled = None if path is None else open_tiled(path, network.threads)  # type: ignore[attr-defined]
+    tiled = None if path is None else _open_tiled(path, network)
     if tiled is None:
         raise OptionError(
             "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights "
             "that deepdetect has trained"
         )
     return tiled
+
+
+def _open_tiled(path: Path, network: Network) -> TiledNetwork | None:
+    from .tiling import open_tiled
+
+    return open_tiled(path, network.threads)  # type: ignore[attr-defined]
 
 
 def _is_constant(rgb: np.ndarray) -> bool:

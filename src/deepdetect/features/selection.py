@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.opencv import cv2
 from .._shared.options import replace_options, suggest_keywords
 from .keypoints import Keypoints, bayer_order
 

@@ -9,11 +9,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import ImageError, MissingImageError
 from .._shared.image_array import Channels, array_to_rgb, check_channels
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .image_file import damaged_image, file_name, is_file, open_image
 
@@ -33,7 +33,7 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda image: cv2.flip(image, 1),
     3: lambda image: cv2.rotate(image, cv2.ROTATE_180),
     4: lambda image: cv2.flip(image, 0),
-    5: cv2.transpose,
+    5: lambda image: cv2.transpose(image),
     6: lambda image: cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE),
     7: lambda image: cv2.flip(cv2.transpose(image), -1),
     8: lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),

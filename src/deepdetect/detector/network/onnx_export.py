@@ -1,15 +1,18 @@
-"""The network as an ONNX file for any image size: `image` in, `probability` and `logits` out."""
+"""From torch to an ONNX file for any image size: `image` in, `probability` and `logits` out."""
 
 from __future__ import annotations
 
+import io
 import logging
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
 from ..._shared.atomic import atomic_path
+from .onnx_graph import ANY_SIZE, add_padding, write_metadata
 
 OPSET = 17
 
@@ -26,29 +29,40 @@ class ProbabilityAndLogits(nn.Module):
         return torch.sigmoid(logits), logits
 
 
-def export_onnx(network: nn.Module, path: str | Path) -> None:
+def export_onnx(
+    network: nn.Module, path: str | Path, metadata: Mapping[str, str] | None = None
+) -> None:
     """Write a network as ONNX, whole or not at all.
 
     Args:
         network: maps (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits; H and W
             are multiples of 8.
         path: file ending in .onnx. Its input is `image` (batch, 3, height, width)
-            float32, its outputs `probability` and `logits`, both (batch, 1, height, width)
-            float32.
+            float32 of any size, its outputs `probability` and `logits`, both
+            (batch, 1, height, width) float32.
+        metadata: what the file says beside what all say (`onnx_graph.METADATA`), as its licence.
     """
+    import onnx
+
     module = ProbabilityAndLogits(network.cpu()).eval()
     example = torch.zeros(2, 3, 64, 96)
     axes = {0: "batch", 2: "height", 3: "width"}
-    with atomic_path(path) as temporary, warnings.catch_warnings():
+    written = io.BytesIO()
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
             module,
             (example,),
-            str(temporary),
+            written,  # type: ignore[arg-type]  # its annotation is of the other exporter
             input_names=["image"],
             output_names=["probability", "logits"],
             dynamic_axes={"image": axes, "probability": axes, "logits": axes},
             opset_version=OPSET,
             dynamo=False,
         )
+    model = onnx.load_model_from_string(written.getvalue())
+    add_padding(model)
+    write_metadata(model, {**ANY_SIZE, **(metadata or {})})
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(model.SerializeToString())

@@ -1,0 +1,234 @@
+"""The graph of an ONNX file: padding and cropping inside it, a fixed size, its metadata.
+
+The package `onnx` is needed, torch is not: files are made from files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ... import __version__
+from ..._shared.errors import WeightsError
+
+if TYPE_CHECKING:
+    from onnx import GraphProto, ModelProto, NodeProto, TensorProto
+
+IMAGE, PROBABILITY, LOGITS = "image", "probability", "logits"
+PADDED_IMAGE, PADDED_LOGITS = "padded_image", "padded_logits"
+"""Names of tensors: the two in the middle are what the network itself maps to each other."""
+
+STRIDE = 8
+"""The network halves an image three times, so the sides of `PADDED_IMAGE` are multiples of 8."""
+
+_PADDING = {"shape", "sides", "minus_sides", "missing", "padding", PADDED_IMAGE}
+_ENDING = {"sigmoid", PROBABILITY}
+"""Names of tensors that are made outside of the network itself."""
+
+METADATA = {
+    "channels": "RGB",
+    "range": "0 to 1",
+    "stride": str(STRIDE),
+    "padding": "inside: the last row and column are repeated up to the stride, the maps cropped",
+    "pixel_origin": "x right, y down, the centre of the first pixel is (0, 0)",
+    "producer": "deepdetect",
+}
+"""What every file says of itself, beside version, weights, licence, precision and size."""
+
+
+ANY_SIZE = {"precision": "fp32", "size": "any", "batch": "any"}
+
+
+def add_padding(model: ModelProto) -> None:
+    """Let a network take any height and width, and give probabilities that are at most 1.
+
+    The image is padded by repeating its last row and column to multiples of 8, and the maps are
+    cropped, as `compute_heatmap` does it. What follows a transposed convolution is folded into it.
+
+    Args:
+        model: maps `image` to `logits` for multiples of 8; changed in place.
+    """
+    from onnx import helper
+
+    graph = model.graph
+    _fold_transposed(graph)
+    rest = split_nodes(graph)[1]
+    for node in rest:
+        rename(node, IMAGE, PADDED_IMAGE)
+        rename(node, LOGITS, PADDED_LOGITS)
+    _constants(graph, {"first_side": [2], "end_of_sides": [4], "side_axis": [0]})
+    _constants(graph, {"stride": [STRIDE], "no_padding": [0] * 6})
+    before = [
+        helper.make_node("Shape", [IMAGE], ["shape"]),
+        helper.make_node("Slice", ["shape", "first_side", "end_of_sides", "side_axis"], ["sides"]),
+        helper.make_node("Neg", ["sides"], ["minus_sides"]),
+        helper.make_node("Mod", ["minus_sides", "stride"], ["missing"]),
+        helper.make_node("Concat", ["no_padding", "missing"], ["padding"], axis=0),
+        helper.make_node("Pad", [IMAGE, "padding"], [PADDED_IMAGE], mode="edge"),
+    ]
+    replace_nodes(graph, [*before, *rest, *_ending(graph)])
+    for value in (*graph.input, *graph.output):
+        for axis, name in ((0, "batch"), (2, "height"), (3, "width")):
+            value.type.tensor_type.shape.dim[axis].dim_param = name
+
+
+def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
+    """Give a network with padding one size, and no node that asks for the size.
+
+    Args:
+        model: what `add_padding` made; changed in place.
+        height, width: of the images, in pixels.
+        batch: number of images.
+    """
+    from onnx import helper
+
+    graph = model.graph
+    below, right = -height % STRIDE, -width % STRIDE
+    inner, before = split_nodes(graph)[1], []
+    if below or right:
+        _constants(graph, {"padding": [0] * 6 + [below, right], "sides": [height, width]})
+        before = [helper.make_node("Pad", [IMAGE, "padding"], [PADDED_IMAGE], mode="edge")]
+    else:
+        for node in inner:
+            rename(node, PADDED_IMAGE, IMAGE)
+            rename(node, PADDED_LOGITS, LOGITS)
+    replace_nodes(graph, [*before, *inner, *_ending(graph, crop=bool(below or right))])
+    for value in (*graph.input, *graph.output):
+        for axis, length in ((0, batch), (2, height), (3, width)):
+            value.type.tensor_type.shape.dim[axis].dim_value = length
+
+
+def is_padded(model: ModelProto) -> bool:
+    """Return whether a network has passed `add_padding`, and takes any size."""
+    return any(PADDED_LOGITS in node.output for node in model.graph.node) and any(
+        node.op_type == "Shape" for node in model.graph.node
+    )
+
+
+def check_graph(model: ModelProto, name: str) -> None:
+    """Check that a graph maps `image` to `logits`.
+
+    Raises:
+        WeightsError: it does not.
+    """
+    inputs = [value.name for value in model.graph.input]
+    outputs = {value.name for value in model.graph.output}
+    if inputs != [IMAGE] or outputs != {PROBABILITY, LOGITS}:
+        raise WeightsError(
+            f"{name} is no network of deepdetect (it maps {', '.join(inputs)} to "
+            f"{', '.join(sorted(outputs))}): give a file that deepdetect has written"
+        )
+
+
+def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:
+    """Write `METADATA`, this package's version, and values; those of before stay beside them."""
+    from onnx import helper
+
+    known = {*METADATA, "version", "weights", "licence", "precision", "size", "batch"}
+    kept = {name: value for name, value in read_metadata(model).items() if name in known}
+    written = {**kept, **METADATA, "version": __version__, **values}
+    helper.set_model_props(model, dict(sorted(written.items())))
+    # OpenCV 4 divides averages at the border as it should only where this name is here.
+    model.producer_name = "pytorch"
+    model.graph.name = "deepdetect"
+
+
+def read_metadata(model: ModelProto) -> dict[str, str]:
+    """Return a file's metadata."""
+    return {one.key: one.value for one in model.metadata_props}
+
+
+def split_nodes(graph: GraphProto) -> tuple[list[NodeProto], list[NodeProto], list[NodeProto]]:
+    """Return the nodes that pad, those of the network itself, and those behind its logits."""
+    before, inner, behind = [], [], []
+    for node in graph.node:
+        cropping = LOGITS in node.output and node.op_type == "Slice"
+        if not _PADDING.isdisjoint(node.output):
+            before.append(node)
+        elif cropping or not _ENDING.isdisjoint(node.output):
+            behind.append(node)
+        else:
+            inner.append(node)
+    return before, inner, behind
+
+
+def _ending(graph: GraphProto, crop: bool = True) -> list[NodeProto]:
+    """Make the nodes that crop the logits and turn them into probabilities."""
+    from onnx import helper
+
+    _constants(graph, {"from_zero": [0, 0], "side_axes": [2, 3]})
+    _constants(graph, {"least": 0, "most": 1}, np.float32)
+    cropping = helper.make_node(
+        "Slice", [PADDED_LOGITS, "from_zero", "sides", "side_axes"], [LOGITS]
+    )
+    return [
+        *([cropping] if crop else []),
+        helper.make_node("Sigmoid", [LOGITS], ["sigmoid"]),
+        # Some runtimes approximate the sigmoid, up to 1.0000001.
+        helper.make_node("Clip", ["sigmoid", "least", "most"], [PROBABILITY]),
+    ]
+
+
+def _fold_transposed(graph: GraphProto) -> None:
+    """Fold batch normalisation into the transposed convolution before it.
+
+    PyTorch's exporter folds it into convolutions only. All others follow a sum or a concatenation,
+    and stay.
+    """
+    from onnx import numpy_helper
+
+    values = {one.name: one for one in graph.initializer}
+    made = {name: node for node in graph.node for name in node.output}
+    for node in graph.node:
+        if node.op_type == "Identity":  # equal weights are written once
+            values[node.output[0]] = values[node.input[0]]
+    kept = []
+    for node in graph.node:
+        before = made.get(node.input[0]) if node.op_type == "BatchNormalization" else None
+        if before is None or before.op_type != "ConvTranspose" or len(before.input) != 2:
+            kept.append(node)
+            continue
+        weight, bias, mean, variance = (
+            numpy_helper.to_array(values[name]).astype(np.float64) for name in node.input[1:]
+        )
+        epsilon = next(one.f for one in node.attribute if one.name == "epsilon")
+        scale = weight / np.sqrt(variance + epsilon)
+        kernel = numpy_helper.to_array(values[before.input[1]]) * scale[:, None, None]
+        names = (f"{before.input[1]}.folded", f"{before.input[1]}.bias")
+        for name, array in zip(names, (kernel, bias - mean * scale), strict=True):
+            graph.initializer.append(numpy_helper.from_array(array.astype(np.float32), name))
+        before.input[1] = names[0]
+        before.input.append(names[1])
+        before.output[0] = node.output[0]
+    replace_nodes(graph, kept)
+
+
+def replace_nodes(graph: GraphProto, nodes: Sequence[NodeProto]) -> None:
+    """Replace all nodes, and drop the weights that none of them reads."""
+    nodes = list(nodes)
+    used = {name for node in nodes for name in node.input}
+    weights = [one for one in graph.initializer if one.name in used]
+    del graph.node[:], graph.initializer[:], graph.value_info[:]
+    graph.node.extend(nodes)
+    graph.initializer.extend(weights)
+
+
+def rename(node: NodeProto, old: str, new: str) -> None:
+    """Rename a tensor in the inputs and outputs of a node."""
+    for names in (node.input, node.output):
+        for k, name in enumerate(names):
+            if name == old:
+                names[k] = new
+
+
+def _constants(graph: GraphProto, values: Mapping[str, Any], kind: type = np.int64) -> None:
+    """Add small constants; one whose name is there already is replaced."""
+    from onnx import numpy_helper
+
+    others: list[TensorProto] = [one for one in graph.initializer if one.name not in values]
+    del graph.initializer[:]
+    graph.initializer.extend(others)
+    for name, value in values.items():
+        graph.initializer.append(numpy_helper.from_array(np.array(value, kind), name))

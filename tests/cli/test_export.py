@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+
+from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
+from tests.cli.conftest import one_sentence  # noqa: E402
+
+
+def test_the_default_is_the_shipped_file(run, tmp_path: Path) -> None:
+    result = run("export", "onnx", "-o", "made.onnx")
+    assert result.exit_code == 0, result.output
+    model, shipped = onnx.load(tmp_path / "made.onnx"), onnx.load(pretrained_weights())
+    assert model.graph == shipped.graph
+    assert "MIT" in result.output
+
+
+def test_size_and_precision(run, tmp_path: Path) -> None:
+    result = run(
+        *("export", "onnx", "dense", "-o", "a/made.onnx", "--size", "48x64", "--batch", 2),
+        *("--precision", "fp16", "--licence", "CC0", "--json"),
+    )
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.output)
+    path = tmp_path / summary["file"]
+    assert summary["bytes"] == path.stat().st_size
+    wanted = {"size": "48x64", "batch": "2", "precision": "fp16", "licence": "CC0"}
+    assert wanted.items() <= summary["metadata"].items()
+    sides = onnx.load(path).graph.output[0].type.tensor_type.shape.dim
+    assert [side.dim_value for side in sides] == [2, 1, 48, 64]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("-o a.onnx --precision int8", "give --calibration"),
+        ("-o a.onnx --calibration {photos}", "--calibration is for int8"),
+        ("-o a.onnx --batch 2", "--batch needs --size"),
+        ("-o a.onnx --size 480", "'480' is no height and width"),
+        ("-o a.onnx --size 4x99999", "--size must lie in"),
+        ("-o a.png", "ends in .onnx"),
+        ("densse -o a.onnx", "did you mean 'dense'"),
+        ("none.onnx -o a.onnx", "there is no weights file"),
+        ("{photos}/cat.jpg -o a.onnx", "no weights file"),
+        ("text.onnx -o a.onnx", "is not an ONNX file that can be read"),
+        ("text.onnx -o text.onnx", "which is an input"),
+        ("-o a.onnx --precision int8 --calibration text.onnx", "text.onnx"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(
+    run, words: str, message: str, photos: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "text.onnx").write_text("I am no network")
+    result = run("export", "onnx", *(word.format(photos=photos) for word in words.split()))
+    assert result.exit_code == 2
+    assert message in result.output.replace("\n", " ")
+    assert one_sentence(result.output) or result.output.startswith("Usage:")
+    assert [path.name for path in tmp_path.iterdir()] == ["text.onnx"]

@@ -1,0 +1,273 @@
+"""Exported files give what the network gives, in other runtimes, at any size and at one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+
+import cv2  # noqa: E402
+import onnxruntime  # noqa: E402
+
+from deepdetect import DeepDetect, OptionError, WeightsError  # noqa: E402
+from deepdetect.detector.backends.onnx_parts import cut_onnx  # noqa: E402
+from deepdetect.detector.network.onnx_graph import read_metadata  # noqa: E402
+from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
+from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
+
+SIZES = [(64, 96), (123, 157), (17, 23), (80, 41), (200, 16)]
+"""Heights and widths: multiples of 8, of 8 in one direction, and of none."""
+
+
+def images_of(photo: np.ndarray, height: int, width: int, batch: int) -> np.ndarray:
+    """Cut (B, 3, H, W) float32 out of a photograph."""
+    parts = [photo[9 * k : 9 * k + height, 5 * k : 5 * k + width] for k in range(batch)]
+    return np.ascontiguousarray(np.stack(parts).transpose(0, 3, 1, 2) * np.float32(1 / 255))
+
+
+def session_of(model: Path | bytes) -> onnxruntime.InferenceSession:
+    settings = onnxruntime.SessionOptions()
+    settings.intra_op_num_threads, settings.log_severity_level = 1, 4
+    given = model if isinstance(model, bytes) else str(model)
+    return onnxruntime.InferenceSession(given, settings, providers=["CPUExecutionProvider"])
+
+
+@pytest.fixture(scope="module")
+def network() -> onnxruntime.InferenceSession:
+    """The network alone, without padding, of the shipped file."""
+    shipped = pretrained_weights().read_bytes()
+    return session_of(cut_onnx(shipped, ["padded_image"], ["padded_logits"]))
+
+
+def expected_logits(network: onnxruntime.InferenceSession, images: np.ndarray) -> np.ndarray:
+    height, width = images.shape[2:]
+    sides = ((0, 0), (0, 0), (0, -height % 8), (0, -width % 8))
+    padded = np.pad(images, sides, mode="edge")
+    return network.run(None, {"padded_image": padded})[0][:, :, :height, :width]
+
+
+def check_answers(logits: np.ndarray, probability: np.ndarray, expected: np.ndarray) -> None:
+    assert logits.shape == probability.shape == expected.shape
+    assert logits.dtype == probability.dtype == np.float32
+    np.testing.assert_allclose(logits, expected, atol=1e-3)
+    exact = 1 / (1 + np.exp(-expected.astype(np.float64)))
+    np.testing.assert_allclose(probability, exact, atol=2e-4)
+    assert probability.min() >= 0
+    assert probability.max() <= 1
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_onnxruntime(
+    height: int, width: int, batch: int, photo: np.ndarray, network: onnxruntime.InferenceSession
+) -> None:
+    images = images_of(photo, height, width, batch)
+    logits, probability = session_of(pretrained_weights()).run(
+        ["logits", "probability"], {"image": images}
+    )
+    check_answers(logits, probability, expected_logits(network, images))
+
+
+def test_the_probability_is_never_over_one() -> None:
+    """Without the limit it is 1.0000001 at some of these."""
+    shipped = pretrained_weights().read_bytes()
+    given = np.linspace(-120, 120, 100_000, dtype=np.float32).reshape(1, 1, 100, -1)
+    found = session_of(cut_onnx(shipped, ["logits"], ["probability"])).run(None, {"logits": given})
+    assert found[0].max() == 1
+    raw = session_of(cut_onnx(shipped, ["logits"], ["sigmoid"])).run(None, {"logits": given})
+    np.testing.assert_array_equal(np.minimum(raw[0], 1), found[0])
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+def test_openvino(batch: int, photo: np.ndarray, network: onnxruntime.InferenceSession) -> None:
+    openvino = pytest.importorskip("openvino", reason="needs OpenVINO")
+    settings = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": 1}
+    model = openvino.Core().compile_model(str(pretrained_weights()), "CPU", settings)
+    for height, width in SIZES:
+        images = images_of(photo, height, width, batch)
+        found = model([images])
+        check_answers(found["logits"], found["probability"], expected_logits(network, images))
+
+
+@pytest.mark.skipif(cv2.__version__ < "5", reason="needs the new engine of OpenCV 5")
+@pytest.mark.parametrize("batch", [1, 2])
+def test_opencv_5_at_any_size(
+    batch: int, photo: np.ndarray, network: onnxruntime.InferenceSession
+) -> None:
+    model = cv2.dnn.readNetFromONNX(str(pretrained_weights()), cv2.dnn.ENGINE_NEW)
+    for height, width in SIZES:
+        images = images_of(photo, height, width, batch)
+        model.setInput(images)
+        check_answers(*model.forward(["logits", "probability"]), expected_logits(network, images))
+
+
+@pytest.mark.skipif(cv2.__version__ < "5", reason="its message is of OpenCV 5")
+def test_the_classic_engine_refuses_the_file_for_any_size() -> None:
+    with pytest.raises(cv2.error, match="Shape"):
+        cv2.dnn.readNetFromONNX(str(pretrained_weights()), cv2.dnn.ENGINE_CLASSIC)
+
+
+NAMES = ["ENGINE_CLASSIC", "ENGINE_NEW"] if cv2.__version__ >= "5" else []
+ENGINES = [[getattr(cv2.dnn, name)] for name in NAMES] or [[]]
+"""OpenCV 4 has one engine, the classic one of OpenCV 5."""
+
+
+@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("size", SIZES)
+def test_opencv_at_one_size(
+    size: tuple[int, int],
+    batch: int,
+    tmp_path: Path,
+    photo: np.ndarray,
+    network: onnxruntime.InferenceSession,
+) -> None:
+    path = tmp_path / "one.onnx"
+    write_onnx("default", path, OnnxOptions(size, batch))
+    model = onnx.load(path)
+    onnx.checker.check_model(model, full_check=True)
+    assert "Shape" not in {node.op_type for node in model.graph.node}
+    images = images_of(photo, *size, batch)
+    for engine in ENGINES:
+        net = cv2.dnn.readNetFromONNX(str(path), *engine)
+        net.setInput(images)
+        check_answers(*net.forward(["logits", "probability"]), expected_logits(network, images))
+
+
+@pytest.mark.parametrize("name", ["default", "dense"])
+def test_the_shipped_files_are_those_of_the_safetensors(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="needs torch, which is for training only")
+    shipped = pretrained_weights(name)
+    write_onnx(shipped.with_suffix(".safetensors"), tmp_path / "made.onnx")
+    made, model = onnx.load(tmp_path / "made.onnx"), onnx.load(shipped)
+    assert made.graph == model.graph
+    metadata = read_metadata(model)
+    assert (metadata["weights"], metadata["licence"]) == (name, "MIT")
+    assert {**read_metadata(made), "weights": name, "licence": "MIT"} == {
+        **metadata,
+        "version": read_metadata(made)["version"],
+    }
+
+
+def test_metadata(tmp_path: Path) -> None:
+    found = write_onnx(
+        "default", tmp_path / "one.onnx", OnnxOptions((48, 64), precision="fp16"), licence="CC0"
+    )
+    read = session_of(tmp_path / "one.onnx").get_modelmeta().custom_metadata_map
+    assert read == found
+    assert {name: read[name] for name in ("channels", "range", "stride", "licence", "size")} == {
+        "channels": "RGB",
+        "range": "0 to 1",
+        "stride": "8",
+        "licence": "CC0",
+        "size": "48x64",
+    }
+    assert read["precision"] == "fp16"
+
+
+@pytest.mark.parametrize("options", [OnnxOptions(), OnnxOptions((123, 157)), OnnxOptions((64, 96))])
+def test_half_precision(
+    options: OnnxOptions,
+    tmp_path: Path,
+    photo: np.ndarray,
+    network: onnxruntime.InferenceSession,
+) -> None:
+    path = tmp_path / "half.onnx"
+    write_onnx("default", path, OnnxOptions(options.size, precision="fp16"))
+    assert path.stat().st_size < 0.55 * pretrained_weights().stat().st_size
+    onnx.checker.check_model(onnx.load(path), full_check=True)
+    images = images_of(photo, *(options.size or (77, 90)), 1)
+    logits = session_of(path).run(["logits"], {"image": images})[0]
+    expected = expected_logits(network, images)
+    assert logits.dtype == np.float32
+    assert 0 < np.abs(logits - expected).max() < 0.5
+    assert np.mean((logits > 0) == (expected > 0)) > 0.998
+
+
+@pytest.mark.slow
+def test_eight_bits(
+    tmp_path: Path, photo: np.ndarray, network: onnxruntime.InferenceSession
+) -> None:
+    from PIL import Image
+
+    for k in range(3):
+        Image.fromarray(photo[20 * k : 20 * k + 150, 30 * k : 30 * k + 180]).save(
+            tmp_path / f"{k}.png"
+        )
+    paths = sorted(tmp_path.glob("*.png"))
+    path = tmp_path / "small.onnx"
+    write_onnx("default", path, OnnxOptions(precision="int8"), calibration=paths)
+    assert path.stat().st_size < 0.5 * pretrained_weights().stat().st_size
+    onnx.checker.check_model(onnx.load(path), full_check=True)
+    images = images_of(photo, 123, 157, 2)
+    logits = session_of(path).run(["logits"], {"image": images})[0]
+    expected = expected_logits(network, images)
+    assert np.mean((logits > 0) == (expected > 0)) > 0.97
+    # The package's own backend takes it, too.
+    assert DeepDetect(path, backend="onnxruntime").heatmap(photo).shape == photo.shape[:2]
+
+
+def test_an_older_file_is_padded(tmp_path: Path, photo: np.ndarray) -> None:
+    """Files of trainings before the padding map multiples of 8, and say nothing of themselves."""
+    model = onnx.load_model_from_string(
+        cut_onnx(pretrained_weights().read_bytes(), ["padded_image"], ["padded_logits"])
+    )
+    for value, name in ((model.graph.input[0], "image"), (model.graph.output[0], "logits")):
+        old, value.name = value.name, name
+        for node in model.graph.node:
+            for names in (node.input, node.output):
+                names[:] = [name if each == old else each for each in names]
+    probability = onnx.helper.make_tensor_value_info("probability", 1, ("b", 1, "h", "w"))
+    model.graph.output.insert(0, probability)
+    model.graph.node.append(onnx.helper.make_node("Sigmoid", ["logits"], ["probability"]))
+    del model.metadata_props[:]
+    onnx.save(model, str(tmp_path / "old.onnx"))
+    metadata = write_onnx(tmp_path / "old.onnx", tmp_path / "new.onnx")
+    assert metadata["weights"] == "old.onnx"
+    assert "licence" not in metadata
+    images = images_of(photo, 45, 50, 1)
+    found, expected = (
+        session_of(path).run(["logits"], {"image": images})[0]
+        for path in (tmp_path / "new.onnx", pretrained_weights())
+    )
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"precision": "fp8"}, "did you mean 'fp"),
+        ({"batch": 2}, "`batch` needs `size`"),
+        ({"size": (4, 64)}, "`size` must lie in"),
+        ({"size": (64,)}, "height and width"),
+        ({"size": (64, 64), "batch": 0}, "`batch` must lie in"),
+        ({"max_calibration_images": 0}, "`max_calibration_images` must lie in"),
+    ],
+)
+def test_options_are_checked(values: dict[str, object], message: str) -> None:
+    with pytest.raises(OptionError, match=message):
+        OnnxOptions(**values)
+
+
+def test_a_changed_file_is_not_changed_again(tmp_path: Path) -> None:
+    write_onnx("default", tmp_path / "half.onnx", OnnxOptions(precision="fp16"))
+    with pytest.raises(WeightsError, match="precision fp16: give the file that it was made from"):
+        write_onnx(tmp_path / "half.onnx", tmp_path / "again.onnx")
+    assert not (tmp_path / "again.onnx").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "calibration", "message"),
+    [
+        (OnnxOptions(precision="int8"), [], "give `calibration`"),
+        (OnnxOptions(), [Path("a.png")], "is for int8, not fp32"),
+    ],
+)
+def test_calibration_is_for_eight_bits(
+    options: OnnxOptions, calibration: list[Path], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(OptionError, match=message):
+        write_onnx("default", tmp_path / "a.onnx", options, calibration=calibration)
+    assert not list(tmp_path.iterdir())

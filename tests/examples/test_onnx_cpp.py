@@ -1,0 +1,64 @@
+"""The C++ example is built, and finds the keypoints that the package finds."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetect
+from deepdetect.detector.pretrained import pretrained_weights
+
+FOLDER = Path(__file__).parents[2] / "examples/onnx_cpp"
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built example."""
+    onnxruntime = Path(os.environ.get("ONNXRUNTIME", Path(sys.prefix) / "onnxruntime")).absolute()
+    if not (onnxruntime / "include/onnxruntime_cxx_api.h").is_file():
+        pytest.skip(f"needs the headers of ONNX Runtime in {onnxruntime}: run make onnxruntime")
+    if shutil.which("make") is None or shutil.which("g++") is None:
+        pytest.skip("needs make and g++")
+    build = tmp_path_factory.mktemp("build")
+    words = ["make", "-C", str(FOLDER), f"ONNXRUNTIME={onnxruntime}", f"BUILD={build}"]
+    made = subprocess.run([*words, "CXXFLAGS=-O1 -Wall -Wextra -Werror"], capture_output=True)
+    assert made.returncode == 0, made.stderr.decode()
+    return build / "keypoints"
+
+
+@pytest.mark.slow
+def test_the_keypoints_are_those_of_the_package(
+    program: Path, photo: np.ndarray, tmp_path: Path
+) -> None:
+    rgb = photo[:123, :157]
+    Image.fromarray(rgb).save(tmp_path / "photo.ppm")
+    words = [str(program), str(pretrained_weights()), str(tmp_path / "photo.ppm")]
+    printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    found = np.array([line.split() for line in printed.splitlines()], float)
+    expected = DeepDetect(backend="onnxruntime").detect(rgb)
+    assert len(expected) > 1000
+    np.testing.assert_array_equal(found[:, :2], expected.xy)
+    np.testing.assert_allclose(found[:, 2], expected.scores, atol=1e-4)
+    words.append("0.9")
+    fewer = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    assert len(fewer.splitlines()) == np.sum(found[:, 2] > 0.9)
+
+
+@pytest.mark.slow
+def test_a_wrong_file_is_one_sentence(program: Path, tmp_path: Path) -> None:
+    (tmp_path / "photo.ppm").write_bytes(b"P6 4 4 255\nshort")
+    words = [str(program), str(pretrained_weights()), str(tmp_path / "photo.ppm")]
+    ended = subprocess.run(words, capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.endswith("photo.ppm is cut off\n")
+
+
+def test_the_example_is_short() -> None:
+    assert len((FOLDER / "keypoints.cpp").read_text(encoding="utf-8").splitlines()) <= 60

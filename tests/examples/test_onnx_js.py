@@ -1,0 +1,86 @@
+"""The JavaScript example finds the keypoints that the package finds."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetect
+from deepdetect.detector.pretrained import pretrained_weights
+
+FOLDER = Path(__file__).parents[2] / "examples/onnx_js"
+NO_NETWORK = ("ENOTFOUND", "EAI_AGAIN", "ECONNREFUSED", "ETIMEDOUT", "ENETUNREACH")
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the example with the packages of its lock file."""
+    if shutil.which("npm") is None or shutil.which("node") is None:
+        pytest.skip("needs node and npm")
+    folder = tmp_path_factory.mktemp("npm") / "example"
+    shutil.copytree(FOLDER, folder, ignore=shutil.ignore_patterns("node_modules"))
+    words = ["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
+    made = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    if any(word in made.stderr for word in NO_NETWORK):
+        pytest.skip("needs npm's registry, which cannot be reached")
+    assert made.returncode == 0, made.stderr
+    return folder
+
+
+def run_example(folder: Path, *words: object) -> np.ndarray:
+    command = ["node", "keypoints.mjs", *map(str, words)]
+    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    return np.array([line.split() for line in ended.stdout.splitlines()], float)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("height", "width"), [(123, 157), (64, 96), (17, 23), (200, 41), (96, 99)])
+def test_the_keypoints_are_those_of_the_package(
+    height: int, width: int, installed: Path, photo: np.ndarray, tmp_path: Path
+) -> None:
+    rgb = photo[:height, :width]
+    Image.fromarray(rgb).save(tmp_path / "photo.png")
+    found = run_example(installed, pretrained_weights(), tmp_path / "photo.png", "0.5")
+    expected = DeepDetect(backend="onnxruntime").detect(rgb)
+    assert len(expected) > 20
+    np.testing.assert_array_equal(found[:, :2], expected.xy)
+    np.testing.assert_allclose(found[:, 2], expected.scores, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_two_images_at_once(installed: Path, photo: np.ndarray, tmp_path: Path) -> None:
+    """A batch of two gives what each image gives by itself."""
+    (installed / "batch.mjs").write_text(
+        """
+import { readFileSync, writeFileSync } from "node:fs";
+import * as ort from "onnxruntime-web";
+ort.env.wasm.numThreads = 1;
+const [model, given, made, height, width] = process.argv.slice(2);
+const planes = new Float32Array(new Uint8Array(readFileSync(given)).buffer);
+const image = new ort.Tensor("float32", planes, [2, 3, Number(height), Number(width)]);
+const session = await ort.InferenceSession.create(readFileSync(model));
+writeFileSync(made, new Uint8Array((await session.run({ image })).logits.data.buffer));
+"""
+    )
+    two = np.stack([photo[:83, :90], photo[100:183, 60:150]])
+    planes = np.ascontiguousarray(two.transpose(0, 3, 1, 2) * np.float32(1 / 255))
+    planes.tofile(tmp_path / "given.bin")
+    words = [pretrained_weights(), tmp_path / "given.bin", tmp_path / "made.bin", 83, 90]
+    command = ["node", "batch.mjs", *map(str, words)]
+    subprocess.run(command, cwd=installed, check=True)
+    found = np.fromfile(tmp_path / "made.bin", np.float32).reshape(2, 83, 90)
+    detector = DeepDetect(backend="onnxruntime")
+    for logits, rgb in zip(found, two, strict=True):
+        np.testing.assert_allclose(logits, detector.heatmap_and_logits(rgb)[1], atol=1e-3)
+
+
+def test_the_example_is_short_and_pinned() -> None:
+    assert len((FOLDER / "keypoints.mjs").read_text(encoding="utf-8").splitlines()) <= 40
+    assert '"onnxruntime-web": "1.30.0"' in (FOLDER / "package.json").read_text(encoding="utf-8")
+    assert '"integrity"' in (FOLDER / "package-lock.json").read_text(encoding="utf-8")
