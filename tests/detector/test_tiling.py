@@ -128,7 +128,7 @@ def test_tiles_of_a_given_size(
             return np.zeros(rgb.shape[:2], np.float32)
 
     monkeypatch.setattr(heatmap, "MIN_TILE_MEGAPIXELS", 0.01)
-    monkeypatch.setattr(heatmap, "open_tiled", lambda path, threads: Tiled())
+    monkeypatch.setattr("deepdetect.detector.tiling.open_tiled", lambda path, threads: Tiled())
     for size, expected in ((0.1, [0.1]), (1.0, [])):
         areas.clear()
         options = HeatmapOptions("native", tile_megapixels=size)
