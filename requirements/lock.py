@@ -48,15 +48,20 @@ class LockFile:
     lowest: bool = False
 
 
-ALL_EXTRAS = tuple(PROJECT["project"]["optional-dependencies"])
+# `labels` and `opencv` bring two packages of one folder; `standard` brings `opencv`.
+ALL_EXTRAS = tuple(
+    extra
+    for extra in PROJECT["project"]["optional-dependencies"]
+    if extra not in ("opencv", "standard")
+)
 LOCK_FILES = (
     LockFile("uv.txt", groups=("lock",), package=False),
     LockFile("lock.txt", groups=("dev",), extras=ALL_EXTRAS),
-    LockFile("demo.txt", groups=("build",), extras=("demo",)),
+    LockFile("demo.txt", groups=("build",), extras=("demo", "labels", "match")),
     LockFile(
         "opencv4.txt",
         groups=("build", "test"),
-        extras=("benchmark", "demo", "onnx"),
+        extras=("benchmark", "demo", "labels", "match", "onnx"),
         overrides="requirements/opencv4.in",
     ),
     LockFile("lowest.txt", groups=("build", "test"), extras=ALL_EXTRAS, lowest=True),

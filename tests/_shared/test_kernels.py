@@ -169,3 +169,16 @@ def test_the_flags_reach_numba() -> None:
     assert double.targetoptions["inline"] == "always"
     assert double.targetoptions["nogil"] is True
     assert double(4) == 8
+
+
+def test_the_first_compilation_is_announced_once(sealed: Path) -> None:
+    code = (
+        "from deepdetect._shared import kernels\n"
+        "kernels.announce_compilation(lambda: print('compiling'))\n"
+        "from kernel_of_test import add\n"
+        "print('imported')\n"
+        "print(add(1, 2), add(1.5, 2))\n"
+    )
+    cache = sealed.parent / "cache"
+    assert run(code, sealed, NUMBA_CACHE_DIR=cache).split() == ["imported", "compiling", "3", "3.5"]
+    assert run(code, sealed, NUMBA_CACHE_DIR=cache).split() == ["imported", "3", "3.5"]

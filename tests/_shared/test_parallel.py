@@ -150,6 +150,7 @@ def test_ctrl_c_ends_all_processes_without_a_word_of_theirs(moment: str, tmp_pat
             "import os\n"
             "Path(f'import{os.getpid()}').touch()\n"
             "time.sleep(1)\n"
+            "__version__ = '5.0.0'\n"
             "setNumThreads = print\n"
         )
     paths = os.pathsep.join([str(tmp_path), *sys.path])

@@ -97,6 +97,25 @@ def test_a_further_method_is_one_more_row_and_the_rest_is_found(made, folder: Pa
     assert values["metadata"]["results made, not found in the cache"] == "4"
 
 
+def test_what_fails_is_listed_and_the_rest_is_there(made, folder: Path, run) -> None:
+    _, output = made
+    Path("never_works.py").write_text("def find(rgb):\n    raise ValueError('not today')\n")
+    arguments = (
+        *("benchmark", "foreground", "--data", folder, "-o", "out", "--baselines", "fast"),
+        *("--cache", output / "cache", "--method", "never_works:find"),
+    )
+    result = run(*arguments)
+    assert result.exit_code == 1, result.output
+    assert "| FAST |" in result.stdout
+    assert "report: out/report.md" in result.stdout
+    first, *failures = result.stderr.strip().splitlines()[-2:]
+    assert first == "deepdetect: one part could not be measured, the rest is in out/report.md:"
+    assert all("not today" in failure for failure in failures)
+    as_json = run(*arguments, "--json")
+    assert as_json.exit_code == 1
+    assert json.loads(as_json.stdout)["skipped"] == [failure.strip() for failure in failures]
+
+
 def test_no_classical_method_may_be_wanted(made, folder: Path, run) -> None:
     _, output = made
     result = run(

@@ -15,7 +15,9 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, DeepDetectError
+from deepdetect.io.image import load_image
 from deepdetect.io.tables import load_keypoints
+from deepdetect.viz.draw import CAPTION_HEIGHT
 
 
 def test_writes_keypoints_and_pictures(run, photos: Path) -> None:
@@ -24,15 +26,25 @@ def test_writes_keypoints_and_pictures(run, photos: Path) -> None:
     assert {p.name for p in Path("out").iterdir()} == {
         ".deepdetect",
         "cat.npz",
-        "cat_keypoints.png",
-        "cat_heatmap.png",
+        "cat_keypoints.jpg",
+        "cat_dense.jpg",
+        "cat_heatmap.jpg",
     }
     keypoints = load_keypoints("out/cat.npz")
     expected = DeepDetect().detect(photos / "cat.jpg")
     np.testing.assert_array_equal(keypoints.xy, expected.xy)
     np.testing.assert_array_equal(keypoints.scores, expected.scores)
     assert f"{len(expected):,} keypoints" in result.stdout
-    assert np.asarray(Image.open("out/cat_heatmap.png")).shape == (150, 200, 3)
+    for name in ("keypoints", "dense", "heatmap"):
+        picture = np.asarray(Image.open(f"out/cat_{name}.jpg"))
+        assert picture.shape == (150 + CAPTION_HEIGHT, 200, 3)
+
+
+def test_points_have_no_dense_picture(run, photos: Path) -> None:
+    result = run("detect", photos / "cat.jpg", "-o", "out", "--max-keypoints", 50)
+    assert result.exit_code == 0, result.output
+    names = {p.name for p in Path("out").glob("cat*")}
+    assert names == {"cat.npz", "cat_keypoints.jpg", "cat_heatmap.jpg"}
 
 
 def test_json_has_the_numbers_and_the_pictures(run, photos: Path) -> None:
@@ -124,8 +136,8 @@ def test_an_image_without_memory_for_it_does_not_end_the_others(
 ) -> None:
     detect = DeepDetect.detect
 
-    def detect_small(self: DeepDetect, image: np.ndarray, *args: object, **options: object):
-        if image.shape[0] == 150:
+    def detect_small(self: DeepDetect, image: Path, *args: object, **options: object):
+        if load_image(image).shape[0] == 150:
             raise short
         return detect(self, image, *args, **options)
 
@@ -189,7 +201,7 @@ def test_pictures_and_other_formats_of_the_same_keypoints_are_added(run, photos:
     kept = contents(Path("out"))
     assert not detect(run, photos / "cat.jpg", "--pictures")[0]["skipped"]
     assert not detect(run, photos / "cat.jpg", "--format", "csv")[0]["skipped"]
-    assert len(contents(Path("out"))) == 4
+    assert len(contents(Path("out"))) == 5
     assert contents(Path("out")).items() >= kept.items()
     assert detect(run, photos / "cat.jpg", "--pictures")[0]["skipped"]
 
@@ -347,9 +359,9 @@ def test_pictures_of_an_earlier_run_are_no_inputs(run, photos: Path, output: str
         assert [Path(image["image"]).name for image in images] == ["0.jpg", "1.jpg"]
         assert [image["skipped"] for image in images] == [skipped] * 2
     other = json.loads(run("detect", folder, "-o", "other", "--json").stdout)["images"]
-    assert len(other) == 6, "elsewhere they are images as any"
-    for image in folder.glob("*.jpg"):
-        image.unlink()
+    assert len(other) == 8, "elsewhere they are images as any"
+    for name in ("0.jpg", "1.jpg"):
+        (folder / name).unlink()
     result = run("detect", folder, "-o", output)
     assert result.exit_code == 2
     assert "results of earlier runs" in result.stderr
@@ -357,9 +369,9 @@ def test_pictures_of_an_earlier_run_are_no_inputs(run, photos: Path, output: str
 
 def test_an_input_is_never_written_over(run, photos: Path) -> None:
     shutil.copy(photos / "left.png", "a.png")
-    shutil.copy(photos / "right.png", "a_heatmap.png")
+    shutil.copy(photos / "cat.jpg", "a_heatmap.jpg")
     before = contents(Path())
-    result = run("detect", "a.png", "a_heatmap.png", "-o", ".", "--overwrite")
+    result = run("detect", "a.png", "a_heatmap.jpg", "-o", ".", "--overwrite")
     assert result.exit_code == 2
     assert "is an input" in result.stderr
     assert contents(Path()) == before
@@ -418,3 +430,15 @@ def test_a_killed_run_goes_on_where_it_stopped(run, photos: Path) -> None:
     assert 0 < skipped + 1 <= done + 1 <= 30
     assert sorted(contents(Path("out"))) == sorted(f"{k}.npz" for k in range(30))
     assert len({*contents(Path("out")).values()}) == 1
+
+
+def test_photographs_over_a_limit_are_refused_and_it_can_be_raised(run, photos: Path) -> None:
+    photo, megapixels = photos / "left.png", 200 * 160 / 1e6
+    words = ("detect", photo, "-o", "limited", "--no-pictures", "--max-megapixels")
+    refused = run(*words, megapixels * 0.99)
+    assert refused.exit_code == 2, refused.output
+    assert "make it smaller, or allow more by --max-megapixels" in refused.stderr
+    assert run(*words, megapixels * 1.01).exit_code == 0
+    wrong = run(*words, 0)
+    assert wrong.exit_code == 2
+    assert "--max-megapixels must be above 0, not 0" in wrong.stderr

@@ -35,3 +35,18 @@ def test_the_command_prints_a_row_for_each(photo: np.ndarray, tmp_path: Path) ->
     rows = json.loads(result.stdout)
     assert len(rows) == 5
     assert rows[0]["precision"] > 0.9
+    result = CliRunner().invoke(main, [*arguments, "--json", str(tmp_path / "gone")])
+    assert result.exit_code == 1, result.output
+    assert json.loads(result.stdout) == rows
+    assert "1 of 2 scenes failed, the others are done" in result.stderr
+    assert str(tmp_path / "gone") in result.stderr.splitlines()[-1]
+
+
+def test_scenes_none_of_which_can_be_read(tmp_path: Path) -> None:
+    gone = [str(tmp_path / name) for name in ("first", "second")]
+    alone = CliRunner().invoke(main, ["evaluate-stereo", gone[0]])
+    assert alone.exit_code == 2, alone.output
+    assert gone[0] in alone.stderr
+    result = CliRunner().invoke(main, ["evaluate-stereo", *gone])
+    assert result.exit_code == 1, result.output
+    assert all(name in result.stderr for name in gone)

@@ -20,7 +20,7 @@ def test_writes_matches_and_a_picture(run, photos: Path) -> None:
         np.testing.assert_array_equal(file["inliers"], expected.inliers)
         np.testing.assert_allclose(file["matrix"], expected.matrix)
         assert str(file["model"]) == expected.model
-    assert np.asarray(Image.open("out/left_right_matches.png")).shape[1] == 400
+    assert np.asarray(Image.open("out/left_right_matches.jpg")).shape[1] == 400
     assert f"{len(expected):,}" in result.stdout
 
 
@@ -126,3 +126,35 @@ def test_resolution_changes_the_preset(run, photos: Path) -> None:
         )
         counts.append(json.loads(result.stdout)["keypoints0"])
     assert counts[0] != counts[1]
+
+
+def test_matches_of_other_images_are_not_written_over(run, photos: Path) -> None:
+    others = Path("others")
+    others.mkdir()
+    for name, source in (("left.png", "right.png"), ("right.png", "left.png")):
+        (others / name).write_bytes((photos / source).read_bytes())
+    options = ("-o", "out", "--max-keypoints", 300, "--unguided")
+    first = ("match", photos / "left.png", photos / "right.png", *options)
+    other = ("match", others / "left.png", others / "right.png", *options)
+    assert run(*first).exit_code == 0
+    written = Path("out/left_right_matches.npz").read_bytes()
+    refused = run(*other)
+    assert refused.exit_code == 2
+    assert "exists already, made from" in refused.stderr
+    assert "--overwrite" in refused.stderr
+    assert Path("out/left_right_matches.npz").read_bytes() == written
+    assert run(*first, "--no-pictures").exit_code == 0, "the same images again"
+    assert run(*other, "--overwrite").exit_code == 0
+    assert Path("out/left_right_matches.npz").read_bytes() != written
+    assert run(*first).exit_code == 2
+
+
+def test_an_image_is_not_written_over_by_its_matches(run, photos: Path) -> None:
+    source = Path("a.png")
+    source.write_bytes((photos / "left.png").read_bytes())
+    Path("a_a_matches.jpg").write_bytes((photos / "cat.jpg").read_bytes())
+    result = run("match", "a.png", "a_a_matches.jpg", "-o", ".", "--unguided")
+    assert result.exit_code == 0 or "is an input" in result.stderr
+    result = run("match", "a.png", "a.png", "-o", ".", "--unguided", "--max-keypoints", 50)
+    assert result.exit_code == 2
+    assert "is not known to be of" in result.stderr

@@ -16,7 +16,7 @@ from deepdetect.io.depth import load_depth_png
 FOCAL, OFFSET, BASELINE = 994.978, 31.086, 193.001
 """In pixels and mm, of the page of skimage.data.stereo_motorcycle."""
 
-FILES = ["m.glb", "m.html", "m.json", "m.ply", "m_depth.npz", "m_depth.png"]
+FILES = ["m.glb", "m.html", "m.json", "m.ply", "m_depth.jpg", "m_depth.npz", "m_depth.png"]
 
 
 @pytest.fixture(scope="module")

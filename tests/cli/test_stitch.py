@@ -122,3 +122,31 @@ def test_errors_speak_of_files_and_flags(
     )
     assert "there is no file my-scale.png:" in refused(*files, "my-scale.png")
     assert not Path("panorama.jpg").exists()
+
+
+def test_photographs_that_cannot_be_read_are_listed(files: list[Path]) -> None:
+    Path("bad.png").write_bytes(b"no image")
+    words = ["stitch", "bad.png", "a.png", "gone.png", "b.png", "-o", "p.png"]
+    result = CliRunner().invoke(main, [*words, "--reference", "b.png", "--json"])
+    assert result.exit_code == 1, result.output
+    report = json.loads(result.stdout)
+    assert report["images"] == ["a.png", "b.png"]
+    assert report["reference"] == "b.png"
+    summary, *failures = result.stderr.strip().splitlines()[-3:]
+    assert summary == "deepdetect: 2 of 4 images failed, the others are done:"
+    assert [failure.strip() for failure in failures] == report["failures"]
+    assert "bad.png" in failures[0]
+    assert "gone.png" in failures[1]
+    assert Path("p.png").is_file()
+
+
+@pytest.mark.parametrize("bad", ["reference", "all but one"])
+def test_too_few_that_can_be_read(bad: str, files: list[Path]) -> None:
+    Path("bad.png").write_bytes(b"no image")
+    words = ["a.png", "b.png", "bad.png", "--reference", "bad.png"]
+    words = words if bad == "reference" else ["a.png", "bad.png"]
+    result = CliRunner().invoke(main, ["stitch", *words, "-o", "p.png"])
+    assert result.exit_code == 1, result.output
+    assert "there is no panorama" in result.stderr
+    assert "bad.png" in result.stderr.splitlines()[-1]
+    assert not Path("p.png").exists()

@@ -656,8 +656,8 @@ def bad_answer(folder: Path, kind: str) -> Path:
     [
         ("nan", "not finite"),
         ("logits of nan", "not finite"),
-        ("half", "map of shape (1, 1, 24, 32) for an image that needs (1, 1, 48, 64)"),
-        ("tile", "map of shape (1, 1, 48, 128) for an image that needs (1, 1, 48, 64)"),
+        ("half", "map of shape (1, 1, 12, 16) for an image that needs (1, 1, 24, 32)"),
+        ("tile", "map of shape (1, 1, 24, 64) for an image that needs (1, 1, 24, 32)"),
         ("five", "no probabilities"),
         ("the same logits", "the same value at every pixel"),
     ],

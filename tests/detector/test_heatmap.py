@@ -229,3 +229,24 @@ def test_flips_of_a_squashed_image() -> None:
     options = HeatmapOptions(40, tta="flip")
     once = compute_heatmap(RGB, answer, HeatmapOptions(40))
     np.testing.assert_allclose(compute_heatmap(RGB, answer, options), once, atol=1e-4)
+
+
+@pytest.mark.parametrize(("side", "expected"), [(64, 0), (80, 1)])
+def test_the_network_of_a_large_image_gives_its_memory_back(
+    side: int, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Network:
+        released = 0
+
+        def __call__(self, image: np.ndarray) -> np.ndarray:
+            return answer(image)
+
+        def release_memory(self) -> None:
+            self.released += 1
+
+    monkeypatch.setattr("deepdetect.detector.heatmap.MAX_AUTO_PIXELS", 1024)
+    monkeypatch.setattr("deepdetect.detector.heatmap.RELEASE_PIXELS", 64 * 64)
+    network = Network()
+    rgb = np.random.default_rng(0).integers(0, 256, (side, side, 3)).astype(np.uint8)
+    compute_heatmap(rgb, network)
+    assert network.released == expected

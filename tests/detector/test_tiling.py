@@ -1,15 +1,18 @@
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, HeatmapOptions
+from deepdetect import DeepDetect, HeatmapOptions, Keypoints, SelectionOptions
 from deepdetect._shared.errors import OptionError
+from deepdetect.detector import detector as detector_module
 from deepdetect.detector import heatmap, tiling
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.detector.tiling import TiledNetwork, open_tiled
+from deepdetect.features.selection import Maps, select_from_maps
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +128,7 @@ def test_tiles_of_a_given_size(
             return np.zeros(rgb.shape[:2], np.float32)
 
     monkeypatch.setattr(heatmap, "MIN_TILE_MEGAPIXELS", 0.01)
-    monkeypatch.setattr(heatmap, "open_tiled", lambda path, threads: Tiled())
+    monkeypatch.setattr("deepdetect.detector.tiling.open_tiled", lambda path, threads: Tiled())
     for size, expected in ((0.1, [0.1]), (1.0, [])):
         areas.clear()
         options = HeatmapOptions("native", tile_megapixels=size)
@@ -174,3 +177,27 @@ def test_a_size_of_tiles_is_never_ignored(photo: np.ndarray) -> None:
         DeepDetect(
             torch_weights, backend="torch", resolution="native", tile_megapixels=2.0
         ).heatmap(large)
+
+
+@pytest.mark.parametrize("resolution", ["auto", "native"])
+def test_nobody_holds_the_image_while_keypoints_are_selected(
+    resolution: str, photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images: list[weakref.ref[np.ndarray]] = []
+    held = []
+
+    def load(_: object, **__: object) -> np.ndarray:
+        rgb = photo[:64, :96].copy()
+        images.append(weakref.ref(rgb))
+        return rgb
+
+    def select(maps: Maps, options: SelectionOptions) -> Keypoints:
+        held.append(images[0]() is not None)
+        return select_from_maps(maps, options)
+
+    monkeypatch.setattr(heatmap, "MAX_AUTO_PIXELS", 2048)
+    monkeypatch.setattr(detector_module, "load_image", load)
+    monkeypatch.setattr(detector_module, "select_from_maps", select)
+    found = DeepDetect(backend="onnxruntime", resolution=resolution).detect("photo.jpg")
+    assert len(found) > 100
+    assert held == [False]

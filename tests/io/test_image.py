@@ -29,7 +29,7 @@ from deepdetect.io.image import (
     luma,
     scale_short_side,
 )
-from deepdetect.io.image_file import FORMATS
+from deepdetect.io.image_file import FORMATS, limit_megapixels
 
 OneLine = Callable[[BaseException], str]
 
@@ -440,6 +440,11 @@ def test_a_file_of_too_many_pixels_is_not_decoded(size: tuple[int, int], one_lin
 def test_the_limit_of_pixels_is_raised_and_lowered_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)  # Pillow's own, which is for all programs
     np.testing.assert_array_equal(load_image(PNG, max_megapixels=450e-6), RGB)
+    with limit_megapixels(449e-6):
+        np.testing.assert_array_equal(load_image(PNG, max_megapixels=450e-6), RGB)
+        with pytest.raises(ImageError, match=r"over 0\.000449 megapixels"):
+            load_image(PNG)
+    np.testing.assert_array_equal(load_image(PNG), RGB)
     with pytest.raises(ImageError, match="25x18 pixels, which is over"):
         load_image(PNG, max_megapixels=449e-6)
     for wrong in (0, -1, float("nan")):

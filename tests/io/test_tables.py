@@ -303,3 +303,16 @@ def test_indices_of_no_keypoint_are_damage(tmp_path: Path) -> None:
     np.savez(tmp_path / "bad.npz", **{**arrays, "indices1": arrays["indices1"] + 5})
     with pytest.raises(ValueError, match=r"holds no matches \(indices1 must lie in \[-1, 2\]"):
         load_matches(tmp_path / "bad.npz")
+
+
+def test_csv_files_are_the_same_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    xy = np.random.default_rng(0).random((10, 2), np.float32) * 100
+    points = Keypoints(xy, xy[:, 0] / 100, (100, 100), sizes=xy[:, 1])
+    save_keypoints(points, tmp_path / "whole.csv")
+    monkeypatch.setattr(tables, "CSV_ROWS", 3)
+    save_keypoints(points, tmp_path / "blocks.csv")
+    text = (tmp_path / "blocks.csv").read_text()
+    assert text == (tmp_path / "whole.csv").read_text()
+    assert len(text.splitlines()) == 11
+    save_keypoints(Keypoints.empty((9, 9)), tmp_path / "empty.csv")
+    assert (tmp_path / "empty.csv").read_text() == "x,y,score\n"

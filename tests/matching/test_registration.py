@@ -89,6 +89,6 @@ def test_the_command_refuses_in_one_sentence(photo: np.ndarray, tmp_path: Path) 
         Image.fromarray(image).save(tmp_path / f"{name}.png")
     words = ["register", str(tmp_path / "a.png"), str(tmp_path / "b.png")]
     result = CliRunner().invoke(main, [*words, "-o", str(tmp_path / "out")])
-    assert result.exit_code == 2
+    assert result.exit_code == 3
     assert result.stderr.startswith("deepdetect: no homography can be trusted")
     assert not (tmp_path / "out").exists()

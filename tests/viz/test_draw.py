@@ -10,12 +10,21 @@ from PIL import Image
 
 from deepdetect import DeepDetectError, Keypoints, OptionError
 from deepdetect.viz.draw import (
+    CAPTION_HEIGHT,
     GREEN,
+    PICTURE_SIDE_PX,
     RED,
+    SHOWN_KEYPOINTS,
     add_caption,
+    add_scale,
+    draw_best_keypoints,
+    draw_dense_keypoints,
+    draw_depth,
     draw_heatmap,
     draw_keypoints,
+    draw_logits,
     draw_matches,
+    fit_picture,
     save_picture,
     vstack,
 )
@@ -127,3 +136,118 @@ def test_a_picture_that_opencv_does_not_encode_leaves_no_file(
         with pytest.raises(DeepDetectError, match="cannot hold a picture of 30x20 pixels: make"):
             save_picture(np.zeros((20, 30, 3), np.uint8), tmp_path / "p.png")
     assert not list(tmp_path.iterdir())
+
+
+def large_photo(photo: np.ndarray) -> np.ndarray:
+    """The photograph at six megapixels, with noise as of a camera."""
+    large = cv2.resize(photo, (3072, 2048), interpolation=cv2.INTER_CUBIC)
+    noise = np.random.default_rng(0).normal(0, 6, large.shape)
+    return np.clip(large + noise, 0, 255).astype(np.uint8)
+
+
+def test_pictures_of_large_photographs_are_small_and_legible(
+    photo: np.ndarray, tmp_path: Path
+) -> None:
+    rgb = large_photo(photo)
+    rows, columns = np.nonzero(cv2.Laplacian(rgb[..., 1], cv2.CV_32F) > 12)
+    keypoints = Keypoints(
+        np.stack([columns, rows], 1), np.ones(len(rows)), (3072, 2048), np.arange(len(rows))
+    )
+    logits = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) / np.float32(4) - 20
+    points = keypoints.xy[::50]
+    pictures = [
+        draw_best_keypoints(rgb, keypoints),
+        draw_dense_keypoints(rgb, keypoints),
+        draw_logits(logits),
+        draw_depth(np.where(logits > -5, logits + 30, np.nan), "mm"),
+        add_caption(
+            draw_matches(*(rgb, rgb, points, points, np.ones(len(points), bool)), by_position=True),
+            "matches",
+        ),
+    ]
+    for picture in pictures:
+        assert picture.shape[1] == PICTURE_SIDE_PX
+        save_picture(picture, tmp_path / "p.jpg")
+        assert (tmp_path / "p.jpg").stat().st_size < 2e6
+        caption = picture[-round(CAPTION_HEIGHT * PICTURE_SIDE_PX / 800) :, : PICTURE_SIDE_PX // 2]
+        written = np.flatnonzero((caption.min(2) > 200).any(1))
+        assert np.ptp(written) > 0.012 * PICTURE_SIDE_PX  # letters, when it is fitted to a screen
+
+
+def test_the_best_keypoints_of_all_parts_are_shown_by_score(photo: np.ndarray) -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 255, (5000, 2))
+    logits = xy[:, 0] / 10
+    picture = draw_best_keypoints(photo, Keypoints(xy, np.ones(5000), (256, 256), logits))
+    colored = np.ptp(picture[:256].astype(int), axis=2) > 30
+    assert colored[:, :64].any()
+    assert colored[:, 192:].any()
+    # From blue to yellow.
+    left, right = (picture[:256][:, part] for part in (slice(0, 40), slice(216, 256)))
+    of = [colored[:, :40], colored[:, 216:]]
+    assert left[of[0]][:, 2].mean() > left[of[0]][:, 0].mean() + 20
+    assert right[of[1]][:, 0].mean() > right[of[1]][:, 2].mean() + 20
+
+
+def test_no_more_keypoints_are_drawn_than_can_be_seen() -> None:
+    rgb = np.zeros((900, 900, 3), np.uint8)
+    row, column = (grid.ravel() * 18 + 9 for grid in np.mgrid[:50, :50])
+    keypoints = Keypoints(np.stack([column, row], 1), rng_scores(2500), (900, 900))
+    picture = draw_best_keypoints(rgb, keypoints)[:900]
+    rims = cv2.connectedComponents((picture.max(2) > 60).astype(np.uint8))[0] - 1
+    assert rims == SHOWN_KEYPOINTS
+
+
+def rng_scores(count: int) -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.5, 1, count)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_keypoints_are_drawn(count: int) -> None:
+    keypoints = Keypoints(np.full((count, 2), 20), np.ones(count), (60, 40))
+    picture = draw_best_keypoints(np.zeros((40, 60, 3), np.uint8), keypoints)
+    assert picture.shape == (40 + CAPTION_HEIGHT, 60, 3)
+    assert picture[:40].any() == bool(count)
+
+
+def test_a_map_of_logits_is_not_saturated() -> None:
+    logits = np.linspace(-12, 40, 200, dtype=np.float32)[None].repeat(20, 0)
+    picture = draw_logits(logits)[:20]
+    assert len(np.unique(picture[0], axis=0)) > 150
+    flat = draw_logits(np.full((20, 30), -np.inf, np.float32))
+    assert (flat[:20] == flat[0, 0]).all()
+
+
+def test_a_depth_map_is_bright_where_it_is_near() -> None:
+    depth = np.full((30, 60), np.nan, np.float32)
+    depth[:, :20], depth[:, 40:] = 100, 900
+    picture = draw_depth(depth, "mm")
+    assert picture[15, 10].sum() > picture[15, 50].sum() + 100
+    assert not picture[15, 30].any()
+    assert draw_depth(np.full((30, 60), np.nan), "mm").shape[1] == 60
+
+
+def test_a_scale_is_below_the_picture_and_as_wide() -> None:
+    picture = add_scale(np.zeros((20, 400, 3), np.uint8), "logit", -3, 12)
+    assert picture.shape == (20 + CAPTION_HEIGHT, 400, 3)
+    assert picture[20:].any()
+
+
+def test_matches_have_the_colour_of_their_position() -> None:
+    black = np.zeros((60, 80, 3), np.uint8)
+    points0, points1 = (
+        np.array([[10, 10], [70, 50], [40, 30]]),
+        np.array([[12, 20], [60, 5], [1, 55]]),
+    )
+    good = np.array([True, True, False])
+    picture = draw_matches(black, black, points0, points1, good, by_position=True)
+    colors = [picture[y, x] for x, y in points0]
+    np.testing.assert_array_equal(colors, [picture[y, x + 80] for x, y in points1])
+    assert np.abs(colors[0].astype(int) - colors[1]).max() > 100
+    assert tuple(colors[2]) == RED
+
+
+def test_small_pictures_keep_their_size() -> None:
+    rgb = np.zeros((30, 40, 3), np.uint8)
+    assert fit_picture(rgb) is rgb
+    assert fit_picture(np.zeros((10, 4000), np.float32)).shape == (5, 2000)

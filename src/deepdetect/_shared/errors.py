@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 
 
@@ -99,6 +98,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
         >>> print(unknown_name("detector", "siift", ["sift", "orb"]))
         unknown detector 'siift': did you mean 'sift'? (known: sift, orb)
     """
+    import difflib
+
     names = list(known)
     spelled = {known_name.lower(): known_name for known_name in names}
     nearest = difflib.get_close_matches(str(name).lower(), spelled, n=1, cutoff=0.5)

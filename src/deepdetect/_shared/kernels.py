@@ -7,6 +7,8 @@ container, it is cached in a folder of this user in the temporary directory, or 
 
 from __future__ import annotations
 
+import functools
+import importlib.util
 import os
 import stat
 import tempfile
@@ -15,10 +17,76 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numba
+from .errors import MissingExtraError
 
 _lock = threading.Lock()
-_config: Any = numba.config  # its names are made at run time
+_announcement: list[Callable[[], object]] = []
+
+
+def announce_compilation(tell: Callable[[], object]) -> None:
+    """Have a function called once, before the first kernel is compiled that no cache holds."""
+    _announcement[:] = [tell]
+
+
+@functools.cache
+def _listen() -> None:
+    """Wait for the first compilation, which numba tells of when it finds nothing in its cache."""
+    from numba.core import event as events
+
+    class Listener(events.Listener):
+        def on_start(self, event: Any) -> None:
+            if _announcement:
+                _announcement.pop()()
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    events.register("numba:compile", Listener())  # type: ignore[no-untyped-call]
+
+
+def has_compiler() -> bool:
+    """Return whether numba is installed."""
+    return importlib.util.find_spec("numba") is not None
+
+
+def require_compiler(task: str, instead: str = "") -> None:
+    """Stop before work that ends in compiled code, where numba is not installed.
+
+    Args:
+        task: what needs it, as "guided matching".
+        instead: what does without, for the end of the message.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    if not has_compiler():
+        raise _missing(task, instead)
+
+
+def _missing(task: str, instead: str = "", reason: str = "is not installed") -> MissingExtraError:
+    return MissingExtraError(
+        f'{task} needs numba, which {reason}: run `pip install "deepdetect[match]"`{instead}'
+    )
+
+
+def _import_numba() -> Any:
+    """Import numba.
+
+    Raises:
+        MissingExtraError: it is not installed, or not for the other packages that are.
+    """
+    try:
+        import numba
+    except ModuleNotFoundError as error:
+        if error.name != "numba":
+            raise
+        raise _missing("this") from None
+    except ImportError as error:  # it takes some versions of NumPy only
+        reason = (str(error).splitlines() or ["no reason given"])[0]
+        raise _missing("this", reason=f"cannot be imported ({reason})") from None
+    if _announcement:
+        _listen()
+    return numba
 
 
 def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -26,7 +94,11 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
 
     Args:
         flags: of `numba.njit`, all but `cache`.
+
+    Raises:
+        MissingExtraError: numba is not installed.
     """
+    numba = _import_numba()
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
@@ -39,19 +111,21 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
 
 def _compiled_elsewhere(function: Callable[..., Any], flags: dict[str, Any]) -> Any:
     """Compile with a cache folder of our own, or without a cache."""
+    numba = _import_numba()
+    config: Any = numba.config  # its names are made at run time
     folder = _temporary_folder()
     if folder is None:
         return numba.njit(**flags)(function)
     with _lock:
-        before = _config.CACHE_DIR
+        before = config.CACHE_DIR
         # Read while a function is decorated, not when it is called.
-        _config.CACHE_DIR = str(folder)
+        config.CACHE_DIR = str(folder)
         try:
             return numba.njit(cache=True, **flags)(function)
         except RuntimeError:  # no space left there, or numba is set to look elsewhere only
             return numba.njit(**flags)(function)
         finally:
-            _config.CACHE_DIR = before
+            config.CACHE_DIR = before
 
 
 def _temporary_folder() -> Path | None:

@@ -9,9 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+from .opencv import DISTRIBUTIONS
 from .parallel import processor_count
 
-PACKAGES = ("numpy", "opencv-contrib-python-headless", "pillow", "torch", "lightning-fabric")
+PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", "torch", "lightning-fabric")
 """The packages that results depend on."""
 
 

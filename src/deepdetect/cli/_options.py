@@ -85,6 +85,22 @@ output_option = click.option(
     show_default=True,
     help="Folder for the results.",
 )
+
+
+def _limit_megapixels(context: click.Context, _: click.Parameter, value: float | None) -> None:
+    if value is not None:
+        from ..io.image_file import limit_megapixels
+
+        context.with_resource(limit_megapixels(value))
+
+
+max_megapixels_option = click.option(
+    "--max-megapixels",
+    type=float,
+    callback=_limit_megapixels,
+    expose_value=False,
+    help="Refuse larger photographs before they are decoded.  [default: 200]",
+)
 format_option = click.option(
     "--format",
     "file_format",
@@ -94,7 +110,7 @@ format_option = click.option(
     help="Format of the data files.",
 )
 pictures_option = click.option(
-    "--pictures/--no-pictures", default=True, show_default=True, help="Write pictures as PNG."
+    "--pictures/--no-pictures", default=True, show_default=True, help="Write pictures, too."
 )
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace what exists already, and do all of it again."
@@ -267,12 +283,12 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def report_failures(failures: Sequence[str], total: int) -> None:
+def report_failures(failures: Sequence[str], total: int, what: str = "images") -> None:
     """Raise a BatchError when some of several images failed; of a single one, its error."""
     if failures and total == 1:
         raise DeepDetectError(failures[0])
     if failures:
-        raise BatchError(f"{len(failures)} of {total} images failed, the others are done", failures)
+        raise BatchError(f"{len(failures)} of {total} {what} failed, the others are done", failures)
 
 
 def print_json(value: Any) -> None:

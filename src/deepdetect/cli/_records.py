@@ -110,6 +110,32 @@ class OutputRecords:
             temporary.write_text(text, encoding="utf-8")
 
 
+def claim_outputs(
+    command: str, inputs: Sequence[Path], outputs: Sequence[Path], overwrite: bool
+) -> None:
+    """Note from which files some outputs in one folder are made; refuse those of other files.
+
+    Outputs of the same files are replaced, whatever the options were: call it before the work.
+
+    Raises:
+        OptionError: an output exists that was made from other files, or by something else.
+        DeepDetectError: the folder cannot be written.
+    """
+    place = outputs[0].parent / FOLDER / command / f"{outputs[0].stem}.json"
+    source = " and ".join(str(path.resolve()) for path in inputs)
+    record = _read(place)
+    there = [path for path in outputs if path.exists()]
+    if there and not overwrite:
+        if record is None or not any(path.name in record["files"] for path in there):
+            raise _exists(there[0], f"and is not known to be of {source}")
+        if record["input"] != source:
+            raise _exists(there[0], f"made from {record['input']}")
+    files = {**(record["files"] if record else {}), **dict.fromkeys(p.name for p in outputs)}
+    value = {"input": source, "state": [0, 0], "settings": {}, "files": files, "numbers": None}
+    with atomic_path(place) as temporary:
+        temporary.write_text(json.dumps(value), encoding="utf-8")
+
+
 def recorded_outputs(folder: Path) -> set[Path]:
     """Return the resolved paths of what commands made in a folder, or were about to make."""
     records = (_read(path) for path in folder.glob(f"{FOLDER}/*/*.json"))

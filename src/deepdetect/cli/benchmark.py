@@ -93,7 +93,9 @@ def benchmark(
 ) -> None:
     """Write a report on the detectors: report.md with figures, tables/*.csv, report.json.
 
-    NAME is one of the data sets or all. A second run does only what is new.
+    NAME is one of the data sets or all. A second run does only what is new. What cannot be
+    measured, as a data set that is missing, an image that is damaged or a method that fails, does
+    not stop the rest: it is listed at the end, with exit code 1.
 
     \b
     deepdetect benchmark oxford --data data -o report
@@ -101,7 +103,7 @@ def benchmark(
     deepdetect benchmark foreground --data data --baselines sift,fast-low -o report
     deepdetect benchmark pose --data data/fountain -o report
     """
-    from .._shared.errors import OptionError
+    from .._shared.errors import BatchError, OptionError
     from .._shared.registry import look_up
     from ..datasets.pair_selection import PairSelectionOptions
     from ..evaluation.baselines.plugin import find_feature
@@ -136,10 +138,16 @@ def benchmark(
     paths = report.save(output)
     if as_json:
         print_json({**report.values(), "files": paths})
-        return
-    for table in report.tables():
-        if table.in_text:
-            click.echo(f"{table.title}\n\n{table.to_markdown()}\n")
-    for reason in report.skipped:
-        click.echo(f"skipped: {reason}")
-    click.echo(f"report: {paths[0]}")
+    else:
+        for table in report.tables():
+            if table.in_text:
+                click.echo(f"{table.title}\n\n{table.to_markdown()}\n")
+        for reason in report.skipped:
+            if reason not in report.failures:
+                click.echo(f"skipped: {reason}")
+        click.echo(f"report: {paths[0]}")
+    if count := len(report.failures):
+        what = "one part" if count == 1 else f"{count} parts"
+        raise BatchError(
+            f"{what} could not be measured, the rest is in {paths[0]}", report.failures
+        )

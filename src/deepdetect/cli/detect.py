@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +21,7 @@ from ._options import (
     format_option,
     json_option,
     make_detector,
+    max_megapixels_option,
     output_option,
     overwrite_option,
     pictures_option,
@@ -33,6 +36,8 @@ if TYPE_CHECKING:
 NUMBERS = ("width", "height", "keypoints", "density", "seconds")
 """What is told of each image, and recorded."""
 
+PICTURES, DENSE_PICTURES = ("keypoints", "heatmap"), ("keypoints", "dense", "heatmap")
+
 
 @generated_command(SELECTION, DETECTOR, short_help="Keypoints of photographs.")
 @click.argument("images", type=PATH, nargs=-1, required=True)
@@ -45,6 +50,7 @@ NUMBERS = ("width", "height", "keypoints", "density", "seconds")
 @format_option
 @pictures_option
 @overwrite_option
+@max_megapixels_option
 @json_option
 def detect(
     images: tuple[Path, ...],
@@ -59,8 +65,9 @@ def detect(
     """Detect the keypoints of IMAGES (files or folders).
 
     Writes for each image STEM.npz (or .csv) with the positions and scores, and the pictures
-    STEM_keypoints.png and STEM_heatmap.png. With --max-keypoints they are the best keypoints of
-    all scales; without, all pixels over the threshold.
+    STEM_keypoints.jpg (the best of all parts of the image, coloured by score), STEM_dense.jpg (all,
+    where they are pixels) and STEM_heatmap.jpg (logits). With --max-keypoints they are the best
+    keypoints of all scales; without, all pixels over the threshold.
 
     Images that are done are skipped when the same command runs again. What was made from other
     images, with other options or by something else is replaced with --overwrite only. An image
@@ -77,12 +84,15 @@ def detect(
     from ._records import OutputRecords, file_digest
 
     paths = expand_images(images, output)
-    outputs = {path: _outputs(path, output, file_format, pictures) for path in paths}
+    selecting = {name: value for name, value in values.items() if name not in DETECTOR.names}
+    chosen = SelectionOptions(**given_only(selecting))
+    shown = (PICTURES if chosen.uses_points else DENSE_PICTURES) if pictures else ()
+    outputs = {path: _outputs(path, output, file_format, shown) for path in paths}
     written = [file for files in outputs.values() for file in files.values()]
     check_inputs_survive(written, paths, "choose another folder with -o")
     mask = load_mask(ignore) if ignore is not None else None
     detector = make_detector(values)
-    selection = vars(SelectionOptions(**given_only(values), ignore=mask))
+    selection = vars(replace(chosen, ignore=mask))
     settings = {
         **selection,
         "ignore": None if ignore is None else file_digest(ignore),
@@ -123,13 +133,12 @@ class _Failure(Exception):
     """One image cannot be worked on; whatever else is raised concerns all of them."""
 
 
-def _outputs(path: Path, output: Path, file_format: str, pictures: bool) -> dict[str, Path]:
+def _outputs(
+    path: Path, output: Path, file_format: str, pictures: Sequence[str]
+) -> dict[str, Path]:
     """Return the files that are made of an image, by what they hold."""
     files = {"file": output / f"{path.stem}.{file_format}"}
-    if pictures:
-        for name in ("keypoints", "heatmap"):
-            files[name] = output / f"{path.stem}_{name}.png"
-    return files
+    return files | {name: output / f"{path.stem}_{name}.jpg" for name in pictures}
 
 
 def _detect_one(
@@ -141,9 +150,10 @@ def _detect_one(
 ) -> dict[str, Any]:
     """Detect, save and draw the keypoints of one image unless it is done; return its numbers."""
     from .._shared.errors import DeepDetectError, MissingExtraError, WeightsError
+    from ..features.selection import SelectionOptions, select_keypoints
     from ..io.image import load_image
     from ..io.tables import save_keypoints
-    from ..viz.draw import add_caption, draw_heatmap, draw_keypoints, save_picture
+    from ..viz.draw import draw_best_keypoints, draw_dense_keypoints, draw_logits, save_picture
 
     paths = list(files.values())
     drawn = {name: file for name, file in files.items() if name != "file"}
@@ -153,12 +163,17 @@ def _detect_one(
         done = records.find(path, paths)
         if done is not None and all(isinstance(done.get(n), int | float) for n in NUMBERS):
             return {"image": path, **{n: done[n] for n in NUMBERS}, **shown, "skipped": True}
-        rgb = load_image(path)
         started = time.perf_counter()
         if drawn:
-            keypoints, heatmap = detector.detect(rgb, **selection, return_heatmap=True)
-        else:
+            rgb = load_image(path)
+        if "dense" in drawn:  # the network is run once for both
+            heatmap, logits = detector.heatmap_and_logits(rgb)
+            keypoints = select_keypoints(heatmap, SelectionOptions(**selection), logits)
+        elif drawn:
             keypoints = detector.detect(rgb, **selection)
+        else:
+            # Nobody holds the image while keypoints are selected and written.
+            keypoints = detector.detect(path, **selection)
         seconds = time.perf_counter() - started
     except (MissingExtraError, WeightsError):  # concern all images
         raise
@@ -168,13 +183,15 @@ def _detect_one(
     records.begin(path, paths)
     save_keypoints(keypoints, files["file"])
     if drawn:
-        caption = f"{len(keypoints):,} keypoints, density {keypoints.density:.3f}"
-        picture = add_caption(draw_keypoints(rgb, keypoints), caption)
-        save_picture(picture, drawn["keypoints"])
-        save_picture(draw_heatmap(heatmap), drawn["heatmap"])
+        save_picture(draw_best_keypoints(rgb, keypoints), drawn["keypoints"])
+        if "dense" in drawn:
+            save_picture(draw_dense_keypoints(rgb, keypoints), drawn["dense"])
+        else:
+            _, logits = detector.heatmap_and_logits(rgb)
+        save_picture(draw_logits(logits), drawn["heatmap"])
     numbers = {
-        "width": rgb.shape[1],
-        "height": rgb.shape[0],
+        "width": keypoints.image_size[0],
+        "height": keypoints.image_size[1],
         "keypoints": len(keypoints),
         "density": round(keypoints.density, 6),
         "seconds": round(seconds, 4),

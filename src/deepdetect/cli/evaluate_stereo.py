@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from ._options import PATH, json_option, print_json
+from .._shared.errors import DeepDetectError
+from ._options import PATH, json_option, print_json, report_failures
+
+if TYPE_CHECKING:
+    from ..evaluation.protocols.stereo import StereoMatchScore
 
 
 @click.command(
@@ -36,7 +42,8 @@ def evaluate_stereo(
 
     A scene is a folder with left.png, right.png, disparity.png and calib.json. Matching uses
     neither the rows nor the truth; a match is correct within 1 px. Random points of the same
-    density and all pixels are the baselines.
+    density and all pixels are the baselines. A scene that cannot be read does not stop the
+    others: they are listed at the end, with exit code 1.
 
     \b
     deepdetect evaluate-stereo cones/ teddy/ --weights default --weights dense
@@ -49,7 +56,14 @@ def evaluate_stereo(
     from ..evaluation.protocols.stereo import score_stereo_matches
     from ..labels import LabelOptions, find_label_settings
 
-    pairs = [load_middlebury(scene) for scene in scenes]
+    pairs, failures = [], []
+    for scene in scenes:
+        try:
+            pairs.append(load_middlebury(scene))
+        except DeepDetectError as error:
+            failures.append(str(error))
+    if not pairs:
+        report_failures(failures, len(scenes), "scenes")
     sources: dict[str, HeatmapDetector] = {}
     for name in labels:
         chosen = find_label_settings(name)
@@ -60,7 +74,12 @@ def evaluate_stereo(
     rows = score_stereo_matches(sources, pairs, quiet=as_json)
     if as_json:
         print_json([{**asdict(row), "precision": row.score.precision} for row in rows])
-        return
+    else:
+        _print_rows(rows)
+    report_failures(failures, len(scenes), "scenes")
+
+
+def _print_rows(rows: Sequence[StereoMatchScore]) -> None:
     width = max(len(row.source) for row in rows)
     click.echo(
         f"{'keypoints':<{width}}  {'pair':<12}{'density':>8}{'matches':>10}"

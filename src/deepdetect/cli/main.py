@@ -8,7 +8,9 @@ from typing import Any
 
 import click
 
-from .._shared.errors import BatchError, DeepDetectError
+from .._shared.errors import BatchError, DeepDetectError, RegistrationError
+from .._shared.kernels import announce_compilation
+from .._shared.progress import say
 from ._generated import with_flags
 from .average import average
 from .benchmark import benchmark
@@ -52,7 +54,7 @@ OLD_FLAGS = {
 class Commands(click.Group):
     """A group that names the nearest right command, and ends with exit code 2 on user errors.
 
-    With 1 where some of many files could not be worked on.
+    With 1 where some of many files could not be worked on, with 3 where nothing was found.
     """
 
     def resolve_command(self, context: click.Context, args: list[str]) -> Any:
@@ -72,14 +74,15 @@ class Commands(click.Group):
                 raise
             raise click.UsageError(f"{error.message} Did you mean '{new}'?", error.ctx) from None
         except BatchError as error:
+            command = self.get_command(context, context.invoked_subcommand or "")
             click.echo(f"deepdetect: {error.summary}:", err=True)
             for failure in error.failures:
-                click.echo(f"  {failure}", err=True)
+                click.echo(f"  {with_flags(failure, command)}", err=True)
             context.exit(1)
         except DeepDetectError as error:
             command = self.get_command(context, context.invoked_subcommand or "")
             click.echo(f"deepdetect: {with_flags(str(error), command)}", err=True)
-            context.exit(2)
+            context.exit(3 if isinstance(error, RegistrationError) else 2)
         except KeyboardInterrupt:
             click.echo("deepdetect: stopped; what was written stays", err=True)
             context.exit(130)
@@ -103,6 +106,9 @@ def main() -> None:
 
     Each command has its own --help.
     """
+    announce_compilation(
+        lambda: say("compiling for the first time, about 10 seconds; it is kept for later runs")
+    )
 
 
 for command in (

@@ -13,10 +13,13 @@ from ._options import (
     DETECTOR,
     PATH,
     SELECTION,
+    check_inputs_survive,
     format_option,
     json_option,
     make_detector,
+    max_megapixels_option,
     output_option,
+    overwrite_option,
     pictures_option,
     print_result,
     seconds_rows,
@@ -53,6 +56,8 @@ GEOMETRY = FieldOptions(
 @click.option("--camera1", type=PATH, help="The same of the second image.  [default: camera0]")
 @format_option
 @pictures_option
+@max_megapixels_option
+@overwrite_option
 @json_option
 def match(
     image0: Path,
@@ -64,6 +69,7 @@ def match(
     camera1: Path | None,
     file_format: str,
     pictures: bool,
+    overwrite: bool,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -82,12 +88,20 @@ def match(
     deepdetect match left.jpg right.jpg --unguided --ratio 0.9 --mutual
     deepdetect match a.png b.png --preset published --homography H1to2p
     """
+    from .._shared.progress import stage_progress
     from ..io.image import load_image
     from ..io.tables import save_matches
     from ..matching.options import UNGUIDED_ONLY, get_preset
     from ..matching.pipeline import match_images
+    from ._records import claim_outputs
 
+    stem = f"{image0.stem}_{image1.stem}_matches"
+    file = output / f"{stem}.{file_format}"
+    picture = output / f"{stem}.jpg" if pictures else None
+    files = [path for path in (file, picture) if path is not None]
+    check_inputs_survive(files, [image0, image1], "choose another folder with -o")
     rgb0, rgb1 = load_image(image0), load_image(image1)
+    claim_outputs("match", [image0, image1], files, overwrite)
     resolution_given = values["resolution"] is not None
     detector = make_detector(values)
     given = given_only(values)
@@ -100,13 +114,11 @@ def match(
             given[name] = _read_matrix(path)
     if get_preset(preset).heatmap is not None and resolution_given:
         given["resolution"] = detector.heatmap_options.resolution
-    matches = match_images(rgb0, rgb1, detector, preset=preset, **given)
-    stem = f"{image0.stem}_{image1.stem}_matches"
-    file = output / f"{stem}.{file_format}"
+    guided = given.get("guided", get_preset(preset).guided)
+    with stage_progress("matching", GUIDED_STAGES if guided else UNGUIDED_STAGES) as done:
+        matches = match_images(rgb0, rgb1, detector, preset=preset, progress=done, **given)
     save_matches(matches, file)
-    picture = None
-    if pictures:
-        picture = output / f"{stem}.png"
+    if picture is not None:
         _draw(rgb0, rgb1, matches, picture)
     numbers = {
         "image0": image0,
@@ -140,7 +152,7 @@ def match(
             (f"inliers ({matches.model})", f"{numbers['inliers']:,}"),
             ("guided by", matches.guide.model if matches.guide and matches.guided else "nothing"),
             *seconds_rows(matches.seconds),
-            ("written", ", ".join(str(path) for path in (file, picture) if path)),
+            ("written", ", ".join(str(path) for path in files)),
         ],
         f"{image0} and {image1}",
     )
@@ -156,6 +168,9 @@ def match(
     if matches.matrix is None and matches.model != "none":
         click.echo(f"no {matches.model} could be estimated from these matches", err=True)
 
+
+GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
+UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
 
 NO_GEOMETRY = 3
 """Exit code where no geometry can be trusted."""
@@ -177,11 +192,14 @@ def _guide_numbers(matches: Any) -> dict[str, Any] | None:
 def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
     from ..viz.draw import add_caption, draw_matches, save_picture
 
-    picture = draw_matches(rgb0, rgb1, matches.points0, matches.points1, matches.inliers)
+    points = matches.points0, matches.points1
+    picture = draw_matches(rgb0, rgb1, *points, matches.inliers, by_position=True)
+    others = len(matches) - int(matches.inliers.sum())
     caption = (
-        f"{len(matches):,} matches, {int(matches.inliers.sum()):,} of them inliers "
-        f"({matches.model}); a random sample is drawn: green inliers, red others"
+        f"{len(matches):,} matches ({matches.model}), of equal colour where they belong together"
     )
+    if others:
+        caption += f"; {others:,} that do not fit it: red"
     save_picture(add_caption(picture, caption), path)
 
 

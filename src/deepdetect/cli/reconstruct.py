@@ -18,6 +18,7 @@ from ._options import (
     check_inputs_survive,
     json_option,
     make_detector,
+    max_megapixels_option,
     print_result,
     seconds_rows,
 )
@@ -57,6 +58,7 @@ STAGES = 8
     show_default=True,
     help="The model, .ply, .glb or .html; the other files get its name and stand beside it.",
 )
+@max_megapixels_option
 @json_option
 def reconstruct(
     left: Path,
@@ -68,9 +70,9 @@ def reconstruct(
 ) -> None:
     """Reconstruct a cloud of coloured 3D points from the photographs LEFT and RIGHT.
 
-    Writes STEM.ply and STEM.glb (the points), STEM.html (an offline viewer), STEM_depth.png (16
-    bits, with its scale), STEM_depth.npz (floats; disparities too for rectified pairs), and
-    STEM.json (counts, times and quality).
+    Writes STEM.ply and STEM.glb (the points), STEM.html (an offline viewer), STEM_depth.jpg (a
+    coloured depth map to look at), STEM_depth.png (16 bits, with its scale), STEM_depth.npz
+    (floats; disparities too for rectified pairs), and STEM.json (counts, times and quality).
 
     For rectified pairs the detector only chooses which pixels of a dense disparity map become
     points; --density 1 takes all of them.
@@ -113,7 +115,7 @@ def _files(model: Path, inputs: list[Path]) -> dict[str, Path]:
     """Name all files, and check that none of them is an input."""
     from ..io.point_cloud import POINT_CLOUD_WRITERS
 
-    endings = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", ".json")
+    endings = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", "_depth.jpg", ".json")
     files = {ending: model.with_name(model.stem + ending) for ending in endings}
     files[model.suffix.lower()] = model
     check_inputs_survive(files.values(), inputs, "give the model another name by -o")
@@ -129,6 +131,7 @@ def _write(
     from .._shared.atomic import atomic_path
     from ..io.depth import save_depth_npz, save_depth_png
     from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
+    from ..viz.draw import draw_depth, save_picture
 
     started = time.perf_counter()
     values = found.summary()
@@ -144,6 +147,7 @@ def _write(
     stored = save_depth_png(depth, files["_depth.png"], found.unit)
     arrays = {} if found.disparity is None else {"disparity": found.disparity_map()}
     save_depth_npz(depth, files["_depth.npz"], found.unit, matched=found.matched_map(), **arrays)
+    save_picture(draw_depth(depth, found.unit), files["_depth.jpg"])
     values["seconds"]["files"] = round(time.perf_counter() - started, 4)
     numbers = {
         **images,

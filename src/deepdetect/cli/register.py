@@ -12,19 +12,28 @@ from ._options import (
     DETECTOR,
     PATH,
     SELECTION,
+    check_inputs_survive,
     json_option,
     make_detector,
+    max_megapixels_option,
     output_option,
+    overwrite_option,
     print_result,
 )
+
+STAGES = ("keypoints", "guided matching", "geometry")
 
 
 @generated_command(SELECTION, DETECTOR, short_help="One photograph registered to another.")
 @click.argument("image0", type=PATH)
 @click.argument("image1", type=PATH)
 @output_option
+@max_megapixels_option
+@overwrite_option
 @json_option
-def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: Any) -> None:
+def register(
+    image0: Path, image1: Path, output: Path, overwrite: bool, as_json: bool, **values: Any
+) -> None:
     """Register IMAGE1 to IMAGE0: for planes, and for photographs from one place.
 
     Writes STEM1_on_STEM0.png (the second image in the frame of the first), the same as
@@ -37,21 +46,22 @@ def register(image0: Path, image1: Path, output: Path, as_json: bool, **values: 
     import numpy as np
 
     from .._shared.atomic import atomic_path
+    from .._shared.progress import stage_progress
     from ..matching.registration import register as register_images
     from ..viz.draw import save_picture
+    from ._records import claim_outputs
 
-    detector = make_detector(values)
-    found = register_images(image0, image1, detector, **given_only(values))
     stem = f"{image1.stem}_on_{image0.stem}"
-    pictures = {
-        "": found.warped,
-        "_checkerboard": found.checkerboard(),
-        "_difference": found.difference(),
-    }
-    files = [output / f"{stem}{name}.png" for name in pictures]
-    for path, picture in zip(files, pictures.values(), strict=True):
-        save_picture(picture, path)
+    files = [output / f"{stem}{name}.png" for name in ("", "_checkerboard", "_difference")]
     files.append(output / f"{stem}_homography.txt")
+    check_inputs_survive(files, [image0, image1], "choose another folder with -o")
+    detector = make_detector(values)
+    claim_outputs("register", [image0, image1], files, overwrite)
+    with stage_progress("registering", STAGES) as done:
+        found = register_images(image0, image1, detector, progress=done, **given_only(values))
+    pictures = found.warped, found.checkerboard(), found.difference()
+    for path, picture in zip(files[:-1], pictures, strict=True):
+        save_picture(picture, path)
     with atomic_path(files[-1]) as temporary:
         np.savetxt(temporary, found.homography, fmt="%.12e")
     numbers = {

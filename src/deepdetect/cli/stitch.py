@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import BatchError, DeepDetectError, ImageError, OptionError
 from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
     DETECTOR,
@@ -16,7 +16,9 @@ from ._options import (
     check_inputs_survive,
     json_option,
     make_detector,
+    max_megapixels_option,
     print_result,
+    report_failures,
     seconds_rows,
 )
 
@@ -44,6 +46,7 @@ PANORAMA = FieldOptions(
     type=PATH,
     help="The one of IMAGES that is not distorted.  [default: the one in the middle]",
 )
+@max_megapixels_option
 @json_option
 def stitch(
     images: tuple[Path, ...],
@@ -54,7 +57,8 @@ def stitch(
 ) -> None:
     """Make a flat panorama of IMAGES: overlapping photographs from one place, or of a plane.
 
-    They may be in any order. Those that overlap with no other are left out and named. A flat
+    They may be in any order. Those that overlap with no other are left out and named. Those that
+    cannot be read do not stop the others: they are listed at the end, with exit code 1. A flat
     panorama shows 100 to 120 degrees at the most.
 
     \b
@@ -69,6 +73,11 @@ def stitch(
     if reference is not None and reference not in images:
         raise OptionError(f"--reference {reference} must be one of the photographs: name it there")
     detector = make_detector(values)
+    given = len(images)
+    images, failures = _readable(images)
+    if len(images) < min(given, 2) or (reference is not None and reference not in images):
+        what = "too few photographs, or not the reference, can be read"
+        raise BatchError(f"there is no panorama, as {what}", failures)
     try:
         panorama = stitch_images(
             images,
@@ -84,12 +93,27 @@ def stitch(
             text = text.replace(f"images[{number}]", str(path))
         raise type(error)(text) from error
     save_picture(panorama.image, output)
-    numbers = _numbers(panorama, images, output)
+    numbers = {**_numbers(panorama, images, output), "failures": failures}
     print_result(as_json, numbers, _rows(panorama, images, output), "panorama")
-    if as_json:
-        return
-    for left_out in numbers["left_out"]:
-        click.echo(f"left out: {left_out['image']}, as {left_out['reason']}", err=True)
+    if not as_json:
+        for left_out in numbers["left_out"]:
+            click.echo(f"left out: {left_out['image']}, as {left_out['reason']}", err=True)
+    report_failures(failures, given)
+
+
+def _readable(images: Sequence[Path]) -> tuple[tuple[Path, ...], list[str]]:
+    """Return the photographs that can be read, and a sentence on each of the others."""
+    from ..io.image import load_image
+
+    readable, failures = [], []
+    for path in images:
+        try:
+            load_image(path)
+        except ImageError as error:
+            failures.append(str(error))
+        else:
+            readable.append(path)
+    return tuple(readable), failures
 
 
 def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[str, Any]:

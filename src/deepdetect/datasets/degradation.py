@@ -11,8 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
+
+from .._shared.opencv import cv2
 
 
 @dataclass(frozen=True)

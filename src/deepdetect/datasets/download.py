@@ -21,9 +21,8 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-import cv2
-
 from .._shared.errors import DeepDetectError, MissingExtraError
+from .._shared.opencv import cv2
 from .._shared.progress import progress
 from ..io.image import IMAGE_SUFFIXES, find_images
 

@@ -8,19 +8,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, overload
+from typing import TYPE_CHECKING, Any, Literal, Protocol, overload
 
-import cv2
 import numpy as np
 
 from .._shared.errors import DeepDetectError, OptionError
 from .._shared.image_array import Channels
+from .._shared.opencv import cv2, is_lack_of_memory
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.selection import (
+    Maps,
     SelectionOptions,
     check_ignore,
-    select_by_logits,
+    select_from_maps,
     select_keypoints,
 )
 from ..io.image import load_image, luma
@@ -29,14 +30,13 @@ from .heatmap import (
     MAX_AUTO_PIXELS,
     HeatmapOptions,
     compute_heatmap_and_logits,
-    compute_native_logits,
-    is_native,
+    compute_maps,
 )
 from .image_lists import Images, for_each_image, ignore_masks, image_list
-from .points.detection import PointOptions, detect_points
-from .points.ranker import WEIGHTS as RANKER
-from .points.ranker import Ranker, load_ranker
-from .pretrained import resolve_weights
+from .pretrained import RANKER, resolve_weights
+
+if TYPE_CHECKING:
+    from .points.ranker import Ranker
 
 CHANNELS_OF_IMAGES = (
     "give it with each image, as detect(image, channels='bgr'); what the network itself is fed is "
@@ -113,7 +113,10 @@ class DeepDetect:
         self.weights = resolve_weights(weights)
         self.heatmap_options = HeatmapOptions(resolution, network_channels, tta, tile_megapixels)
         self.ranker = RANKER if ranker is None else Path(ranker)
-        load_ranker(self.ranker)
+        if ranker is not None:  # what may be wrong with it is said now
+            from .points.ranker import load_ranker
+
+            load_ranker(self.ranker)
         self._runtime = RuntimeOptions(backend, providers, threads)
         self._network, self.backend = open_network(self.weights, self._runtime)
 
@@ -187,21 +190,23 @@ class DeepDetect:
 
     def _run(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of an image that `load_image` returned."""
-        with memory_named(rgb):
+        with memory_named(rgb.shape):
             return compute_heatmap_and_logits(rgb, self._network, self.heatmap_options)
 
     def _dense(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
         """Find dense keypoints in an image that `load_image` returned."""
-        with memory_named(rgb):
-            if is_native(rgb, self.heatmap_options):
-                logits = compute_native_logits(rgb, self._network, self.heatmap_options)
-                return select_by_logits(logits, options)
-            heatmap, logits = self._run(rgb)
-            return select_keypoints(heatmap, options, logits)
+        with memory_named(rgb.shape):
+            return select_from_maps(self._maps(rgb), options)
+
+    def _maps(self, rgb: np.ndarray) -> Maps:
+        """Run the network on an image that `load_image` returned."""
+        return compute_maps(rgb, self._network, self.heatmap_options)
 
     def _points(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
         """Find points in an image that `load_image` returned."""
-        with memory_named(rgb):
+        from .points.ranker import load_ranker
+
+        with memory_named(rgb.shape):
             return find_points(rgb, options, self.heatmap_options, load_ranker(self.ranker))
 
     def __repr__(self) -> str:
@@ -357,25 +362,27 @@ class DeepDetect:
         """Find the keypoints of a loaded image, and its heat map where it is asked for."""
         if options.uses_points:
             return self._points(rgb, options), self._run(rgb)[0] if return_heatmap else None
-        if not return_heatmap:
-            return self._dense(rgb, options), None
-        heatmap, logits = self._run(rgb)
-        with memory_named(rgb):
-            return select_keypoints(heatmap, options, logits), heatmap
+        with memory_named(rgb.shape):
+            if return_heatmap:
+                heatmap, logits = self._run(rgb)
+                return select_keypoints(heatmap, options, logits), heatmap
+            maps = self._maps(rgb)
+            del rgb  # the keypoints need the room
+            return select_from_maps(maps, options), None
 
 
 @contextmanager
-def memory_named(rgb: np.ndarray) -> Iterator[None]:
-    """Make lack of memory, in work on a loaded image, an error of one sentence."""
+def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
+    """Make lack of memory, in work on an image of this shape, an error of one sentence."""
     try:
         yield
         return
     except MemoryError:
         pass
-    except cv2.error as error:
-        if error.code != cv2.Error.StsNoMem:
+    except Exception as error:
+        if not is_lack_of_memory(error):
             raise
-    height, width = rgb.shape[:2]
+    height, width = shape[:2]
     raise DeepDetectError(
         f"there is not enough memory for an image of {width}x{height} pixels: "
         "use `resolution='auto'`, fewer keypoints, or a smaller image"
@@ -397,6 +404,8 @@ def find_points(
             resolution is "native".
         ranker: None: the one inside the package.
     """
+    from .points.detection import PointOptions, detect_points
+
     gray = luma(rgb)
     height, width = gray.shape
     ignore = None if options.ignore is None else check_ignore(options.ignore, gray.shape)

@@ -6,24 +6,30 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.image_array import Channels, check_channels
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
-from .._shared.parallel import available_memory
-from ..features.selection import bands, sigmoid
+from .._shared.parallel import available_memory, release_freed_memory
+from ..features.selection import Maps, Rows, bands, sigmoid
 from .backends import Network
-from .tiling import TiledNetwork, open_tiled
+
+if TYPE_CHECKING:
+    from .tiling import TiledNetwork
 
 STRIDE = 8
 """The network halves an image three times, so its sides must be multiples of 8."""
 
 MAX_AUTO_PIXELS = 2_000_000
 """Of an image that the resolution "auto" takes as it is."""
+
+RELEASE_PIXELS = 20_000_000
+"""Of an image whose maps need the memory that the network keeps: less would not be worth it."""
 
 MIN_TILE_MEGAPIXELS = 1.5
 """Of smaller tiles most would be overlap."""
@@ -108,14 +114,30 @@ def compute_heatmap_and_logits(
         The heat map, and the (H, W) float32 logits of its probabilities. Float32 rounds the
         highest probabilities to 1; logits still distinguish them, so keypoints are ranked by them.
     """
+    maps = compute_maps(rgb, network, options)
+    heatmap, rows_of = np.empty(maps.shape, np.float32), maps.heatmap()
+    for rows in bands(maps.shape):
+        heatmap[rows] = rows_of(rows)
+    del rows_of  # it may hold another map
+    return heatmap, maps.logits()
+
+
+def compute_maps(
+    rgb: np.ndarray, network: Network, options: HeatmapOptions = HeatmapOptions()
+) -> Maps:
+    """Run the network on an image; arguments as of `compute_heatmap`.
+
+    Returns:
+        The heat map and its logits. Where the network sees a smaller image, only what it
+        says of that is kept, and enlarged when a map is asked for.
+    """
     height, width = rgb.shape[:2]
-    if is_native(rgb, options):
-        logits = compute_native_logits(rgb, network, options)
-        return probabilities(logits), logits
+    if _is_native(rgb, options):
+        return Maps.of_logits(_native_logits(rgb, network, options))
     if options.tile_megapixels != "auto":
         raise OptionError("`tile_megapixels` needs `resolution='native'`: scaled images are small")
     if _is_constant(rgb):
-        return np.zeros((height, width), np.float32), np.full((height, width), -np.inf, np.float32)
+        return Maps.of_logits(np.full((height, width), -np.inf, np.float32))
     shown = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
     shown = np.ascontiguousarray(shown)
     if options.resolution == "auto":
@@ -126,20 +148,27 @@ def compute_heatmap_and_logits(
         side = int(options.resolution)
         small = cv2.resize(shown, (side, side), interpolation=cv2.INTER_CUBIC)
     logits = _mean_of_flips(partial(_run, network), small, options)
-    heatmap, enlarged = (
-        cv2.resize(map_, (width, height), interpolation=cv2.INTER_CUBIC)
-        for map_ in (sigmoid(logits), logits)
-    )
-    return np.clip(heatmap, 0, 1, out=heatmap), enlarged
+    if height * width > RELEASE_PIXELS and hasattr(network, "release_memory"):
+        network.release_memory()
+        release_freed_memory()
+
+    def enlarged(map_: np.ndarray) -> np.ndarray:
+        return cv2.resize(map_, (width, height), interpolation=cv2.INTER_CUBIC)
+
+    def heatmap() -> Rows:
+        map_ = enlarged(sigmoid(logits))
+        return lambda rows: np.clip(map_[rows], 0, 1)
+
+    return Maps((height, width), heatmap, lambda: enlarged(logits))
 
 
-def is_native(rgb: np.ndarray, options: HeatmapOptions) -> bool:
+def _is_native(rgb: np.ndarray, options: HeatmapOptions) -> bool:
     """Return whether the network sees an image at its own size."""
     whole = rgb.shape[0] * rgb.shape[1] <= MAX_AUTO_PIXELS
     return options.resolution == "native" or (options.resolution == "auto" and whole)
 
 
-def compute_native_logits(rgb: np.ndarray, network: Network, options: HeatmapOptions) -> np.ndarray:
+def _native_logits(rgb: np.ndarray, network: Network, options: HeatmapOptions) -> np.ndarray:
     """Run the network on an image at its own size, in tiles where it is too large for the memory.
 
     Args:
@@ -166,10 +195,10 @@ def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwo
     if options.tile_megapixels == "auto":
         if path is None or pixels * network.bytes_per_pixel <= available_memory():  # type: ignore[attr-defined]
             return None
-        return open_tiled(path, network.threads)  # type: ignore[attr-defined]
+        return _open_tiled(path, network)
     if pixels <= options.tile_megapixels * 1e6:
         return None
-    tiled = None if path is None else open_tiled(path, network.threads)  # type: ignore[attr-defined]
+    tiled = None if path is None else _open_tiled(path, network)
     if tiled is None:
         raise OptionError(
             "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights "
@@ -178,16 +207,14 @@ def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwo
     return tiled
 
 
+def _open_tiled(path: Path, network: Network) -> TiledNetwork | None:
+    from .tiling import open_tiled
+
+    return open_tiled(path, network.threads)  # type: ignore[attr-defined]
+
+
 def _is_constant(rgb: np.ndarray) -> bool:
     return all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape))
-
-
-def probabilities(logits: np.ndarray) -> np.ndarray:
-    """Return the heat map of logits."""
-    heatmap = np.empty_like(logits)
-    for rows in bands(logits.shape):
-        heatmap[rows] = sigmoid(logits[rows])
-    return heatmap
 
 
 def _pad(rgb: np.ndarray) -> np.ndarray:

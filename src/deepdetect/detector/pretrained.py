@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 
 from .._shared.registry import look_up, resolve_name_or_path
+
+FOLDER = Path(__file__).parent / "weights"
+
+RANKER = Path(__file__).parent / "points" / "ranker.npz"
+"""The trained ranker of points; its card is beside it."""
 
 PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
@@ -29,9 +33,7 @@ def pretrained_weights(name: str = "default", suffix: str = ".onnx") -> Path:
         >>> pretrained_weights("dense").name
         'dense.onnx'
     """
-    return Path(
-        str(files("deepdetect") / "detector" / "weights" / look_up("weights", name, PRETRAINED))
-    ).with_suffix(suffix)
+    return (FOLDER / look_up("weights", name, PRETRAINED)).with_suffix(suffix)
 
 
 def resolve_weights(weights: str | Path, suffix: str = ".onnx") -> Path:

@@ -9,11 +9,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError
+from .._shared.opencv import cv2
 
 Arrays = Mapping[str, np.ndarray]
 

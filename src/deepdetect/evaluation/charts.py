@@ -6,10 +6,10 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import MissingExtraError
+from .._shared.opencv import cv2
 
 MARKERS = ("o", "s", "^", "x")
 DASHES = ("-", "--", ":", "-.")

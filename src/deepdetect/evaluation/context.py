@@ -84,12 +84,14 @@ class BenchmarkContext:
     Attributes:
         data: folder of the data sets, or of the only one that is needed.
         cache: of the stages.
-        skipped: what could not be measured, each with the reason.
+        skipped: what was not measured, each with the reason.
+        failures: of that, what was wanted and could not be measured.
     """
 
     data: Path
     cache: StageCache = field(default_factory=lambda: StageCache(None))
     skipped: list[str] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
     _temporary: Path | None = field(default=None, init=False, repr=False)
     _recent: OrderedDict[tuple[str, str], ImageKeypoints] = field(
         default_factory=OrderedDict, init=False, repr=False
@@ -126,8 +128,13 @@ class BenchmarkContext:
         except (CacheError, OptionError):
             raise
         except DeepDetectError as error:
-            self.skipped.append(f"{name}: {error}")
+            self.fail(f"{name}: {error}")
             return None
+
+    def fail(self, reason: str) -> None:
+        """Note what was wanted and cannot be measured."""
+        self.skipped.append(reason)
+        self.failures.append(reason)
 
     def keypoints(self, feature: LocalFeature, image: Path) -> ImageKeypoints:
         """Find the keypoints of an image, or read them from the cache."""

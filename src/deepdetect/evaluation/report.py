@@ -136,12 +136,14 @@ class Report:
         metadata: how it was made: command, versions, commit, machine, data.
         sections: in order.
         skipped: what was not measured, each with the reason.
+        failures: of that, what was wanted and could not be measured.
     """
 
     title: str
     metadata: dict[str, str]
     sections: tuple[Section, ...]
     skipped: tuple[str, ...] = ()
+    failures: tuple[str, ...] = ()
 
     def tables(self) -> list[Table]:
         """Return the tables of all sections."""

@@ -54,7 +54,7 @@ def run_benchmarks(
         except ImageError as error:
             if len(chosen) == 1:
                 raise
-            context.skipped.append(f"the benchmark {benchmark.name}: {error}")
+            context.fail(f"the benchmark {benchmark.name}: {error}")
     with progress(sum(map(len, plans)), "benchmark", "task", quiet) as bar:
         sections = tuple(plan.run(context, bar) for plan in plans)
     metadata = {
@@ -65,7 +65,8 @@ def run_benchmarks(
         "peak memory": f"{peak_memory() / 1e9:.2f} GB",
     }
     title = f"DeepDetect benchmark: {', '.join(names)}"
-    return Report(title, metadata, sections, tuple(dict.fromkeys(context.skipped)))
+    skipped, failures = (tuple(dict.fromkeys(x)) for x in (context.skipped, context.failures))
+    return Report(title, metadata, sections, skipped, failures)
 
 
 def _weights(chosen: Sequence[Benchmark], options: BenchmarkOptions) -> dict[str, str]:

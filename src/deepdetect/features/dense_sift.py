@@ -7,10 +7,11 @@ result equals OpenCV's but for rounding.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.kernels import require_compiler
+from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .keypoints import on_pixels
 
@@ -46,6 +47,7 @@ def dense_sift(
         (N, 128) uint8: four rows of four columns of eight orientations.
 
     Raises:
+        MissingExtraError: numba is not installed.
         OptionError: a position is not on a pixel of the image, or the size is out of its range, or
             the positions are not so many rows or columns apart.
 
@@ -60,6 +62,7 @@ def dense_sift(
         )
     if not on_pixels(xy, gray.shape):
         raise OptionError("dense SIFT needs keypoints on whole pixels within the image")
+    require_compiler("dense SIFT", ", or take the descriptor sift-opencv")
     from .descriptor_kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 
     if not len(xy):

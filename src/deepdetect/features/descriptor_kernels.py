@@ -151,19 +151,6 @@ def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
                 out[32 * b + 8 * c + o] = np.uint8(min(np.float32(255), value))
 
 
-@compiled(nogil=True)
-def square_root(first, last, descriptors):  # type: ignore[no-untyped-def]
-    """Convert SIFT to RootSIFT in place: 512 times the root of each number over the sum."""
-    for k in range(first, last):
-        total = 0
-        for d in range(128):
-            total += descriptors[k, d]
-        scale = np.float32(512) / np.sqrt(np.float32(max(total, 1)))
-        for d in range(128):
-            value = np.rint(scale * np.sqrt(np.float32(descriptors[k, d])))
-            descriptors[k, d] = np.uint8(min(np.float32(255), value))
-
-
 # No full fastmath: its approximate division and root do not give 0 for equal descriptors.
 @compiled(nogil=True, fastmath={"reassoc", "nsz", "contract"})
 def correlation_distances(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]

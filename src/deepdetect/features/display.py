@@ -7,11 +7,11 @@ import html
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import ImageError, MissingExtraError
 from .._shared.image_array import Channels, array_to_rgb
+from .._shared.opencv import cv2
 
 MAX_CIRCLES = 5000
 """More keypoints than this are plotted as single pixels."""

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import MissingExtraError, OptionError
 from .._shared.image_array import Channels
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 
 MAX_COORDINATE_BITS = 12

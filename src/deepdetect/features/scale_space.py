@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import cv2
 import numpy as np
+
+from .._shared.opencv import cv2
 
 LAYERS = 3
 """Of an octave that hold keypoints: from one to the next, sigma grows by the cube root of 2."""

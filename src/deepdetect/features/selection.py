@@ -6,12 +6,15 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.opencv import cv2
 from .._shared.options import replace_options, suggest_keywords
 from .keypoints import Keypoints, bayer_order
+
+Rows = Callable[[slice], np.ndarray]
+"""What gives the rows of a map that are asked for."""
 
 MODES = ("auto", "dense", "points")
 SPREADS = ("none", "grid", "anms")
@@ -190,18 +193,31 @@ def select_keypoints(
             f"the logits have shape {ranking.shape}, the heat map {heatmap.shape}: "
             "they must be equal"
         )
-    found = _select(lambda rows: heatmap[rows], ranking, options)
+    maps = Maps(ranking.shape, lambda: heatmap.__getitem__, lambda: ranking)
+    found = select_from_maps(maps, options)
     return found if logits is not None else replace(found, logits=None)
 
 
-def select_by_logits(logits: np.ndarray, options: SelectionOptions) -> Keypoints:
-    """Select the keypoints of a heat map that is the sigmoid of logits, and is never held whole.
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """A heat map and the logits by which its pixels are ranked, each made when it is asked for.
 
-    Args:
-        logits: (H, W) float32.
-        options: as of `select_keypoints`, which gives the same.
+    Of a large image either takes more memory than most of its keypoints: one is held at a time.
+
+    Attributes:
+        shape: (H, W).
+        heatmap: makes the map, (H, W) float32, and gives its rows.
+        logits: makes the logits, (H, W) float32.
     """
-    return _select(lambda rows: sigmoid(logits[rows]), logits, options)
+
+    shape: tuple[int, ...]
+    heatmap: Callable[[], Rows]
+    logits: Callable[[], np.ndarray]
+
+    @classmethod
+    def of_logits(cls, logits: np.ndarray) -> Maps:
+        """Return maps whose heat map is the sigmoid of the logits, and is never held whole."""
+        return cls(logits.shape, lambda: lambda rows: sigmoid(logits[rows]), lambda: logits)
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
@@ -217,70 +233,109 @@ def bands(shape: tuple[int, ...]) -> Iterator[slice]:
         yield slice(start, min(start + rows, shape[0]))
 
 
-def _select(
-    heatmap: Callable[[slice], np.ndarray], ranking: np.ndarray, options: SelectionOptions
-) -> Keypoints:
-    """Select keypoints; the heat map is asked for by rows. Their logits are their ranks."""
-    height, width = ranking.shape
-    ignore = None if options.ignore is None else check_ignore(options.ignore, ranking.shape)
+def select_from_maps(maps: Maps, options: SelectionOptions) -> Keypoints:
+    """Select keypoints as `select_keypoints` does; their logits are their ranks."""
+    height, width = maps.shape
+    passing = _passing(maps, options)
+    ranking = maps.logits()
+    chosen = _choose(passing, ranking, options)
+    del passing
+    counts = [int(np.bitwise_count(chosen[rows]).sum()) for rows in bands(maps.shape)]
+    xy = np.empty((sum(counts), 2), np.float32)
+    scores, logits = np.empty(len(xy), np.float32), np.empty(len(xy), np.float32)
+    ends = np.cumsum(counts).tolist()
+    parts = [
+        (rows, slice(end - count, end))
+        for rows, end, count in zip(bands(maps.shape), ends, counts, strict=True)
+    ]
+    # One map at a time, and what is not written yet takes no memory.
+    for rows, part in parts:
+        pixels = _unpack(chosen[rows], width)
+        logits[part] = ranking[rows].ravel()[pixels]
+        if options.refines:
+            row, column = np.divmod(pixels, width)
+            for k, axis in ((0, 1), (1, 0)):
+                xy[part, k] = _peak_offset(ranking, row + rows.start, column, axis)
+    del ranking
+    heatmap = maps.heatmap()
+    for rows, part in parts:
+        scores[part] = heatmap(rows).ravel()[_unpack(chosen[rows], width)]
+    del heatmap
+    for rows, part in parts:
+        row, column = np.divmod(_unpack(chosen[rows], width), width)
+        for k, whole in ((0, column), (1, row + rows.start)):
+            found = whole.astype(np.float32)
+            xy[part, k] = found + xy[part, k] if options.refines else found
+    del chosen
+    return Keypoints(xy, scores, (width, height), logits)
+
+
+def _unpack(packed: np.ndarray, width: int) -> np.ndarray:
+    """Return the numbers of the pixels that are set in packed rows."""
+    return np.flatnonzero(np.unpackbits(packed, axis=1, count=width))
+
+
+def _passing(maps: Maps, options: SelectionOptions) -> np.ndarray:
+    """Return the pixels over the threshold that are not ignored, eight of a row in a byte."""
+    height, width = maps.shape
+    ignore = None if options.ignore is None else check_ignore(options.ignore, maps.shape)
     # With a density, all pixels but the impossible ones may be needed.
     threshold = options.threshold if options.density is None else 0.0
+    packed = np.empty((height, -(-width // 8)), np.uint8)
+    heatmap = maps.heatmap()
+    for rows in bands(maps.shape):
+        passing = heatmap(rows) > threshold
+        if ignore is not None:
+            passing &= ~ignore[rows]
+        packed[rows] = np.packbits(passing, axis=1)
+    return packed
+
+
+def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions) -> np.ndarray:
+    """Return the pixels that become keypoints, packed as those are that pass the threshold."""
+    height, width = ranking.shape
     radius = options.suppression_radius
     count = _wanted_count(options, ranking.size)
-    lowest = np.float32(-np.inf)
+    if not radius and count is None:
+        return passing
+    ranks = ranking.ravel()
 
     def wanted(rows: slice) -> np.ndarray:
         """Return the pixels of a band that pass all but the limit on their number."""
         # What is nearby decides which are suppressed.
         seen = slice(max(0, rows.start - radius), min(height, rows.stop + radius))
-        passing = heatmap(seen) > threshold
-        if ignore is not None:
-            passing &= ~ignore[seen]
-        pixels = np.flatnonzero(passing)
+        pixels = _unpack(passing[seen], width)
         if radius and len(pixels):
-            ranks = ranking[seen].ravel()[pixels]
-            pixels = pixels[_suppress(pixels, ranks, passing.shape, radius, seen.start, height)]
+            near = ranking[seen]
+            found = _suppress(pixels, near.ravel()[pixels], near.shape, radius, seen.start, height)
+            pixels = pixels[found]
         pixels += seen.start * width
         return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
 
-    ranks = ranking.ravel()
     in_bands = list(bands(ranking.shape))
     only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # looked for once
+    lowest = np.float32(-np.inf)
     if count is not None:
         parts = (ranks[wanted(rows) if only is None else only] for rows in in_bands)
         lowest = _least_of_the_best(parts, count, ranking.dtype)
-    kept, tied = [], []
+    chosen, kept, tied = np.zeros_like(passing), 0, []
     for rows in in_bands:
         found = wanted(rows) if only is None else only
         if count is not None:
             found = found[ranks[found] >= lowest]
             tied.append(found[ranks[found] == lowest])
-        kept.append(found.astype(np.uint32 if ranking.size < 2**32 else np.int64))
-    pixels = np.concatenate(kept)
-    del kept
-    if count is not None and len(pixels) > count:
+        kept += len(found)
+        mask = np.zeros(ranking[rows].shape, bool)
+        mask.ravel()[found - rows.start * width] = True
+        chosen[rows] = np.packbits(mask, axis=1)
+    if count is not None and kept > count:
         last = np.concatenate(tied)
         row, column = np.divmod(last, width)
         spread = bayer_order(np.column_stack([column, row]), (width, height))
-        spare = len(pixels) - count
-        dropped = last[np.argsort(spread, kind="stable")[len(last) - spare :]]
-        pixels = np.delete(pixels, np.searchsorted(pixels, np.sort(dropped)))
-    xy = np.empty((len(pixels), 2), np.float32)
-    scores, logits = np.empty((2, len(pixels)), np.float32)
-    starts = [rows.start * width for rows in bands(ranking.shape)]
-    edges = np.searchsorted(pixels, np.array(starts, pixels.dtype))  # of one type: no copy
-    for rows, start, stop in zip(
-        bands(ranking.shape), edges, [*edges[1:], len(pixels)], strict=True
-    ):
-        own = pixels[start:stop].astype(np.int64)
-        row, column = np.divmod(own, width)
-        xy[start:stop, 0], xy[start:stop, 1] = column, row
-        scores[start:stop] = heatmap(rows).ravel()[own - rows.start * width]
-        logits[start:stop] = ranks[own]
-        if options.refines:
-            for k, axis in ((0, 1), (1, 0)):
-                xy[start:stop, k] += _peak_offset(ranking, row, column, axis)
-    return Keypoints(xy, scores, (width, height), logits)
+        dropped = last[np.argsort(spread, kind="stable")[len(last) - (kept - count) :]]
+        row, column = np.divmod(dropped, width)
+        np.bitwise_and.at(chosen, (row, column // 8), ~(128 >> column % 8).astype(np.uint8))
+    return chosen
 
 
 def _least_of_the_best(parts: Iterable[np.ndarray], count: int, kind: np.dtype) -> np.floating:

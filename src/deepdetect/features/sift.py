@@ -9,10 +9,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.kernels import has_compiler
+from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
 from .dense_sift import MAX_SIZE_PX, MIN_SIZE_PX, dense_sift
@@ -29,7 +30,7 @@ def sift_descriptors(
     """Compute SIFT descriptors, by the fastest implementation for these keypoints.
 
     Many upright keypoints on whole pixels are described all at once, which differs from OpenCV's
-    result by 1 in one of ten thousand numbers; others by OpenCV.
+    result by 1 in one of ten thousand numbers; others, and all of them without numba, by OpenCV.
 
     Args:
         gray: (H, W) uint8 luma.
@@ -47,7 +48,7 @@ def sift_descriptors(
     """
     dense = len(xy) > MIN_DENSE_DENSITY * gray.size
     upright = angle == 0 and MIN_SIZE_PX <= size <= MAX_SIZE_PX
-    if dense and upright and on_pixels(xy, gray.shape):
+    if dense and upright and has_compiler() and on_pixels(xy, gray.shape):
         return dense_sift(gray, xy, size)
     return opencv_sift_descriptors(gray, xy, size, angle)
 
@@ -150,11 +151,21 @@ def to_root_sift(descriptors: np.ndarray, overwrite: bool = False) -> np.ndarray
     Returns:
         (N, 128) uint8: the square roots of the L1-normalised ones times 512, at most 255.
     """
-    from .descriptor_kernels import square_root
-
     result = descriptors if overwrite else descriptors.copy()
-    parallel_for(len(result), square_root, result)
+    parallel_for(len(result), _square_root, result)
     return result
+
+
+def _square_root(start: int, stop: int, descriptors: np.ndarray) -> None:
+    """Convert the rows from `start` to before `stop` in place."""
+    roots = np.sqrt(np.arange(256, dtype=np.float32))
+    for first in range(start, stop, ROWS_AT_ONCE):
+        rows = descriptors[first : min(first + ROWS_AT_ONCE, stop)]
+        totals = np.maximum(rows.sum(1, dtype=np.int64), 1).astype(np.float32)
+        values = roots.take(rows)
+        values *= (np.float32(512) / np.sqrt(totals))[:, None]
+        np.rint(values, out=values)
+        rows[:] = np.minimum(values, 255, out=values)
 
 
 def correlation_distance(
@@ -189,6 +200,9 @@ def correlation_distance(
     parallel_for(len(out), correlation_distances, first, rows0, second, rows1, mean, out)
     return out
 
+
+ROWS_AT_ONCE = 1024
+"""Descriptors that are converted together, so that they stay in the processor's cache."""
 
 Descriptor = Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]
 

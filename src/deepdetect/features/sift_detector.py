@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .keypoints import Keypoints
 from .sift import to_root_sift

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from .._shared.kernels import has_compiler
+
+MIN_COMPILED_POINTS = 30_000
+"""From which importing the compiled code, where there is numba, takes less time than it saves."""
+
 DISTANCE_STEP_PX = 0.25
 """To which the distance of `spread_by_distance` is found."""
 
@@ -26,8 +31,6 @@ def suppress_neighbors(
         >>> suppress_neighbors(xy, np.array([1.0, 2, 3, 0]), 2).tolist()
         [2, 0, 3]
     """
-    from .suppression_kernel import keep_distant
-
     order = np.argsort(-np.asarray(scores), kind="stable")
     if not len(order):
         return order
@@ -36,9 +39,60 @@ def suppress_neighbors(
     radii = np.broadcast_to(np.asarray(radius_px, np.float64), len(order))[order]
     cell = float(radii.min())
     columns, rows = (int(side) + 1 for side in places.max(0) / cell)
-    x, y = (np.ascontiguousarray(axis) for axis in places.T)
-    kept: np.ndarray = keep_distant(x, y, radii, cell, columns, rows)
-    return order[kept]
+    if len(order) >= MIN_COMPILED_POINTS and has_compiler():
+        from .suppression_kernel import keep_distant
+
+        x, y = (np.ascontiguousarray(axis) for axis in places.T)
+        kept: np.ndarray = keep_distant(x, y, radii, cell, columns, rows)
+        return order[kept]
+    return order[_keep_distant(places, radii, cell, columns)]
+
+
+def _keep_distant(places: np.ndarray, radii: np.ndarray, cell: float, columns: int) -> list[int]:
+    """Return which points, best first, have no kept point closer than the smaller of their radii.
+
+    The same as the compiled `keep_distant`, in Python.
+
+    Args:
+        places: (N, 2) positions, all of them 0 or more.
+        radii: (N,) in pixels.
+        cell: side of the cells of a grid that kept points are listed in.
+        columns: of that grid.
+    """
+    reaches = np.ceil(radii / cell).astype(np.int64)
+    margin = int(reaches.max())  # so that no cell beside a row is one of the next row
+    width = columns + 2 * margin
+    column, row = (places / cell).astype(np.int64).T
+    cells = (row + margin) * width + column + margin
+    near = {reach: _cells_around(reach, width) for reach in np.unique(reaches).tolist()}
+    lists: dict[int, list[tuple[float, float, float]]] = {}
+    kept = []
+    points = zip(
+        *(each.tolist() for each in (*places.T, radii * radii, cells, reaches)), strict=True
+    )
+    for k, (x, y, squared, own, reach) in enumerate(points):
+        nearby = (lists[own + step] for step in near[reach] if own + step in lists)
+        if not any(_is_near(x, y, squared, others) for others in nearby):
+            kept.append(k)
+            lists.setdefault(own, []).append((x, y, squared))
+    return kept
+
+
+def _is_near(x: float, y: float, squared: float, others: list[tuple[float, float, float]]) -> bool:
+    for other_x, other_y, other_squared in others:
+        least = squared if squared < other_squared else other_squared
+        if (other_x - x) ** 2 + (other_y - y) ** 2 < least:
+            return True
+    return False
+
+
+def _cells_around(reach: int, width: int) -> list[int]:
+    """Return the steps to cells so near that they may hold a closer point, nearest first."""
+    steps = range(-reach, reach + 1)
+    around = sorted(
+        (down**2 + across**2, down * width + across) for down in steps for across in steps
+    )
+    return [step for _, step in around]
 
 
 def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.ndarray:

@@ -15,9 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol
 
-import cv2
 import numpy as np
 
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .residuals import transform_points
 

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .model_selection import measure_parallax
 from .residuals import epipolar_errors, transfer_errors

@@ -20,10 +20,10 @@ import math
 from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .residuals import transform_points
 from .zncc import (

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
+
+from .._shared.opencv import cv2
 
 ANTIALIASING_SIGMA = 0.5
 """Of the blur before an image is downscaled, in units of sqrt(1 / scale^2 - 1) pixels."""

@@ -16,9 +16,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .acontrario import log10_nfa
 from .camera import Calibration, Camera

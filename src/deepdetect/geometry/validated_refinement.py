@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
-import cv2
 import numpy as np
 
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .homography_refinement import (
     IrlsOptions,

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
+
+from .._shared.opencv import cv2
 
 
 def window_sums(

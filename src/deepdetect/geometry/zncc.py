@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.opencv import cv2
 
 WINDOW_PX = 15
 """Side of the square windows."""

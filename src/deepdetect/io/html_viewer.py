@@ -18,6 +18,9 @@ import numpy as np
 
 from ..geometry.point_cloud import PointCloud, angular_spacing, robust_box
 
+DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
+"""Tangent of half the field of view, and its range."""
+
 MAX_LEVEL = 65535
 """Positions are stored in 16 bits per axis."""
 
@@ -113,7 +116,17 @@ def _description(cloud: PointCloud, stored: PagePoints) -> dict[str, object]:
         "radius": box.radius,
         "reach": float(reach),
         "spacing": angular_spacing(cloud),
+        "slope": _largest_slope(cloud),
     }
+
+
+def _largest_slope(cloud: PointCloud) -> float:
+    """Return the tangent of half the field of view from the origin that shows nearly all points."""
+    before = cloud.points[cloud.points[:, 2] > 0].astype(np.float64)
+    if not len(before):
+        return DEFAULT_SLOPE
+    slopes = np.abs(before[:, :2] / before[:, 2:]).max(1)
+    return float(np.clip(1.05 * np.percentile(slopes, 99), *SLOPES))
 
 
 def _base64(array: np.ndarray) -> str:

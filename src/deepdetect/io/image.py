@@ -9,13 +9,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import ImageError, MissingImageError
 from .._shared.image_array import Channels, array_to_rgb, check_channels
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
-from .image_file import MAX_MEGAPIXELS, damaged_image, file_name, is_file, open_image
+from .image_file import damaged_image, file_name, is_file, open_image
 
 MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
@@ -33,7 +33,7 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda image: cv2.flip(image, 1),
     3: lambda image: cv2.rotate(image, cv2.ROTATE_180),
     4: lambda image: cv2.flip(image, 0),
-    5: cv2.transpose,
+    5: lambda image: cv2.transpose(image),
     6: lambda image: cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE),
     7: lambda image: cv2.flip(cv2.transpose(image), -1),
     8: lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),
@@ -43,7 +43,7 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 
 @suggest_keywords
 def load_image(
-    image: Any, *, channels: Channels = "rgb", max_megapixels: float = MAX_MEGAPIXELS
+    image: Any, *, channels: Channels = "rgb", max_megapixels: float | None = None
 ) -> np.ndarray:
     """Read an image of any usual kind as 8-bit RGB.
 
@@ -57,7 +57,8 @@ def load_image(
         channels: the order of the colours in an array or a tensor: "bgr" for the images of
             `cv2.imread` and `cv2.VideoCapture`. Files and PIL images say theirs themselves.
         max_megapixels: larger files are refused before they are decoded, as a file of few bytes
-            can hold billions of pixels. One megapixel takes 3 MB, and up to 7 MB while it is read.
+            can hold billions of pixels. None: 200, or what `--max-megapixels` says.
+            One megapixel takes 3 MB, and up to 7 MB while it is read.
             Of TIFF and WebP, Pillow reads 178 megapixels at most (`PIL.Image.MAX_IMAGE_PIXELS`).
 
     Returns:
@@ -137,7 +138,7 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     return found
 
 
-def _read_file(source: Any, max_megapixels: float) -> np.ndarray:
+def _read_file(source: Any, max_megapixels: float | None) -> np.ndarray:
     with open_image(source, max_megapixels=max_megapixels) as image:
         rgb = _from_pil(image, file_name(source))
         orientation = _orientation(image)

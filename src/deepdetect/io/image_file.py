@@ -10,6 +10,7 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, BinaryIO
 
 from .._shared.errors import ImageError, MissingImageError, OptionError
@@ -31,9 +32,34 @@ SIGNATURE_BYTES = 16
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
+_limit: ContextVar[float] = ContextVar("max_megapixels", default=MAX_MEGAPIXELS)
+
+
+@contextmanager
+def limit_megapixels(max_megapixels: float) -> Iterator[None]:
+    """Refuse larger images than these in the block, where a call gives no limit of its own.
+
+    It is for commands: what reads a photograph, and how often, lies deep below them.
+
+    Raises:
+        OptionError: `max_megapixels` is not above 0.
+    """
+    token = _limit.set(_check_limit(max_megapixels))
+    try:
+        yield
+    finally:
+        _limit.reset(token)
+
+
+def _check_limit(max_megapixels: float) -> float:
+    if not (isinstance(max_megapixels, (int, float)) and max_megapixels > 0):
+        raise OptionError(f"`max_megapixels` must be above 0, not {max_megapixels}")
+    return max_megapixels
+
+
 @contextmanager
 def open_image(
-    source: Any, *, what: str = "image", max_megapixels: float = MAX_MEGAPIXELS
+    source: Any, *, what: str = "image", max_megapixels: float | None = None
 ) -> Iterator[Any]:
     """Open an image file as a PIL image; its pixels are decoded when it is loaded.
 
@@ -41,7 +67,8 @@ def open_image(
         source: a path; the content of a file, as bytes; or a binary file, which is read from its
             beginning and stays open.
         what: what errors call an image that has no name.
-        max_megapixels: larger images are refused before they are decoded.
+        max_megapixels: larger images are refused before they are decoded. None: 200, or the
+            limit of `limit_megapixels`.
 
     Yields:
         The image. Errors of Pillow in the block become those below.
@@ -51,14 +78,13 @@ def open_image(
             too large or no image.
         OptionError: `max_megapixels` is not above 0.
     """
-    if not (isinstance(max_megapixels, (int, float)) and max_megapixels > 0):
-        raise OptionError(f"`max_megapixels` must be above 0, not {max_megapixels}")
+    limit = _limit.get() if max_megapixels is None else _check_limit(max_megapixels)
     name = file_name(source, what)
     try:
         with _binary_file(source, name) as file:
             _check_png(file, name)
             with _identify(file, name) as image:
-                _check_size(image.size, name, max_megapixels)
+                _check_size(image.size, name, limit)
                 yield image
     except FileNotFoundError:
         raise MissingImageError(f"there is no file {name}: check the path") from None
@@ -178,7 +204,7 @@ def _check_size(size: tuple[int, int], name: str, max_megapixels: float) -> None
     if megapixels > max_megapixels:
         raise ImageError(
             f"{name} has {size[0]}x{size[1]} pixels, which is over {max_megapixels:g} megapixels: "
-            "make it smaller, or load it in Python with a larger `max_megapixels`"
+            "make it smaller, or allow more by `max_megapixels`"
         )
 
 

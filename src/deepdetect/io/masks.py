@@ -10,7 +10,7 @@ import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import ImageError
-from .image_file import MAX_MEGAPIXELS, open_image
+from .image_file import open_image
 
 SETTINGS_KEY = "deepdetect-label"
 """Keyword of the PNG text chunk that holds the settings a mask was made with."""
@@ -40,14 +40,15 @@ def encode_mask(mask: np.ndarray, settings: str = "") -> bytes:
     return content.getvalue()
 
 
-def load_mask(source: Any, *, max_megapixels: float = MAX_MEGAPIXELS) -> np.ndarray:
+def load_mask(source: Any, *, max_megapixels: float | None = None) -> np.ndarray:
     """Read a mask of any bit depth: True where a pixel is brighter than half.
 
     In a file that holds only zeros and ones, the ones are True.
 
     Args:
         source: a path, the content of a file as bytes, or an open binary file.
-        max_megapixels: larger files are refused before they are decoded.
+        max_megapixels: larger files are refused before they are decoded. None: 200, or what
+            `--max-megapixels` says.
 
     Returns:
         (H, W) bool.

@@ -23,6 +23,9 @@ FORMATS = ("npz", "csv")
 MAX_DEFLATE_RATIO = 1032
 """By how much zip's usual compression can shrink at most (https://zlib.net/zlib_tech.html)."""
 
+CSV_ROWS = 100_000
+"""Written at a time: a table of all takes as much memory as the keypoints once more."""
+
 
 @suggest_keywords
 def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
@@ -51,7 +54,7 @@ def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
         known = (("size", keypoints.sizes), ("angle", keypoints.angles))
         columns += [(name, values) for name, values in known if values is not None]
         header = ",".join(name for name, _ in columns)
-        _save_csv(path, header, np.column_stack([values for _, values in columns]))
+        _save_csv(path, header, [values for _, values in columns])
 
 
 def _optional(keypoints: Keypoints) -> list[tuple[str, np.ndarray | None]]:
@@ -104,7 +107,7 @@ def save_matches(matches: Matches, path: str | Path) -> None:
     """
     if _format(path) == "csv":
         columns = [matches.points0, matches.points1, matches.scores, matches.inliers]
-        _save_csv(path, "x0,y0,x1,y1,score,inlier", np.column_stack(columns))
+        _save_csv(path, "x0,y0,x1,y1,score,inlier", columns)
         return
     names = ("points0", "points1", "scores", "inliers", "indices0", "indices1")
     arrays = {name: getattr(matches, name) for name in names}
@@ -269,6 +272,9 @@ def _save_npz(path: str | Path, **arrays: np.ndarray) -> None:
                 np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
 
 
-def _save_csv(path: str | Path, header: str, table: np.ndarray) -> None:
-    with atomic_path(path) as temporary:
-        np.savetxt(temporary, table, fmt="%.7g", delimiter=",", header=header, comments="")
+def _save_csv(path: str | Path, header: str, columns: list[np.ndarray]) -> None:
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(f"{header}\n".encode())
+        for start in range(0, len(columns[0]), CSV_ROWS):
+            table = np.column_stack([values[start : start + CSV_ROWS] for values in columns])
+            np.savetxt(file, table, fmt="%.7g", delimiter=",")

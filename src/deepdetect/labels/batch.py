@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError
+from .._shared.errors import DeepDetectError, MissingExtraError
 from .._shared.parallel import TaskMap, map_in_processes
 from ..io.image import load_image, luma
 from ..io.masks import load_mask_settings, save_mask
@@ -155,7 +155,8 @@ def label_file(task: LabelTask) -> list[LabelReport]:
     """Make the masks of one image file.
 
     Raises:
-        DeepDetectError: a mask cannot be written, which concerns all images.
+        DeepDetectError: a mask cannot be written, or a package is missing, which concerns all
+            images.
     """
     reports: list[LabelReport] = []
     image: np.ndarray | None = None
@@ -164,6 +165,8 @@ def label_file(task: LabelTask) -> list[LabelReport]:
             image = load_image(task.image) if image is None else image
             rgb = image if target.transform is None else target.transform(image)
             label = fuse(luma(rgb), target.options)
+        except MissingExtraError:  # concerns all images
+            raise
         except DeepDetectError as error:
             left = task.targets[len(reports) :]
             return reports + [LabelReport(task.image, t.mask, error=str(error)) for t in left]

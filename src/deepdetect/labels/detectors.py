@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.opencv import cv2, opencv_factory
 from .._shared.options import check_ranges
 
 Limits = dict[str, tuple[float, float]]
@@ -37,11 +37,6 @@ KERNEL_SIZES = (1, 31)
 
 MAX_CANNY_THRESHOLD = 2040
 """Largest sum of both gradients of the 3x3 Sobel filter, in grey levels."""
-
-
-def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
-    """Return a factory of OpenCV: version 5 moved some from `cv2` to `cv2.xfeatures2d`."""
-    return getattr(cv2 if hasattr(cv2, name) else cv2.xfeatures2d, name)
 
 
 def pixels_mask(shape: tuple[int, ...], xy: np.ndarray) -> np.ndarray:

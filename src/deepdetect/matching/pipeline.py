@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.image_array import Channels
+from .._shared.kernels import require_compiler
 from .._shared.options import replace_options, suggest_keywords
 from .._shared.parallel import available_memory
 from .._shared.timing import StageTimer
@@ -69,6 +70,7 @@ def match_images(
     iterations: int | None = None,
     seed: int | None = None,
     guided_options: GuidedOptions | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> Matches:
     """Detect and match the keypoints of two images.
 
@@ -105,6 +107,7 @@ def match_images(
         estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations, seed:
             how the geometry is estimated (`GeometryOptions`).
         guided_options: all tuned numbers of guided matching.
+        progress: called with the name of each stage when it ends.
 
     Returns:
         The matches, the geometry, and which agree with it. Where guided matching can trust no
@@ -113,6 +116,7 @@ def match_images(
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
+        MissingExtraError: guided matching needs numba, and it is not installed.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -160,7 +164,9 @@ def match_images(
     )
     if seeds is not None and not chosen.guided:
         raise OptionError("seeds guide the matching: leave them out, or guided=False")
-    timer = StageTimer()
+    if chosen.guided:
+        require_compiler("guided matching", ", or match by descriptors alone with `guided=False`")
+    timer = StageTimer(progress)
     rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
     detector = _configured(detector, chosen.heatmap)
     with timer.stage("keypoints"):

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from .._shared.errors import RegistrationError
 from .._shared.image_array import Channels
+from .._shared.kernels import require_compiler
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.detector import HeatmapDetector
 from ..geometry.zncc import median_local_zncc, warp_to_reference
@@ -83,6 +85,7 @@ def register(
     mutual: bool | None = None,
     seed: int | None = None,
     guided_options: GuidedOptions | None = None,
+    progress: Callable[[str], object] | None = None,
 ) -> Registration:
     """Find the homography between two images and warp the second into the frame of the first.
 
@@ -93,11 +96,13 @@ def register(
         image0, image1: anything `load_image` takes.
         detector: as for `match_images`.
         channels, threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread,
-            resolution, network_channels, mutual, seed, guided_options: as for `match_images`.
+            resolution, network_channels, mutual, seed, guided_options, progress: as for
+            `match_images`.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
+        MissingExtraError: numba is not installed.
         RegistrationError: no homography between the images can be trusted.
 
     Example:
@@ -109,6 +114,7 @@ def register(
         >>> found.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
+    require_compiler("registration")
     first, second = load_image(image0, channels=channels), load_image(image1, channels=channels)
     found = match_images(
         first,
@@ -128,6 +134,7 @@ def register(
         mutual=mutual,
         seed=seed,
         guided_options=guided_options,
+        progress=progress,
     )
     if not found.guided or found.matrix is None:
         raise RegistrationError(

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from .._shared.errors import ReconstructionError
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import grid_subsample
 from ..geometry import (

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..io.image import luma
 

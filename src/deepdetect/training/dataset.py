@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from .._shared.errors import DeepDetectError, ImageError
+from .._shared.opencv import cv2
 from .._shared.parallel import available_memory
 from .augmentation import flip, jitter_color, transpose
 from .engine import DistributedContext

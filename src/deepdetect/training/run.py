@@ -209,11 +209,17 @@ def _peak_memory_bytes() -> int | None:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
+INSTALL_TRAINING = (
+    'pip install "deepdetect[train]", without a GPU with the option '
+    "--extra-index-url https://download.pytorch.org/whl/cpu, which spares 6 GB"
+)
+
+
 def require_packages() -> None:
     """Raise a MissingExtraError that says what to install where training cannot run."""
     for package in ("torch", "lightning_fabric", "safetensors", "onnx"):
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(
                 f"training needs the package {package.replace('_', '-')}, which is not installed: "
-                "run pip install torch lightning-fabric safetensors onnx matplotlib"
+                f"run {INSTALL_TRAINING}"
             )

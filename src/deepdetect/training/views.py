@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from .._shared.errors import ImageError
+from .._shared.opencv import cv2
 from ..io.image import find_images, load_image, scale_short_side
 from .augmentation import AUGMENTATION_VERSION, AugmentationRanges, Darkening, augment, darken
 from .recipe import TrainingOptions

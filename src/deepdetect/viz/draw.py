@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError
+from .._shared.opencv import cv2
 from ..features.keypoints import Keypoints
+from ..features.sift_detector import spread_over_grid
 
 MAX_CIRCLES = 5000
 """More keypoints than this are drawn as single pixels."""
@@ -19,7 +20,28 @@ SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_JPEG_SIDE_PX = 65_500
 """The largest width and height that libjpeg writes."""
 
+PICTURE_SIDE_PX = 2000
+"""Longer side of what `fit_picture` returns: as JPEG it takes less than two megabytes."""
+
+READABLE_WIDTH_PX = 800
+"""Captions, lines and points grow with pictures that are wider than this."""
+
+JPEG_QUALITY = 85
+SHOWN_KEYPOINTS = 1000
+AREA_OF_KEYPOINT_PX = 200
+"""Pixels of a small picture for each keypoint that is drawn, so that all can be told apart."""
+
+SHOWN_PERCENTILE = 99.0
+"""Values above it, and below the opposite one, have the last colours: few may be far away."""
+
+LEAST_LEVEL, LEAST_DEPTH_LEVEL = 0.35, 0.2
+"""Darker colours of the scale are not seen on a photograph, or look like unknown depth."""
+
+LINES, DOTS = 60, 1500
+
 CAPTION_HEIGHT = 28
+"""Of pictures that are not wider than `READABLE_WIDTH_PX`."""
+
 GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
 
@@ -66,7 +88,8 @@ def _encode(rgb: np.ndarray, suffix: str) -> bytes | None:
     if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
         return None
     try:
-        done, data = cv2.imencode(suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        settings = [] if suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        done, data = cv2.imencode(suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), settings)
     except cv2.error:
         return None
     return data.tobytes() if done else None
@@ -82,14 +105,119 @@ def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
 
 
+def draw_logits(logits: np.ndarray) -> np.ndarray:
+    """Colour a (H, W) map of logits, with a scale below it: 0 is a probability of one half.
+
+    Of probabilities most would be the darkest or the brightest colour: a sixth of the pixels of a
+    photograph have one that float32 rounds to 1.
+
+    Returns:
+        (H + caption, W, 3) uint8 RGB; not larger than `fit_picture` makes it.
+    """
+    shown = fit_picture(np.asarray(logits, np.float32))
+    known = np.where(np.isfinite(shown), shown, 0)
+    low, high = (float(v) for v in np.percentile(known, (100 - SHOWN_PERCENTILE, SHOWN_PERCENTILE)))
+    low, high = min(low, -1.0), max(high, 1.0)
+    levels = np.where(np.isfinite(shown), (known - low) / (high - low), shown > 0)
+    words = "logit of a keypoint, 0: probability .5"
+    return add_scale(draw_heatmap(levels), words, low, high)
+
+
+def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
+    """Colour a (H, W) depth map, NaN where unknown: yellow is near, dark blue far, black unknown.
+
+    Returns:
+        (H + caption, W, 3) uint8 RGB with a scale; not larger than `fit_picture` makes it.
+    """
+    known = np.isfinite(depth)
+    if not known.any():
+        return add_caption(np.zeros((*depth.shape, 3), np.uint8), "no depth is known")
+    few = 100 - SHOWN_PERCENTILE
+    near, far = (float(v) for v in np.percentile(depth[known], (few, SHOWN_PERCENTILE)))
+    # By inverse depth, as differences are seen.
+    inverse = 1 / np.maximum(np.where(known, depth, far), 1e-9)
+    levels = (inverse - 1 / far) / max(1 / near - 1 / far, 1e-12)
+    colors = draw_heatmap(LEAST_DEPTH_LEVEL + (1 - LEAST_DEPTH_LEVEL) * np.clip(levels, 0, 1))
+    # A point is more than a pixel, so that few of them are seen, too.
+    spread = cv2.dilate(np.where(known[..., None], colors, 0).astype(np.uint8), np.ones((3, 3)))
+    colors = np.where(known[..., None], colors, spread)
+    words = f"depth in {'baselines' if unit == 'baseline' else unit}, black: unknown"
+    return add_scale(fit_picture(colors), words, far, near, LEAST_DEPTH_LEVEL)
+
+
+def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
+    """Draw the best keypoints of all parts of an image, coloured by their score.
+
+    At most `SHOWN_KEYPOINTS`, fewer on small images: in turn the best of each cell of a grid. They
+    are circles of their size, or all alike where they have none.
+
+    Returns:
+        (H + caption, W, 3) uint8 RGB with a scale of the scores, or of the logits where there are
+        any; not larger than `fit_picture` makes it.
+    """
+    shown = fit_picture(rgb)
+    factor = shown.shape[1] / rgb.shape[1]
+    canvas = _dimmed(shown)
+    values = keypoints.scores if keypoints.logits is None else keypoints.logits
+    name = "score" if keypoints.logits is None else "logit"
+    unit = _unit(canvas)
+    room = int(canvas.shape[0] * canvas.shape[1] / (AREA_OF_KEYPOINT_PX * unit**2))
+    most = max(1, min(SHOWN_KEYPOINTS, room, len(keypoints)))
+    # No more cells than keypoints, or the dimmest parts would be left out.
+    shorter, longer = sorted(canvas.shape[:2])
+    cells = max(1, int((most * longer / shorter) ** 0.5))
+    rows = spread_over_grid(keypoints.xy, values, keypoints.image_size, most, cells)
+    counted = (
+        f"{len(rows):,} of {len(keypoints):,} keypoints"
+        if len(rows) < len(keypoints)
+        else (f"{len(keypoints):,} keypoints")
+    )
+    if not len(rows):
+        return add_caption(canvas, "no keypoints")
+    few = 100 - SHOWN_PERCENTILE
+    low, high = (float(v) for v in np.percentile(values[rows], (few, SHOWN_PERCENTILE)))
+    levels = np.clip((values[rows] - low) / max(high - low, 1e-9), 0, 1)
+    colors = _viridis(LEAST_LEVEL + (1 - LEAST_LEVEL) * levels).tolist()
+    radii = np.full(len(rows), 3 * unit)
+    if keypoints.sizes is not None:
+        radii = np.maximum(keypoints.sizes[rows] * factor / 2, 2 * unit)
+    centres = _placed(keypoints.xy[rows], factor)
+    # The best on top, and a dark rim, so that each is seen before any colour.
+    for k in np.argsort(values[rows]):
+        _circle(canvas, centres[k], radii[k], (0, 0, 0), max(2, round(2.5 * unit)))
+        _circle(canvas, centres[k], radii[k], colors[k], max(1, round(1.25 * unit)))
+    return add_scale(canvas, f"{counted}, {name}", low, high, LEAST_LEVEL)
+
+
+def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
+    """Draw all keypoints as pixels, with a caption that counts them, as `fit_picture` sizes it."""
+    caption = f"{len(keypoints):,} keypoints, {keypoints.density:.1%} of the pixels"
+    return add_caption(fit_picture(_draw_pixels(rgb, keypoints)), caption)
+
+
+def fit_picture(picture: np.ndarray) -> np.ndarray:
+    """Scale a picture or a map down so that its longer side is at most `PICTURE_SIDE_PX`."""
+    height, width = picture.shape[:2]
+    factor = PICTURE_SIDE_PX / max(height, width)
+    if factor >= 1:
+        return picture
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+
+
 def draw_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     """Draw keypoints over a dimmed RGB image: as circles when they are few, else as pixels."""
+    if len(keypoints) > MAX_CIRCLES:
+        return _draw_pixels(rgb, keypoints)
+    canvas, unit = rgb // 2, _unit(rgb)
+    for x, y in np.rint(keypoints.xy).astype(int).tolist():
+        cv2.circle(canvas, (x, y), round(3 * unit), GREEN, round(unit), cv2.LINE_AA)
+    return canvas
+
+
+def _draw_pixels(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     canvas = rgb // 2
     pixels = np.rint(keypoints.xy).astype(int)
-    if len(keypoints) <= MAX_CIRCLES:
-        for x, y in pixels.tolist():
-            cv2.circle(canvas, (x, y), 3, GREEN, 1, cv2.LINE_AA)
-        return canvas
     # Half transparent, so that the image shows through the dense points.
     columns, rows = pixels.T
     canvas[rows, columns] = canvas[rows, columns] // 2 + np.array(GREEN, np.uint8) // 2
@@ -103,10 +231,13 @@ def draw_matches(
     points1: np.ndarray,
     good: np.ndarray,
     lines: int = 150,
+    *,
+    by_position: bool = False,
 ) -> np.ndarray:
     """Draw the two images side by side, with lines between a sample of the matches.
 
-    The lower image is enlarged to the height of the other.
+    The lower image is enlarged to the height of the other, and both are scaled down where the
+    picture would be wider or higher than `PICTURE_SIDE_PX`.
 
     Args:
         rgb0, rgb1: the images, (H, W, 3) uint8 RGB.
@@ -114,11 +245,15 @@ def draw_matches(
         good: (M,) bool: green lines, the others red.
         lines: number of lines; the sample is random with a fixed seed, so green and red
             have the proportions of all matches.
+        by_position: colour good matches by where they are in the first image, and draw more of
+            them as dots than as lines, so that one sees what was found where.
 
     Returns:
         (H, W, 3) uint8 RGB, H that of the taller image, W that of both at this height.
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
+    width = sum(rgb.shape[1] * height / len(rgb) for rgb in (rgb0, rgb1))
+    height = max(1, round(height * min(1.0, PICTURE_SIDE_PX / max(width, height))))
     shown = [_of_height(rgb, height) for rgb in (rgb0, rgb1)]
     canvas = cv2.convertScaleAbs(np.concatenate(shown, axis=1), alpha=0.7)
     points0, points1 = (
@@ -126,23 +261,73 @@ def draw_matches(
         - 0.5
         for points, view, rgb in zip((points0, points1), shown, (rgb0, rgb1), strict=True)
     )
-    chosen = np.random.default_rng(0).permutation(len(points0))[:lines]
-    for k in sorted(chosen, key=lambda k: bool(good[k])):  # the good ones on top
-        start = tuple(int(v) for v in np.rint(points0[k]))
-        end = tuple(int(v) for v in np.rint(points1[k] + [shown[0].shape[1], 0]))
-        colour = GREEN if good[k] else RED
-        cv2.line(canvas, start, end, colour, 1, cv2.LINE_AA)
-        cv2.circle(canvas, start, 2, colour, -1, cv2.LINE_AA)
-        cv2.circle(canvas, end, 2, colour, -1, cv2.LINE_AA)
+    good = np.asarray(good, bool)
+    order = np.random.default_rng(0).permutation(len(points0))[: DOTS if by_position else lines]
+    colors = np.where(good[order, None], GREEN, RED)
+    if by_position:
+        where = points0[order] / (shown[0].shape[1], height)
+        colors[good[order]] = _colors_of_positions(where[good[order]])
+    with_line = np.arange(len(order)) < (LINES if by_position else lines)
+    unit = _unit(canvas)
+    for k in np.argsort(good[order], kind="stable"):  # the good ones on top
+        row, color = order[k], tuple(int(v) for v in colors[k])
+        start = tuple(int(v) for v in np.rint(points0[row]))
+        end = tuple(int(v) for v in np.rint(points1[row] + [shown[0].shape[1], 0]))
+        if with_line[k]:
+            cv2.line(canvas, start, end, color, round(unit), cv2.LINE_AA)
+        for place in (start, end):
+            cv2.circle(canvas, place, round(2 * unit), color, -1, cv2.LINE_AA)
     return canvas
 
 
+def _colors_of_positions(where: np.ndarray) -> np.ndarray:
+    """Return (N, 3) RGB colours of positions in [0, 1]: hue from left to right, dark downwards.
+
+    None is red, which matches that are not good have.
+    """
+    x, y = np.clip(where, 0, 1).T
+    hsv = np.stack([20 + 120 * x, np.full(len(x), 230), 255 - 110 * y], 1)  # of 180, 255, 255
+    hsv = np.rint(hsv).astype(np.uint8)[None]
+    return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if len(x) else np.empty((0, 3), np.uint8)
+
+
 def _of_height(rgb: np.ndarray, height: int) -> np.ndarray:
-    """Enlarge an image to a height."""
+    """Scale an image to a height."""
     if len(rgb) == height:
         return rgb
     width = max(1, round(rgb.shape[1] * height / len(rgb)))
-    return cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR)
+    how = cv2.INTER_LINEAR if height > len(rgb) else cv2.INTER_AREA
+    return cv2.resize(rgb, (width, height), interpolation=how)
+
+
+def _unit(picture: np.ndarray) -> float:
+    """Return by how much captions, lines and points are enlarged."""
+    return max(1.0, picture.shape[1] / READABLE_WIDTH_PX)
+
+
+def _dimmed(rgb: np.ndarray) -> np.ndarray:
+    """Return a grey, darker copy, on which colours are seen."""
+    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(cv2.convertScaleAbs(gray, alpha=0.6), cv2.COLOR_GRAY2RGB)
+
+
+def _placed(xy: np.ndarray, factor: float) -> np.ndarray:
+    """Return where positions of an image are in a picture that is so many times as large."""
+    return (np.asarray(xy, np.float64) + 0.5) * factor - 0.5
+
+
+def _circle(
+    canvas: np.ndarray, centre: np.ndarray, radius: float, color: Sequence[int], width: int
+) -> None:
+    """Draw a circle with sub-pixel position and radius."""
+    x, y = np.rint(centre * 16).astype(int).tolist()
+    cv2.circle(canvas, (x, y), round(radius * 16), tuple(color), width, cv2.LINE_AA, 4)
+
+
+def _viridis(levels: np.ndarray) -> np.ndarray:
+    """Return the (N, 3) colours of levels in [0, 1]."""
+    colors: np.ndarray = draw_heatmap(np.asarray(levels).reshape(1, -1))[0]
+    return colors
 
 
 def draw_masks(rgb: np.ndarray, masks: Mapping[str, np.ndarray], title: str) -> np.ndarray:
@@ -164,13 +349,37 @@ def draw_masks(rgb: np.ndarray, masks: Mapping[str, np.ndarray], title: str) -> 
 
 
 def add_caption(rgb: np.ndarray, text: str) -> np.ndarray:
-    """Add a line of text below a picture, scaled down to fit its width."""
-    strip = np.zeros((CAPTION_HEIGHT, rgb.shape[1], 3), np.uint8)
-    scale = 0.5
-    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    scale *= min(1.0, (rgb.shape[1] - 12) / max(width, 1))
-    cv2.putText(strip, text, (6, 19), cv2.FONT_HERSHEY_SIMPLEX, scale, WHITE, 1, cv2.LINE_AA)
-    return np.concatenate([rgb, strip])
+    """Add a line of text below a picture, scaled to be legible and to fit its width."""
+    return np.concatenate([rgb, _caption(text, rgb.shape[1], _unit(rgb))])
+
+
+def add_scale(
+    rgb: np.ndarray, text: str, low: float, high: float, least_level: float = 0.0
+) -> np.ndarray:
+    """Add a line of text below a picture, and the colours of values from `low` to `high`.
+
+    The colours are those of `draw_heatmap` from `least_level` to 1.
+    """
+    width, unit = rgb.shape[1], _unit(rgb)
+    bar = max(1, width // 5)
+    ends = [f"{value:.4g}" for value in (low, high)]
+    strip = _caption(f"{text}: {ends[0]}", width - bar - max(1, width // 9), unit)
+    gap = len(strip) // 4
+    colors = np.zeros((len(strip), bar, 3), np.uint8)
+    colors[gap : len(strip) - gap] = _viridis(np.linspace(least_level, 1, bar))
+    last = _caption(ends[1], width - strip.shape[1] - bar, unit)
+    return np.concatenate([rgb, np.concatenate([strip, colors, last], axis=1)])
+
+
+def _caption(text: str, width: int, unit: float) -> np.ndarray:
+    """Return a black strip with a line of text, so many times as large as the smallest."""
+    strip = np.zeros((round(CAPTION_HEIGHT * unit), width, 3), np.uint8)
+    scale, font = 0.5 * unit, cv2.FONT_HERSHEY_SIMPLEX
+    (long, _), _ = cv2.getTextSize(text, font, scale, max(1, round(unit)))
+    scale *= min(1.0, (width - 12 * unit) / max(long, 1))
+    place = round(6 * unit), round(19 * unit)
+    cv2.putText(strip, text, place, font, scale, WHITE, max(1, round(unit)), cv2.LINE_AA)
+    return strip
 
 
 def hstack(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.opencv import cv2
 from ..geometry.point_cloud import (
     BOX_PERCENTILE,
     PointCloud,

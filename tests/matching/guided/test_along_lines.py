@@ -8,6 +8,7 @@ import pytest
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.matching.guided.along_lines import (
     LineSearchOptions,
+    _poisson_tail,
     log10_chance,
     match_along_lines,
 )
@@ -116,3 +117,13 @@ def test_unrelated_keypoints_are_explained_by_chance() -> None:
         first, _ = random_pair(300, seed)
         _, second = random_pair(300, seed + 100)
         assert log10_chance(first, second, ROWS, np.empty((0, 2))) > -3
+
+
+@pytest.mark.parametrize("mean", [1.0, 3.25, 77.5, 3000.5])
+def test_the_tail_of_a_poisson_variable(mean: float) -> None:
+    special = pytest.importorskip("scipy.special", reason="compares with scipy")
+    for count in (1, 2, 10, 77, 78, 200, 2900, 3001, 3300):
+        expected = float(special.pdtrc(count - 1, mean))
+        if expected > 1e-300:
+            assert _poisson_tail(count, mean) == pytest.approx(expected, rel=1e-9)
+    assert _poisson_tail(0, mean) == 1

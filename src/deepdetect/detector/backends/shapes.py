@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,7 +18,7 @@ LOGITS = "logits"
 PADDED_IMAGE = "padded_image"
 """Name of the tensor that holds the image, padded to multiples of 8, in files that pad it."""
 
-PROBE_SHAPE = (48, 64)
+PROBE_SHAPE = (24, 32)
 """Height and width of the image that a network is tried on."""
 
 
@@ -105,7 +106,9 @@ def check_answer(network: Callable[[np.ndarray], np.ndarray], path: Path) -> Non
         WeightsError: it gives a map of another size, values that are not finite or no
             probabilities, or the same value everywhere.
     """
-    noise = np.random.default_rng(0).random((1, 3, *PROBE_SHAPE), np.float32)
+    # Noise enough for this; importing NumPy's generators takes 6 MB.
+    numbers = np.arange(3 * math.prod(PROBE_SHAPE), dtype=np.uint16) * np.uint16(40503)
+    noise = numbers.reshape(1, 3, *PROBE_SHAPE).astype(np.float32) * np.float32(2**-16)
     logits = network(noise)
     if logits.min() == logits.max():
         raise WeightsError(

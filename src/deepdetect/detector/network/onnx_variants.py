@@ -13,7 +13,7 @@ import numpy as np
 
 from ..._shared.atomic import atomic_path
 from ..._shared.errors import MissingExtraError, OptionError, WeightsError, unknown_name
-from ..._shared.options import check_ranges
+from ..._shared.options import check_ranges, suggest_keywords
 from ..pretrained import resolve_weights
 from .onnx_graph import (
     ANY_SIZE,
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 PRECISIONS = ("fp32", "fp16", "int8")
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class OnnxOptions:
     """What an exported ONNX file is like.

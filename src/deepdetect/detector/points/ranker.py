@@ -12,10 +12,8 @@ from typing import TypeVar
 import numpy as np
 
 from ..._shared.errors import MissingWeightsError, WeightsError
+from ..pretrained import RANKER
 from .candidate_features import FEATURES
-
-WEIGHTS = Path(__file__).parent / "ranker.npz"
-"""The trained ranker inside the package; its card is beside it."""
 
 MAX_DEVIATIONS = 6.0
 """Features further from their mean are taken as this many standard deviations away."""
@@ -62,7 +60,7 @@ class Ranker:
         return logits
 
 
-def load_ranker(path: Path = WEIGHTS) -> Ranker:
+def load_ranker(path: Path = RANKER) -> Ranker:
     """Load a ranker; the last few are kept.
 
     Args:

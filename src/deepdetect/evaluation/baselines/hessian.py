@@ -5,9 +5,9 @@ One line of OpenCV for each scale and no training: what a learned ranking of key
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from ..._shared.opencv import cv2
 from ...features.keypoints import Keypoints
 from ...features.selection import SelectionOptions, select_keypoints
 from ...features.suppression import suppress_neighbors

@@ -13,8 +13,8 @@ from ..._shared.errors import DeepDetectError, OptionError
 from ...detector.detector import DeepDetect, find_keypoints, find_points
 from ...detector.heatmap import HeatmapOptions
 from ...detector.points.detection import PointOptions
-from ...detector.points.ranker import WEIGHTS as RANKER
 from ...detector.points.ranker import load_ranker
+from ...detector.pretrained import RANKER
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
 from ...features.selection import SelectionOptions

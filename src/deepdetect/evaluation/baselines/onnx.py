@@ -11,10 +11,10 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ..._shared.errors import WeightsError
+from ..._shared.opencv import cv2
 from ...detector.backends.without_telemetry import import_onnxruntime
 from .method import LocalFeature, external_feature
 

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 
+from ..._shared.opencv import cv2, opencv_factory
 from ...features.keypoints import Keypoints
 from ...io.image import luma
 from .method import BaselineError, LocalFeature, OwnScaleDescriptor
@@ -43,12 +43,6 @@ OPENCV_SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
     ),
 }
 """OpenCV's factory and its settings by name; all others have its defaults."""
-
-
-def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
-    """Return a factory of OpenCV's; version 5 moved some from `cv2` to `cv2.xfeatures2d`."""
-    home = cv2 if hasattr(cv2, name) else cv2.xfeatures2d
-    return getattr(home, name)
 
 
 def make_opencv(name: str) -> cv2.Feature2D:

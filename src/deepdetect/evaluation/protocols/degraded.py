@@ -7,9 +7,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import cv2
-
 from ..._shared.atomic import atomic_path
+from ..._shared.opencv import cv2
 from ...datasets.degradation import DEGRADATIONS, Degradation, degrade
 from ...datasets.types import PlanarPair
 from ...io.image import load_image

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 
+from ..._shared.opencv import cv2
 from ...datasets.posed_images import PosedPair
 from ...detector.detector import DeepDetect
 from ...detector.heatmap import HeatmapOptions

@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 
-import cv2
 import numpy as np
 
+from ..._shared.opencv import cv2
 from ...datasets.types import CalibratedStereoPair
 from ...detector.detector import DeepDetect, HeatmapDetector
 from ...detector.heatmap import HeatmapOptions

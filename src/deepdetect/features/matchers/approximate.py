@@ -9,10 +9,10 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ..._shared.errors import MissingExtraError
+from ..._shared.opencv import cv2
 
 FLANN_INDEX_KDTREE = 1
 

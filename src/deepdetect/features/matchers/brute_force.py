@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..._shared.opencv import cv2
 
 BLOCK_SIZE = 32_000_000
 """Numbers of four bytes that exact search holds at a time, to bound the memory (about 128 MB)."""

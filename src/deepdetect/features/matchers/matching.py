@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ..._shared.kernels import has_compiler
 from ..._shared.registry import look_up
 from .approximate import faiss_neighbours, flann_neighbours
 from .brute_force import exact_neighbours, hamming_neighbours
@@ -54,12 +55,13 @@ def automatic_neighbours(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find neighbours exactly where keypoints are few, else by PatchMatch, else by FLANN.
 
-    PatchMatch spreads good matches over dense keypoints, and needs their positions; FLANN does not.
+    PatchMatch spreads good matches over dense keypoints, and needs their positions and numba; FLANN
+    does not.
     Arguments and result as of `Matcher`.
     """
     if len(queries) * len(base) <= MAX_EXACT_PRODUCT:
         return exact_neighbours(queries, base, count, seed, positions)
-    if positions is not None:
+    if positions is not None and has_compiler():
         return patchmatch_neighbours(queries, base, count, seed, positions)
     return flann_neighbours(queries, base, count, seed, positions)
 

@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import pdtrc
 
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
@@ -163,8 +162,19 @@ def log10_chance(
             by_chance.append(further(back.T @ fundamental))
     expected = max(float(np.mean(by_chance)), 1.0)
     count = further(fundamental)
-    probability = float(pdtrc(count - 1, expected)) if count else 1.0
-    return math.log10(max(probability, 1e-300))
+    return math.log10(max(_poisson_tail(count, expected), 1e-300))
+
+
+def _poisson_tail(count: int, mean: float) -> float:
+    """Return the probability that a Poisson variable is at least `count`."""
+    # The terms e^-mean mean^k / k!, as far as they count.
+    first = count if count > mean else 0
+    last = int(max(count, mean) + 40 * math.sqrt(max(count, mean)) + 40)
+    steps = np.log(mean) - np.log(np.arange(first + 1, last + 1))
+    start = first * math.log(mean) - mean - math.lgamma(first + 1)
+    terms = np.exp(start + np.concatenate([[0.0], np.cumsum(steps)]))
+    # Small ones are added up directly, as one less the others would be rounded off.
+    return float(terms.sum()) if count > mean else float(max(0.0, 1 - terms[:count].sum()))
 
 
 def _lines(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:

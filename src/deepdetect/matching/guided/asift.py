@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
-import cv2
 import numpy as np
 
+from ..._shared.opencv import cv2
 from ..._shared.parallel import processor_count
 from ...features.keypoints import Keypoints
 from ...features.sift_detector import SiftOptions, detect_sift

@@ -15,9 +15,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
+from ..._shared.opencv import cv2
 from ...features.matches import GuidedMatches
 from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
 from ...geometry.homography_refinement import equalise

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
+
+from ..._shared.opencv import cv2
 
 MAX_DIFFERENCE_PX = 1.0
 """A disparity that differs by more from its neighbour's belongs to another surface."""

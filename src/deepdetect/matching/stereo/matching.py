@@ -6,11 +6,12 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-import cv2
 import numpy as np
 
 from ..._shared.errors import ImageError, OptionError
 from ..._shared.image_array import Channels
+from ..._shared.kernels import require_compiler
+from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
 from ...io.image import load_image, luma
@@ -220,6 +221,7 @@ def disparity_map(
     Raises:
         ImageError: the images cannot be read, or differ in size.
         OptionError: the disparity range is wider than the image.
+        MissingExtraError: numba is not installed.
 
     Example:
         >>> scene = np.random.default_rng(0).integers(0, 256, (64, 120), np.uint8)
@@ -257,6 +259,7 @@ def compute_disparity(
     if left.shape != right.shape:
         sizes = " and ".join(f"{view.shape[1]}x{view.shape[0]}" for view in (left, right))
         raise ImageError(f"the views of a rectified pair must have one size, not {sizes}")
+    require_compiler("stereo matching")
     disparities = _disparity_range(left, right, options)
     if disparities is None:
         nowhere = np.zeros(left.shape, bool)

@@ -15,9 +15,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
+from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 from .consistency import MAX_DIFFERENCE_PX

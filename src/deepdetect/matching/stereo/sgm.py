@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 

@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
-import cv2
 import numpy as np
 
 from ..._shared.errors import OptionError, RegistrationError
+from ..._shared.opencv import cv2
 from ..._shared.parallel import available_memory
 from ...geometry.rescaling import downscale, scaled_homography
 from ...geometry.residuals import transform_points

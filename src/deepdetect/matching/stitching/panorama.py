@@ -11,6 +11,7 @@ import numpy as np
 
 from ..._shared.errors import OptionError
 from ..._shared.image_array import Channels
+from ..._shared.kernels import require_compiler
 from ..._shared.options import suggest_keywords
 from ..._shared.timing import StageTimer
 from ...detector.detector import DeepDetect, HeatmapDetector
@@ -104,6 +105,7 @@ def stitch(
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is out of its range, there are fewer than two images, or the
             panorama would be too large.
+        MissingExtraError: numba is not installed.
         RegistrationError: no two images overlap, or one reaches the horizon of the reference.
 
     Example:
@@ -118,6 +120,7 @@ def stitch(
     """
     check_max_keypoints(max_keypoints)
     _check(images, reference, scale, max_canvas_megapixels, registration_side)
+    require_compiler("stitching")
     timer = StageTimer()
     small: dict[int, tuple[np.ndarray, float]] = {}
     sizes: dict[int, tuple[int, int]] = {}

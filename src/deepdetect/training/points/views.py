@@ -10,8 +10,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
+
+from ..._shared.opencv import cv2
 
 KINDS = ("zoom", "blur", "viewpoint", "light")
 

@@ -1,0 +1,134 @@
+"""OpenCV, imported when it is first used, whichever of its packages is installed.
+
+This package depends on none of them: they all install into one folder `cv2`, so that a second one
+would replace the first. Modules write `from .._shared.opencv import cv2`.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import re
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+from .errors import MissingExtraError
+
+LOWEST_VERSION = (4, 10)
+"""The first one that works with NumPy 2."""
+
+DISTRIBUTIONS = (
+    "opencv-python",
+    "opencv-python-headless",
+    "opencv-contrib-python",
+    "opencv-contrib-python-headless",
+)
+"""The packages on PyPI that bring `cv2`."""
+
+
+NO_MEMORY_TO_LOAD = ("failed to map segment from shared object", "Cannot allocate memory")
+"""How glibc's words end where a library does not fit into the memory; it adds other reasons."""
+
+
+class _OpenCV(ModuleType):
+    """Stands for `cv2`, and imports it when it is asked for anything."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_opencv(), name)
+
+
+if TYPE_CHECKING:
+    import cv2 as cv2
+else:
+    cv2 = _OpenCV("cv2")
+
+
+@functools.cache
+def import_opencv() -> ModuleType:
+    """Import OpenCV.
+
+    Raises:
+        MissingExtraError: there is none, it cannot be imported, or it is too old.
+        MemoryError: it does not fit into the memory.
+    """
+    try:
+        found = importlib.import_module("cv2")
+    except ModuleNotFoundError as error:
+        if error.name != "cv2":
+            raise
+        raise MissingExtraError(
+            'OpenCV is not installed: `pip install "deepdetect[opencv]"` brings it, '
+            f"and so does any other package of OpenCV {_text(LOWEST_VERSION)} or later"
+        ) from None
+    except ImportError as error:
+        reason = (str(error).splitlines() or ["no reason given"])[0]
+        if reason.endswith(NO_MEMORY_TO_LOAD):
+            raise MemoryError(reason) from None
+        raise MissingExtraError(
+            f"the installed OpenCV cannot be imported ({reason}): repair it, or replace it by "
+            "opencv-python-headless, which needs no libraries of a screen"
+        ) from None
+    version = getattr(found, "__version__", None)
+    if version is None:  # a folder `cv2` that another package of OpenCV has left behind
+        names = installed_distributions()
+        raise MissingExtraError(
+            "the folder cv2 of the installed OpenCV is not complete, as after the removal of "
+            "another package of it: pip install --force-reinstall "
+            + (names[0] if names else "opencv-python-headless")
+        )
+    if tuple(int(part) for part in re.findall(r"\d+", version)[:2]) < LOWEST_VERSION:
+        raise MissingExtraError(
+            f"OpenCV {version} is installed, and {_text(LOWEST_VERSION)} or later is needed: "
+            f"pip install --upgrade {' '.join(installed_distributions()) or 'opencv-python'}"
+        )
+    return found
+
+
+def is_lack_of_memory(error: Exception) -> bool:
+    """Return whether an exception is OpenCV's for lack of memory; OpenCV is not imported for it."""
+    loaded = sys.modules.get("cv2")
+    if loaded is None or not isinstance(error, getattr(loaded, "error", ())):
+        return False
+    return bool(getattr(error, "code", None) == loaded.Error.StsNoMem)
+
+
+def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
+    """Return a factory of OpenCV, as "AgastFeatureDetector_create".
+
+    Version 5 moved some from `cv2` to `cv2.xfeatures2d`, which is one of the contrib modules.
+
+    Raises:
+        MissingExtraError: it is in the contrib modules, and these are not installed.
+    """
+    for home in (cv2, getattr(cv2, "xfeatures2d", None)):
+        if hasattr(home, name):
+            factory: Callable[..., cv2.Feature2D] = getattr(home, name)
+            return factory
+    short = name.removesuffix("_create").removesuffix("FeatureDetector").upper()
+    others = " ".join(each for each in installed_distributions() if "contrib" not in each)
+    raise MissingExtraError(
+        f"{short} needs OpenCV's contrib modules, which the installed OpenCV {cv2.__version__} "
+        "lacks: "
+        + (f"pip uninstall {others}, then " if others else "")
+        + "pip install --force-reinstall --no-deps opencv-contrib-python-headless"
+    )
+
+
+def installed_distributions() -> list[str]:
+    """Return which of the packages that bring `cv2` are installed."""
+    import importlib.metadata  # takes longer than all of this package
+
+    found = []
+    for name in DISTRIBUTIONS:
+        try:
+            importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        found.append(name)
+    return found
+
+
+def _text(version: tuple[int, ...]) -> str:
+    return ".".join(str(part) for part in version)

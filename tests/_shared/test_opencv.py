@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+
+import cv2
+import pytest
+
+from deepdetect._shared import opencv
+from deepdetect._shared.errors import MissingExtraError
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV is looked for once: here, in each test."""
+    opencv.import_opencv.cache_clear()
+    yield
+    monkeypatch.undo()
+    opencv.import_opencv.cache_clear()
+
+
+def put(monkeypatch: pytest.MonkeyPatch, **names: object) -> None:
+    """Put another OpenCV into the place of the installed one."""
+    other = ModuleType("cv2")
+    vars(other).update(names)
+    monkeypatch.setitem(sys.modules, "cv2", other)
+
+
+def test_it_stands_for_the_installed_one() -> None:
+    assert opencv.cv2.resize is cv2.resize
+    assert opencv.cv2.__version__ == cv2.__version__
+    assert not hasattr(opencv.cv2, "no_such_name")
+
+
+def test_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(MissingExtraError, match=r"OpenCV is not installed: .*deepdetect\[opencv\]"):
+        assert opencv.cv2.resize
+
+
+@pytest.mark.parametrize("version", ["4.9.0", "3.4.18", "4.9.0-dev"])
+def test_too_old(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
+    put(monkeypatch, __version__=version)
+    with pytest.raises(MissingExtraError, match=rf"OpenCV {version} is installed, and 4\.10 or"):
+        assert opencv.cv2.resize
+
+
+@pytest.mark.parametrize("version", ["4.10.0", "4.14.0-pre", "5.0.0"])
+def test_new_enough(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
+    put(monkeypatch, __version__=version, resize=7)
+    assert opencv.cv2.resize == 7
+
+
+def test_an_empty_folder_that_another_package_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    put(monkeypatch)
+    with pytest.raises(MissingExtraError, match=r"not complete.*--force-reinstall opencv"):
+        assert opencv.cv2.resize
+
+
+def test_libraries_of_a_screen_that_are_missing(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "cv2.py").write_text("raise ImportError('libGL.so.1: cannot open\\nmore')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "cv2")
+    with pytest.raises(MissingExtraError, match=r"cannot be imported \(libGL.so.1: cannot open\)"):
+        assert opencv.cv2.resize
+
+
+@pytest.mark.parametrize("home", ["main", "xfeatures2d"])
+def test_factories_of_both_places(monkeypatch: pytest.MonkeyPatch, home: str) -> None:
+    contrib = ModuleType("xfeatures2d")
+    put(monkeypatch, __version__="5.0.0", xfeatures2d=contrib)
+    place = sys.modules["cv2"] if home == "main" else contrib
+    place.BRISK_create = len
+    assert opencv.opencv_factory("BRISK_create") is len
+
+
+def test_factories_of_contrib_modules_that_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    put(monkeypatch, __version__="5.0.0")
+    monkeypatch.setattr(opencv, "installed_distributions", lambda: ["opencv-python"])
+    words = "AGAST needs .*contrib modules.* 5.0.0 lacks: pip uninstall opencv-python, then pip"
+    with pytest.raises(MissingExtraError, match=words):
+        opencv.opencv_factory("AgastFeatureDetector_create")
+
+
+def test_what_is_installed() -> None:
+    assert set(opencv.installed_distributions()) <= set(opencv.DISTRIBUTIONS)

@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+import pytest
+
+from deepdetect import DeepDetect
+from deepdetect._shared.errors import OptionError, WeightsError
+from deepdetect.detector.backends.onnxruntime_backend import open_onnxruntime
+from deepdetect.detector.backends.options import RuntimeOptions
+from deepdetect.detector.pretrained import pretrained_weights
+
+CUDA = RuntimeOptions("onnxruntime", ("CUDAExecutionProvider", "CPUExecutionProvider"))
+
+
+@pytest.fixture
+def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for a build with CUDA whose libraries are missing."""
+    session = onnxruntime.InferenceSession
+
+    def start(path: str, *args: Any, providers: Sequence[str], **named: Any) -> Any:
+        if "CUDAExecutionProvider" in providers:
+            raise RuntimeError("CUDA failure 35: driver is insufficient\nsecond line")
+        return session(path, *args, providers=providers, **named)
+
+    known = ["CUDAExecutionProvider", "CPUExecutionProvider"]
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: known)
+    monkeypatch.setattr(onnxruntime, "InferenceSession", start)
+
+
+def test_a_provider_that_cannot_start_is_no_damaged_file(broken_cuda: None) -> None:
+    with pytest.raises(OptionError, match=r"could not start .CUDA failure 35: driver is insuff"):
+        open_onnxruntime(pretrained_weights(), CUDA)
+
+
+def test_a_damaged_file_is_named_whatever_the_provider(broken_cuda: None, tmp_path: Path) -> None:
+    path = tmp_path / "damaged.onnx"
+    path.write_bytes(pretrained_weights().read_bytes()[:1000])
+    with pytest.raises(WeightsError, match=r"damaged\.onnx is not an ONNX file"):
+        open_onnxruntime(path, CUDA)
+
+
+def test_memory_that_was_given_back_changes_no_answer() -> None:
+    network: Any = DeepDetect(backend="onnxruntime", threads=1)._network
+    image = np.random.default_rng(0).random((1, 3, 64, 96), np.float32)
+    before = network(image)
+    network.release_memory()
+    np.testing.assert_array_equal(network(image), before)
