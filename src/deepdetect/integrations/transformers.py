@@ -80,13 +80,18 @@ class DeepDetectConfig(PreTrainedConfig):
         )
 
 
+LOGIT_OUTSIDE = -100.0
+"""Of pixels outside an image, beside larger ones: their probability is 0."""
+
+
 @dataclass
 class DeepDetectKeypointOutput(ModelOutput):
     """What the model returns for a batch of images.
 
     Attributes:
         loss: the binary cross-entropy, where labels were given.
-        logits: (B, H, W) of the probability of a keypoint at each pixel.
+        logits: (B, H, W) of the probability of a keypoint at each pixel; -100 outside of images
+            that are smaller than others of the batch.
         keypoints: (B, N, 2) relative positions (x, y): (0, 0) is the upper left corner of the image
             and (1, 1) its lower right one, so that the centre of the first of W pixels is 0.5 / W.
             `DeepDetectImageProcessor.post_process_keypoint_detection` turns them to pixels.
@@ -166,18 +171,17 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
             **keywords: not used; programs that go through all models give some.
         """
         import torch
-        from torch.nn.functional import binary_cross_entropy_with_logits, pad
+        from torch.nn.functional import binary_cross_entropy_with_logits
 
-        height, width = pixel_values.shape[-2:]
-        filled = pad(pixel_values, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate")
-        logits = self.network(filled)[:, 0, :height, :width]
+        sizes = _sizes(pixel_values, pixel_mask)
+        logits = self._logits(pixel_values, sizes)
         loss = None
         if labels is not None:
             weight = None if pixel_mask is None else pixel_mask.to(logits.dtype)
             loss = binary_cross_entropy_with_logits(
                 logits, labels.to(logits.dtype), weight, reduction="sum"
             ) / (logits.numel() if weight is None else weight.sum())
-        found = self._select(logits, pixel_mask)
+        found = self._select(logits, sizes)
         most = max(len(points) for points in found)
         keypoints, scores = (
             logits.new_zeros(len(found), most, 2),
@@ -196,17 +200,30 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
             return_dict = getattr(self.config, "return_dict", True)
         return output if return_dict else output.to_tuple()
 
-    def _select(self, logits: Tensor, pixel_mask: Tensor | None) -> list[Keypoints]:
-        """Select the keypoints of each image inside its mask."""
+    def _logits(self, pixel_values: Tensor, sizes: list[tuple[int, int]]) -> Tensor:
+        """Run the network on images of equal size together: each gets what it gets alone."""
+        from torch.nn.functional import pad
+
+        shape = (len(sizes), *pixel_values.shape[-2:])
+        logits = pixel_values.new_full(shape, LOGIT_OUTSIDE)
+        for height, width in set(sizes):
+            rows = [row for row, size in enumerate(sizes) if size == (height, width)]
+            filled = pad(
+                pixel_values[rows, :, :height, :width],
+                (0, -width % STRIDE, 0, -height % STRIDE),
+                mode="replicate",
+            )
+            logits[rows, :height, :width] = self.network(filled)[:, 0, :height, :width].to(logits)
+        return logits
+
+    def _select(self, logits: Tensor, sizes: list[tuple[int, int]]) -> list[Keypoints]:
+        """Select the keypoints of each image."""
         options = self.config.selection()
-        found = []
-        for row, values in enumerate(logits.detach().float().cpu().numpy()):
-            height, width = values.shape
-            if pixel_mask is not None:
-                inside = pixel_mask[row] > 0
-                height, width = int(inside[:, 0].sum()), int(inside[0].sum())
-            found.append(select_by_logits(np.ascontiguousarray(values[:height, :width]), options))
-        return found
+        maps = logits.detach().float().cpu().numpy()
+        return [
+            select_by_logits(np.ascontiguousarray(values[:height, :width]), options)
+            for values, (height, width) in zip(maps, sizes, strict=True)
+        ]
 
 
 class DeepDetectImageProcessor(BaseImageProcessor):
@@ -318,6 +335,16 @@ def register() -> None:
     transformers.AutoImageProcessor.register(
         config, slow_image_processor_class=DeepDetectImageProcessor, exist_ok=True
     )
+
+
+def _sizes(pixel_values: Tensor, pixel_mask: Tensor | None) -> list[tuple[int, int]]:
+    """Return the height and width of each image of a batch."""
+    if pixel_mask is None:
+        height, width = pixel_values.shape[-2:]
+        return [(height, width)] * len(pixel_values)
+    inside = pixel_mask > 0
+    heights, widths = inside[:, :, 0].sum(dim=1).tolist(), inside[:, 0].sum(dim=1).tolist()
+    return list(zip(heights, widths, strict=True))
 
 
 def _listed(images: Any) -> list[Any]:
