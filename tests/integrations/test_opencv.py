@@ -106,6 +106,8 @@ def test_it_is_no_feature2d() -> None:
 def test_wrong_use(bgr: np.ndarray) -> None:
     with pytest.raises(OptionError, match="did you mean 'bgr'"):
         DeepDetectFeature2D(channels="bgra")  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="did you mean 'max_keypoints'"):
+        DeepDetectFeature2D(nmax_keypoints=9)  # type: ignore[call-arg]
     with pytest.raises(OptionError, match="max_keypoints"):
         DeepDetectFeature2D(0)
     with pytest.raises(OptionError, match="the method compute"):

@@ -180,5 +180,7 @@ def test_wrong_use() -> None:
         DeepDetectImageProcessor(max_pixels=0)
     with pytest.raises(WeightsError, match="there is no weights file"):
         DeepDetectForKeypointDetection.from_deepdetect("missing/weights.safetensors")
+    with pytest.raises(OptionError, match="did you mean 'max_keypoints'"):
+        DeepDetectForKeypointDetection.from_deepdetect(max_keypoint=9)
     with pytest.raises(OptionError, match="there are no images"):
         DeepDetectImageProcessor()([])

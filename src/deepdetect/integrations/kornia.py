@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
 from ..detector.detector import DeepDetect
 from ..features.keypoints import Keypoints
 from .described_points import PointExtractor, Spread, image_from_tensor, unit_descriptors
@@ -38,6 +39,7 @@ class DeepDetectDetector(Module):
         MissingExtraError: torch or kornia is not installed.
     """
 
+    @suggest_keywords
     def __init__(
         self,
         max_keypoints: int = 2048,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import suggest_keywords
 from ..detector.detector import DeepDetect
 from ..features.keypoints import Keypoints
 from ..features.scale_space import SIZE_PER_SIGMA
@@ -82,6 +83,7 @@ class DeepDetectExtractor(Module):
         MissingExtraError: torch is not installed.
     """
 
+    @suggest_keywords
     def __init__(
         self,
         max_num_keypoints: int = 2048,

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
+from .._shared.options import suggest_keywords
 from ..detector.detector import DeepDetect
 from ..features.keypoints import Keypoints
 from ..features.scale_space import nearest_layers
@@ -40,6 +41,7 @@ class DeepDetectFeature2D:
         (4, (4, 128))
     """
 
+    @suggest_keywords
     def __init__(
         self,
         max_keypoints: int = 2048,

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
 from ..detector.detector import DeepDetect
 from ..features.keypoints import Keypoints
 from ..features.scale_space import SIZE_PER_SIGMA
@@ -54,6 +55,7 @@ class DeepDetectFeatures:
     responses: np.ndarray | None = None
     descriptors: np.ndarray | None = None
 
+    @suggest_keywords
     def __init__(
         self,
         max_keypoints: int = 2048,

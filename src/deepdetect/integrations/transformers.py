@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS, STRIDE
 from ..detector.pretrained import resolve_weights
 from ..features.keypoints import Keypoints
@@ -131,21 +132,33 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
         self.post_init()
 
     @classmethod
+    @suggest_keywords
     def from_deepdetect(
-        cls, weights: str | Path = "default", **config: Any
+        cls,
+        weights: str | Path = "default",
+        *,
+        keypoint_threshold: float = 0.5,
+        max_keypoints: int | None = None,
+        nms_radius: int | None = None,
     ) -> DeepDetectForKeypointDetection:
         """Return the model with weights of DeepDetect, in evaluation mode.
 
         Args:
             weights: "default" or "dense", the weights inside the package, or a safetensors file
                 that `deepdetect train` has written.
-            **config: of `DeepDetectConfig`.
+            keypoint_threshold, max_keypoints, nms_radius: as of `DeepDetectConfig`.
 
         Raises:
             WeightsError: the weights are missing, damaged or do not fit.
             OptionError: an option is unknown or out of its range.
         """
-        model = cls(DeepDetectConfig(**config))
+        model = cls(
+            DeepDetectConfig(
+                keypoint_threshold=keypoint_threshold,
+                max_keypoints=max_keypoints,
+                nms_radius=nms_radius,
+            )
+        )
         from ..detector.network.weights import load_network
 
         network = load_network(resolve_weights(weights, ".safetensors"))
