@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-
 from .._shared.errors import OptionError, unknown_name
 from .._shared.options import suggest_keywords
 from ..detector.detector import DeepDetect
@@ -17,7 +15,7 @@ from ..features.keypoints import Keypoints
 from ..features.scale_space import SIZE_PER_SIGMA
 from ..io.image import load_image
 from .described_points import PointExtractor, Spread, image_from_tensor, unit_descriptors
-from .packages import base_class, missing_package
+from .packages import base_class
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -34,6 +32,8 @@ MAX_KEYPOINTS = 4096
 
 def to_lightglue(points: Keypoints, scale: Scale = "diameter") -> dict[str, Tensor]:
     """Convert described keypoints to the features of one image that LightGlue takes.
+
+    It is `Keypoints.to_lightglue` with descriptors of length 1, as LightGlue's weights want them.
 
     Args:
         points: with sizes, angles and descriptors.
@@ -54,19 +54,10 @@ def to_lightglue(points: Keypoints, scale: Scale = "diameter") -> dict[str, Tens
         raise unknown_name("scale", scale, SCALES)
     if points.sizes is None or points.angles is None or points.descriptors is None:
         raise OptionError("LightGlue needs keypoints with sizes, angles and descriptors")
-    try:
-        import torch
-    except ImportError:
-        raise missing_package("torch") from None
-    arrays = {
-        "keypoints": points.xy,
-        "keypoint_scores": points.scores,
-        "descriptors": unit_descriptors(points),
-        "scales": points.sizes / (1 if scale == "diameter" else SIZE_PER_SIGMA),
-        "oris": np.deg2rad(points.angles),
-        "image_size": np.array(points.image_size),
-    }
-    return {name: torch.from_numpy(value).float()[None] for name, value in arrays.items()}
+    features: dict[str, Tensor] = points.to_lightglue(unit_descriptors(points))
+    if scale == "sigma":
+        features["scales"] = features["scales"] / SIZE_PER_SIGMA
+    return features
 
 
 class DeepDetectExtractor(Module):

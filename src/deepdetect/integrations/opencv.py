@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError
+from .._shared.image_array import Channels, check_channels
 from .._shared.options import suggest_keywords
 from ..detector.detector import DeepDetect
 from ..features.keypoints import Keypoints
@@ -47,11 +48,10 @@ class DeepDetectFeature2D:
         max_keypoints: int = 2048,
         *,
         spread: Spread = "none",
-        channels: Literal["bgr", "rgb"] = "bgr",
+        channels: Channels = "bgr",
         detector: DeepDetect | None = None,
     ) -> None:
-        if channels not in ("bgr", "rgb"):
-            raise unknown_name("order of channels", channels, ("bgr", "rgb"))
+        check_channels(channels)
         self._channels = channels
         self._points = PointExtractor(max_keypoints, spread, detector)
 
@@ -130,10 +130,7 @@ class DeepDetectFeature2D:
         return "Feature2D.DeepDetect"
 
     def _load(self, image: Any) -> np.ndarray:
-        rgb = load_image(image)
-        colours = isinstance(image, np.ndarray) and image.ndim == 3 and image.shape[2] >= 3
-        turned = colours and self._channels == "bgr"
-        return np.ascontiguousarray(rgb[:, :, ::-1]) if turned else rgb
+        return load_image(image, channels=self._channels)
 
 
 def _ignored(mask: np.ndarray | None) -> np.ndarray | None:
