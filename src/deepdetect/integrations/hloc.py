@@ -1,0 +1,199 @@
+"""hloc (Hierarchical-Localization): an extractor, a matcher of its features, and a dense matcher.
+
+`register()` makes hloc find them by the name "deepdetect".
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._shared.errors import OptionError, unknown_name
+from ..detector.detector import DeepDetect
+from ..features.matchers import get_matcher, match_descriptors
+from ..matching.pipeline import match_images
+from .described_points import PointExtractor, image_from_tensor, unit_descriptors
+from .packages import base_class, import_package
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from .packages import AnyBase as BaseModel
+else:
+    BaseModel = base_class("hloc.utils.base_model", "BaseModel")
+
+NAME = "deepdetect"
+
+MAX_KEYPOINTS = np.iinfo(np.int16).max
+"""Hloc writes the rows of matches as int16."""
+
+EXTRACTOR_CONF: dict[str, Any] = {
+    "output": "feats-deepdetect-n4096",
+    "model": {"name": NAME, "max_keypoints": 4096},
+    "preprocessing": {"grayscale": False, "resize_max": 1600},
+}
+"""For `hloc.extract_features.main`."""
+
+MATCHER_CONF: dict[str, Any] = {
+    "output": "matches-deepdetect",
+    "model": {"name": NAME},
+}
+"""For `hloc.match_features.main`."""
+
+DENSE_MATCHER_CONF: dict[str, Any] = {
+    "output": "matches-deepdetect-dense",
+    "model": {"name": f"{NAME}_dense"},
+    "preprocessing": {"grayscale": False, "resize_max": 1024, "dfactor": 8},
+    "max_error": 2,
+    "cell_size": 8,
+}
+"""For `hloc.match_dense.main`: errors and cells, in pixels, of the keypoints that matches join."""
+
+
+class DeepDetectExtractor(BaseModel):
+    """The best keypoints of all scales with RootSIFT descriptors, for `hloc.extract_features`.
+
+    Its options in hloc's configuration: `max_keypoints`; `spread` as of `DeepDetect.detect`; and
+    `angle_unit` of `oris`, "degrees" as of hloc's own SIFT, or "radians" as LightGlue wants them.
+    Positions are float64, which hloc does not round to half precision.
+    """
+
+    default_conf: dict[str, Any] = {  # noqa: RUF012  # hloc's way to declare it
+        "max_keypoints": 4096,
+        "spread": "none",
+        "angle_unit": "degrees",
+    }
+    required_inputs = ["image"]  # noqa: RUF012
+    detection_noise = 1.0
+
+    def _init(self, conf: dict[str, Any]) -> None:
+        _check_names(conf, self.default_conf)
+        if conf["angle_unit"] not in ("degrees", "radians"):
+            raise unknown_name("angle unit", conf["angle_unit"], ("degrees", "radians"))
+        if conf["max_keypoints"] > MAX_KEYPOINTS:
+            raise OptionError(
+                f"hloc can match up to {MAX_KEYPOINTS} keypoints, not {conf['max_keypoints']}: "
+                "give fewer as `max_keypoints`"
+            )
+        self._points = PointExtractor(conf["max_keypoints"], conf["spread"])
+        self._radians = conf["angle_unit"] == "radians"
+
+    def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
+        import torch
+
+        image = data["image"]
+        points = self._points.detect_and_describe(image_from_tensor(image[0]))
+        assert points.angles is not None
+        arrays = {
+            "keypoints": points.xy.astype(np.float64),
+            "scores": points.scores,
+            "descriptors": unit_descriptors(points).T.copy(),
+            "scales": points.sizes,
+            "oris": np.deg2rad(points.angles) if self._radians else points.angles,
+        }
+        return {name: torch.from_numpy(a)[None].to(image.device) for name, a in arrays.items()}
+
+
+class DeepDetectMatcher(BaseModel):
+    """Nearest neighbours of descriptors with the ratio test, for `hloc.match_features`.
+
+    Its options in hloc's configuration: `ratio`, the largest, and `mutual`, as of
+    `DeepDetect`'s unguided matches. It matches the features of any extractor whose descriptors are
+    compared by their Euclidean distance.
+    """
+
+    default_conf: dict[str, Any] = {"ratio": 0.85, "mutual": True}  # noqa: RUF012
+    required_inputs = ["descriptors0", "descriptors1"]  # noqa: RUF012
+
+    def _init(self, conf: dict[str, Any]) -> None:
+        _check_names(conf, self.default_conf)
+        if not 0 < conf["ratio"] <= 1:
+            raise OptionError(f"`ratio` must lie in (0, 1], not {conf['ratio']}")
+        self._ratio, self._mutual = float(conf["ratio"]), bool(conf["mutual"])
+
+    def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
+        import torch
+
+        described = [data[name][0].T.cpu().float().numpy() for name in self.required_inputs]
+        if len(described[1]) > MAX_KEYPOINTS:
+            raise OptionError(
+                f"hloc can match up to {MAX_KEYPOINTS} keypoints, not {len(described[1])}: "
+                "extract fewer"
+            )
+        first, second = (np.ascontiguousarray(descriptors) for descriptors in described)
+        found = match_descriptors(
+            first, second, get_matcher("exact"), ratio=self._ratio, mutual=self._mutual
+        )
+        matches = np.full(len(described[0]), -1, np.int64)
+        scores = np.zeros(len(described[0]), np.float32)
+        matches[found.rows0], scores[found.rows0] = found.rows1, 1 - found.ratios
+        return {
+            "matches0": torch.from_numpy(matches)[None],
+            "matching_scores0": torch.from_numpy(scores)[None],
+        }
+
+
+class DeepDetectDenseMatcher(BaseModel):
+    """Dense guided matches of two images, for `hloc.match_dense`.
+
+    Its options in hloc's configuration: `weights` as of `DeepDetect`, and `max_keypoints`, None for
+    dense keypoints. Where no geometry can be trusted there are no matches.
+    """
+
+    default_conf: dict[str, Any] = {"weights": "default", "max_keypoints": None}  # noqa: RUF012
+    required_inputs = ["image0", "image1"]  # noqa: RUF012
+
+    def _init(self, conf: dict[str, Any]) -> None:
+        _check_names(conf, self.default_conf)
+        self._detector = DeepDetect(conf["weights"])
+        self._max_keypoints = conf["max_keypoints"]
+
+    def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
+        import torch
+
+        # Hloc wants the positions in the first image to be the refined ones; ours are the second's.
+        second, first = (image_from_tensor(data[name][0]) for name in ("image1", "image0"))
+        matches = match_images(second, first, self._detector, max_keypoints=self._max_keypoints)
+        arrays = {
+            "keypoints0": matches.points1,
+            "keypoints1": matches.points0,
+            "scores": matches.scores,
+        }
+        device = data["image0"].device
+        return {name: torch.from_numpy(a).float().to(device) for name, a in arrays.items()}
+
+
+def register() -> None:
+    """Make hloc find the extractor, the matcher and the dense matcher by their names.
+
+    Call it once in the program that calls hloc; then `{"name": "deepdetect"}` is an extractor of
+    `hloc.extract_features` and a matcher of `hloc.match_features`, and `{"name":
+    "deepdetect_dense"}` a matcher of `hloc.match_dense`.
+
+    Raises:
+        MissingExtraError: hloc is not installed.
+    """
+    models = (
+        ("hloc.extractors", NAME, DeepDetectExtractor),
+        ("hloc.matchers", NAME, DeepDetectMatcher),
+        ("hloc.matchers", f"{NAME}_dense", DeepDetectDenseMatcher),
+    )
+    for package, name, model in models:
+        parent = import_package(package)
+        # Hloc imports a module by name, and takes the one model that says it is from there.
+        module = ModuleType(f"{package}.{name}", model.__doc__)
+        model.__module__ = module.__name__
+        setattr(module, model.__name__, model)
+        sys.modules[module.__name__] = module
+        setattr(parent, name, module)
+
+
+def _check_names(conf: dict[str, Any], known: Iterable[str]) -> None:
+    """Refuse options that a model does not have; "name" is hloc's own."""
+    for name in conf:
+        if name not in {"name", *known}:
+            raise unknown_name("option", name, known)

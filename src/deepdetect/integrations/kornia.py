@@ -1,0 +1,143 @@
+"""kornia: modules that find and describe keypoints as local affine frames (LAFs)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
+from ..detector.detector import DeepDetect
+from ..features.keypoints import Keypoints
+from .described_points import PointExtractor, Spread, image_from_tensor, unit_descriptors
+from .packages import base_class, import_package
+
+if TYPE_CHECKING:
+    from torch import Tensor
+    from torch.nn import Module
+else:
+    Module = base_class("torch.nn", "Module")
+
+LAF_SCALE_PER_SIZE = 3.0
+"""A LAF's scale is half the side of the patch that is described: six sigma, as SIFT's."""
+
+
+class DeepDetectDetector(Module):
+    """Finds the best keypoints of all scales, for `kornia.feature.LocalFeature`.
+
+    It takes the place of `kornia.feature.ScaleSpaceDetector`; kornia describes the keypoints. No
+    gradients pass through it.
+
+    Args:
+        max_keypoints: at most this many in an image.
+        spread: "none", "grid" or "anms", as of `DeepDetect.detect`.
+        detector: with options of its own.
+
+    Raises:
+        OptionError: an option is unknown or out of its range.
+        MissingExtraError: torch or kornia is not installed.
+    """
+
+    @suggest_keywords
+    def __init__(
+        self,
+        max_keypoints: int = 2048,
+        *,
+        spread: Spread = "none",
+        detector: DeepDetect | None = None,
+    ) -> None:
+        super().__init__()
+        self._laf_from_center_scale_ori = import_package("kornia.feature").laf_from_center_scale_ori
+        self._points = PointExtractor(max_keypoints, spread, detector)
+
+    def forward(self, img: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Find keypoints.
+
+        Args:
+            img: (B, 1, H, W) or (B, 3, H, W) in [0, 1], RGB.
+            mask: (B, 1, H, W), above 0 where keypoints are wanted.
+
+        Returns:
+            (B, N, 2, 3) LAFs and (B, N) scores, best first, where N is that of the image with the
+            most keypoints; the others end with LAFs and scores of 0, as of kornia's detectors.
+            Where there are no keypoints N is 0.
+
+        Raises:
+            ImageError: an image is not fit.
+        """
+        import torch
+
+        found = [
+            self._points.detect(image_from_tensor(one), hidden)
+            for one, hidden in zip(img, _hidden(mask, img), strict=True)
+        ]
+        lafs = [self._lafs(points) for points in found]
+        scores = [torch.from_numpy(points.scores) for points in found]
+        return _padded(lafs, img), _padded(scores, img)
+
+    def _lafs(self, points: Keypoints) -> Tensor:
+        """Return (N, 2, 3) frames."""
+        import torch
+
+        assert points.sizes is not None
+        assert points.angles is not None
+        if not len(points):
+            return torch.zeros(0, 2, 3)
+        scales = torch.from_numpy(LAF_SCALE_PER_SIZE * points.sizes).view(1, -1, 1, 1)
+        # Kornia's angles grow against the clock, OpenCV's and ours with it.
+        angles = torch.from_numpy(-points.angles).view(1, -1, 1)
+        lafs: Tensor = self._laf_from_center_scale_ori(
+            torch.from_numpy(points.xy)[None], scales, angles
+        )[0]
+        return lafs
+
+
+class DeepDetectFeature(DeepDetectDetector):
+    """Finds and describes the best keypoints, for `kornia.feature.LocalFeatureMatcher`.
+
+    It takes the place of `kornia.feature.LocalFeature`, and describes keypoints by RootSIFT.
+    Arguments and errors as of `DeepDetectDetector`.
+    """
+
+    def forward(  # type: ignore[override]  # as kornia's features differ from its detectors
+        self, img: Tensor, mask: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Find and describe keypoints.
+
+        Args:
+            img, mask: as of `DeepDetectDetector`.
+
+        Returns:
+            (B, N, 2, 3) LAFs and (B, N) scores as of `DeepDetectDetector`, and (B, N, 128)
+            descriptors of length 1.
+        """
+        import torch
+
+        found = [
+            self._points.detect_and_describe(image_from_tensor(one), hidden)
+            for one, hidden in zip(img, _hidden(mask, img), strict=True)
+        ]
+        lafs = [self._lafs(points) for points in found]
+        scores = [torch.from_numpy(points.scores) for points in found]
+        descriptors = [torch.from_numpy(unit_descriptors(points)) for points in found]
+        return _padded(lafs, img), _padded(scores, img), _padded(descriptors, img)
+
+
+def _hidden(mask: Tensor | None, img: Tensor) -> list[np.ndarray | None]:
+    """Return for each image where no keypoint is wanted."""
+    if mask is None:
+        return [None] * len(img)
+    if mask.shape != (len(img), 1, *img.shape[-2:]):
+        raise OptionError(
+            f"the mask must have the shape {(len(img), 1, *img.shape[-2:])}, "
+            f"not {tuple(mask.shape)}"
+        )
+    return [(one[0] <= 0).cpu().numpy() for one in mask]
+
+
+def _padded(rows: list[Tensor], img: Tensor) -> Tensor:
+    """Return tensors of unequal lengths as one, filled with zeros, where the images are."""
+    from torch.nn.utils.rnn import pad_sequence
+
+    return pad_sequence(rows, batch_first=True).to(img.device)

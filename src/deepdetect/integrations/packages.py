@@ -1,0 +1,88 @@
+"""The packages of other programs, which need not be installed."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
+from .._shared.errors import MissingExtraError
+
+if TYPE_CHECKING:
+
+    class AnyBase:
+        """What type checkers take for a base class that they do not know."""
+
+        def __init__(self, *arguments: Any, **keywords: Any) -> None: ...
+
+        def __getattr__(self, name: str) -> Any: ...
+
+
+HOW_TO_INSTALL = {
+    "hloc": "pip install git+https://github.com/cvg/Hierarchical-Localization",
+}
+"""Of packages that are not on PyPI under their name."""
+
+
+def missing_package(module: str) -> MissingExtraError:
+    """Return the error for a package that is not installed, for the caller to raise.
+
+    Example:
+        >>> print(missing_package("h5py"))
+        the drop-in for h5py needs the package h5py, which is not installed: run pip install h5py
+    """
+    package = module.partition(".")[0]
+    install = HOW_TO_INSTALL.get(package, f"pip install {package}")
+    program = "PyTorch" if package == "torch" else package
+    return MissingExtraError(
+        f"the drop-in for {program} needs the package {package}, which is not installed: "
+        f"run {install}"
+    )
+
+
+def import_package(module: str) -> Any:
+    """Import a module of a package that need not be installed.
+
+    Raises:
+        MissingExtraError: the package is not installed.
+    """
+    if importlib.util.find_spec(module.partition(".")[0]) is None:
+        raise missing_package(module)
+    return importlib.import_module(module)
+
+
+class _Missing(type):
+    """The type of classes whose base is missing: all that one does with them raises an error."""
+
+    module: str
+
+    def __call__(cls, *args: object, **keywords: object) -> Any:
+        raise missing_package(cls.module)
+
+    def __getattr__(cls, name: str) -> Any:
+        if name.startswith("_"):  # Python looks for many of these
+            raise AttributeError(name)
+        raise missing_package(cls.module)
+
+
+def base_class(module: str, name: str) -> type:
+    """Return a class to derive from, of a package that need not be installed.
+
+    Without the package modules can still be imported; what is derived from the class raises a
+    MissingExtraError when it is used.
+
+    Args:
+        module: where the class is, as "torch.nn".
+        name: of the class.
+
+    Example:
+        >>> base_class("no_such_package", "Model")()
+        Traceback (most recent call last):
+        ...
+        deepdetect.MissingExtraError: the drop-in for no_such_package needs the package \
+no_such_package, which is not installed: run pip install no_such_package
+    """
+    if importlib.util.find_spec(module.partition(".")[0]) is None:
+        return _Missing(name, (), {"module": module})
+    found: type = getattr(importlib.import_module(module), name)
+    return found

@@ -1,0 +1,67 @@
+"""Two views of a photograph, and what is known of them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import cv2
+import numpy as np
+import pytest
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """A photograph, the same turned and enlarged, (H, W, 3) uint8 RGB, and the (2, 3) affinity."""
+
+    first: np.ndarray
+    second: np.ndarray
+    affinity: np.ndarray
+
+    def correct(self, points0: np.ndarray, points1: np.ndarray, within_px: float = 3) -> float:
+        """Return the share of matches that the affinity confirms."""
+        assert len(points0) == len(points1) > 0
+        moved = np.asarray(points0, np.float64) @ self.affinity[:, :2].T + self.affinity[:, 2]
+        return float((np.hypot(*(moved - points1).T) < within_px).mean())
+
+
+@pytest.fixture(scope="session")
+def views(photo: np.ndarray) -> Views:
+    """Not square, so that swapped axes fail; turned by 30 degrees, enlarged by 1.2."""
+    first = np.ascontiguousarray(photo[:200])
+    affinity = cv2.getRotationMatrix2D((128, 100), 30, 1.2)
+    second = cv2.warpAffine(first, affinity, (256, 200), flags=cv2.INTER_CUBIC)
+    return Views(first, second, affinity)
+
+
+@pytest.fixture
+def stand_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[[str, dict[str, str], ModuleType], ModuleType]]:
+    """Take a package, or where it is missing one of the same contract, for a module of ours."""
+    import importlib
+    import importlib.util
+
+    used: list[tuple[str, ModuleType]] = []
+
+    def take(package: str, files: dict[str, str], module: ModuleType) -> ModuleType:
+        if importlib.util.find_spec(package) is None:
+            for name, text in files.items():
+                path = tmp_path / "stand-ins" / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text)
+            monkeypatch.syspath_prepend(tmp_path / "stand-ins")
+            used.append((package, module))
+            importlib.reload(module)
+        return module
+
+    yield take
+    monkeypatch.undo()
+    for package, module in used:
+        for name in [n for n in sys.modules if n == package or n.startswith(f"{package}.")]:
+            del sys.modules[name]
+        importlib.invalidate_caches()
+        importlib.reload(module)

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, MissingExtraError, OptionError
+from deepdetect.integrations.kornia import DeepDetectDetector, DeepDetectFeature
+from deepdetect.io.image import luma
+
+from .conftest import Views
+
+torch = pytest.importorskip("torch", reason="needs torch")
+kornia_feature = pytest.importorskip("kornia.feature", reason="needs kornia")
+
+
+def tensor(*images: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float() / 255
+
+
+def test_frames_are_those_of_the_detector(views: Views) -> None:
+    expected = DeepDetect().detect(views.first, max_keypoints=100)
+    lafs, scores = DeepDetectDetector(100)(tensor(views.first))
+    assert lafs.shape == (1, 100, 2, 3)
+    assert np.array_equal(kornia_feature.get_laf_center(lafs)[0], expected.xy)
+    assert np.array_equal(scores[0], expected.scores)
+
+
+def test_patches_are_what_sift_describes(views: Views) -> None:
+    """A SIFT descriptor covers a square of six times the size, its x axis along the angle."""
+    points = DeepDetect().detect(views.first, max_keypoints=200)
+    inside = np.abs(points.xy - (127.5, 99.5)) < (127.5, 99.5) - 4.3 * points.sizes[:, None]
+    rows = np.flatnonzero(inside.all(axis=1))
+    assert len(rows) > 30
+    gray = luma(views.first)
+    image = tensor(views.first).mean(1, keepdim=True)
+    lafs = DeepDetectDetector(200)(tensor(views.first))[0][:, rows]
+    patches = kornia_feature.extract_patches_from_pyramid(image, lafs, 16)[0, :, 0].numpy()
+    for row, patch in zip(rows, patches, strict=True):
+        (x, y), size, angle = points.xy[row], points.sizes[row], np.deg2rad(points.angles[row])
+        axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        step = 6 * size / 16
+        to_image = np.column_stack([step * axes, (x, y) - step * axes @ (7.5, 7.5)])
+        smooth = cv2.GaussianBlur(gray, (0, 0), 0.4 * step)
+        expected = cv2.warpAffine(
+            smooth, to_image, (16, 16), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
+        assert np.corrcoef(patch.ravel(), expected.ravel())[0, 1] > 0.9, row
+
+
+def test_sizes_and_angles_are_as_of_kornias_sift(views: Views) -> None:
+    """Where OpenCV's and kornia's SIFT find a place, the frames made by our rule agree."""
+    gray = luma(views.first)
+    with torch.inference_mode():
+        image = torch.from_numpy(gray)[None, None] / 255
+        lafs = kornia_feature.SIFTFeatureScaleSpace(300)(image)[0]
+    keypoints = cv2.SIFT_create(300, enable_precise_upscale=True).detect(gray, None)
+    xy = np.array([k.pt for k in keypoints])
+    distances = np.linalg.norm(
+        xy[:, None] - kornia_feature.get_laf_center(lafs)[0].numpy()[None], axis=2
+    )
+    rows0, rows1 = np.nonzero(distances < 0.5)
+    assert len(rows0) > 40
+    scales = kornia_feature.get_laf_scale(lafs)[0, rows1, 0, 0].numpy()
+    sizes = np.array([keypoints[row].size for row in rows0])
+    assert np.median(scales / sizes) == pytest.approx(3, rel=0.05)
+    angles = kornia_feature.get_laf_orientation(lafs)[0, rows1, 0].numpy()
+    turned = np.array([keypoints[row].angle for row in rows0]) + angles
+    assert np.median(np.abs((turned + 180) % 360 - 180)) < 10
+
+
+@pytest.mark.parametrize("descriptor", ["ours", "kornia"])
+def test_matches_of_two_views(views: Views, descriptor: str) -> None:
+    local_feature = DeepDetectFeature(500)
+    if descriptor == "kornia":
+        patches = kornia_feature.LAFDescriptor(kornia_feature.SIFTDescriptor(32, rootsift=True))
+        local_feature = kornia_feature.LocalFeature(DeepDetectDetector(500), patches)
+    matcher = kornia_feature.LocalFeatureMatcher(
+        local_feature, kornia_feature.DescriptorMatcher("smnn", 0.9)
+    )
+    found = matcher({"image0": tensor(views.first), "image1": tensor(views.second)})
+    points0, points1 = found["keypoints0"].numpy(), found["keypoints1"].numpy()
+    assert len(points0) > 100
+    assert views.correct(points0, points1) > 0.85
+
+
+def test_a_batch_is_filled_as_kornia_does(views: Views) -> None:
+    flat = np.full_like(views.first, 90)
+    lafs, scores, descriptors = DeepDetectFeature(50)(tensor(views.first, flat))
+    assert (lafs.shape[:2], scores.shape, descriptors.shape) == ((2, 50), (2, 50), (2, 50, 128))
+    assert kornia_feature.laf_is_filled(lafs).sum(dim=1).tolist() == [50, 0]
+    assert torch.allclose(descriptors[0].norm(dim=1), torch.ones(50))
+    alone = DeepDetectFeature(50)(tensor(flat))
+    assert [len(part[0]) for part in alone] == [0, 0, 0]
+
+
+def test_a_mask_hides(views: Views) -> None:
+    mask = torch.zeros(1, 1, 200, 256)
+    mask[:, :, :, :100] = 1
+    lafs, _ = DeepDetectDetector(50)(tensor(views.first), mask)
+    assert kornia_feature.get_laf_center(lafs)[..., 0].max() < 101
+    with pytest.raises(OptionError, match="the mask must have the shape"):
+        DeepDetectDetector(50)(tensor(views.first), mask[0])
+
+
+def test_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match="run pip install kornia"):
+        DeepDetectDetector()

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, Keypoints, OptionError
+from deepdetect.features.sift import described_at_own_size
+from deepdetect.integrations.lightglue import DeepDetectExtractor, to_lightglue
+from deepdetect.io.image import luma
+
+from .conftest import Views
+
+torch = pytest.importorskip("torch", reason="needs torch")
+
+
+def tensor(image: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(image.copy()).permute(2, 0, 1).float() / 255
+
+
+def test_sift_keypoints_become_what_lightglues_extractor_makes_of_them(views: Views) -> None:
+    """Its SIFT takes OpenCV's sizes and its angles in radians; RootSIFT is of length 1."""
+    gray = luma(views.first)
+    sift = cv2.SIFT_create(50, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(gray, None)
+    points = described_at_own_size(gray, Keypoints.from_opencv(keypoints, (256, 200)))
+    features = to_lightglue(points)
+    assert np.array_equal(features["keypoints"][0], [k.pt for k in keypoints])
+    assert np.array_equal(features["scales"][0], np.float32([k.size for k in keypoints]))
+    assert np.allclose(features["oris"][0], np.deg2rad([k.angle for k in keypoints]))
+    assert features["image_size"].tolist() == [[256, 200]]
+    expected = np.sqrt(descriptors / np.abs(descriptors).sum(axis=1, keepdims=True))
+    cosine = (features["descriptors"][0].numpy() * expected).sum(axis=1)
+    assert np.median(cosine) > 0.99
+    assert np.allclose(features["descriptors"][0].norm(dim=1), 1, atol=1e-6)
+    sigma = to_lightglue(points, "sigma")["scales"]
+    assert np.array_equal(2 * sigma, features["scales"])
+
+
+def test_the_extractor_gives_points(views: Views) -> None:
+    expected = DeepDetect().detect(views.first, max_keypoints=100)
+    features = DeepDetectExtractor(100).extract(tensor(views.first))
+    assert {name: tuple(value.shape) for name, value in features.items()} == {
+        "keypoints": (1, 100, 2),
+        "keypoint_scores": (1, 100),
+        "descriptors": (1, 100, 128),
+        "scales": (1, 100),
+        "oris": (1, 100),
+        "image_size": (1, 2),
+    }
+    assert {value.dtype for value in features.values()} == {torch.float32}
+    assert np.array_equal(features["keypoints"][0], expected.xy)
+    for image in (views.first, tensor(views.first)[None]):
+        again = DeepDetectExtractor(100).extract(image)
+        assert all(torch.equal(again[name], features[name]) for name in features)
+
+
+def test_scales_and_angles_are_as_kornia_makes_them_of_frames(views: Views) -> None:
+    """Of its frames kornia gives LightGlue a sixth of the scale, and the negative angle."""
+    feature = pytest.importorskip("kornia.feature", reason="needs kornia")
+    from deepdetect.integrations.kornia import DeepDetectDetector
+
+    lafs, _ = DeepDetectDetector(100)(tensor(views.first)[None])
+    features = DeepDetectExtractor(100, scale="sigma").extract(tensor(views.first))
+    assert torch.allclose(features["scales"], feature.get_laf_scale(lafs)[..., 0, 0] / 6)
+    turned = torch.deg2rad(feature.get_laf_orientation(lafs)[..., 0]) + features["oris"]
+    assert torch.allclose(torch.cos(turned), torch.ones(1), atol=1e-5)
+
+
+def test_lightglue_runs_on_our_points(views: Views) -> None:
+    """Wiring only: without its weights, which are not ours, the matches mean nothing."""
+    feature = pytest.importorskip("kornia.feature", reason="needs kornia")
+    torch.manual_seed(0)
+    matcher = feature.LightGlue(
+        None, input_dim=128, add_scale_ori=True, n_layers=2, filter_threshold=0.0
+    ).eval()
+    extractor = DeepDetectExtractor(60)
+    features = [extractor.extract(tensor(image)) for image in (views.first, views.second)]
+    with torch.inference_mode():
+        found = matcher({"image0": features[0], "image1": features[1]})
+    assert found["matches0"].shape == (1, 60)
+    assert found["log_assignment"].shape == (1, 61, 61)
+    assert found["log_assignment"].isfinite().all()
+    rows0, rows1 = found["matches"][0].T
+    assert len(rows0) > 0
+    assert int(max(rows0.max(), rows1.max())) < 60
+
+
+def test_wrong_use(views: Views) -> None:
+    with pytest.raises(OptionError, match="up to 4096 keypoints, not 5000"):
+        DeepDetectExtractor(5000)
+    with pytest.raises(OptionError, match="did you mean 'sigma'"):
+        DeepDetectExtractor(scale="sigmas")  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match="takes one image, not 2"):
+        DeepDetectExtractor().extract(torch.zeros(2, 3, 32, 32))
+    with pytest.raises(OptionError, match="sizes, angles and descriptors"):
+        to_lightglue(Keypoints([[1, 2]], [1], (8, 8)))

@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, Keypoints, OptionError
+from deepdetect.features.sift import described_at_own_size
+from deepdetect.integrations.skimage import DeepDetectFeatures
+from deepdetect.io.image import luma
+
+from .conftest import Views
+
+feature = pytest.importorskip("skimage.feature", reason="needs scikit-image")
+
+
+def test_rows_come_before_columns(views: Views) -> None:
+    expected = DeepDetect().detect(views.first, max_keypoints=100)
+    features = DeepDetectFeatures(100)
+    features.detect(views.first)
+    assert features.descriptors is None
+    assert np.array_equal(features.keypoints, expected.xy[:, ::-1])
+    assert np.array_equal(features.scales, expected.sizes / 2)
+    assert np.array_equal(features.orientations, np.deg2rad(expected.angles))
+    assert np.array_equal(features.responses, expected.scores)
+    features.extract(views.first)
+    described = described_at_own_size(luma(views.first), expected).descriptors
+    assert np.abs(features.descriptors.astype(int) - described).max() <= 1  # angles in radians
+    both = DeepDetectFeatures(100)
+    both.detect_and_extract(views.first)
+    assert np.array_equal(both.descriptors, described)
+
+
+def test_a_bright_spot_is_found_in_its_row_and_column() -> None:
+    image = np.zeros((60, 90))
+    image[20, 70] = 1
+    image = cv2.GaussianBlur(image, (0, 0), 3)
+    features = DeepDetectFeatures(1)
+    features.detect(image / image.max())
+    assert features.keypoints == pytest.approx(np.array([[20, 70]]), abs=0.2)
+    # Scikit-image finds it in the same place.
+    assert feature.peak_local_max(image).tolist() == [[20, 70]]
+
+
+def test_it_has_the_methods_and_attributes_of_sift(views: Views) -> None:
+    sift, ours = feature.SIFT(), DeepDetectFeatures(50)
+    for name in ("detect", "extract", "detect_and_extract"):
+        assert callable(getattr(sift, name))
+        assert callable(getattr(ours, name))
+    gray = luma(views.first) / 255
+    sift.detect_and_extract(gray)
+    ours.detect_and_extract(gray)
+    for name in ("keypoints", "orientations", "descriptors"):
+        theirs, own = getattr(sift, name), getattr(ours, name)
+        assert own.ndim == theirs.ndim
+        assert own.shape[1:] == theirs.shape[1:]
+    assert ours.descriptors.dtype == sift.descriptors.dtype
+    # The same unit: where both found a place, sigmas agree.
+    distances = np.hypot(*(sift.positions[:, None] - ours.keypoints[None]).transpose(2, 0, 1))
+    theirs, own = np.nonzero(distances < 0.5)
+    assert len(own) > 5
+    assert np.median(ours.scales[own] / sift.sigmas[theirs]) == pytest.approx(1.25, rel=0.2)
+
+
+def test_matches_of_two_views(views: Views) -> None:
+    found = []
+    for image in (views.first, views.second):
+        features = DeepDetectFeatures(500)
+        features.detect_and_extract(image)
+        found.append(features)
+    rows0, rows1 = feature.match_descriptors(
+        found[0].descriptors, found[1].descriptors, max_ratio=0.8, cross_check=True
+    ).T
+    points0, points1 = found[0].keypoints[rows0, ::-1], found[1].keypoints[rows1, ::-1]
+    assert len(rows0) > 100
+    assert views.correct(points0, points1) > 0.9
+
+
+def test_keypoints_of_scikit_images_corners_are_described(views: Views) -> None:
+    gray = luma(views.first) / 255
+    corners = feature.corner_peaks(feature.corner_harris(gray), min_distance=5)
+    features = DeepDetectFeatures()
+    features.extract(gray, corners, scales=4.0)
+    points = Keypoints(
+        corners[:, ::-1], np.ones(len(corners)), (256, 200), sizes=np.full(len(corners), 8.0)
+    )
+    turned = feature.corner_orientations(gray, corners, np.ones((3, 3)))
+    features_turned = DeepDetectFeatures()
+    features_turned.extract(gray, corners, 4.0, turned)
+    expected = described_at_own_size(
+        np.rint(gray * 255).astype(np.uint8),
+        Keypoints(
+            points.xy,
+            points.scores,
+            points.image_size,
+            sizes=points.sizes,
+            angles=np.rad2deg(turned) % 360,
+        ),
+    )
+    assert features.descriptors.shape == (len(corners), 128)
+    assert np.array_equal(features_turned.descriptors, expected.descriptors)
+
+
+def test_wrong_use(views: Views) -> None:
+    features = DeepDetectFeatures()
+    with pytest.raises(OptionError, match="call detect first"):
+        features.extract(views.first)
+    with pytest.raises(OptionError, match="need scales"):
+        features.extract(views.first, np.array([[5, 5]]))
+    with pytest.raises(OptionError, match="belong to keypoints"):
+        features.extract(views.first, scales=4.0)
