@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 VENV_OPENCV4 ?= .venv-opencv4
 VENV_LOWEST ?= .venv-lowest
+VENV_RAY ?= .venv-ray
+VENV_INTEGRATIONS ?= .venv-integrations
 DEMO_OUTPUT ?= demo-output
 # What installs the lock files: uv is eight times as fast as pip, which does the same.
 INSTALLER ?= uv
@@ -30,7 +32,7 @@ install_locked = $(call install,$(1)) --no-deps --require-hashes -r $(2)
 install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requirements/torch.txt
 install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
 
-.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-lowest coverage lint spelling types contracts check \
+.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest coverage lint spelling types contracts check \
 	format lock upgrade check-lock audit sbom dist clean
 
 demo: $(VENV)/.demo
@@ -41,7 +43,7 @@ test: $(VENV)/.test
 	$(VENV)/bin/python $(PYTEST) $(TESTS)
 
 # All tests, and ten minutes of wrong input and kills.
-test-all: $(VENV)/.test test-opencv4 onnxruntime
+test-all: $(VENV)/.test test-opencv4 test-ray test-integrations onnxruntime
 	$(VENV)/bin/python $(PYTEST) --runslow
 	$(VENV)/bin/python -m fuzz --seconds 540 --kills 8
 
@@ -57,6 +59,14 @@ onnxruntime: $(VENV)/.test
 
 test-opencv4: $(VENV_OPENCV4)/.test
 	$(VENV_OPENCV4)/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_OPENCV4)
+
+# Collections on a cluster of this machine.
+test-ray: $(VENV_RAY)/.test
+	$(VENV_RAY)/bin/python -m pytest -p no:cacheprovider --runslow tests/batch
+
+# Drop-ins for other programs, with these installed.
+test-integrations: $(VENV_INTEGRATIONS)/.test
+	$(VENV_INTEGRATIONS)/bin/python $(PYTEST) -p no:cacheprovider tests/integrations
 
 # The lowest versions that pyproject.toml allows, but for torch.
 test-lowest: $(VENV_LOWEST)/.test
@@ -109,7 +119,7 @@ dist: $(VENV)/.test
 	$(VENV)/bin/python -m build --no-isolation
 
 clean:
-	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(DEMO_OUTPUT)
+	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(VENV_RAY) $(VENV_INTEGRATIONS) $(DEMO_OUTPUT)
 	rm -rf build dist sbom.json htmlcov .coverage .coverage.* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 
 %/bin/uv: requirements/uv.txt
@@ -138,4 +148,15 @@ $(VENV_LOWEST)/.test: $(VENV_LOWEST)/bin/uv requirements/lowest.txt requirements
 	$(call install_locked,$(VENV_LOWEST),requirements/lowest.txt)
 	$(call install_torch,$(VENV_LOWEST))
 	$(call install_package,$(VENV_LOWEST))
+	touch $@
+
+$(VENV_RAY)/.test: $(VENV_RAY)/bin/uv requirements/ray.txt pyproject.toml
+	$(call install_locked,$(VENV_RAY),requirements/ray.txt)
+	$(call install_package,$(VENV_RAY))
+	touch $@
+
+$(VENV_INTEGRATIONS)/.test: $(VENV_INTEGRATIONS)/bin/uv requirements/integrations.txt requirements/torch.txt pyproject.toml
+	$(call install_locked,$(VENV_INTEGRATIONS),requirements/integrations.txt)
+	$(call install_torch,$(VENV_INTEGRATIONS))
+	$(call install_package,$(VENV_INTEGRATIONS))
 	touch $@

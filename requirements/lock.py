@@ -48,11 +48,11 @@ class LockFile:
     lowest: bool = False
 
 
-# `labels` and `opencv` bring two packages of one folder; `standard` brings `opencv`.
+# `labels` and `opencv` bring two packages of one folder; `standard` brings `opencv`. Ray is large.
 ALL_EXTRAS = tuple(
     extra
     for extra in PROJECT["project"]["optional-dependencies"]
-    if extra not in ("opencv", "standard")
+    if extra not in ("opencv", "ray", "standard")
 )
 LOCK_FILES = (
     LockFile("uv.txt", groups=("lock",), package=False),
@@ -63,6 +63,12 @@ LOCK_FILES = (
         groups=("build", "test"),
         extras=("benchmark", "demo", "labels", "match", "onnx"),
         overrides="requirements/opencv4.in",
+    ),
+    LockFile("ray.txt", groups=("build", "test"), extras=("demo", "labels", "match", "ray")),
+    LockFile(
+        "integrations.txt",
+        groups=("build", "test", "integrations"),
+        extras=("demo", "labels", "match", "train"),
     ),
     LockFile("lowest.txt", groups=("build", "test"), extras=ALL_EXTRAS, lowest=True),
 )
