@@ -2,6 +2,7 @@ from ._shared.errors import (
     DeepDetectError as DeepDetectError,
     ImageError as ImageError,
     MissingExtraError as MissingExtraError,
+    NoDepthError as NoDepthError,
     OptionError as OptionError,
     ReconstructionError as ReconstructionError,
     RegistrationError as RegistrationError,

@@ -37,6 +37,13 @@ class ReconstructionError(DeepDetectError, ValueError):
     """Two images give no depth; the message says which of the usual reasons. A `ValueError`."""
 
 
+class NoDepthError(ReconstructionError):
+    """What two images show has no depth, or they do not overlap: nothing is wrong with the options.
+
+    The command line ends with exit code 3.
+    """
+
+
 class MissingExtraError(DeepDetectError, ImportError):
     """An optional package is needed for what was asked and is not installed; an `ImportError`."""
 
@@ -111,6 +118,7 @@ for _error in (
     DeepDetectError,
     ImageError,
     MissingExtraError,
+    NoDepthError,
     OptionError,
     ReconstructionError,
     RegistrationError,

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from .._shared.errors import BatchError, DeepDetectError, RegistrationError
+from .._shared.errors import BatchError, DeepDetectError, NoDepthError, RegistrationError
 from .._shared.kernels import announce_compilation
 from .._shared.progress import say
 from ._generated import with_flags
@@ -82,7 +82,7 @@ class Commands(click.Group):
         except DeepDetectError as error:
             command = self.get_command(context, context.invoked_subcommand or "")
             click.echo(f"deepdetect: {with_flags(str(error), command)}", err=True)
-            context.exit(3 if isinstance(error, RegistrationError) else 2)
+            context.exit(3 if isinstance(error, NoDepthError | RegistrationError) else 2)
         except KeyboardInterrupt:
             click.echo("deepdetect: stopped; what was written stays", err=True)
             context.exit(130)

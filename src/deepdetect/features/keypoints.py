@@ -172,7 +172,7 @@ class Keypoints:
         Returns:
             float32 tensors with a batch dimension: "keypoints" (1, N, 2), "keypoint_scores"
             (1, N), "scales" (1, N) in pixels, "oris" (1, N) in radians, "image_size" (1, 2) as
-            (width, height), and "descriptors" (1, N, D).
+            (width, height), and "descriptors" (1, N, D) of length 1.
 
         Raises:
             OptionError: there is not one descriptor for each keypoint.
@@ -198,7 +198,9 @@ class Keypoints:
             "image_size": np.array(self.image_size),
         }
         if described.descriptors is not None:
-            arrays["descriptors"] = described.descriptors
+            found = described.descriptors.astype(np.float32)
+            lengths = np.linalg.norm(found, axis=1, keepdims=True)
+            arrays["descriptors"] = found / np.maximum(lengths, np.finfo(np.float32).tiny)
         return {name: torch.tensor(a, dtype=torch.float32)[None] for name, a in arrays.items()}
 
     @suggest_keywords

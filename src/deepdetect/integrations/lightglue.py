@@ -14,7 +14,7 @@ from ..detector.detector import DeepDetect
 from ..features.keypoints import Keypoints
 from ..features.scale_space import SIZE_PER_SIGMA
 from ..io.image import load_image
-from .described_points import PointExtractor, Spread, image_from_tensor, unit_descriptors
+from .described_points import PointExtractor, Spread, image_from_tensor
 from .packages import base_class
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ MAX_KEYPOINTS = 4096
 def to_lightglue(points: Keypoints, scale: Scale = "diameter") -> dict[str, Tensor]:
     """Convert described keypoints to the features of one image that LightGlue takes.
 
-    It is `Keypoints.to_lightglue` with descriptors of length 1, as LightGlue's weights want them.
+    It is `Keypoints.to_lightglue` of keypoints that have all that LightGlue's weights want.
 
     Args:
         points: with sizes, angles and descriptors.
@@ -54,7 +54,7 @@ def to_lightglue(points: Keypoints, scale: Scale = "diameter") -> dict[str, Tens
         raise unknown_name("scale", scale, SCALES)
     if points.sizes is None or points.angles is None or points.descriptors is None:
         raise OptionError("LightGlue needs keypoints with sizes, angles and descriptors")
-    features: dict[str, Tensor] = points.to_lightglue(unit_descriptors(points))
+    features: dict[str, Tensor] = points.to_lightglue()
     if scale == "sigma":
         features["scales"] = features["scales"] / SIZE_PER_SIGMA
     return features

@@ -18,7 +18,7 @@ from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS, STRIDE
 from ..detector.pretrained import resolve_weights
 from ..features.keypoints import Keypoints
-from ..features.selection import SelectionOptions, select_by_logits
+from ..features.selection import Maps, SelectionOptions, select_from_maps
 from ..io.image import load_image
 from .described_points import image_from_tensor
 from .packages import base_class, import_package
@@ -234,7 +234,7 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
         options = self.config.selection()
         maps = logits.detach().float().cpu().numpy()
         return [
-            select_by_logits(np.ascontiguousarray(values[:height, :width]), options)
+            select_from_maps(Maps.of_logits(np.ascontiguousarray(values[:height, :width])), options)
             for values, (height, width) in zip(maps, sizes, strict=True)
         ]
 

@@ -1,6 +1,6 @@
 """Why two images give no depth, in one sentence and before any cloud is made.
 
-Each check raises `ReconstructionError` when its reason holds, and is silent on good pairs. They run
+Each check raises `NoDepthError` when its reason holds, and is silent on good pairs. They run
 in this order: `check_images`, `check_matches`, and with a pose those of `calibration_checks`; for
 rectified pairs `check_images`, then those of `rectified_checks`.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .._shared.errors import ReconstructionError
+from .._shared.errors import NoDepthError
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import grid_subsample
@@ -192,17 +192,17 @@ def check_images(
     Copies that lost more show the same view: `check_matches` and `check_disparities` refuse them.
 
     Raises:
-        ReconstructionError: they are the same.
+        NoDepthError: they are the same.
 
     Example:
         >>> check_images(np.zeros((20, 20), np.uint8), np.zeros((20, 20), np.uint8))
         Traceback (most recent call last):
         ...
-        deepdetect.ReconstructionError: both images are the same picture: depth needs two \
+        deepdetect.NoDepthError: both images are the same picture: depth needs two \
 photographs from two places
     """
     if gray0.shape == gray1.shape and _is_copy(gray0, gray1, options):
-        raise ReconstructionError(
+        raise NoDepthError(
             "both images are the same picture: depth needs two photographs from two places"
         )
 
@@ -228,7 +228,7 @@ def check_matches(
         What the pose is compared with.
 
     Raises:
-        ReconstructionError: too few matches agree with one geometry; nothing moves; or one
+        NoDepthError: too few matches agree with one geometry; nothing moves; or one
             homography explains them all.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
@@ -246,7 +246,7 @@ def check_matches(
         for model, threshold in thresholds.items()
     )
     if len(indices) < options.min_matches or epipolar.matrix is None:
-        raise ReconstructionError(_no_overlap(len(points0)))
+        raise NoDepthError(_no_overlap(len(points0)))
     off_plane = _plane_errors(first, second, plane.matrix)
     alarms = [
         log10_nfa(errors, model, thresholds[model], size1)
@@ -256,17 +256,17 @@ def check_matches(
         )
     ]
     if min(alarms) > MAX_LOG10_NFA:
-        raise ReconstructionError(_no_overlap(len(points0)))
+        raise NoDepthError(_no_overlap(len(points0)))
     motion = np.linalg.norm(second - first, axis=1)[epipolar.inliers | plane.inliers]
     if is_static(motion, options.static):
-        raise ReconstructionError(
+        raise NoDepthError(
             "nothing moves between the images: they show the same view, depth needs two "
             "photographs from two places"
         )
     planar = is_planar(first, second, plane, epipolar, options.min_planar_ratio, seed)
     if planar and not has_foreground(off_plane, epipolar.inliers, options.foreground):
         explained = first[plane.inliers], second[plane.inliers]
-        raise ReconstructionError(_no_depth(*explained, calibration, options))
+        raise NoDepthError(_no_depth(*explained, calibration, options))
     return Evidence(
         indices=indices,
         fundamental=epipolar.matrix,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .._shared.errors import ReconstructionError
+from .._shared.errors import NoDepthError, ReconstructionError
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import SelectionOptions, grid_subsample
@@ -143,16 +143,16 @@ def check_keypoints(keypoints: int, selection: SelectionOptions) -> None:
     """Refuse an image without keypoints.
 
     Raises:
-        ReconstructionError: there are none.
+        NoDepthError: there are none.
     """
     if keypoints:
         return
     if selection.density is not None:
-        raise ReconstructionError(
+        raise NoDepthError(
             f"a density of {selection.density:g} gives no keypoint in the left image: raise "
             "`density`"
         )
-    raise ReconstructionError(
+    raise NoDepthError(
         f"no pixel of the left image is above the threshold of {selection.threshold:g}: lower "
         "`threshold`, or give `density` (an image of one grey level shows nothing)"
     )
@@ -170,11 +170,11 @@ def check_matched(
         options: the thresholds.
 
     Raises:
-        ReconstructionError: there are too few.
+        NoDepthError: there are too few.
     """
     least = options.min_unique_fraction if unique else options.min_matched_fraction
     if matched < least * keypoints:
-        raise ReconstructionError(
+        raise NoDepthError(
             f"only {matched:,} of {keypoints:,} keypoints have a match on their row: the "
             "photographs hardly overlap or show different scenes, or the pair is not rectified"
         )
@@ -184,26 +184,26 @@ def check_disparities(disparity: np.ndarray, options: RectifiedCheckOptions = DE
     """Refuse disparities of a rectified pair that are all one value.
 
     Raises:
-        ReconstructionError: there are none, or they do not differ.
+        NoDepthError: there are none, or they do not differ.
 
     Example:
         >>> check_disparities(np.full(100, 7.0))
         Traceback (most recent call last):
         ...
-        deepdetect.ReconstructionError: all disparities are 7 px: one image is the other \
+        deepdetect.NoDepthError: all disparities are 7 px: one image is the other \
 shifted sideways, or both show one plane, and there is no depth
     """
     known = np.asarray(disparity)[np.isfinite(disparity)]
     if not len(known):
-        raise ReconstructionError("no disparity was found: the images do not overlap")
+        raise NoDepthError("no disparity was found: the images do not overlap")
     if is_static(known, options.static):
-        raise ReconstructionError(
+        raise NoDepthError(
             "all disparities are 0: both images were taken from one place, without a baseline"
         )
     low, middle, high = np.quantile(known, [0.05, 0.5, 0.95])
     if high - low >= options.min_disparity_spread_px:
         return
-    raise ReconstructionError(
+    raise NoDepthError(
         f"all disparities are {middle:.3g} px: one image is the other shifted sideways, or both "
         "show one plane, and there is no depth"
     )
@@ -223,7 +223,7 @@ def check_pure_rotation(
     the noise, a rotation is not noticed.
 
     Raises:
-        ReconstructionError: one rotation explains most disparities, and far better than a plane.
+        NoDepthError: one rotation explains most disparities, and far better than a plane.
     """
     chosen = np.arange(len(pixels))
     if len(chosen) > options.max_samples:
@@ -237,7 +237,7 @@ def check_pure_rotation(
     better = np.median(by_rotation) < options.max_ratio_to_plane * np.median(by_plane)
     explained = np.mean(by_rotation < options.max_error_px)
     if better and explained > options.min_explained_fraction:
-        raise ReconstructionError(
+        raise NoDepthError(
             "a rotation of the camera explains most disparities and there is no depth: move it "
             "sideways between the photographs"
         )
