@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .._shared.errors import BatchError, DeepDetectError, ImageError, OptionError
+from .._shared.errors import (
+    BatchError,
+    DeepDetectError,
+    ImageError,
+    OptionError,
+    RegistrationError,
+)
 from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
     DETECTOR,
@@ -17,6 +23,7 @@ from ._options import (
     json_option,
     make_detector,
     max_megapixels_option,
+    overwrite_option,
     print_result,
     report_failures,
     seconds_rows,
@@ -47,11 +54,13 @@ PANORAMA = FieldOptions(
     help="The one of IMAGES that is not distorted.  [default: the one in the middle]",
 )
 @max_megapixels_option
+@overwrite_option
 @json_option
 def stitch(
     images: tuple[Path, ...],
     output: Path,
     reference: Path | None,
+    overwrite: bool,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -64,8 +73,11 @@ def stitch(
     \b
     deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
     """
+    from .._shared.progress import stage_progress
+    from ..matching.stitching import STAGES
     from ..matching.stitching import stitch as stitch_images
     from ..viz.draw import picture_suffix, save_picture
+    from ._records import claim_outputs
 
     # Before the work, which would else be lost.
     picture_suffix(output)
@@ -78,15 +90,22 @@ def stitch(
     if len(images) < min(given, 2) or (reference is not None and reference not in images):
         what = "too few photographs, or not the reference, can be read"
         raise BatchError(f"there is no panorama, as {what}", failures)
+    claim_outputs("stitch", images, [output], overwrite)
     try:
-        panorama = stitch_images(
-            images,
-            detector=detector,
-            reference=None if reference is None else images.index(reference),
-            **given_only(values),
-        )
+        with stage_progress("stitching", STAGES) as done:
+            panorama = stitch_images(
+                images,
+                detector=detector,
+                reference=None if reference is None else images.index(reference),
+                progress=done,
+                **given_only(values),
+            )
     except DeepDetectError as error:
-        if type(error) not in (DeepDetectError, OptionError):  # an image, named as it was given
+        if type(error) not in (
+            DeepDetectError,
+            OptionError,
+            RegistrationError,
+        ):  # an image, named as it was given
             raise
         text = str(error)
         for number, path in enumerate(images):

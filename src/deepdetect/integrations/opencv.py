@@ -6,11 +6,11 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.image_array import Channels, check_channels
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.detector import DeepDetect
 from ..features.keypoints import Keypoints

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS, STRIDE
 from ..detector.pretrained import resolve_weights

@@ -1,6 +1,6 @@
 """Panoramas: photographs registered with each other by dense matches, and put together."""
 
 from .options import StitchingOptions
-from .panorama import Panorama, stitch
+from .panorama import STAGES, Panorama, stitch
 
-__all__ = ["Panorama", "StitchingOptions", "stitch"]
+__all__ = ["STAGES", "Panorama", "StitchingOptions", "stitch"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,9 @@ from ..guided import GuidedOptions
 from .compositing import composite, least_distorted, plan_canvas
 from .joint_registration import register_jointly
 from .options import DEFAULTS, StitchingOptions
+
+STAGES = ("reading", "registration", "compositing")
+"""Of a panorama."""
 
 
 @suggest_keywords
@@ -74,6 +77,7 @@ def stitch(
     max_keypoints: int | None = None,
     options: StitchingOptions = DEFAULTS,
     seed: int = 0,
+    progress: Callable[[str], object] | None = None,
 ) -> Panorama:
     """Make a flat panorama of photographs from one place, or of a plane.
 
@@ -97,6 +101,7 @@ def stitch(
             them, dense keypoints confirm them.
         options: what counts as an overlap, the joint fit, exposure, seams and blending.
         seed: of all random choices.
+        progress: called with the name of each stage (`STAGES`) when it ends.
 
     Returns:
         The panorama, of all photographs that could be connected.
@@ -121,6 +126,7 @@ def stitch(
     check_max_keypoints(max_keypoints)
     _check(images, reference, scale, max_canvas_megapixels, registration_side)
     require_compiler("stitching")
+    done = progress or (lambda stage: None)
     timer = StageTimer()
     small: dict[int, tuple[np.ndarray, float]] = {}
     sizes: dict[int, tuple[int, int]] = {}
@@ -130,6 +136,7 @@ def stitch(
             sizes[number] = (rgb.shape[1], rgb.shape[0])
             small[number] = downscale(rgb, registration_side)
         del rgb
+    done("reading")
     with timer.stage("registration"):
         registration = register_jointly(
             [rgb for rgb, _ in small.values()],
@@ -139,6 +146,7 @@ def stitch(
             options=options,
             seed=seed,
         )
+    done("registration")
     homographies = {
         number: scaled_homography(matrix, 1 / small[number][1], 1)
         for number, matrix in registration.homographies.items()
@@ -156,6 +164,7 @@ def stitch(
         panorama, valid, gains = composite(
             lambda number: load_image(images[number], channels=channels), small, canvas, options
         )
+    done("compositing")
     return Panorama(
         panorama,
         valid,
