@@ -10,8 +10,9 @@ import numpy as np
 from .._shared.errors import OptionError, unknown_name
 from .._shared.options import suggest_keywords
 
-UNITS = ("mm", "baseline")
-"""Millimetres, or the distance of the two cameras where it is not known."""
+UNITS = ("mm", "baseline", "spacing")
+"""Millimetres; where the scale is not known, the distance of the two cameras, or the median distance
+from one of many cameras to the nearest other one."""
 
 BOX_PERCENTILE = 1.0
 """Percent of the points that lie beyond each side of the robust box."""
@@ -23,12 +24,14 @@ MAX_ANGULAR_SPACING = 0.02
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class PointCloud:
-    """Coloured points in the frame of the left camera: x right, y down, z forward.
+    """Coloured points in the frame of a camera: x right, y down, z forward.
 
     Attributes:
-        points: (N, 3) float32 or float64 positions, the left camera's centre at (0, 0, 0).
+        points: (N, 3) float32 or float64 positions, the camera's centre at (0, 0, 0).
         colors: (N, 3) uint8 sRGB.
-        unit: "mm", or "baseline": lengths are multiples of the distance of the two cameras.
+        unit: "mm"; or lengths are multiples of the distance of the two cameras ("baseline"), or of
+            the median distance from one of many cameras to the nearest other one ("spacing").
+        frame: which camera that is.
 
     `len` and indexing by slices, masks and index arrays work.
 
@@ -45,6 +48,7 @@ class PointCloud:
     points: np.ndarray
     colors: np.ndarray
     unit: str
+    frame: str = "left camera"
 
     def __post_init__(self) -> None:
         if self.unit not in UNITS:
@@ -80,7 +84,7 @@ class PointCloud:
     def __getitem__(self, index: slice | np.ndarray | list[int]) -> PointCloud:
         if isinstance(index, (int, np.integer)):
             index = [int(index)]
-        return PointCloud(self.points[index], self.colors[index], self.unit)
+        return PointCloud(self.points[index], self.colors[index], self.unit, self.frame)
 
 
 @dataclass(frozen=True, eq=False)

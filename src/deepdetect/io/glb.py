@@ -17,12 +17,14 @@ import numpy as np
 
 from ..geometry.point_cloud import PointCloud
 
-METRES_PER_UNIT = {"mm": 1e-3, "baseline": 1.0}
-"""A baseline of unknown length becomes one metre, and the file says so."""
+METRES_PER_UNIT = {"mm": 1e-3, "baseline": 1.0, "spacing": 1.0}
+"""What has an unknown length becomes one metre, and the file says so."""
 
 SCALE_NOTES = {
     "mm": "metres",
     "baseline": "the scale is not known: 1 stands for the distance of the two cameras",
+    "spacing": "the scale is not known: 1 stands for the median distance from a camera to the "
+    "nearest other one",
 }
 
 FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
@@ -81,7 +83,7 @@ def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str])
             "generator": "deepdetect",
             "extras": {
                 "unit": SCALE_NOTES[cloud.unit],
-                "frame": "origin at the left camera, x right, y up, z backward",
+                "frame": f"origin at the {cloud.frame}, x right, y up, z backward",
                 "notes": dict(metadata),
             },
         },

@@ -8,14 +8,16 @@ from __future__ import annotations
 import base64
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from ..geometry.camera import Camera
 from ..geometry.point_cloud import PointCloud, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
@@ -27,8 +29,15 @@ MAX_LEVEL = 65535
 MARGIN = 1.0
 """Points further outside the robust box than this many times its size are left out."""
 
-UNIT_NAMES = {"mm": "mm", "baseline": "baselines (distance of the two cameras; no scale)"}
-SHORT_UNITS = {"mm": "mm", "baseline": "baselines"}
+UNIT_NAMES = {
+    "mm": "mm",
+    "baseline": "baselines (distance of the two cameras; no scale)",
+    "spacing": "spacings (median distance from a camera to the nearest other one; no scale)",
+}
+SHORT_UNITS = {"mm": "mm", "baseline": "baselines", "spacing": "spacings"}
+
+CAMERA_SIZE = 0.35
+"""Depth of the pyramid that stands for a camera, over the distance to the nearest other one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +58,40 @@ class PagePoints:
     left_out: int
 
 
-def write_html_page(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
+@dataclass(frozen=True, eq=False)
+class ViewerCamera:
+    """A camera that the page draws.
+
+    Attributes:
+        name: of its photograph.
+        camera: its intrinsics.
+        rotation, translation: (3, 3) and (3,), from the cloud's frame to the camera's.
+    """
+
+    name: str
+    camera: Camera
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) float64, in the cloud's frame."""
+        return np.asarray(-self.rotation.T @ self.translation)
+
+    def corners(self, depth: float) -> np.ndarray:
+        """Return the (4, 3) corners of what it sees at a depth, around the image."""
+        width, height = self.camera.size
+        pixels = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+        rays = self.camera.rays(pixels) * depth
+        return np.asarray((rays - self.translation) @ self.rotation)
+
+
+def write_html_page(
+    cloud: PointCloud,
+    path: Path,
+    metadata: Mapping[str, str],
+    cameras: Sequence[ViewerCamera] = (),
+) -> None:
     """Write the page: 12 bytes per point, as 16-bit positions and 8-bit colours in base64.
 
     Args:
@@ -57,6 +99,7 @@ def write_html_page(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) 
         path: the file.
         metadata: added to the caption, which has the counts, the unit and the precision; the
             entry "title" becomes the heading.
+        cameras: drawn as pyramids, with a line from each to the next.
     """
     stored = page_points(cloud)
     caption = {
@@ -71,7 +114,7 @@ def write_html_page(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) 
         "caption": "\n".join(
             f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in caption.items()
         ),
-        "cloud": json.dumps(_description(cloud, stored)),  # numbers and a known word only
+        "cloud": json.dumps(_description(cloud, stored, cameras)),  # numbers and a known word only
         "positions": _base64(stored.levels.astype("<u2")),
         "colors": _base64(stored.colors),
     }
@@ -103,10 +146,39 @@ def page_points(cloud: PointCloud) -> PagePoints:
     return PagePoints(levels, cloud.colors[near], low, step, int((~near).sum()))
 
 
-def _description(cloud: PointCloud, stored: PagePoints) -> dict[str, object]:
+def camera_lines(cameras: Sequence[ViewerCamera]) -> np.ndarray:
+    """Return the ends (N, 2, 3) of the lines that draw cameras, and the path from each to the next.
+
+    Example:
+        >>> poses = [(np.eye(3), np.array([x, 0.0, 0])) for x in (0.0, -1.0)]
+        >>> cameras = [ViewerCamera("", Camera((64, 48), 50.0), *pose) for pose in poses]
+        >>> camera_lines(cameras).shape, camera_lines(cameras)[-1].tolist()
+        ((17, 2, 3), [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    """
+    if not len(cameras):
+        return np.empty((0, 2, 3))
+    centres = np.array([camera.centre for camera in cameras])
+    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
+    np.fill_diagonal(distances, np.inf)
+    spacing = float(np.median(distances.min(axis=1))) if len(cameras) > 1 else 1.0
+    lines = []
+    for camera, centre in zip(cameras, centres, strict=True):
+        corners = camera.corners(CAMERA_SIZE * spacing)
+        lines += [(centre, corner) for corner in corners]
+        lines += [(corners[k - 1], corners[k]) for k in range(4)]
+    lines += list(pairwise(centres))
+    return np.array(lines) + 0.0  # no negative zeros
+
+
+def _description(
+    cloud: PointCloud, stored: PagePoints, cameras: Sequence[ViewerCamera] = ()
+) -> dict[str, object]:
     box = robust_box(cloud)
     corners = np.stack([stored.offset, stored.offset + MAX_LEVEL * stored.step])
     reach = np.linalg.norm(np.abs(corners - box.centre).max(0))
+    lines = camera_lines(cameras).reshape(-1, 3)
+    if len(lines):
+        reach = max(reach, np.linalg.norm(lines - box.centre, axis=1).max())
     return {
         "count": len(stored.levels),
         "unit": cloud.unit,
@@ -117,6 +189,7 @@ def _description(cloud: PointCloud, stored: PagePoints) -> dict[str, object]:
         "reach": float(reach),
         "spacing": angular_spacing(cloud),
         "slope": _largest_slope(cloud),
+        "lines": lines.round(6).ravel().tolist(),
     }
 
 

@@ -18,6 +18,7 @@ VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
 UNIT_NAMES = {
     "mm": "millimetres",
     "baseline": "baselines (1 = the distance of the two cameras)",
+    "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
 }
 
 
@@ -41,7 +42,7 @@ def _header(cloud: PointCloud, metadata: Mapping[str, str]) -> str:
     comments = [
         "written by deepdetect",
         f"unit: {UNIT_NAMES[cloud.unit]}",
-        "frame: left camera, x right, y down, z forward, origin at its centre",
+        f"frame: {cloud.frame}, x right, y down, z forward, origin at its centre",
         *(f"{name}: {text}" for name, text in metadata.items()),
     ]
     return "\n".join(

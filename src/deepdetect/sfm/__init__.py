@@ -1,0 +1,1 @@
+"""Structure from motion: cameras and dense points from many photographs."""

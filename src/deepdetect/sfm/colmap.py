@@ -1,0 +1,64 @@
+"""pycolmap: imported in the right order, and quiet."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from .._shared.errors import MissingExtraError
+
+PIXEL_CENTRE = 0.5
+"""COLMAP's position of the centre of the first pixel; ours is 0."""
+
+
+def import_pycolmap() -> Any:
+    """Import pycolmap, after OpenCV: the other way round some versions of both crash.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    import cv2  # noqa: F401
+
+    try:
+        import pycolmap
+    except ImportError:
+        raise MissingExtraError(
+            "a reconstruction from many photographs needs pycolmap: pip install 'deepdetect[sfm]'"
+        ) from None
+    return pycolmap
+
+
+@contextmanager
+def quiet_pycolmap() -> Iterator[Any]:
+    """Give pycolmap, and keep what it logs off standard error: its own settings do not.
+
+    What Python writes there is still seen.
+    """
+    pycolmap = import_pycolmap()
+    stream = sys.stderr
+    try:
+        own = stream.fileno() == 2
+    except (AttributeError, OSError, ValueError):
+        own = False
+    try:
+        stream.flush()
+        saved = os.dup(2)
+    except (AttributeError, OSError):  # without a standard error
+        yield pycolmap
+        return
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        if own:
+            sys.stderr = os.fdopen(os.dup(saved), "w", buffering=1, errors="backslashreplace")
+        yield pycolmap
+    finally:
+        if own:
+            sys.stderr.close()
+            sys.stderr = stream
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(null)

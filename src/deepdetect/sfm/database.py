@@ -1,0 +1,68 @@
+"""COLMAP's database: photographs, cameras, keypoints and matches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .colmap import PIXEL_CENTRE, quiet_pycolmap
+from .lens import Lens
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class DatabaseImage:
+    """A photograph in the database.
+
+    Attributes:
+        name: its path below the folder of the photographs.
+        lens: its camera; photographs with the same object share one.
+        xy: (N, 2) keypoints, centre of the first pixel (0, 0).
+    """
+
+    name: str
+    lens: Lens
+    xy: np.ndarray
+
+
+def write_database(
+    path: Path, images: Sequence[DatabaseImage], matches: Mapping[Pair, np.ndarray]
+) -> None:
+    """Write a new database of COLMAP.
+
+    Each photograph is a frame of its own, of a rig with its camera alone.
+
+    Args:
+        path: the file, which must not exist or be empty.
+        images: the photographs.
+        matches: (K, 2) rows of keypoints by the names of the two photographs.
+
+    Raises:
+        MissingExtraError: pycolmap is not installed.
+    """
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
+        cameras: dict[int, tuple[int, int]] = {}  # camera and rig by the object of the lens
+        numbers: dict[str, int] = {}
+        for image in images:
+            if id(image.lens) not in cameras:
+                camera = image.lens.colmap_camera()
+                camera.camera_id = database.write_camera(camera)
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(camera.sensor_id)
+                cameras[id(image.lens)] = camera.camera_id, database.write_rig(rig)
+            camera_id, rig_id = cameras[id(image.lens)]
+            row = pycolmap.Image(name=image.name, camera_id=camera_id)
+            row.image_id = numbers[image.name] = database.write_image(row)
+            frame = pycolmap.Frame()
+            frame.rig_id = rig_id
+            frame.add_data_id(row.data_id)
+            database.write_frame(frame)
+            keypoints = np.ascontiguousarray(image.xy + PIXEL_CENTRE, np.float32)
+            database.write_keypoints(row.image_id, keypoints)
+        for (name0, name1), rows in matches.items():
+            found = np.ascontiguousarray(rows, np.uint32).reshape(-1, 2)
+            database.write_matches(numbers[name0], numbers[name1], found)

@@ -1,0 +1,124 @@
+"""What many photographs gave: cameras, sparse and dense points, and what is known about them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..geometry.point_cloud import PointCloud
+from .lens import Lens
+from .views import PosedView
+
+SCALE = "lengths are in spacings, the median distance from a camera to the nearest other one: the \
+true scale is not known"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MultiViewReconstruction:
+    """Cameras and points of many photographs.
+
+    The world is the frame of the camera of `reference`: x right, y down, z forward. 1 is the median
+    distance from a camera to the nearest other one; the true scale is not known.
+
+    Attributes:
+        views: of the photographs that are part of it, by name; their cameras are pinhole cameras.
+        lenses: the same cameras with their distortion.
+        left_out: why each of the others is not, by name.
+        reference: name of the photograph whose camera's frame is the world.
+        sparse: the points by which the poses were estimated.
+        sparse_errors: (N,) float32 their mean reprojection errors in pixels.
+        sparse_views: (N,) int32 number of photographs that each of them is seen in.
+        dense: the dense points; without any where none were asked for.
+        dense_errors: (M,) float32 reprojection errors of these in pixels: the root mean square of
+            all photographs that agree.
+        dense_views: (M,) uint8 number of photographs that agree on each of them.
+        keypoints: number of keypoints of each photograph.
+        matched: number of verified matches of each pair that has some.
+        pairs: number of pairs that were matched.
+        seconds: time of each stage of this run; what an earlier run had done took none.
+        files: what was written.
+    """
+
+    views: Mapping[str, PosedView]
+    lenses: Mapping[str, Lens]
+    left_out: Mapping[str, str]
+    reference: str
+    sparse: PointCloud
+    sparse_errors: np.ndarray
+    sparse_views: np.ndarray
+    dense: PointCloud
+    dense_errors: np.ndarray
+    dense_views: np.ndarray
+    keypoints: Mapping[str, int]
+    matched: Mapping[tuple[str, str], int]
+    pairs: int
+    seconds: Mapping[str, float]
+    files: tuple[Path, ...]
+
+    def __repr__(self) -> str:
+        total = len(self.views) + len(self.left_out)
+        return (
+            f"MultiViewReconstruction({len(self.views)} of {total} photographs, "
+            f"{len(self.sparse):,} sparse and {len(self.dense):,} dense points)"
+        )
+
+    @property
+    def cloud(self) -> PointCloud:
+        """The dense points, or the sparse ones where there are none."""
+        return self.dense if len(self.dense) else self.sparse
+
+    @property
+    def centres(self) -> np.ndarray:
+        """(V, 3) float64 centres of the cameras, in the order of `views`: the path."""
+        return np.array([view.centre for view in self.views.values()]).reshape(-1, 3)
+
+    def summary(self) -> dict[str, Any]:
+        """Return all but the arrays as plain values for JSON: counts, times and errors."""
+        return {
+            "photographs": len(self.views) + len(self.left_out),
+            "registered": len(self.views),
+            "left_out": dict(self.left_out),
+            "reference": self.reference,
+            "scale": SCALE,
+            "keypoints": sum(self.keypoints.values()),
+            "pairs": self.pairs,
+            "verified_pairs": len(self.matched),
+            "verified_matches": sum(self.matched.values()),
+            "sparse_points": len(self.sparse),
+            "mean_track_length": _rounded(self.sparse_views, np.mean),
+            "mean_sparse_reprojection_error_px": _rounded(self.sparse_errors, np.mean),
+            "dense_points": len(self.dense),
+            "median_dense_reprojection_error_px": _rounded(self.dense_errors, np.median),
+            "dense_points_by_views": _counts(self.dense_views),
+            "cameras": {name: self._camera(name) for name in self.views},
+            "seconds": {stage: round(value, 3) for stage, value in self.seconds.items()},
+        }
+
+    def _camera(self, name: str) -> dict[str, Any]:
+        view, lens = self.views[name], self.lenses[name]
+        return {
+            "width": lens.size[0],
+            "height": lens.size[1],
+            "model": lens.model,
+            "focal_px": [round(value, 3) for value in view.camera.focal_px],
+            "cx": round(view.camera.centre[0], 3),
+            "cy": round(view.camera.centre[1], 3),
+            "colmap_params": [float(f"{value:.9g}") for value in lens.params],
+            "intrinsics": lens.source,
+            "rotation": view.rotation.tolist(),
+            "translation": np.asarray(view.translation).tolist(),
+            "centre": view.centre.tolist(),
+        }
+
+
+def _rounded(values: np.ndarray, function: Any) -> float | None:
+    return round(float(function(values)), 4) if len(values) else None
+
+
+def _counts(values: np.ndarray) -> dict[str, int]:
+    found, counts = np.unique(values, return_counts=True)
+    return {str(value): int(count) for value, count in zip(found, counts, strict=True)}
