@@ -51,6 +51,11 @@ from .matching.stereo.matching import (
     DisparityOptions as DisparityOptions,
     disparity_map as disparity_map,
 )
+from .sfm.pipeline import (
+    MultiViewOptions as MultiViewOptions,
+    reconstruct_many as reconstruct_many,
+)
+from .sfm.result import MultiViewReconstruction as MultiViewReconstruction
 from .training.recipe import TrainingOptions as TrainingOptions
 from .training.run import train as train
 

@@ -1,4 +1,4 @@
-"""`deepdetect reconstruct`: two photographs to a 3D point cloud and depth maps."""
+"""`deepdetect reconstruct`: two photographs, or a folder of them, to a 3D point cloud."""
 
 from __future__ import annotations
 
@@ -19,9 +19,12 @@ from ._options import (
     json_option,
     make_detector,
     max_megapixels_option,
+    overwrite_option,
     print_result,
+    processes_option,
     seconds_rows,
 )
+from ._reconstruct_many import MANY, OUTPUT, reconstruct_folder
 
 if TYPE_CHECKING:
     from ..io.depth import DepthPng
@@ -36,7 +39,11 @@ CAMERAS = FieldOptions(
     types={"calibration": PATH},
 )
 WHOLE_PIXEL_SELECTION = dataclasses.replace(SELECTION, skip=(*SELECTION.skip, "subpixel"))
-DENSE_DETECTOR = dataclasses.replace(DETECTOR, defaults={**DETECTOR.defaults, "weights": "dense"})
+DENSE_DETECTOR = dataclasses.replace(
+    DETECTOR, defaults={**DETECTOR.defaults, "weights": "dense, of more than two: default"}
+)
+
+MODEL = Path("deepdetect-output/model.ply")
 
 STAGES = 8
 """Of a reconstruction at most; the files are one more."""
@@ -46,42 +53,71 @@ STAGES = 8
     CAMERAS,
     WHOLE_PIXEL_SELECTION,
     DENSE_DETECTOR,
-    short_help="A 3D reconstruction of two photographs.",
+    MANY,
+    short_help="A 3D reconstruction of two photographs, or of many.",
 )
-@click.argument("left", type=PATH)
-@click.argument("right", type=PATH)
+@click.argument("images", type=PATH, nargs=-1, required=True)
 @click.option(
     "-o",
     "--output",
     type=PATH,
-    default=Path("deepdetect-output/model.ply"),
-    show_default=True,
-    help="The model, .ply, .glb or .html; the other files get its name and stand beside it.",
+    help="Of two photographs the model, .ply, .glb or .html; the other files get its name and "
+    f"stand beside it. Of more the folder for all files.  [default: {MODEL}; {OUTPUT}]",
 )
 @max_megapixels_option
+@processes_option
+@overwrite_option
 @json_option
 def reconstruct(
-    left: Path,
-    right: Path,
-    calibration: Path | None,
-    output: Path,
+    images: tuple[Path, ...],
+    output: Path | None,
+    workers: int | None,
+    overwrite: bool,
     as_json: bool,
     **values: Any,
 ) -> None:
-    """Reconstruct a cloud of coloured 3D points from the photographs LEFT and RIGHT.
+    """Reconstruct a cloud of coloured 3D points from IMAGES: two, or a folder or more of them.
 
-    Writes STEM.ply and STEM.glb (the points), STEM.html (an offline viewer), STEM_depth.jpg (a
-    coloured depth map to look at), STEM_depth.png (16 bits, with its scale), STEM_depth.npz
-    (floats; disparities too for rectified pairs), and STEM.json (counts, times and quality).
+    Two photographs, left and right: writes STEM.ply and STEM.glb (the points), STEM.html (an
+    offline viewer), STEM_depth.jpg (a coloured depth map to look at), STEM_depth.png (16 bits, with
+    its scale), STEM_depth.npz (floats; disparities too for rectified pairs), and STEM.json (counts,
+    times and quality).
 
     For rectified pairs the detector only chooses which pixels of a dense disparity map become
     points; --density 1 takes all of them.
+
+    A folder, or three and more photographs: their cameras are estimated, too. Writes model.ply,
+    model.glb, model.html (with the cameras), model.json, and COLMAP's sparse/ and database.db into
+    a folder. When it is interrupted or killed, the same command goes on. Photographs that cannot be
+    read, or show something else, are left out, and listed.
 
     \b
     deepdetect reconstruct left.png right.png --calibration calib.json -o model.ply
     deepdetect reconstruct left.jpg right.jpg --focal 1250 -o model.ply
     deepdetect reconstruct phone1.jpg phone2.jpg
+    deepdetect reconstruct photos/ -o model/
+    deepdetect reconstruct frames/ --sequential 8 -o model/
     """
+    folders = [path for path in images if path.is_dir()]
+    if len(images) > 2 or folders:
+        if folders and len(images) > 1:
+            raise click.UsageError("give one folder, or photographs: not both")
+        reconstruct_folder(images, output, workers, overwrite, as_json, values)
+        return
+    if len(images) < 2:
+        raise click.UsageError("give two photographs, or more, or a folder of them")
+    of_many = {name: values.pop(name) for name in MANY.names}
+    if given_only(of_many) or workers is not None or overwrite:
+        name = next(iter({**given_only(of_many), "workers": workers, "overwrite": overwrite}))
+        flag = MANY.flags.get(name, "--" + name.replace("_", "-"))
+        raise click.UsageError(f"{flag} is for more than two photographs")
+    _reconstruct_two(images[0], images[1], output or MODEL, as_json, **values)
+
+
+def _reconstruct_two(
+    left: Path, right: Path, output: Path, as_json: bool, calibration: Path | None, **values: Any
+) -> None:
+    """Reconstruct two photographs, and print what was found."""
     from .._shared.progress import progress
     from ..io.point_cloud import find_writer
     from ..reconstruction.pipeline import reconstruct as reconstruct_pair

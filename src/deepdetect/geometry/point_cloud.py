@@ -11,8 +11,8 @@ from .._shared.errors import OptionError, unknown_name
 from .._shared.options import suggest_keywords
 
 UNITS = ("mm", "baseline", "spacing")
-"""Millimetres; where the scale is not known, the distance of the two cameras, or the median distance
-from one of many cameras to the nearest other one."""
+"""Millimetres; where the scale is not known, the distance of the two cameras, or the median
+distance from one of many cameras to the nearest other one."""
 
 BOX_PERCENTILE = 1.0
 """Percent of the points that lie beyond each side of the robust box."""

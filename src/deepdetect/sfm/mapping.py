@@ -6,6 +6,7 @@ Schönberger and Frahm, "Structure-from-Motion Revisited", 2016.
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,9 +32,12 @@ class MappingOptions:
         min_verified: matches of a pair that must agree with a two-view geometry.
         max_verification_error_px: of a match that agrees.
         min_views: of a model; smaller ones are given up.
-        refine_tracks: align the patches around all observations of a point, and adjust again.
+        refine_tracks: align the patches around all observations of a point, and adjust again;
+            None: where the cameras are estimated.
         track_refinement: how they are aligned.
         robust_scale_px: of the loss (Cauchy) of the adjustment after that.
+        min_views_of_principal_point: photographs of each camera from which that adjustment also
+            estimates its principal point: with fewer it is in the middle.
         seed: of all random choices.
 
     Raises:
@@ -43,9 +47,10 @@ class MappingOptions:
     min_verified: int = 15
     max_verification_error_px: float = 4.0
     min_views: int = 3
-    refine_tracks: bool = False
+    refine_tracks: bool | None = None
     track_refinement: TrackRefinementOptions = field(default_factory=TrackRefinementOptions)
     robust_scale_px: float = 0.3
+    min_views_of_principal_point: int = 8
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -53,7 +58,7 @@ class MappingOptions:
             self,
             positive=("min_verified", "max_verification_error_px", "robust_scale_px"),
             not_negative=("seed",),
-            between={"min_views": (2, np.inf)},
+            between={"min_views": (2, np.inf), "min_views_of_principal_point": (3, np.inf)},
         )
 
 
@@ -260,17 +265,20 @@ def refine_model(
         # The last observation but one takes the point with it.
         if not good and model.images[image].points2D[row].has_point3D():
             model.delete_observation(image, row)
-    adjust(model, known_cameras, options.robust_scale_px)
+    adjust(model, known_cameras, options)
 
 
-def adjust(model: Any, known_cameras: bool, robust_scale_px: float) -> None:
+def adjust(model: Any, known_cameras: bool, options: MappingOptions) -> None:
     """Adjust all cameras and points (bundle adjustment) with a robust loss."""
+    taken = Counter(model.images[number].camera_id for number in model.reg_image_ids())
+    enough = min(taken.values()) >= options.min_views_of_principal_point
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.BundleAdjustmentOptions()
         how.refine_focal_length = how.refine_extra_params = not known_cameras
+        how.refine_principal_point = enough and not known_cameras
         how.print_summary = False
         how.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        how.ceres.loss_function_scale = robust_scale_px
+        how.ceres.loss_function_scale = options.robust_scale_px
         pycolmap.bundle_adjustment(model, how)
         model.update_point_3d_errors()
 

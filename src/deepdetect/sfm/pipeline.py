@@ -158,7 +158,8 @@ def reconstruct_many(
         max_keypoints: of each photograph.
         dense: whether dense points are made.
         stride_px: a dense point is sought at every so many pixels of a row and of a column.
-        refine_tracks: whether the patches around the observations of each sparse point are aligned.
+        refine_tracks: whether the patches around the observations of each sparse point are aligned,
+            and all is adjusted once more; None: where the cameras are estimated.
         single_camera: whether photographs of one size were taken by one camera.
         detector: arguments of `DeepDetect`.
         seed: of all random choices.
@@ -468,7 +469,7 @@ class _Run:
                 self.output / "database.db", folder, space, known, options, bar.update
             )
         shutil.rmtree(space, ignore_errors=True)
-        if options.refine_tracks:
+        if options.refine_tracks or (options.refine_tracks is None and not known):
             grays = {
                 model.images[number].name: luma(load_image(folder / model.images[number].name))
                 for number in model.reg_image_ids()

@@ -1,0 +1,95 @@
+"""`deepdetect reconstruct` with a folder, or with three or more photographs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ._generated import FieldOptions, given_only
+from ._options import DETECTOR, SELECTION, print_result, seconds_rows
+
+if TYPE_CHECKING:
+    from ..sfm.result import MultiViewReconstruction
+
+MANY = FieldOptions(
+    "sfm.pipeline:reconstruct_many",
+    names=("pairs", "sequential", "dense", "stride_px", "refine_tracks", "single_camera"),
+    flags={
+        "stride_px": "--stride",
+        "single_camera": "--single-camera/--camera-each",
+    },
+    metavars={"sequential": "N", "stride_px": "PX"},
+    defaults={"refine_tracks": "where the cameras are estimated", "stride_px": "2"},
+)
+"""Options that two photographs do not have."""
+
+OUTPUT = Path("deepdetect-output/model")
+
+
+def reconstruct_folder(
+    images: Sequence[Path],
+    output: Path | None,
+    workers: int | None,
+    overwrite: bool,
+    as_json: bool,
+    values: dict[str, Any],
+) -> None:
+    """Reconstruct many photographs, and print what was found."""
+    from ..features.selection import SelectionOptions
+    from ..sfm.pipeline import MultiViewOptions, reconstruct_many
+
+    target = OUTPUT if output is None else output
+    detector = given_only({name: values.pop(name) for name in DETECTOR.names})
+    if values.pop("rectified") is not None:
+        raise click.UsageError("--rectified and --not-rectified are for two photographs")
+    fields = {field.name for field in dataclasses.fields(SelectionOptions)} - {*SELECTION.skip}
+    selection = {name: values.pop(name) for name in fields if name in values}
+    options = MultiViewOptions()
+    chosen = dataclasses.replace(options.selection, **given_only(selection))
+    found = reconstruct_many(
+        images[0] if len(images) == 1 else images,
+        target,
+        detector=detector,
+        options=dataclasses.replace(options, selection=chosen),
+        workers=workers,
+        overwrite=overwrite,
+        quiet=False,
+        **given_only(values),
+    )
+    numbers = json.loads((target / "model.json").read_text(encoding="utf-8"))
+    print_result(as_json, numbers, _rows(found, numbers), str(images[0].parent))
+
+
+def _rows(found: MultiViewReconstruction, numbers: dict[str, Any]) -> list[tuple[str, str]]:
+    """Make the table of the terminal."""
+    cameras = list(numbers["cameras"].values())
+    focal = sorted({(camera["focal_px"][0], camera["intrinsics"]) for camera in cameras})
+    shown = ", ".join(f"{px:g} px ({source})" for px, source in focal[:3])
+    rows = [
+        ("photographs", f"{numbers['registered']} of {numbers['photographs']}"),
+        *((f"left out: {name}", reason) for name, reason in numbers["left_out"].items()),
+        ("focal length", shown + (", ..." if len(focal) > 3 else "")),
+        ("keypoints", f"{numbers['keypoints']:,}"),
+        ("pairs", f"{numbers['verified_pairs']:,} verified of {numbers['pairs']:,}"),
+        (
+            "sparse points",
+            f"{numbers['sparse_points']:,}, reprojection error "
+            f"{numbers['mean_sparse_reprojection_error_px']:.3f} px (mean)",
+        ),
+    ]
+    if numbers["dense_points"]:
+        error = numbers["median_dense_reprojection_error_px"]
+        rows.append(
+            (
+                "dense points",
+                f"{numbers['dense_points']:,}, reprojection error {error:.3f} px (median)",
+            )
+        )
+    rows += [("scale", numbers["scale"]), *seconds_rows(numbers["seconds"])]
+    rows.append(("written", ", ".join(numbers["files"])))
+    return rows

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import OptionError
+from deepdetect.features.sift import to_root_sift
+from deepdetect.sfm.pair_selection import (
+    PairSelectionOptions,
+    sequential_pairs,
+    similar_pairs,
+    vlad_vectors,
+)
+
+
+def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> None:
+    options = PairSelectionOptions(max_exhaustive=20)
+    assert [options.way(count) for count in (3, 20, 21)] == ["all", "all", "similar"]
+    assert PairSelectionOptions(pairs="sequential").way(3) == "sequential"
+
+
+@pytest.mark.parametrize("wrong", [{"pairs": "sequental"}, {"sequential": 0}, {"words": -1}])
+def test_wrong_options_are_refused(wrong: dict) -> None:
+    with pytest.raises(OptionError, match=r"sequential|must be above 0"):
+        PairSelectionOptions(**wrong)
+
+
+def test_a_sequence_is_matched_with_what_follows() -> None:
+    pairs = sequential_pairs("abcdef", 2)
+    assert len(pairs) == 2 * 6 - 3
+    assert all(0 < ord(b) - ord(a) <= 2 for a, b in pairs)
+
+
+def described(image: np.ndarray) -> np.ndarray:
+    found = to_root_sift(cv2.SIFT_create().detectAndCompute(image, None)[1].astype(np.uint8))
+    found = found.astype(np.float32)
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
+
+
+def test_views_of_one_thing_are_more_alike_than_others() -> None:
+    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    crops = []
+    color = (data.astronaut(), data.coffee(), data.chelsea())
+    for picture in (data.camera(), *(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in color)):
+        crops += [picture[:260, :340], picture[30:290, 60:400]]
+    vectors = vlad_vectors([described(np.ascontiguousarray(crop)) for crop in crops])
+    np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
+    pairs = similar_pairs([str(k) for k in range(8)], vectors, 1)
+    assert pairs == [("0", "1"), ("2", "3"), ("4", "5"), ("6", "7")]
+
+
+def test_a_photograph_without_keypoints_is_like_no_other() -> None:
+    rng = np.random.default_rng(0)
+    one = rng.random((30, 128), np.float32)
+    vectors = vlad_vectors([one, one[:0], rng.random((30, 128), np.float32)])
+    assert not vectors[1].any()
+    assert (vectors @ vectors[1] == 0).all()
+
+
+def test_pairs_are_listed_once_and_the_vocabulary_repeats() -> None:
+    rng = np.random.default_rng(1)
+    sets = [rng.random((50, 16), np.float32) for _ in range(6)]
+    vectors = vlad_vectors(sets)
+    np.testing.assert_array_equal(vectors, vlad_vectors(sets))
+    names = list("abcdef")
+    pairs = similar_pairs(names, vectors, 10)  # more than there are
+    assert pairs == list(itertools.combinations(names, 2))

@@ -1,0 +1,343 @@
+"""Small photographs of the fountain, whose cameras are known; and what goes wrong with folders."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import (
+    Camera,
+    ImageError,
+    MissingExtraError,
+    MultiViewReconstruction,
+    OptionError,
+    ReconstructionError,
+    reconstruct_many,
+)
+from deepdetect.sfm.dense import DenseOptions
+from deepdetect.sfm.pipeline import MultiViewOptions
+
+QUICK = {"workers": 1, "max_keypoints": 1500}
+
+
+def true_poses(shared: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return rotations and centres in metres, by name."""
+    from deepdetect.datasets.posed_images import load_posed_scenes
+
+    (scene,) = load_posed_scenes(shared / "data" / "fountain")
+    return {
+        image.path.name: (image.rotation, -image.rotation.T @ image.translation)
+        for image in scene.images
+    }
+
+
+def relative_rotation_error(views, truth) -> float:
+    """Return the mean error in degrees of rotations from the first view.
+
+    Four cameras stand nearly on a line, so that their centres say little of how it is turned.
+    """
+    first, *others = views
+    angles = []
+    for name in others:
+        own, known = (
+            rotations[name] @ rotations[first].T
+            for rotations in (
+                {each: view.rotation for each, view in views.items()},
+                {each: pose[0] for each, pose in truth.items()},
+            )
+        )
+        cosine = (np.trace(own @ known.T) - 1) / 2
+        angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return float(np.mean(angles))
+
+
+def pose_errors(views, truth) -> tuple[float, float, float]:
+    """Return mean errors of centres in mm, of rotations in degrees, and the scale, once aligned."""
+    names = list(views)
+    own = np.array([views[name].centre for name in names])
+    known = np.array([truth[name][1] for name in names])
+    means = own.mean(0), known.mean(0)
+    left, values, right = np.linalg.svd((known - means[1]).T @ (own - means[0]))
+    signs = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
+    turn = left @ signs @ right
+    scale = (values @ np.diag(signs)) / ((own - means[0]) ** 2).sum()
+    placed = scale * (own - means[0]) @ turn.T + means[1]
+    angles = []
+    for name in names:
+        both = views[name].rotation @ turn.T @ truth[name][0].T
+        angles.append(np.degrees(np.arccos(np.clip((np.trace(both) - 1) / 2, -1, 1))))
+    return (
+        1000 * float(np.linalg.norm(placed - known, axis=1).mean()),
+        float(np.mean(angles)),
+        scale,
+    )
+
+
+@pytest.fixture(scope="module")
+def small(write_fountain, tmp_path_factory) -> tuple[Path, Path]:
+    """A folder of good and bad photographs, and the one that its model was written to."""
+    pytest.importorskip("h5py", reason="needs h5py")
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    from PIL import Image
+
+    root = tmp_path_factory.mktemp("sfm")
+    folder = write_fountain(root / "photos")
+    Image.new("RGB", (384, 256)).save(folder / "black.png")
+    (folder / "broken.jpg").write_bytes((folder / "0003.jpg").read_bytes()[:2000])
+    Image.fromarray(data.astronaut()[:256, :384]).save(folder / "other.jpg")
+    found = reconstruct_many(folder, root / "model", **QUICK)
+    assert isinstance(found, MultiViewReconstruction)
+    return folder, root / "model"
+
+
+def test_good_photographs_are_registered_and_bad_ones_named(small, shared: Path) -> None:
+    folder, output = small
+    found = reconstruct_many(folder, output, **QUICK)
+    assert set(found.views) == {"0003.jpg", "0004.jpg", "0005.jpg", "0006.jpg"}
+    assert set(found.left_out) == {"black.png", "broken.jpg", "other.jpg"}
+    assert "it is black" in found.left_out["black.png"]
+    assert "broken.jpg" in found.left_out["broken.jpg"]
+    assert "matches none of the others" in found.left_out["other.jpg"]
+    # Of a path of 4 m; the focal length is estimated.
+    assert pose_errors(found.views, true_poses(shared))[0] < 25
+    assert relative_rotation_error(found.views, true_poses(shared)) < 0.5
+    focal = found.views["0005.jpg"].camera.focal_px[0]
+    assert focal == pytest.approx(1380.9 / 4, rel=0.03)
+
+
+def test_points_agree_with_the_photographs(small) -> None:
+    folder, output = small
+    found = reconstruct_many(folder, output, **QUICK)
+    assert len(found.sparse) > 150
+    assert len(found.dense) > 10 * len(found.sparse)
+    assert np.median(found.sparse_errors) < 0.5
+    assert np.median(found.dense_errors) < 0.3
+    assert found.dense_views.min() >= 3
+    # The world is the frame of the reference, and 1 the spacing of the cameras.
+    reference = found.views[found.reference]
+    np.testing.assert_allclose(reference.rotation, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(reference.centre, 0, atol=1e-9)
+    distances = np.linalg.norm(found.centres[:, None] - found.centres, axis=2)
+    np.fill_diagonal(distances, np.inf)
+    assert np.median(distances.min(axis=1)) == pytest.approx(1)
+    # Dense points lie where the sparse ones do, as seen from there.
+    depths = [np.median(cloud.points[:, 2]) for cloud in (found.dense, found.sparse)]
+    assert depths[0] == pytest.approx(depths[1], rel=0.2)
+    # A point has the colour of the photograph at its place.
+    from deepdetect import load_image
+
+    xy, depth = reference.project(found.dense.points)
+    rgb = load_image(folder / found.reference)
+    inside = ((xy > 1) & (xy < np.array(reference.camera.size) - 2)).all(axis=1) & (depth > 0)
+    column, row = np.rint(xy[inside]).astype(int).T
+    difference = np.abs(rgb[row, column].astype(int) - found.dense.colors[inside]).mean(axis=1)
+    assert np.median(difference) < 12
+
+
+def test_all_files_are_there_and_readable(small, pycolmap) -> None:
+    _, output = small
+    assert {path.name for path in output.iterdir()} == {
+        *("model.ply", "model.glb", "model.html", "model.json"),
+        *("sparse", "database.db", "work"),
+    }
+    values = json.loads((output / "model.json").read_text())
+    assert (values["photographs"], values["registered"]) == (7, 4)
+    model = pycolmap.Reconstruction(output / "sparse")
+    assert model.num_reg_images() == 4
+    assert model.num_points3D() == values["sparse_points"]
+    for image in model.images.values():
+        if image.has_pose:
+            camera = values["cameras"][image.name]
+            np.testing.assert_allclose(image.projection_center(), camera["centre"], atol=1e-6)
+            assert image.camera.principal_point_x - 0.5 == pytest.approx(camera["cx"], abs=1e-3)
+    header = (output / "model.ply").read_bytes()[:600].decode("ascii", "replace")
+    assert f"element vertex {values['dense_points']}" in header
+    assert f"frame: camera of {values['reference']}" in header
+    assert "unit: spacings" in header
+    assert '"lines": [' in (output / "model.html").read_text()
+
+
+def test_a_run_goes_on_where_it_was_killed(small, tmp_path: Path, monkeypatch) -> None:
+    from deepdetect.sfm import pipeline
+
+    folder, before = small
+    output = tmp_path / "model"
+    shutil.copytree(before, output)
+    for name in ("model.ply", "model.json"):
+        (output / name).unlink()
+    lost, *kept = sorted((output / "work" / "dense").iterdir())
+    lost.unlink()
+    times = {path: path.stat().st_mtime_ns for path in [*kept, output / "sparse" / "images.bin"]}
+    monkeypatch.setattr(pipeline, "map_photographs", None)  # it would fail
+    found = reconstruct_many(folder, output, **QUICK)
+    assert times == {path: path.stat().st_mtime_ns for path in times}
+    assert lost.exists()
+    assert (output / "model.ply").read_bytes() == (before / "model.ply").read_bytes()
+    assert len(found.matched) == json.loads((before / "model.json").read_text())["verified_pairs"]
+
+
+def test_other_settings_are_not_mixed_with_earlier_ones(small, tmp_path: Path) -> None:
+    folder, before = small
+    output = tmp_path / "model"
+    shutil.copytree(before, output)
+    with pytest.raises(OptionError, match=r"max_keypoints.*--overwrite"):
+        reconstruct_many(folder, output, workers=1, max_keypoints=700)
+
+
+def test_a_known_camera_stays_as_it_is(write_fountain, shared: Path, tmp_path: Path, pycolmap):
+    folder = write_fountain(tmp_path / "photos")
+    camera = Camera((384, 256), (1379.74 / 4, 1382.08 / 4), (189.65, 125.41))
+    found = reconstruct_many(
+        sorted(folder.iterdir()), tmp_path / "model", calibration=camera, dense=False, **QUICK
+    )
+    assert len(found.views) == 4
+    assert found.views["0004.jpg"].camera == camera
+    assert len(found.dense) == 0
+    assert found.cloud is found.sparse
+    assert pose_errors(found.views, true_poses(shared))[0] < 25
+    assert relative_rotation_error(found.views, true_poses(shared)) < 0.4
+
+
+def test_photographs_with_blanks_in_their_names_in_a_sequence(
+    write_fountain, tmp_path: Path, pycolmap
+) -> None:
+    folder = write_fountain(tmp_path / "photos")
+    for path in list(folder.iterdir()):
+        path.rename(folder / f"view {path.name}")
+    found = reconstruct_many(folder, tmp_path / "model", sequential=2, dense=False, **QUICK)
+    assert found.pairs == 5
+    assert len(found.views) == 4
+
+
+def test_too_few_photographs_are_one_sentence(
+    tmp_path: Path, photo: np.ndarray, one_line: Callable, pycolmap
+) -> None:
+    from PIL import Image
+
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    with pytest.raises(ImageError):
+        reconstruct_many(folder, tmp_path / "model", **QUICK)
+    Image.fromarray(photo).save(folder / "a.png")
+    Image.new("RGB", (200, 200)).save(folder / "black.png")
+    with pytest.raises(ReconstructionError, match=r"1 of 2 photographs.*black\.png") as caught:
+        reconstruct_many(folder, tmp_path / "model", **QUICK)
+    one_line(caught.value)
+
+
+def test_unrelated_photographs_are_one_sentence(tmp_path: Path, one_line, pycolmap) -> None:
+    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    from PIL import Image
+
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in ("astronaut", "coffee", "chelsea"):
+        Image.fromarray(getattr(data, name)()[:280, :380]).save(folder / f"{name}.png")
+    with pytest.raises(ReconstructionError, match="do not hang together") as caught:
+        reconstruct_many(folder, tmp_path / "model", **QUICK)
+    one_line(caught.value)
+    assert not (tmp_path / "model" / "model.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("output", "options", "message"),
+    [
+        ("model.ply", {}, "name of a file"),
+        ("model", {"max_keypoint": 5}, "did you mean 'max_keypoints'"),
+        ("model", {"pairs": "sequentially"}, "did you mean 'sequential'"),
+        ("photos", {}, "holds the photographs"),
+    ],
+)
+def test_wrong_arguments_are_one_sentence(
+    tmp_path: Path, one_line, output: str, options: dict, message: str, pycolmap
+) -> None:
+    (tmp_path / "photos").mkdir()
+    with pytest.raises(OptionError, match=message) as caught:
+        reconstruct_many(tmp_path / "photos", tmp_path / output, **options)
+    one_line(caught.value)
+
+
+def test_two_files_of_one_name_are_refused(tmp_path: Path, photo_path: Path, pycolmap) -> None:
+    other = tmp_path / "b" / photo_path.name
+    other.parent.mkdir()
+    shutil.copy(photo_path, other)
+    with pytest.raises(OptionError, match="have one name"):
+        reconstruct_many([photo_path, other], tmp_path / "model")
+    with pytest.raises(ImageError, match="there is no file"):
+        reconstruct_many([photo_path, tmp_path / "missing.jpg"], tmp_path / "model")
+
+
+def test_without_pycolmap_there_is_one_sentence(tmp_path: Path, monkeypatch, one_line) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(MissingExtraError, match=r"deepdetect\[sfm\]") as caught:
+        reconstruct_many(tmp_path, tmp_path / "model")
+    one_line(caught.value)
+    assert not (tmp_path / "model").exists()
+
+
+def test_the_order_of_imports_does_not_matter(pycolmap) -> None:
+    """In a fresh process pycolmap comes after OpenCV, whatever the user imports first."""
+    code = (
+        "import deepdetect; from deepdetect.sfm.colmap import import_pycolmap; "
+        "p = import_pycolmap(); import cv2, numpy as np; "
+        "cv2.SIFT_create().detect(np.zeros((64, 64), np.uint8)); print(p.__name__)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout.strip()) == (0, "pycolmap"), done.stderr
+
+
+@pytest.mark.slow
+def test_the_fountain_is_as_good_as_with_sift(shared: Path, tmp_path: Path, pycolmap) -> None:
+    """All of the bars but time, beside pycolmap's own SIFT on the same photographs."""
+    from deepdetect.sfm.mapping import read_sparse_model
+
+    folder, truth = shared / "data" / "fountain", true_poses(shared)
+    camera = Camera((1536, 1024), (1379.74, 1382.08), (760.095, 503.155))
+    parameters = ",".join(map(str, (*camera.focal_px, 760.595, 503.655)))
+    known = {"camera_model": "PINHOLE", "camera_params": parameters}
+    names = sorted(path.name for path in folder.glob("*.jpg"))
+    for given in (camera, None):
+        database = tmp_path / f"{given is None}.db"
+        (tmp_path / f"{given is None}").mkdir()
+        pycolmap.extract_features(
+            database,
+            folder,
+            image_names=names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=pycolmap.ImageReaderOptions(**(known if given else {})),
+        )
+        pycolmap.match_exhaustive(database)
+        how = pycolmap.IncrementalPipelineOptions()
+        if given:
+            how.ba_refine_focal_length = how.ba_refine_extra_params = False
+        models = pycolmap.incremental_mapping(database, folder, tmp_path / f"{given is None}", how)
+        sift = read_sparse_model(max(models.values(), key=lambda model: model.num_reg_images()))
+        theirs = pose_errors({view.name: view for view in sift.views.values()}, truth)
+        found = reconstruct_many(
+            folder,
+            tmp_path / "model" / f"{given is None}",
+            calibration=given,
+            dense=given is not None,
+        )
+        ours = pose_errors(found.views, truth)
+        assert len(found.views) == 11
+        assert ours[0] <= theirs[0] * (1 if given else 0.5)
+        assert ours[1] <= theirs[1] * (1 if given else 0.5)
+        if given:
+            assert len(found.dense) >= 10 * len(sift.points)
+            assert np.median(found.dense_errors) < 0.5
+
+
+def test_options_are_all_at_once() -> None:
+    options = MultiViewOptions(dense=DenseOptions(stride_px=4))
+    assert options.dense is not None
+    assert options.dense.stride_px == 4
+    assert options.selection.max_keypoints == 8192
