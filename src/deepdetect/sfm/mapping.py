@@ -35,7 +35,8 @@ class MappingOptions:
         refine_tracks: align the patches around all observations of a point, and adjust again;
             None: where the cameras are estimated.
         track_refinement: how they are aligned.
-        robust_scale_px: of the loss (Cauchy) of the adjustment after that.
+        robust_scale_px: of the loss (Cauchy) of the last adjustment: larger errors count less.
+        refined_scale_px: the same where tracks are aligned.
         min_views_of_principal_point: photographs of each camera from which that adjustment also
             estimates its principal point: with fewer it is in the middle.
         seed: of all random choices.
@@ -49,14 +50,18 @@ class MappingOptions:
     min_views: int = 3
     refine_tracks: bool | None = None
     track_refinement: TrackRefinementOptions = field(default_factory=TrackRefinementOptions)
-    robust_scale_px: float = 0.3
+    robust_scale_px: float = 1.0
+    refined_scale_px: float = 0.3
     min_views_of_principal_point: int = 8
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_ranges(
             self,
-            positive=("min_verified", "max_verification_error_px", "robust_scale_px"),
+            positive=(
+                *("min_verified", "max_verification_error_px"),
+                *("robust_scale_px", "refined_scale_px"),
+            ),
             not_negative=("seed",),
             between={"min_views": (2, np.inf), "min_views_of_principal_point": (3, np.inf)},
         )
@@ -228,17 +233,18 @@ def _mean_errors(
     return sums / np.maximum(np.bincount(seen.points, minlength=len(points)), 1)
 
 
-def refine_model(
-    model: Any, images: Mapping[str, np.ndarray], known_cameras: bool, options: MappingOptions
+def align_tracks(
+    model: Any,
+    images: Mapping[str, np.ndarray],
+    options: TrackRefinementOptions = TrackRefinementOptions(),
 ) -> None:
-    """Align the observations of each point, and adjust all cameras and points.
+    """Align the observations of each point; an adjustment must follow.
 
     Observations that do not align are left out, points with fewer than two others too.
 
     Args:
         model: a `pycolmap.Reconstruction`, which is changed.
         images: (H, W) uint8 luma by name.
-        known_cameras: whether the cameras stay as they are.
         options: how.
     """
     sparse = read_sparse_model(model)
@@ -253,7 +259,7 @@ def refine_model(
         for number, view in sparse.views.items()
     }
     refined, aligned = refine_observations(
-        straight, sparse.views, sparse.points, sparse.seen, options.track_refinement
+        straight, sparse.views, sparse.points, sparse.seen, options
     )
     for number, lens in sparse.lenses.items():
         own = sparse.seen.views == number
@@ -265,11 +271,19 @@ def refine_model(
         # The last observation but one takes the point with it.
         if not good and model.images[image].points2D[row].has_point3D():
             model.delete_observation(image, row)
-    adjust(model, known_cameras, options)
 
 
-def adjust(model: Any, known_cameras: bool, options: MappingOptions) -> None:
-    """Adjust all cameras and points (bundle adjustment) with a robust loss."""
+def adjust(
+    model: Any, known_cameras: bool, scale_px: float, options: MappingOptions = MappingOptions()
+) -> None:
+    """Adjust all cameras and points (bundle adjustment) with a robust loss.
+
+    Args:
+        model: a `pycolmap.Reconstruction`, which is changed.
+        known_cameras: whether the cameras stay as they are.
+        scale_px: of the loss.
+        options: when the principal point is estimated.
+    """
     taken = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     enough = min(taken.values()) >= options.min_views_of_principal_point
     with quiet_pycolmap() as pycolmap:
@@ -278,7 +292,7 @@ def adjust(model: Any, known_cameras: bool, options: MappingOptions) -> None:
         how.refine_principal_point = enough and not known_cameras
         how.print_summary = False
         how.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        how.ceres.loss_function_scale = options.robust_scale_px
+        how.ceres.loss_function_scale = scale_px
         pycolmap.bundle_adjustment(model, how)
         model.update_point_3d_errors()
 

@@ -49,10 +49,11 @@ from .lens import Lens
 from .mapping import (
     MappingOptions,
     SparseModel,
+    adjust,
+    align_tracks,
     map_photographs,
     normalise_model,
     read_sparse_model,
-    refine_model,
     verify_pairs,
     write_sparse_model,
 )
@@ -474,7 +475,10 @@ class _Run:
                 model.images[number].name: luma(load_image(folder / model.images[number].name))
                 for number in model.reg_image_ids()
             }
-            refine_model(model, grays, known, options)
+            align_tracks(model, grays, options.track_refinement)
+            adjust(model, known, options.refined_scale_px, options)
+        else:
+            adjust(model, known, options.robust_scale_px, options)
         normalise_model(model)
         record.unlink(missing_ok=True)
         write_sparse_model(model, sparse)

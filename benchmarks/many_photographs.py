@@ -1,0 +1,221 @@
+"""Compare reconstructions of many photographs with pycolmap's own SIFT, by the true cameras.
+
+    python benchmarks/many_photographs.py SCENE [--output FOLDER] [--pictures FOLDER] [--bad FOLDER]
+
+SCENE is a folder of photographs with known cameras (docs/benchmarks.md lists the layouts). Both
+pipelines run with the true intrinsics and with estimated ones. Printed are the photographs that are
+registered, mean errors of camera centres and rotations after the alignment of the centres, points,
+reprojection errors and CPU seconds. `--pictures` draws the cameras, the sparse and the dense model.
+With `--bad` the photographs of that folder are added, and a black and a damaged one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from deepdetect import Camera, MultiViewReconstruction, PointCloud, reconstruct_many
+from deepdetect.datasets.posed_images import PosedScene, load_posed_scenes
+from deepdetect.geometry.point_cloud import robust_box
+from deepdetect.io.html_viewer import ViewerCamera, camera_lines
+from deepdetect.io.image import find_images, load_image
+from deepdetect.sfm.colmap import quiet_pycolmap
+from deepdetect.sfm.mapping import SparseModel, read_sparse_model
+from deepdetect.viz.render import ViewCamera, orbit_camera, render
+
+LINE_POINTS = 300
+"""That draw a line of a camera."""
+
+PICTURE_SIZE = (900, 560)
+
+
+def main() -> None:
+    """Print a row for each pipeline."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--output", type=Path, default=Path("deepdetect-output/many"))
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of the model")
+    parser.add_argument("--bad", type=Path, help="folder of photographs of something else")
+    parser.add_argument("--workers", type=int, help="processes")
+    args = parser.parse_args()
+    (scene,) = load_posed_scenes(args.scene)
+    names = sorted(image.path.name for image in scene.images)
+    if args.bad is not None:
+        show_bad(scene, args.bad, args.output / "bad", args.workers)
+        return
+    camera = true_camera(scene)
+    print(
+        "| pipeline | registered | centres, mm | rotations, ° | sparse points | their error, px "
+        "| dense points | their error, px | CPU s |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|"
+    )
+    for known in (True, False):
+        cameras = "true" if known else "estimated"
+        started = cpu_seconds()
+        sparse = map_by_sift(args.scene, names, camera if known else None, args.output / "sift")
+        views = {view.name: view for view in sparse.views.values()}
+        error = sparse.errors.mean()
+        row(f"SIFT, {cameras} intrinsics", scene, views, len(sparse.points), error, None, started)
+        for refined in (False, True):
+            started = cpu_seconds()
+            found = reconstruct_many(
+                [args.scene / name for name in names],
+                args.output / f"{cameras}-{'refined' if refined else 'plain'}",
+                calibration=camera if known else None,
+                dense=known and not refined,
+                refine_tracks=refined,
+                workers=args.workers,
+                overwrite=True,
+            )
+            title = f"ours, {cameras} intrinsics" + (", tracks refined" if refined else "")
+            errors = found.sparse_errors.mean()
+            row(title, scene, found.views, len(found.sparse), errors, found, started)
+            if args.pictures is not None and len(found.dense):
+                draw(found, args.scene, args.pictures)
+
+
+def cpu_seconds() -> float:
+    """Return what this process and those that it has started have used."""
+    used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(each.ru_utime + each.ru_stime for each in used)
+
+
+def true_camera(scene: PosedScene) -> Camera:
+    """Return the camera of all photographs."""
+    matrix = scene.images[0].intrinsics
+    height, width = load_image(scene.images[0].path).shape[:2]
+    return Camera((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
+
+
+def map_by_sift(folder: Path, names: list[str], camera: Camera | None, output: Path) -> SparseModel:
+    """Run pycolmap's own pipeline with its defaults."""
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir(parents=True)
+    with quiet_pycolmap() as pycolmap:
+        reading, mapping = pycolmap.ImageReaderOptions(), pycolmap.IncrementalPipelineOptions()
+        if camera is not None:
+            reading.camera_model = "PINHOLE"
+            centre = (camera.centre[0] + 0.5, camera.centre[1] + 0.5)
+            reading.camera_params = ",".join(map(str, (*camera.focal_px, *centre)))
+            mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
+        pycolmap.extract_features(
+            output / "database.db",
+            folder,
+            image_names=names,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            reader_options=reading,
+        )
+        pycolmap.match_exhaustive(output / "database.db")
+        models = pycolmap.incremental_mapping(output / "database.db", folder, output, mapping)
+    return read_sparse_model(max(models.values(), key=lambda model: model.num_reg_images()))
+
+
+def row(
+    title: str,
+    scene: PosedScene,
+    views: dict,
+    points: int,
+    error: float,
+    found: MultiViewReconstruction | None,
+    started: float,
+) -> None:
+    """Print a row of the table."""
+    centres, rotations = pose_errors(scene, views)
+    dense = found is not None and len(found.dense)
+    last = f"{len(found.dense):,} | {np.median(found.dense_errors):.3f}" if dense else "– | –"
+    print(
+        f"| {title} | {len(views)} of {len(scene.images)} | {1000 * centres:.2f} | {rotations:.3f} "
+        f"| {points:,} | {error:.2f} | {last} | {cpu_seconds() - started:.0f} |",
+        flush=True,
+    )
+
+
+def pose_errors(scene: PosedScene, views: dict) -> tuple[float, float]:
+    """Return mean errors of centres, in the scene's unit, and of rotations in degrees."""
+    images = {image.path.name: image for image in scene.images}
+    own = np.array([view.centre for view in views.values()])
+    true = np.array([-images[name].rotation.T @ images[name].translation for name in views])
+    means = own.mean(axis=0), true.mean(axis=0)
+    left, values, right = np.linalg.svd((true - means[1]).T @ (own - means[0]))
+    signs = np.array([1, 1, np.sign(np.linalg.det(left @ right))])
+    turn = left * signs @ right
+    scale = (values * signs).sum() / ((own - means[0]) ** 2).sum()
+    centres = np.linalg.norm(scale * (own - means[0]) @ turn.T + means[1] - true, axis=1)
+    angles = [
+        np.degrees(
+            np.linalg.norm(cv2.Rodrigues(view.rotation @ turn.T @ images[name].rotation.T)[0])
+        )
+        for name, view in views.items()
+    ]
+    return float(centres.mean()), float(np.mean(angles))
+
+
+def show_bad(scene: PosedScene, bad: Path, output: Path, workers: int | None) -> None:
+    """Reconstruct the scene with photographs that do not belong to it."""
+    folder = output / "photos"
+    folder.mkdir(parents=True, exist_ok=True)
+    for image in scene.images:
+        shutil.copy(image.path, folder)
+    for path in find_images(bad):
+        shutil.copy(path, folder / f"bad-{path.name}")
+    height, width = load_image(scene.images[0].path).shape[:2]
+    cv2.imwrite(str(folder / "black.png"), np.zeros((height, width, 3), np.uint8))
+    (folder / "damaged.jpg").write_bytes(scene.images[0].path.read_bytes()[:20_000])
+    started = time.perf_counter()
+    found = reconstruct_many(folder, output / "model", dense=False, workers=workers)
+    centres, rotations = pose_errors(scene, found.views)
+    print(f"{found}\ncentres {1000 * centres:.2f} mm, rotations {rotations:.3f} degrees")
+    for name, reason in found.left_out.items():
+        print(f"{name}: {reason}")
+    print(f"{time.perf_counter() - started:.0f} s")
+
+
+def draw(found: MultiViewReconstruction, folder: Path, pictures: Path) -> None:
+    """Draw the cameras over the sparse points, and the dense points from three sides."""
+    pictures.mkdir(parents=True, exist_ok=True)
+    cameras = [
+        ViewerCamera(name, view.camera, view.rotation, np.asarray(view.translation))
+        for name, view in found.views.items()
+    ]
+    ends = camera_lines(cameras)
+    steps = np.linspace(0, 1, LINE_POINTS)[:, None]
+    lines = np.concatenate([start + steps * (end - start) for start, end in ends])
+    red = np.tile(np.array([[200, 40, 30]], np.uint8), (len(lines), 1))
+    for name, cloud, width in (("path", found.sparse, 2.0), ("dense-path", found.dense, 1.5)):
+        joined = PointCloud(
+            np.concatenate([cloud.points, lines]), np.concatenate([cloud.colors, red]), cloud.unit
+        )
+        save(pictures / f"{name}.jpg", render(joined, overview(cloud, lines), width))
+    for name, azimuth, elevation in (("front", 0, 0), ("side", 30, 12)):
+        camera = orbit_camera(found.dense, azimuth, elevation, PICTURE_SIZE)
+        save(pictures / f"dense-{name}.jpg", render(found.dense, camera))
+
+
+def overview(cloud: PointCloud, lines: np.ndarray) -> ViewCamera:
+    """Place a camera behind and above, so that it sees the cloud and the cameras."""
+    camera = orbit_camera(cloud, 25, 40, PICTURE_SIZE)
+    box = robust_box(cloud)
+    inside = ((cloud.points > box.low) & (cloud.points < box.high)).all(axis=1)
+    shown = np.concatenate([cloud.points[inside], lines])
+    camera = replace(camera, position=box.centre + 2.5 * (camera.position - box.centre))
+    plain = replace(camera, focal=1.0, principal_point=np.zeros(2))
+    xy, _ = plain.project(shown)
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    focal = float((0.95 * np.array(PICTURE_SIZE) / (high - low)).min())
+    middle = (np.array(PICTURE_SIZE) - 1) / 2 - focal * (low + high) / 2
+    return replace(camera, focal=focal, principal_point=middle)
+
+
+def save(path: Path, picture: np.ndarray) -> None:
+    """Write a picture as JPEG."""
+    cv2.imwrite(str(path), picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+
+if __name__ == "__main__":
+    main()
