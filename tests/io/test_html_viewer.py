@@ -11,8 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from deepdetect.geometry.camera import Camera
 from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.io.html_viewer import page_points
+from deepdetect.io.html_viewer import (
+    ViewerCamera,
+    camera_lines,
+    page_points,
+    write_html_page,
+)
 from deepdetect.io.point_cloud import save_point_cloud
 
 
@@ -204,3 +210,31 @@ def test_the_template_is_part_of_the_package() -> None:
     from importlib.resources import files
 
     assert files("deepdetect.io").joinpath("viewer.html").is_file()
+
+
+def view_cameras() -> list[ViewerCamera]:
+    camera = Camera((640, 480), 500.0)
+    return [
+        ViewerCamera(f"{x:g}", camera, np.eye(3), np.array([-x, 0.0, 0.0])) for x in (0.0, 1.0, 2.0)
+    ]
+
+
+def test_cameras_are_lines_of_the_page(cones: PointCloud, tmp_path: Path) -> None:
+    path = tmp_path / "cones.html"
+    write_html_page(cones, path, {}, view_cameras())
+    page = Page(path.read_text("utf-8"))
+    _, _, cloud = stored_points(page)
+    lines = np.array(cloud["lines"]).reshape(-1, 2, 3)
+    assert len(lines) == 3 * 8 + 2  # a pyramid each, and the path
+    np.testing.assert_allclose(lines[-2:, :, 0], [[0, 1], [1, 2]])
+    # The first pyramid is that of what the camera sees: a corner's ray, at one depth.
+    corner = lines[0, 1]
+    expected = (np.array([-0.5, -0.5]) - (319.5, 239.5)) / 500
+    np.testing.assert_allclose(corner[:2] / corner[2], expected)
+    assert cloud["reach"] >= np.linalg.norm(lines - cloud["centre"], axis=2).max() - 1e-4
+    assert saved(cones, tmp_path / "plain.html").scripts["cloud"].count('"lines": []') == 1
+
+
+def test_a_single_camera_is_drawn_without_a_path() -> None:
+    assert camera_lines(view_cameras()[:1]).shape == (8, 2, 3)
+    assert camera_lines([]).shape == (0, 2, 3)

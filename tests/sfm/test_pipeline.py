@@ -22,6 +22,7 @@ from deepdetect import (
     reconstruct_many,
 )
 from deepdetect.sfm.dense import DenseOptions
+from deepdetect.sfm.pair_selection import PairSelectionOptions
 from deepdetect.sfm.pipeline import MultiViewOptions
 
 QUICK = {"workers": 1, "max_keypoints": 1500}
@@ -214,6 +215,20 @@ def test_photographs_with_blanks_in_their_names_in_a_sequence(
         path.rename(folder / f"view {path.name}")
     found = reconstruct_many(folder, tmp_path / "model", sequential=2, dense=False, **QUICK)
     assert found.pairs == 5
+    assert len(found.views) == 4
+
+
+def test_the_most_alike_are_matched(write_fountain, tmp_path: Path, pycolmap) -> None:
+    folder = write_fountain(tmp_path / "photos")
+    found = reconstruct_many(
+        folder,
+        tmp_path / "model",
+        pairs="similar",
+        dense=False,
+        options=MultiViewOptions(pair_selection=PairSelectionOptions(similar=2)),
+        **QUICK,
+    )
+    assert 4 <= found.pairs <= 6
     assert len(found.views) == 4
 
 

@@ -107,8 +107,7 @@ def reconstruct(
     if len(images) < 2:
         raise click.UsageError("give two photographs, or more, or a folder of them")
     of_many = {name: values.pop(name) for name in MANY.names}
-    if given_only(of_many) or workers is not None or overwrite:
-        name = next(iter({**given_only(of_many), "workers": workers, "overwrite": overwrite}))
+    for name in given_only({**of_many, "workers": workers, "overwrite": overwrite or None}):
         flag = MANY.flags.get(name, "--" + name.replace("_", "-"))
         raise click.UsageError(f"{flag} is for more than two photographs")
     _reconstruct_two(images[0], images[1], output or MODEL, as_json, **values)

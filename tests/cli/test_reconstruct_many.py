@@ -1,0 +1,98 @@
+"""`deepdetect reconstruct` with folders; what its results are worth is tested in tests/sfm."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from .conftest import one_sentence
+
+
+@pytest.fixture
+def fountain(shared: Path, tmp_path: Path) -> Path:
+    """Small photographs of the fountain, and a black one."""
+    pytest.importorskip("h5py", reason="needs h5py")
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in ("0004", "0005", "0006"):
+        with Image.open(shared / "data" / "fountain" / f"{name}.jpg") as image:
+            image.resize((384, 256), Image.Resampling.LANCZOS).save(folder / f"{name}.jpg")
+    Image.new("RGB", (384, 256)).save(folder / "black.png")
+    return folder
+
+
+def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
+    arguments = ("reconstruct", fountain, "-o", "model", "--workers", 1, "--focal", 345)
+    result = run(*arguments, "--max-keypoints", 1500, "--json")
+    assert result.exit_code == 0, result.output
+    values = json.loads(result.stdout)
+    assert values == json.loads(Path("model/model.json").read_text())
+    assert (values["photographs"], values["registered"]) == (4, 3)
+    assert list(values["left_out"]) == ["black.png"]
+    assert values["dense_points"] > 1000
+    assert values["cameras"]["0005.jpg"]["intrinsics"] == "focal_px"
+    assert set(values["seconds"]) == {"features", "matching", "mapping", "dense points"}
+    for file in values["files"]:
+        assert Path(file).exists()
+    assert "mapping" in result.stderr
+
+    again = run(*arguments, "--max-keypoints", 1500)
+    assert again.exit_code == 0, again.output
+    assert "3 of 4" in again.stdout
+    assert "left out: black.png" in again.stdout
+    other = run(*arguments, "--max-keypoints", 1000)
+    assert other.exit_code == 2
+    assert "--overwrite" in other.stderr
+
+
+def test_a_list_of_photographs_is_a_folder(run, fountain: Path) -> None:
+    images = sorted(fountain.glob("*.jpg"))
+    result = run(
+        *("reconstruct", *images, "-o", "model", "--workers", 1, "--max-keypoints", 1000),
+        *("--no-dense", "--sequential", 2, "--json"),
+    )
+    assert result.exit_code == 0, result.output
+    values = json.loads(result.stdout)
+    assert (values["registered"], values["pairs"], values["dense_points"]) == (3, 3, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("a.png",), "give two photographs"),
+        ((".", "a.png"), "one folder, or photographs"),
+        (("a.png", "b.png", "--no-dense"), "--dense is for more than two"),
+        (("a.png", "b.png", "--sequential", "3"), "--sequential is for more than two"),
+        (("a.png", "b.png", "--overwrite"), "--overwrite is for more than two"),
+        (("a.png", "b.png", "--workers", "2"), "--workers is for more than two"),
+        ((".", "--rectified"), "for two photographs"),
+    ],
+)
+def test_options_of_the_other_kind_are_refused(run, arguments, message: str) -> None:
+    for name in ("a.png", "b.png"):
+        Image.fromarray(np.zeros((32, 32, 3), np.uint8)).save(name)
+    result = run("reconstruct", *arguments)
+    assert result.exit_code == 2
+    assert message in " ".join(result.stderr.split())
+    assert "Traceback" not in result.output
+
+
+def test_without_pycolmap_it_says_what_to_install(run, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    result = run("reconstruct", tmp_path, "-o", "model")
+    assert result.exit_code == 2
+    assert one_sentence(result.stderr)
+    assert "pip install 'deepdetect[sfm]'" in result.stderr
+    assert not Path("model").exists()
+
+
+def test_a_missing_folder_is_one_sentence(run) -> None:
+    result = run("reconstruct", "nowhere")
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
