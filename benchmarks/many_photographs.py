@@ -1,6 +1,7 @@
 """Compare reconstructions of many photographs with pycolmap's own SIFT, by the true cameras.
 
     python benchmarks/many_photographs.py SCENE [--output FOLDER] [--pictures FOLDER] [--bad FOLDER]
+        [--resume] [--workers N]
 
 SCENE is a folder of photographs with known cameras (docs/benchmarks.md lists the layouts). Both
 pipelines run with the true intrinsics and with estimated ones. Printed are the photographs that are
@@ -35,6 +36,9 @@ LINE_POINTS = 300
 
 PICTURE_SIZE = (900, 560)
 
+NEAR = 1.5
+"""Points are drawn up to this many times their median depth."""
+
 
 def main() -> None:
     """Print a row for each pipeline."""
@@ -44,6 +48,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the model")
     parser.add_argument("--bad", type=Path, help="folder of photographs of something else")
     parser.add_argument("--workers", type=int, help="processes")
+    parser.add_argument("--resume", action="store_true", help="keep what earlier runs have made")
     args = parser.parse_args()
     (scene,) = load_posed_scenes(args.scene)
     names = sorted(image.path.name for image in scene.images)
@@ -71,7 +76,7 @@ def main() -> None:
                 dense=known and not refined,
                 refine_tracks=refined,
                 workers=args.workers,
-                overwrite=True,
+                overwrite=not args.resume,
             )
             title = f"ours, {cameras} intrinsics" + (", tracks refined" if refined else "")
             errors = found.sparse_errors.mean()
@@ -177,7 +182,7 @@ def show_bad(scene: PosedScene, bad: Path, output: Path, workers: int | None) ->
 
 
 def draw(found: MultiViewReconstruction, folder: Path, pictures: Path) -> None:
-    """Draw the cameras over the sparse points, and the dense points from three sides."""
+    """Draw the cameras with the sparse and with the dense points, and these from two sides."""
     pictures.mkdir(parents=True, exist_ok=True)
     cameras = [
         ViewerCamera(name, view.camera, view.rotation, np.asarray(view.translation))
@@ -187,14 +192,19 @@ def draw(found: MultiViewReconstruction, folder: Path, pictures: Path) -> None:
     steps = np.linspace(0, 1, LINE_POINTS)[:, None]
     lines = np.concatenate([start + steps * (end - start) for start, end in ends])
     red = np.tile(np.array([[200, 40, 30]], np.uint8), (len(lines), 1))
-    for name, cloud, width in (("path", found.sparse, 2.0), ("dense-path", found.dense, 1.5)):
+    # Houses far behind would make all else small.
+    sparse, dense = (
+        cloud[cloud.points[:, 2] < NEAR * np.median(cloud.points[:, 2])]
+        for cloud in (found.sparse, found.dense)
+    )
+    for name, cloud, width in (("sparse", sparse, 2.0), ("dense", dense, 1.5)):
         joined = PointCloud(
             np.concatenate([cloud.points, lines]), np.concatenate([cloud.colors, red]), cloud.unit
         )
         save(pictures / f"{name}.jpg", render(joined, overview(cloud, lines), width))
     for name, azimuth, elevation in (("front", 0, 0), ("side", 30, 12)):
-        camera = orbit_camera(found.dense, azimuth, elevation, PICTURE_SIZE)
-        save(pictures / f"dense-{name}.jpg", render(found.dense, camera))
+        camera = orbit_camera(dense, azimuth, elevation, PICTURE_SIZE)
+        save(pictures / f"dense-{name}.jpg", render(dense, camera))
 
 
 def overview(cloud: PointCloud, lines: np.ndarray) -> ViewCamera:

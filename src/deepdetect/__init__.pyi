@@ -51,10 +51,8 @@ from .matching.stereo.matching import (
     DisparityOptions as DisparityOptions,
     disparity_map as disparity_map,
 )
-from .sfm.pipeline import (
-    MultiViewOptions as MultiViewOptions,
-    reconstruct_many as reconstruct_many,
-)
+from .sfm.options import MultiViewOptions as MultiViewOptions
+from .sfm.pipeline import reconstruct_many as reconstruct_many
 from .sfm.result import MultiViewReconstruction as MultiViewReconstruction
 from .training.recipe import TrainingOptions as TrainingOptions
 from .training.run import train as train

@@ -21,9 +21,9 @@ from deepdetect import (
     ReconstructionError,
     reconstruct_many,
 )
-from deepdetect.sfm.dense import DenseOptions
+from deepdetect.sfm.fusion import DenseOptions
+from deepdetect.sfm.options import MultiViewOptions
 from deepdetect.sfm.pair_selection import PairSelectionOptions
-from deepdetect.sfm.pipeline import MultiViewOptions
 
 QUICK = {"workers": 1, "max_keypoints": 1500}
 
@@ -167,7 +167,7 @@ def test_all_files_are_there_and_readable(small, pycolmap) -> None:
 
 
 def test_a_run_goes_on_where_it_was_killed(small, tmp_path: Path, monkeypatch) -> None:
-    from deepdetect.sfm import pipeline
+    from deepdetect.sfm import stages
 
     folder, before = small
     output = tmp_path / "model"
@@ -177,7 +177,7 @@ def test_a_run_goes_on_where_it_was_killed(small, tmp_path: Path, monkeypatch) -
     lost, *kept = sorted((output / "work" / "dense").iterdir())
     lost.unlink()
     times = {path: path.stat().st_mtime_ns for path in [*kept, output / "sparse" / "images.bin"]}
-    monkeypatch.setattr(pipeline, "map_photographs", None)  # it would fail
+    monkeypatch.setattr(stages, "map_photographs", None)  # it would fail
     found = reconstruct_many(folder, output, **QUICK)
     assert times == {path: path.stat().st_mtime_ns for path in times}
     assert lost.exists()
@@ -205,6 +205,27 @@ def test_a_known_camera_stays_as_it_is(write_fountain, shared: Path, tmp_path: P
     assert found.cloud is found.sparse
     assert pose_errors(found.views, true_poses(shared))[0] < 25
     assert relative_rotation_error(found.views, true_poses(shared)) < 0.4
+
+
+def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
+    write_fountain, tmp_path: Path, photo: np.ndarray, pycolmap
+) -> None:
+    from PIL import Image
+
+    folder = write_fountain(tmp_path / "photos", ("0004", "0005", "0006"))
+    Image.fromarray(photo).save(folder / "other.png")
+    calibration = {"focal_px": [344.935, 345.52], "cx": 189.65, "cy": 125.41, "width": 384}
+    (tmp_path / "calib.json").write_text(json.dumps({**calibration, "height": 256}))
+    arguments = {"calibration": tmp_path / "calib.json", "dense": False, **QUICK}
+    found = reconstruct_many(folder, tmp_path / "model", **arguments)
+    assert len(found.views) == 3
+    assert "calibration is for another size" in found.left_out["other.png"]
+    assert found.lenses["0004.jpg"].source == "given"
+    (tmp_path / "calib.json").write_text(json.dumps({**calibration, "height": 999}))
+    with pytest.raises(ReconstructionError, match="384x999"):
+        reconstruct_many(folder, tmp_path / "model", **arguments)
+    with pytest.raises(ReconstructionError, match="not both"):
+        reconstruct_many(folder, tmp_path / "model", focal_px=300, **arguments)
 
 
 def test_photographs_with_blanks_in_their_names_in_a_sequence(

@@ -24,7 +24,7 @@ MANY = FieldOptions(
         "single_camera": "--single-camera/--camera-each",
     },
     metavars={"sequential": "N", "stride_px": "PX"},
-    defaults={"refine_tracks": "where the cameras are estimated", "stride_px": "2"},
+    defaults={"refine_tracks": "no", "stride_px": "2"},
 )
 """Options that two photographs do not have."""
 
@@ -41,7 +41,8 @@ def reconstruct_folder(
 ) -> None:
     """Reconstruct many photographs, and print what was found."""
     from ..features.selection import SelectionOptions
-    from ..sfm.pipeline import MultiViewOptions, reconstruct_many
+    from ..sfm.options import MultiViewOptions
+    from ..sfm.pipeline import reconstruct_many
 
     target = OUTPUT if output is None else output
     detector = given_only({name: values.pop(name) for name in DETECTOR.names})

@@ -18,15 +18,17 @@ def import_pycolmap() -> Any:
     """Import pycolmap, after OpenCV: the other way round some versions of both crash.
 
     Raises:
-        MissingExtraError: it is not installed.
+        MissingExtraError: it is not installed, or h5py is not.
     """
     import cv2  # noqa: F401
 
     try:
+        import h5py  # noqa: F401
         import pycolmap
     except ImportError:
         raise MissingExtraError(
-            "a reconstruction from many photographs needs pycolmap: pip install 'deepdetect[sfm]'"
+            "a reconstruction from many photographs needs pycolmap and h5py: "
+            "pip install 'deepdetect[sfm]'"
         ) from None
     return pycolmap
 

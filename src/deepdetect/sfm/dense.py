@@ -1,89 +1,24 @@
 """Dense points from photographs with known cameras.
 
 Each photograph in turn is the reference. It is rectified with its best neighbours, and matched with
-them row by row (`matching.guided.rectified`). A pixel becomes a point where at least two of the
-neighbours agree with one position in space; it is the position that projects nearest to all of
-their matches.
+them row by row (`matching.guided.rectified`); `fusion` makes points of the matches.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from .._shared.options import check_ranges
 from ..geometry.camera import Camera
 from ..io.image import load_image, luma
-from ..matching.guided.options import RectifiedMatchingOptions
 from ..matching.guided.rectified import match_by_rectification
+from .fusion import DenseOptions, DensePoints, angles_between, fuse_matches
 from .lens import Lens
 from .mapping import SparseModel
 from .views import PosedView, relative_fundamental
-
-BLOCK = 50_000
-"""Pixels that are triangulated at once, which bounds the memory."""
-
-REWEIGHTINGS = 2
-"""Of the linear triangulation, after which it minimises distances in pixels."""
-
-
-def _known_poses() -> RectifiedMatchingOptions:
-    """The epipolar geometry is known: it is not estimated again, nor doubted."""
-    return RectifiedMatchingOptions(max_refits=0, min_agreement=0.0)
-
-
-@dataclass(frozen=True)
-class DenseOptions:
-    """How photographs with known cameras become dense points.
-
-    Attributes:
-        neighbours: photographs that each one is matched with.
-        min_common_points: sparse points that both see.
-        ideal_angle_deg: between the lines of sight from both: smaller ones count less.
-        max_angle_deg: larger ones count less, since surfaces look different.
-        stride_px: a point is sought at every so many pixels of a row and of a column.
-        max_side_px: longer sides are scaled down to this.
-        min_views: photographs that must agree on a point, the reference among them.
-        max_error_px: between a match and the projection of the point that it agrees with.
-        min_triangulation_deg: smallest angle between two of the lines of sight.
-        duplicate_depth: of a point that another reference has given already, the relative
-            difference of the depths; it is left out.
-        matching: of the rows.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    neighbours: int = 4
-    min_common_points: int = 30
-    ideal_angle_deg: float = 5.0
-    max_angle_deg: float = 30.0
-    stride_px: int = 2
-    max_side_px: int = 2000
-    min_views: int = 3
-    max_error_px: float = 1.0
-    min_triangulation_deg: float = 1.0
-    duplicate_depth: float = 0.01
-    matching: RectifiedMatchingOptions = field(default_factory=_known_poses)
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("ideal_angle_deg", "max_error_px"),
-            not_negative=("min_triangulation_deg", "duplicate_depth"),
-            between={
-                "neighbours": (1, np.inf),
-                "min_common_points": (8, np.inf),
-                "max_angle_deg": (1, 180),
-                "stride_px": (1, np.inf),
-                "max_side_px": (64, np.inf),
-                "min_views": (2, np.inf),
-            },
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,39 +45,6 @@ class Reference:
     view: PosedView
     lens: Lens
     neighbours: tuple[Neighbour, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class DensePoints:
-    """Points that several photographs agree on.
-
-    Attributes:
-        points: (N, 3) float32.
-        colors: (N, 3) uint8 sRGB.
-        errors: (N,) float32 distance of the projections from the matches in pixels, the root mean
-            square of all photographs that agree.
-        views: (N,) uint8, how many these are.
-    """
-
-    points: np.ndarray
-    colors: np.ndarray
-    errors: np.ndarray
-    views: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def __getitem__(self, index: np.ndarray) -> DensePoints:
-        return DensePoints(*(values[index] for values in vars(self).values()))
-
-    @classmethod
-    def joined(cls, parts: Sequence[DensePoints]) -> DensePoints:
-        """Return all points of several."""
-        if not parts:
-            empty = np.empty((0, 3), np.float32)
-            return cls(empty, empty.astype(np.uint8), empty[:, 0], empty[:, 0].astype(np.uint8))
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        return cls(*(np.concatenate(values) for values in columns))
 
 
 def find_references(sparse: SparseModel, options: DenseOptions = DenseOptions()) -> list[Reference]:
@@ -193,15 +95,9 @@ def _angle_weights(
     points: np.ndarray, centre0: np.ndarray, centre1: np.ndarray, options: DenseOptions
 ) -> np.ndarray:
     """Return what each point says for matching two views, by its triangulation angle."""
-    angle = np.degrees(_angles(points - centre0, points - centre1))
+    angle = np.degrees(angles_between(points - centre0, points - centre1))
     weight = np.minimum(angle / options.ideal_angle_deg, 1) ** 1.5
     return np.asarray(weight * np.minimum(options.max_angle_deg / np.maximum(angle, 1e-9), 1) ** 2)
-
-
-def _angles(rays0: np.ndarray, rays1: np.ndarray) -> np.ndarray:
-    """Return the angles between vectors (N, 3) in radians."""
-    across = np.linalg.norm(np.cross(rays0, rays1), axis=1)
-    return np.asarray(np.arctan2(across, np.einsum("ij,ij->i", rays0, rays1)))
 
 
 def dense_points(
@@ -278,158 +174,3 @@ def limited_view(view: PosedView, options: DenseOptions) -> PosedView:
 def _scaled(xy: np.ndarray, scale: float) -> np.ndarray:
     """Return positions in an image that has been scaled."""
     return np.asarray((xy + 0.5) * scale - 0.5)
-
-
-def fuse_matches(
-    reference: PosedView,
-    xy: np.ndarray,
-    views: Sequence[PosedView],
-    matches: Sequence[np.ndarray],
-    options: DenseOptions = DenseOptions(),
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the points that the matches of several views agree on.
-
-    The match of each view in turn gives a point, with which those of other views agree or not. The
-    point with most agreement is triangulated again from all that agree.
-
-    Args:
-        reference: the view of the pixels.
-        xy: (N, 2) its pixels.
-        views: the others.
-        matches: (N, 2) positions in each of them, NaN where there is none.
-        options: when they agree.
-
-    Returns:
-        (N, 3) float64 points, (N,) float64 errors as of `DensePoints`, and (N,) int64 number of
-        views that agree, the reference among them; 0 where too few do, and there is no point.
-    """
-    points = np.full((len(xy), 3), np.nan)
-    errors = np.full(len(xy), np.nan)
-    counts = np.zeros(len(xy), np.int64)
-    for start in range(0, len(xy) if views else 0, BLOCK):
-        part = slice(start, start + BLOCK)
-        points[part], errors[part], counts[part] = _fuse_block(
-            reference, xy[part], views, [places[part] for places in matches], options
-        )
-    return points, errors, counts
-
-
-def _fuse_block(
-    reference: PosedView,
-    xy: np.ndarray,
-    views: Sequence[PosedView],
-    matches: Sequence[np.ndarray],
-    options: DenseOptions,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    all_views = [reference, *views]
-    places = np.stack([xy, *matches])
-    known = np.isfinite(places).all(axis=2)
-    agreeing = np.zeros(known.shape, bool)
-    most = np.zeros(len(xy), np.int64)
-    for k in range(1, len(all_views)):
-        if not known[k].any():
-            continue
-        alone = np.zeros(known.shape, bool)
-        alone[0] = alone[k] = known[k]
-        points = _triangulate(all_views, places, alone)
-        distance, _ = _distances(all_views, places, points)
-        agree = known & known[k] & (distance < options.max_error_px)
-        number = agree.sum(axis=0)
-        better = agree[0] & agree[k] & (number > most)
-        agreeing[:, better], most[better] = agree[:, better], number[better]
-    points = _triangulate(all_views, places, agreeing)
-    distance, depth = _distances(all_views, places, points)
-    number = agreeing.sum(axis=0)
-    squares = np.where(agreeing, distance**2, 0).sum(axis=0)
-    errors = np.sqrt(squares / np.maximum(number, 1))
-    ahead = np.where(agreeing, depth > 0, True).all(axis=0)
-    angle = np.zeros(len(xy))
-    for k, view in enumerate(views, 1):
-        between = np.degrees(_angles(points - reference.centre, points - view.centre))
-        angle = np.maximum(angle, np.where(agreeing[k], between, 0))
-    good = (
-        (number >= options.min_views)
-        & np.isfinite(points).all(axis=1)
-        & ahead
-        & (errors < options.max_error_px)
-        & (angle >= options.min_triangulation_deg)
-    )
-    return points, errors, np.where(good, number, 0)
-
-
-def _triangulate(views: Sequence[PosedView], places: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Triangulate (N, 3) points from positions (V, N, 2) in the views that are used (V, N).
-
-    Linear, weighted by depths: after some rounds the least squares of distances in pixels.
-    """
-    count = places.shape[1]
-    points = np.full((count, 3), np.nan)
-    depth = np.ones(places.shape[:2])
-    for _ in range(1 + REWEIGHTINGS):
-        normal = np.zeros((count, 3, 3))
-        right = np.zeros((count, 3))
-        for k, view in enumerate(views):
-            weight = np.where(used[k], 1 / depth[k], 0)
-            projection = view.projection
-            for axis in (0, 1):
-                where = np.where(used[k], places[k, :, axis], 0)
-                row = (where[:, None] * projection[2] - projection[axis]) * weight[:, None]
-                normal += row[:, :3, None] * row[:, None, :3]
-                right -= row[:, :3] * row[:, 3:]
-        solvable = (used.sum(axis=0) >= 2) & (np.linalg.det(normal) > 0)
-        points[solvable] = np.linalg.solve(normal[solvable], right[solvable, :, None])[:, :, 0]
-        for k, view in enumerate(views):
-            seen = np.abs(points @ view.rotation[2] + view.translation[2])
-            depth[k] = np.where(np.isfinite(seen) & (seen > 1e-9), seen, 1)
-    return points
-
-
-def _distances(
-    views: Sequence[PosedView], places: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return (V, N) distances of projections from positions, infinite behind a view; depths."""
-    distances, depths = np.full(places.shape[:2], np.inf), np.full(places.shape[:2], -1.0)
-    for k, view in enumerate(views):
-        projected, depth = view.project(points)
-        distance = np.linalg.norm(projected - places[k], axis=1)
-        fine = np.isfinite(distance) & (depth > 0)
-        distances[k, fine], depths[k, fine] = distance[fine], depth[fine]
-    return distances, depths
-
-
-def merge_dense_points(
-    parts: Sequence[tuple[PosedView, DensePoints]], options: DenseOptions = DenseOptions()
-) -> DensePoints:
-    """Join the points of all references, without those that an earlier one has given already.
-
-    Args:
-        parts: references with their points.
-        options: `stride_px` and `duplicate_depth`.
-    """
-    kept: list[DensePoints] = []
-    for view, own in parts:
-        seen = _nearest_depths(view, kept, options.stride_px)
-        projected, depth = view.project(own.points)
-        cells = np.rint(projected / options.stride_px).astype(np.int64)
-        cells = cells.clip(0, np.array(seen.shape[::-1]) - 1)
-        before = seen[cells[:, 1], cells[:, 0]]
-        again = np.abs(before - depth) <= options.duplicate_depth * depth
-        kept.append(own[np.flatnonzero(~again)])
-    return DensePoints.joined(kept)
-
-
-def _nearest_depths(view: PosedView, parts: Sequence[DensePoints], stride: int) -> np.ndarray:
-    """Return the depth of the nearest point in each cell of a view, infinite without any."""
-    columns, rows = (-(-side // stride) for side in view.camera.size)
-    nearest = np.full(columns * rows, np.inf)
-    for part in parts:
-        projected, depth = view.project(part.points)
-        cells = np.rint(np.where(depth[:, None] > 0, projected, -1e6) / stride)
-        inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=1)
-        column, row = cells[inside].astype(np.int64).T
-        order = np.argsort(-depth[inside], kind="stable")  # the last that is written stays
-        cell = (row * columns + column)[order]
-        there = np.full(columns * rows, np.inf)
-        there[cell] = depth[inside][order]
-        nearest = np.minimum(nearest, there)
-    return nearest.reshape(rows, columns)

@@ -32,8 +32,8 @@ class MappingOptions:
         min_verified: matches of a pair that must agree with a two-view geometry.
         max_verification_error_px: of a match that agrees.
         min_views: of a model; smaller ones are given up.
-        refine_tracks: align the patches around all observations of a point, and adjust again;
-            None: where the cameras are estimated.
+        refine_tracks: align the patches around all observations of a point before the last
+            adjustment.
         track_refinement: how they are aligned.
         robust_scale_px: of the loss (Cauchy) of the last adjustment: larger errors count less.
         refined_scale_px: the same where tracks are aligned.
@@ -48,7 +48,7 @@ class MappingOptions:
     min_verified: int = 15
     max_verification_error_px: float = 4.0
     min_views: int = 3
-    refine_tracks: bool | None = None
+    refine_tracks: bool = False
     track_refinement: TrackRefinementOptions = field(default_factory=TrackRefinementOptions)
     robust_scale_px: float = 1.0
     refined_scale_px: float = 0.3

@@ -1,0 +1,51 @@
+"""How many photographs become cameras and points: all options at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from .._shared.options import check_ranges
+from ..batch.pair_matching import PairMatchingOptions
+from ..features.selection import SelectionOptions
+from .fusion import DenseOptions
+from .mapping import MappingOptions
+from .pair_selection import PairSelectionOptions
+
+MAX_KEYPOINTS = 8192
+"""Of a photograph, where nothing else is asked for."""
+
+
+def _points() -> SelectionOptions:
+    return SelectionOptions(max_keypoints=MAX_KEYPOINTS)
+
+
+def _matching() -> PairMatchingOptions:
+    return PairMatchingOptions(ratio=0.85, mutual=True)
+
+
+@dataclass(frozen=True, eq=False)
+class MultiViewOptions:
+    """How many photographs become cameras and points.
+
+    Attributes:
+        selection: which points become keypoints.
+        pair_selection: which photographs are matched with each other.
+        matching: of their keypoints.
+        mapping: of cameras and sparse points.
+        dense: of dense points; None: there are none.
+        single_camera: whether photographs of one size were taken by one camera; None: where their
+            EXIF gives one focal length, or none.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    selection: SelectionOptions = field(default_factory=_points)
+    pair_selection: PairSelectionOptions = field(default_factory=PairSelectionOptions)
+    matching: PairMatchingOptions = field(default_factory=_matching)
+    mapping: MappingOptions = field(default_factory=MappingOptions)
+    dense: DenseOptions | None = field(default_factory=DenseOptions)
+    single_camera: bool | None = None
+
+    def __post_init__(self) -> None:
+        check_ranges(self)

@@ -1,0 +1,138 @@
+"""Fusion of matches with synthetic cameras, whose points are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deepdetect import OptionError
+from deepdetect.geometry.camera import Camera
+from deepdetect.sfm.fusion import (
+    DenseOptions,
+    DensePoints,
+    fuse_matches,
+    merge_dense_points,
+)
+from deepdetect.sfm.views import PosedView
+
+SIZE = (320, 240)
+
+
+def view(x: float, name: str = "") -> PosedView:
+    """Return a camera at (x, 0, 0) that looks at (0, 0, 6)."""
+    angle = np.arctan2(x, 6)
+    rotation = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
+    return PosedView(name, Camera(SIZE, 300.0), rotation, -rotation @ [x, 0, 0])
+
+
+@pytest.fixture
+def scene() -> tuple[PosedView, list[PosedView], np.ndarray, np.ndarray]:
+    """A reference, four neighbours, pixels of the reference and the points that they show."""
+    rng = np.random.default_rng(0)
+    xy = rng.uniform((20, 20), (300, 220), (500, 2))
+    reference = view(0)
+    points = reference.camera.rays(xy) * rng.uniform(5, 7, (500, 1))
+    return reference, [view(x) for x in (-1.0, -0.5, 0.5, 1.0)], xy, points
+
+
+def test_exact_matches_give_the_points(scene) -> None:
+    reference, others, xy, points = scene
+    matches = [other.project(points)[0] for other in others]
+    found, errors, counts = fuse_matches(reference, xy, others, matches)
+    np.testing.assert_allclose(found, points, atol=1e-6)
+    assert errors.max() < 1e-6
+    assert (counts == 5).all()
+
+
+def test_noise_is_averaged_over_the_views(scene) -> None:
+    reference, others, xy, points = scene
+    rng = np.random.default_rng(1)
+    matches = [other.project(points)[0] + rng.normal(0, 0.1, xy.shape) for other in others]
+    several, errors, counts = fuse_matches(reference, xy, others, matches)
+    single, _, _ = fuse_matches(reference, xy, others[2:3], matches[2:3], DenseOptions(min_views=2))
+    good = counts > 0
+    assert good.mean() > 0.95
+    assert 0.05 < np.median(errors[good]) < 0.15
+    depth_errors = [
+        np.median(np.abs(each[good, 2] - points[good, 2])) for each in (several, single)
+    ]
+    assert depth_errors[0] < 0.6 * depth_errors[1]
+
+
+def test_a_wrong_match_is_outvoted(scene) -> None:
+    reference, others, xy, points = scene
+    matches = [other.project(points)[0] for other in others]
+    matches[1] = matches[1] + (40, 0)
+    matches[3] = matches[3] - (25, 0)
+    found, errors, counts = fuse_matches(reference, xy, others, matches)
+    np.testing.assert_allclose(found, points, atol=1e-6)
+    assert (counts == 3).all()
+    assert errors.max() < 1e-6
+
+
+def test_two_views_are_not_enough(scene) -> None:
+    reference, others, xy, points = scene
+    matches = [other.project(points)[0] for other in others[:2]]
+    matches[1][:250] = np.nan  # there is no match
+    matches[1][250:] += (30, 0)  # a match that contradicts
+    _, _, counts = fuse_matches(reference, xy, others[:2], matches)
+    assert not counts.any()
+    _, _, counts = fuse_matches(reference, xy, others[:2], matches, DenseOptions(min_views=2))
+    assert (counts >= 2).all()
+
+
+def test_points_without_parallax_or_behind_the_cameras_are_left_out(scene) -> None:
+    reference, _, xy, _ = scene
+    near = [view(x) for x in (0.01, 0.02, 0.03)]
+    far = reference.camera.rays(xy) * 6
+    matches = [other.project(far)[0] for other in near]
+    assert not fuse_matches(reference, xy, near, matches)[2].any()
+    wide = [view(x) for x in (-1.0, 1.0, 0.5)]
+    behind = [other.project(-far)[0] for other in wide]
+    assert np.isfinite(behind[0]).all()
+    assert not fuse_matches(reference, xy, wide, behind)[2].any()
+
+
+def test_without_matches_there_are_no_points(scene) -> None:
+    reference, others, xy, _ = scene
+    for views in ([], others):
+        nothing = [np.full_like(xy, np.nan) for _ in views]
+        assert not fuse_matches(reference, xy, views, nothing)[2].any()
+
+
+def surface(reference: PosedView, depth: float = 6.0, stride: int = 2) -> DensePoints:
+    """Return the points of a plane in the world that a view shows, one at each second pixel."""
+    y, x = np.mgrid[0 : SIZE[1] : stride, 0 : SIZE[0] : stride]
+    rays = reference.camera.rays(np.column_stack([x.ravel(), y.ravel()])) @ reference.rotation
+    points = reference.centre + rays * ((depth - reference.centre[2]) / rays[:, 2:])
+    count = len(points)
+    ones = np.ones(count, np.float32)
+    return DensePoints(
+        points.astype(np.float32), np.zeros((count, 3), np.uint8), ones, ones.astype(np.uint8)
+    )
+
+
+def test_what_two_references_show_is_kept_once() -> None:
+    first, second = view(0), view(0.5)
+    parts = [(first, surface(first)), (second, surface(second))]
+    merged = merge_dense_points(parts)
+    new = len(merged) - len(parts[0][1])
+    projected, _ = first.project(parts[1][1].points)
+    outside = (~((projected > -1) & (projected < SIZE)).all(axis=1)).sum()
+    assert outside > 300
+    assert outside <= new < 1.3 * outside + 600
+    assert len(merge_dense_points(parts[:1])) == len(parts[0][1])
+
+
+def test_another_surface_is_no_duplicate() -> None:
+    first, second = view(0), view(0.01)
+    parts = [(first, surface(first, 6.0)), (second, surface(second, 5.0))]
+    assert len(merge_dense_points(parts)) == len(parts[0][1]) + len(parts[1][1])
+
+
+@pytest.mark.parametrize("wrong", [{"min_views": 1}, {"stride_px": 0}, {"max_error_px": -1}])
+def test_wrong_options_are_refused(wrong: dict) -> None:
+    with pytest.raises(OptionError, match="must be"):
+        DenseOptions(**wrong)
