@@ -18,6 +18,7 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,7 +29,7 @@ from deepdetect.geometry.point_cloud import robust_box
 from deepdetect.io.html_viewer import ViewerCamera, camera_lines
 from deepdetect.io.image import find_images, load_image
 from deepdetect.sfm.colmap import quiet_pycolmap
-from deepdetect.sfm.mapping import SparseModel, read_sparse_model
+from deepdetect.sfm.mapping import MappingOptions, adjust, read_sparse_model
 from deepdetect.viz.render import ViewCamera, orbit_camera, render
 
 LINE_POINTS = 300
@@ -63,10 +64,14 @@ def main() -> None:
     for known in (True, False):
         cameras = "true" if known else "estimated"
         started = cpu_seconds()
-        sparse = map_by_sift(args.scene, names, camera if known else None, args.output / "sift")
-        views = {view.name: view for view in sparse.views.values()}
-        error = sparse.errors.mean()
-        row(f"SIFT, {cameras} intrinsics", scene, views, len(sparse.points), error, None, started)
+        model = map_by_sift(args.scene, names, camera if known else None, args.output / "sift")
+        for title in ("SIFT", "SIFT and our last adjustment"):
+            sparse = read_sparse_model(model)
+            views = {view.name: view for view in sparse.views.values()}
+            error = sparse.errors.mean()
+            count = len(sparse.points)
+            row(f"{title}, {cameras} intrinsics", scene, views, count, error, None, started)
+            adjust(model, known, MappingOptions().robust_scale_px)
         for refined in (False, True):
             started = cpu_seconds()
             found = reconstruct_many(
@@ -98,8 +103,8 @@ def true_camera(scene: PosedScene) -> Camera:
     return Camera((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
 
 
-def map_by_sift(folder: Path, names: list[str], camera: Camera | None, output: Path) -> SparseModel:
-    """Run pycolmap's own pipeline with its defaults."""
+def map_by_sift(folder: Path, names: list[str], camera: Camera | None, output: Path) -> Any:
+    """Run pycolmap's own pipeline with its defaults; return the largest model."""
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
     with quiet_pycolmap() as pycolmap:
@@ -118,7 +123,7 @@ def map_by_sift(folder: Path, names: list[str], camera: Camera | None, output: P
         )
         pycolmap.match_exhaustive(output / "database.db")
         models = pycolmap.incremental_mapping(output / "database.db", folder, output, mapping)
-    return read_sparse_model(max(models.values(), key=lambda model: model.num_reg_images()))
+    return max(models.values(), key=lambda model: model.num_reg_images())
 
 
 def row(

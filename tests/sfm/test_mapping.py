@@ -1,0 +1,110 @@
+"""Models of pycolmap with synthetic cameras and points; the pipeline tests the mapping itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import Camera, OptionError
+from deepdetect.sfm.lens import Lens
+from deepdetect.sfm.mapping import (
+    MappingOptions,
+    adjust,
+    camera_spacing,
+    normalise_model,
+    read_sparse_model,
+    write_sparse_model,
+)
+
+PLACES = np.array([[0.0, 0, 0], [2, 0, 0], [4, 0.5, 0], [6, 0, 0.5]])
+
+
+@pytest.fixture
+def model(pycolmap):
+    """A model of four cameras in a row, with exact points, in no special frame."""
+    made = pycolmap.Reconstruction()
+    camera = Lens.of_camera(Camera((640, 480), 500.0)).colmap_camera()
+    camera.camera_id = 1
+    made.add_camera_with_trivial_rig(camera)
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-1, -2, 8), (7, 2, 12), (80, 3))
+    for number, place in enumerate(PLACES, 1):
+        # Rolled cameras: parallel ones do not tell the principal point from the direction.
+        turn = pycolmap.Rotation3d(np.array([0.1, 0.25 - 0.1 * number, 0.4 * number]))
+        pose = pycolmap.Rigid3d(turn, -turn.matrix() @ place)
+        seen = points @ turn.matrix().T + pose.translation
+        xy = seen[:, :2] / seen[:, 2:] * 500 + (320, 240)
+        image = pycolmap.Image(name=f"{number}.jpg", keypoints=xy, camera_id=1, image_id=number)
+        made.add_image_with_trivial_frame(image, pose)
+    for row, point in enumerate(points):
+        track = pycolmap.Track()
+        for number in range(1, 5):
+            track.add_element(number, row)
+        made.add_point3D(point, track)
+    return made
+
+
+def test_cameras_and_points_are_in_our_convention(model) -> None:
+    sparse = read_sparse_model(model)
+    assert [view.name for view in sparse.views.values()] == [f"{k}.jpg" for k in range(1, 5)]
+    assert sparse.views[1].camera == Camera((640, 480), 500.0)
+    np.testing.assert_allclose([view.centre for view in sparse.views.values()], PLACES, atol=1e-9)
+    assert sparse.errors.max() < 1e-6  # with pixels off by a half it would be 0.7
+    assert (sparse.tracks == 4).all()
+
+
+def test_the_world_becomes_the_frame_of_one_camera(model) -> None:
+    before = read_sparse_model(model)
+    name = normalise_model(model)
+    after = read_sparse_model(model)
+    views = list(after.views.values())
+    reference = next(view for view in views if view.name == name)
+    np.testing.assert_allclose(reference.rotation, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(reference.centre, 0, atol=1e-9)
+    assert camera_spacing(views) == pytest.approx(1)
+    assert after.errors.max() < 1e-6
+    scale = camera_spacing(list(before.views.values()))
+    distances = [np.linalg.norm(sparse.points[0] - sparse.points[1]) for sparse in (before, after)]
+    assert distances[0] / distances[1] == pytest.approx(scale)
+
+
+def test_the_last_adjustment_brings_cameras_back(model) -> None:
+    exact = read_sparse_model(model)
+    rng = np.random.default_rng(1)
+    for number in model.points3D:
+        model.points3D[number].xyz = model.points3D[number].xyz + rng.normal(0, 0.02, 3)
+    assert np.median(read_sparse_model(model).errors) > 0.3
+    adjust(model, True, 1.0)
+    found = read_sparse_model(model)
+    assert found.errors.max() < 1e-3
+    assert found.views[1].camera == exact.views[1].camera
+
+
+def test_the_principal_point_is_estimated_from_many_photographs_only(model, pycolmap) -> None:
+    camera = model.cameras[1]
+    camera.params = np.array([500.0, 500.0, 312.0, 236.0])
+    adjust(model, False, 1.0)  # four photographs are fewer than eight
+    centre = read_sparse_model(model).views[1].camera.centre
+    assert centre == (311.5, 235.5)
+    adjust(model, False, 1.0, MappingOptions(min_views_of_principal_point=3))
+    centre = read_sparse_model(model).views[1].camera.centre
+    assert centre == pytest.approx((319.5, 239.5), abs=0.1)
+
+
+def test_a_written_model_replaces_the_one_before(model, pycolmap, tmp_path: Path) -> None:
+    folder = tmp_path / "sparse"
+    write_sparse_model(model, folder)
+    first = (folder / "images.bin").read_bytes()
+    normalise_model(model)
+    write_sparse_model(model, folder)
+    assert (folder / "images.bin").read_bytes() != first
+    assert pycolmap.Reconstruction(folder).num_points3D() == 80
+    assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
+
+
+@pytest.mark.parametrize("wrong", [{"min_views": 1}, {"min_verified": 0}, {"robust_scale_px": 0}])
+def test_wrong_options_are_refused(wrong: dict) -> None:
+    with pytest.raises(OptionError, match="must"):
+        MappingOptions(**wrong)
