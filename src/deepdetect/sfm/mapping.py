@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import ReconstructionError
+from .._shared.errors import NoDepthError
 from .._shared.options import check_ranges
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .lens import Lens
@@ -32,6 +32,8 @@ class MappingOptions:
         min_verified: matches of a pair that must agree with a two-view geometry.
         max_verification_error_px: of a match that agrees.
         min_views: of a model; smaller ones are given up.
+        max_models: groups of photographs that do not hang together, of which models are made.
+        max_first_pairs: pairs with which each of them may begin.
         refine_tracks: align the patches around all observations of a point before the last
             adjustment.
         track_refinement: how they are aligned.
@@ -48,6 +50,8 @@ class MappingOptions:
     min_verified: int = 15
     max_verification_error_px: float = 4.0
     min_views: int = 3
+    max_models: int = 5
+    max_first_pairs: int = 20
     refine_tracks: bool = False
     track_refinement: TrackRefinementOptions = field(default_factory=TrackRefinementOptions)
     robust_scale_px: float = 1.0
@@ -60,7 +64,7 @@ class MappingOptions:
             self,
             positive=(
                 *("min_verified", "max_verification_error_px"),
-                *("robust_scale_px", "refined_scale_px"),
+                *("robust_scale_px", "refined_scale_px", "max_models", "max_first_pairs"),
             ),
             not_negative=("seed",),
             between={"min_views": (2, np.inf), "min_views_of_principal_point": (3, np.inf)},
@@ -154,11 +158,13 @@ def map_photographs(
         The largest model of pycolmap, and the names of the photographs in each of the others.
 
     Raises:
-        ReconstructionError: no photographs hang together.
+        NoDepthError: no photographs hang together.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()
         how.min_model_size = options.min_views
+        how.max_num_models = options.max_models
+        how.init_num_trials = options.max_first_pairs
         how.min_num_matches = options.min_verified
         how.extract_colors = False
         how.random_seed = options.seed
@@ -175,7 +181,7 @@ def map_photographs(
         )
     found = sorted(models.values(), key=lambda model: -model.num_reg_images())
     if not found or found[0].num_reg_images() < options.min_views:
-        raise ReconstructionError(
+        raise NoDepthError(
             "the photographs do not hang together: take them so that each shows most of what the "
             "one before shows, from another place"
         )

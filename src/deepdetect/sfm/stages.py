@@ -19,7 +19,7 @@ import numpy as np
 
 from .. import __version__
 from .._shared.atomic import atomic_path
-from .._shared.errors import ImageError, OptionError, ReconstructionError
+from .._shared.errors import ImageError, MissingImageError, OptionError, ReconstructionError
 from .._shared.parallel import available_memory, map_in_processes, processor_count
 from .._shared.progress import progress
 from ..batch.extraction import extract_features
@@ -91,7 +91,7 @@ class Stages:
         paths = [Path(path) for path in images]
         missing = [path for path in paths if not path.is_file()]
         if missing:
-            raise ImageError(f"there is no file {missing[0]}: check the path")
+            raise MissingImageError(f"there is no file {missing[0]}: check the path")
         taken: dict[str, Path] = {}
         for path in paths:
             if taken.setdefault(path.name, path).resolve() != path.resolve():
