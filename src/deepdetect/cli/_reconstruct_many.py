@@ -48,8 +48,6 @@ def reconstruct_folder(
     detector = given_only({name: values.pop(name) for name in DETECTOR.names})
     if values.pop("rectified") is not None:
         raise click.UsageError("--rectified and --not-rectified are for two photographs")
-    if values.pop("max_megapixels") is not None:
-        raise click.UsageError("--max-megapixels is for two photographs")
     fields = {field.name for field in dataclasses.fields(SelectionOptions)} - {*SELECTION.skip}
     selection = {name: values.pop(name) for name in fields if name in values}
     options = MultiViewOptions()
