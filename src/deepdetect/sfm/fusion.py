@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from ..matching.guided.options import RectifiedMatchingOptions
 from .views import PosedView
 
@@ -27,6 +27,7 @@ def _known_poses() -> RectifiedMatchingOptions:
     return RectifiedMatchingOptions(max_refits=0, min_agreement=0.0)
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class DenseOptions:
     """How photographs with known cameras become dense points.

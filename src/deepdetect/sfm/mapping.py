@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import NoDepthError
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .lens import Lens
 from .track_refinement import Observations, TrackRefinementOptions, refine_observations
@@ -24,6 +24,7 @@ from .views import PosedView
 Pair = tuple[str, str]
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class MappingOptions:
     """How poses and sparse points are estimated.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from ..batch.pair_matching import PairMatchingOptions
 from ..features.selection import SelectionOptions
 from .fusion import DenseOptions
@@ -23,6 +23,7 @@ def _matching() -> PairMatchingOptions:
     return PairMatchingOptions(ratio=0.85, mutual=True)
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class MultiViewOptions:
     """How many photographs become cameras and points.

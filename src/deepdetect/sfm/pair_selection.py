@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 
 Pair = tuple[str, str]
 
@@ -22,6 +22,7 @@ KMEANS_ITERATIONS = 10
 MAX_TRAINING_DESCRIPTORS = 50_000
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class PairSelectionOptions:
     """Which photographs are matched with each other.

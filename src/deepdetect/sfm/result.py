@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .._shared.options import suggest_keywords
 from ..geometry.point_cloud import PointCloud
 from .lens import Lens
 from .views import PosedView
@@ -17,6 +18,7 @@ SCALE = "lengths are in spacings, the median distance from a camera to the neare
 true scale is not known"
 
 
+@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class MultiViewReconstruction:
     """Cameras and points of many photographs.

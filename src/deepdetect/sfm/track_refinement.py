@@ -15,13 +15,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from .._shared.options import check_ranges
+from .._shared.options import check_ranges, suggest_keywords
 from .views import PosedView
 
 BLOCK = 2000
 """Patches that are aligned at once, which bounds the memory."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class TrackRefinementOptions:
     """How the observations of a point are aligned.

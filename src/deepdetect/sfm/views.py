@@ -23,7 +23,7 @@ class PosedView:
     Example:
         >>> view = PosedView("a.jpg", Camera((640, 480), 500.0), np.eye(3), np.array([1.0, 0, 0]))
         >>> view.centre.tolist(), view.project(np.array([[0.0, 0.0, 10.0]]))[0].tolist()
-        ([-1.0, -0.0, -0.0], [[369.5, 239.5]])
+        ([-1.0, 0.0, 0.0], [[369.5, 239.5]])
     """
 
     name: str
@@ -54,8 +54,10 @@ def relative_fundamental(first: PosedView, second: PosedView) -> np.ndarray:
         >>> camera = Camera((640, 480), 500.0)
         >>> views = [PosedView("", camera, np.eye(3), np.array([x, 0.0, 0])) for x in (0, -1)]
         >>> matrix = relative_fundamental(*views)
-        >>> (matrix / matrix[2, 1]).round(9).tolist()  # matches lie on the same row
-        [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [-0.0, 1.0, 0.0]]
+        >>> (matrix / matrix[2, 1]).round(9) + 0.0  # matches lie on the same row
+        array([[ 0.,  0.,  0.],
+               [ 0.,  0., -1.],
+               [ 0.,  1.,  0.]])
     """
     rotation = second.rotation @ first.rotation.T
     translation = second.translation - rotation @ first.translation
