@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from .._shared.errors import MissingExtraError
+from .._shared.opencv import import_opencv
 
 PIXEL_CENTRE = 0.5
 """COLMAP's position of the centre of the first pixel; ours is 0."""
@@ -20,8 +21,7 @@ def import_pycolmap() -> Any:
     Raises:
         MissingExtraError: it is not installed, or h5py is not.
     """
-    import cv2  # noqa: F401
-
+    import_opencv()
     try:
         import h5py  # noqa: F401
         import pycolmap

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from .._shared.opencv import cv2
 from ..geometry.camera import Camera
 from ..io.image import load_image, luma
 from ..matching.guided.rectified import match_by_rectification

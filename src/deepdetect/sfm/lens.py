@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 
+from .._shared.opencv import cv2
 from ..geometry.camera import Camera
 from .colmap import PIXEL_CENTRE, import_pycolmap
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
+from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .views import PosedView
 
