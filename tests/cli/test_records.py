@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from deepdetect import OptionError
-from deepdetect.cli._records import OutputRecords
+from deepdetect.cli._records import OutputRecords, claim_outputs
 
 
 @pytest.fixture
@@ -52,3 +52,27 @@ def test_a_lost_output_is_made_again(tmp_path: Path, source: Path) -> None:
     outputs[1].unlink()
     assert records.find(source, outputs) is None
     assert records.find(source, outputs[:1]) == {"keypoints": 3}
+
+
+def test_each_output_belongs_to_the_files_that_it_was_made_from(tmp_path: Path) -> None:
+    first, second = [tmp_path / "a.png"], [tmp_path / "b.png"]
+    jpeg, png = tmp_path / "out" / "pan.jpg", tmp_path / "out" / "pan.png"
+    claim_outputs("stitch", first, [jpeg], overwrite=False)
+    jpeg.write_bytes(b"of a")
+    claim_outputs("stitch", second, [png], overwrite=False)
+    png.write_bytes(b"of b")
+    for inputs, outputs in ((second, [jpeg]), (first, [png]), (second, [png, jpeg])):
+        with pytest.raises(OptionError, match="made from"):
+            claim_outputs("stitch", inputs, outputs, overwrite=False)
+    claim_outputs("stitch", first, [jpeg], overwrite=False)
+    claim_outputs("stitch", second, [jpeg], overwrite=True)
+
+
+def test_what_nobody_claimed_is_not_replaced(tmp_path: Path) -> None:
+    inputs = [tmp_path / "a.png"]
+    outputs = [tmp_path / "m.npz", tmp_path / "m.jpg"]
+    claim_outputs("match", inputs, outputs[:1], overwrite=False)
+    for path in outputs:
+        path.write_bytes(b"the picture is somebody's own")
+    with pytest.raises(OptionError, match=r"m\.jpg exists already, and is not known"):
+        claim_outputs("match", inputs, outputs, overwrite=False)

@@ -170,3 +170,12 @@ def test_a_heat_map_has_no_points(detector: DeepDetect, one_line) -> None:
         with pytest.raises(OptionError, match="find points in the image") as caught:
             select_keypoints(heatmap, options)
         one_line(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [(None, "cv2.imread"), (iter([np.zeros((40, 40), np.uint8)]), "give a list")],
+)
+def test_what_is_no_image_is_named(detector: DeepDetect, image: object, words: str) -> None:
+    with pytest.raises(ImageError, match=words):
+        detector.detect(image)

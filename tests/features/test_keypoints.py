@@ -330,3 +330,10 @@ def test_without_torch_it_is_one_sentence(monkeypatch: pytest.MonkeyPatch, one_l
     with pytest.raises(MissingExtraError, match="pip install torch") as caught:
         POINTS.to_lightglue()
     one_line(caught.value)
+
+
+def test_lightglue_gets_no_angle_that_is_unset() -> None:
+    pytest.importorskip("torch")
+    points = Keypoints([[3, 4], [5, 6]], [1, 1], (9, 9), angles=np.array([-1, 90], np.float32))
+    angles = points.to_lightglue(angle=45)["oris"]
+    np.testing.assert_allclose(angles, np.deg2rad([[45, 90]]), rtol=1e-6)

@@ -29,8 +29,12 @@ def as_array(image: Any) -> np.ndarray:
     """Return an array-like, or a PyTorch tensor of any device, as an array.
 
     Raises:
-        ImageError: its rows are of unequal length.
+        ImageError: it is None or an iterator, or its rows are of unequal length.
     """
+    if image is None:
+        raise ImageError("the image is None, as `cv2.imread` returns for a missing file: check it")
+    if hasattr(image, "__next__"):
+        raise ImageError("an image is an iterator: give a list of images")
     if hasattr(image, "detach") and hasattr(image, "cpu"):  # a tensor
         image = image.detach().cpu()
         if image.is_floating_point():

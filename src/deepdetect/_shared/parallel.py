@@ -93,6 +93,9 @@ def map_in_processes(
     from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
     from concurrent.futures.process import BrokenProcessPool
 
+    from .opencv import import_opencv
+
+    import_opencv()  # what is missing is said here, and not by workers that cannot start
     # Spawned, not forked: a fork copies the locks of the parent's threads.
     context = multiprocessing.get_context("spawn")
     ended = context.Event()

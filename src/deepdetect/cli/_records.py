@@ -113,7 +113,7 @@ class OutputRecords:
 def claim_outputs(
     command: str, inputs: Sequence[Path], outputs: Sequence[Path], overwrite: bool
 ) -> None:
-    """Note from which files some outputs in one folder are made; refuse those of other files.
+    """Note from which files each output is made; refuse to replace those of other files.
 
     Outputs of the same files are replaced, whatever the options were: call it before the work.
 
@@ -121,19 +121,21 @@ def claim_outputs(
         OptionError: an output exists that was made from other files, or by something else.
         DeepDetectError: the folder cannot be written.
     """
-    place = outputs[0].parent / FOLDER / command / f"{outputs[0].stem}.json"
     source = " and ".join(str(path.resolve()) for path in inputs)
-    record = _read(place)
-    there = [path for path in outputs if path.exists()]
-    if there and not overwrite:
-        if record is None or not any(path.name in record["files"] for path in there):
-            raise _exists(there[0], f"and is not known to be of {source}")
+    places = {path: path.parent / FOLDER / command / f"{path.name}.json" for path in outputs}
+    for path, place in places.items():
+        if overwrite or not path.exists():
+            continue
+        record = _read(place)
+        if record is None or path.name not in record["files"]:
+            raise _exists(path, f"and is not known to be of {source}")
         if record["input"] != source:
-            raise _exists(there[0], f"made from {record['input']}")
-    files = {**(record["files"] if record else {}), **dict.fromkeys(p.name for p in outputs)}
-    value = {"input": source, "state": [0, 0], "settings": {}, "files": files, "numbers": None}
-    with atomic_path(place) as temporary:
-        temporary.write_text(json.dumps(value), encoding="utf-8")
+            raise _exists(path, f"made from {record['input']}")
+    for path, place in places.items():
+        files = {path.name: None}
+        value = {"input": source, "state": [0, 0], "settings": {}, "files": files, "numbers": None}
+        with atomic_path(place) as temporary:
+            temporary.write_text(json.dumps(value), encoding="utf-8")
 
 
 def recorded_outputs(folder: Path) -> set[Path]:

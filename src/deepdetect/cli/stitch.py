@@ -8,13 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .._shared.errors import (
-    BatchError,
-    DeepDetectError,
-    ImageError,
-    OptionError,
-    RegistrationError,
-)
+from .._shared.errors import DeepDetectError, ImageError, OptionError, RegistrationError
 from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
     DETECTOR,
@@ -89,7 +83,7 @@ def stitch(
     images, failures = _readable(images)
     if len(images) < min(given, 2) or (reference is not None and reference not in images):
         what = "too few photographs, or not the reference, can be read"
-        raise BatchError(f"there is no panorama, as {what}", failures)
+        raise ImageError(f"there is no panorama, as {what}: {'; '.join(failures)}")
     claim_outputs("stitch", images, [output], overwrite)
     try:
         with stage_progress("stitching", STAGES) as done:

@@ -167,7 +167,7 @@ class Keypoints:
             descriptors: (N, D) float32; None: those that the keypoints have. Without any the
                 dictionary has none.
             size: diameter in pixels where the keypoints have no sizes.
-            angle: orientation in degrees where they have no angles.
+            angle: orientation in degrees where they have no angles, or OpenCV's -1.
 
         Returns:
             float32 tensors with a batch dimension: "keypoints" (1, N, 2), "keypoint_scores"
@@ -190,6 +190,7 @@ class Keypoints:
         count = len(self)
         sizes = np.full(count, size, np.float32) if self.sizes is None else self.sizes
         angles = np.full(count, angle, np.float32) if self.angles is None else self.angles
+        angles = np.where(angles == UNSET_ANGLE, np.float32(angle), angles)
         arrays = {
             "keypoints": self.xy,
             "keypoint_scores": self.scores,
@@ -316,6 +317,9 @@ def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
         column, row = column >> 1, row >> 1
     return (order / 4**bits).astype(np.float32)
 
+
+UNSET_ANGLE = -1
+"""OpenCV's angle of a keypoint that has none."""
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
 """Of a position from the keypoint that it belongs to."""

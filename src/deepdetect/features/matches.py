@@ -163,6 +163,8 @@ class Matches:
             )
         for name, dtype in _COLUMNS.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype))
+        if not (np.isfinite(self.points0).all() and np.isfinite(self.points1).all()):
+            raise OptionError("matches need finite positions: leave out those that are not")
         for side in (0, 1):
             name = f"indices{side}"
             indices, keypoints = getattr(self, name), getattr(self, f"keypoints{side}")
