@@ -145,7 +145,7 @@ def test_too_few_that_can_be_read(bad: str, files: list[Path]) -> None:
     words = ["a.png", "b.png", "bad.png", "--reference", "bad.png"]
     words = words if bad == "reference" else ["a.png", "bad.png"]
     result = CliRunner().invoke(main, ["stitch", *words, "-o", "p.png"])
-    assert result.exit_code == 1, result.output
+    assert result.exit_code == 2, result.output
     assert "there is no panorama" in result.stderr
     assert "bad.png" in result.stderr.splitlines()[-1]
     assert not Path("p.png").exists()
