@@ -171,6 +171,36 @@ def test_more_keypoints_than_int16_holds() -> None:
     assert scores.tolist() == [1, 1]
 
 
+@pytest.mark.parametrize("matcher", ["auto", "patchmatch"])
+def test_many_points_are_not_matched_by_patchmatch(matcher: str, tmp_path: Path) -> None:
+    """It needs a grid: `auto` takes FLANN there, which finds the matches."""
+    import h5py
+
+    pytest.importorskip("numba", reason="needs numba (the extra match)")
+    generator = np.random.default_rng(0)
+    descriptors = np.abs(generator.normal(size=(20_100, 16))).astype(np.float32)
+    descriptors /= 2 * np.linalg.norm(descriptors, axis=1, keepdims=True)
+    order = generator.permutation(len(descriptors))
+    with h5py.File(tmp_path / "f.h5", "w") as file:
+        file.attrs["deepdetect"] = '{"descriptor": "rootsift"}'  # so they are bytes
+        for name, rows in (("x.jpg", np.arange(len(order))), ("y.jpg", order)):
+            file[f"{name}/descriptors"] = descriptors[rows].T
+            file[f"{name}/keypoints"] = generator.uniform(0, 999, (len(order), 2)).astype("f4")
+            file[f"{name}/scales"] = np.ones(len(order), np.float32)
+    options = PairMatchingOptions(matcher=matcher, mutual=False)
+    arguments = tmp_path / "f.h5", [("x.jpg", "y.jpg")], tmp_path / "m.h5"
+    if matcher == "patchmatch":
+        with pytest.raises(OptionError, match="dense keypoints of one scale and angle"):
+            match_pairs(*arguments, options=options, workers=1)
+        return
+    match_pairs(*arguments, options=options, workers=1)
+    with h5py.File(tmp_path / "m.h5") as file:
+        matches = file["x.jpg/y.jpg/matches0"][()]
+    found = matches >= 0
+    assert found.mean() > 0.5
+    assert (order[matches[found]] == np.flatnonzero(found)).mean() > 0.95
+
+
 def test_lists_of_pairs(tmp_path: Path) -> None:
     path = tmp_path / "pairs.txt"
     path.write_text("a.jpg b.jpg\n\nb.jpg a.jpg\na.jpg b.jpg\nwith blank.jpg\tc d.jpg\n")

@@ -742,3 +742,14 @@ def test_images_of_opencv_are_matched_as_what_they_show(photo: np.ndarray) -> No
     np.testing.assert_array_equal(found.keypoints1.scores, expected.keypoints1.scores)
     with pytest.raises(OptionError, match="unknown channel order 'brg'"):
         match_images(*bgr, channels="brg")
+
+
+def test_patchmatch_refuses_points_with_scales(photo: np.ndarray) -> None:
+    with pytest.raises(OptionError, match="dense keypoints of one scale and angle"):
+        match_images(
+            photo,
+            photo,
+            guided=False,
+            matcher="patchmatch",
+            selection=SelectionOptions(max_keypoints=200),
+        )

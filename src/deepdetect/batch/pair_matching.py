@@ -274,7 +274,10 @@ def _match_part(task: Task, features: Path, options: PairMatchingOptions) -> dic
             for (name0, name1), state in pairs:
                 if held is None or held[0] != name0:
                     held = name0, _read_features(file, name0)
-                matches, scores = match_features(held[1], _read_features(file, name1), options)
+                scaled = any("scales" in file[name] for name in (name0, name1))
+                matches, scores = match_features(
+                    held[1], _read_features(file, name1), options, scaled=scaled
+                )
                 counts[name0, name1] = int(np.count_nonzero(matches >= 0))
                 arrays = {"matches0": matches, "matching_scores0": scores}
                 yield Group(pair_name(name0, name1), arrays, state)
@@ -296,13 +299,18 @@ def _read_features(file: Any, name: str) -> Features:
 
 
 def match_features(
-    features0: Features, features1: Features, options: PairMatchingOptions = PairMatchingOptions()
+    features0: Features,
+    features1: Features,
+    options: PairMatchingOptions = PairMatchingOptions(),
+    *,
+    scaled: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Match the features of two images.
 
     Args:
         features0, features1: positions (N, 2) in pixels, and descriptors (N, D) uint8 or float32.
         options: how.
+        scaled: keypoints have sizes of their own, as points do and dense keypoints do not.
 
     Returns:
         (N0,) int32 rows of the second image, -1 where there is no match, and (N0,) float32 scores.
@@ -319,7 +327,7 @@ def match_features(
         ratio=options.ratio,
         mutual=options.mutual,
         seed=options.seed,
-        positions=(np.rint(features0[0]), np.rint(features1[0])),
+        positions=None if scaled else (features0[0], features1[0]),
     )
     rows0, rows1, ratios = found.rows0, found.rows1, found.ratios
     if options.verify != "none":

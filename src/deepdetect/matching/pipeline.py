@@ -290,8 +290,17 @@ def unguided_matches(
             ratio=options.ratio,
             mutual=options.mutual,
             seed=options.geometry.seed,
-            positions=(np.rint(keypoints[0].xy), np.rint(keypoints[1].xy)),
+            positions=_dense_positions(keypoints),
         )
+
+
+def _dense_positions(
+    keypoints: Sequence[Keypoints],
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the positions of keypoints of one scale; None of those with their own."""
+    if any(each.sizes is not None for each in keypoints):
+        return None
+    return keypoints[0].xy, keypoints[1].xy
 
 
 def _describe(gray: np.ndarray, keypoints: Keypoints, options: MatchingOptions) -> np.ndarray:

@@ -8,7 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect import OptionError
-from deepdetect.features.matchers import MATCHERS, DescriptorMatches, get_matcher, match_descriptors
+from deepdetect.features.matchers import (
+    MATCHERS,
+    DescriptorMatches,
+    get_matcher,
+    match_descriptors,
+    matching,
+)
 from deepdetect.features.matchers.approximate import flann_neighbours
 from deepdetect.features.matchers.brute_force import exact_neighbours
 
@@ -238,14 +244,36 @@ def test_every_matcher_keeps_the_contract(name: str, count: int) -> None:
 def test_auto_takes_the_matcher_that_fits(
     count: int, positions: bool, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from deepdetect.features.matchers import matching
-
     called = []
     for name in ("exact", "patchmatch", "flann"):
         monkeypatch.setattr(
             matching, f"{name}_neighbours", lambda *_, name=name: called.append(name)
         )
-    some = np.zeros((count, 8), np.float32)
+    some = np.zeros((count, 8), np.uint8)
     places = np.zeros((count, 2))
     get_matcher("auto")(some, some, 1, 0, (places, places) if positions else None)
     assert called == [expected]
+
+
+def test_auto_takes_patchmatch_only_where_it_suits(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = np.random.default_rng(0)
+    base = generator.integers(0, 256, (400, 16)).astype(np.uint8)
+    order = generator.permutation(400)
+    pixels = np.stack(np.divmod(np.arange(400), 20), 1).astype(np.float32)
+    monkeypatch.setattr(matching, "MAX_EXACT_PRODUCT", 0)
+    taken = []
+
+    def spy(*arguments):
+        taken.append("patchmatch")
+        return exact_neighbours(*arguments)
+
+    monkeypatch.setattr(matching, "patchmatch_neighbours", spy)
+    monkeypatch.setattr(matching, "has_compiler", lambda: True)
+    both, floats = (pixels, pixels[order]), base.astype(np.float32)
+    automatic = get_matcher("auto")
+    for queries, positions in ((base, (pixels + 0.25, pixels)), (base, None), (floats, both)):
+        rows, _ = automatic(queries[order], base, 2, 0, positions)
+        assert (rows[:, 0] == order).mean() > 0.9
+    assert taken == []
+    automatic(base[order], base, 2, 0, both[::-1])
+    assert taken == ["patchmatch"]

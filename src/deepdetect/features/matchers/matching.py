@@ -12,6 +12,7 @@ import numpy as np
 
 from ..._shared.kernels import has_compiler
 from ..._shared.registry import look_up
+from ..keypoints import on_pixels
 from .approximate import faiss_neighbours, flann_neighbours
 from .brute_force import exact_neighbours, hamming_neighbours
 from .patchmatch import patchmatch_neighbours
@@ -34,7 +35,8 @@ class Matcher(Protocol):
             queries, base: (N, D) and (M, D) descriptors, M >= count, uint8 or float32.
             count: neighbours of each query.
             seed: of random choices: the same seed gives the same result.
-            positions: (N, 2) and (M, 2) keypoints in pixels.
+            positions: (N, 2) and (M, 2) keypoints in pixels; None where they are not all of one
+                scale and angle, so that neighbours need not match alike.
 
         Returns:
             (N, count) int32 rows of `base` and (N, count) float32 distances, nearest first.
@@ -55,13 +57,14 @@ def automatic_neighbours(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find neighbours exactly where keypoints are few, else by PatchMatch, else by FLANN.
 
-    PatchMatch spreads good matches over dense keypoints, and needs their positions and numba; FLANN
-    does not.
+    PatchMatch spreads good matches over dense keypoints: it needs bytes, keypoints on whole pixels
+    of one scale and angle, and numba; FLANN does not.
     Arguments and result as of `Matcher`.
     """
     if len(queries) * len(base) <= MAX_EXACT_PRODUCT:
         return exact_neighbours(queries, base, count, seed, positions)
-    if positions is not None and has_compiler():
+    suits = positions is not None and all(on_pixels(xy) for xy in positions)
+    if suits and queries.dtype == base.dtype == np.uint8 and has_compiler():
         return patchmatch_neighbours(queries, base, count, seed, positions)
     return flann_neighbours(queries, base, count, seed, positions)
 
@@ -120,7 +123,8 @@ def match_descriptors(
         ratio: the ratio of a match must be below this (paper's code: 0.99).
         mutual: keep only mutual nearest neighbours.
         seed: of a matcher that is random.
-        positions: (N, 2) and (M, 2) of the keypoints, for a matcher that uses them.
+        positions: (N, 2) and (M, 2) of the keypoints, for a matcher that uses them; None where
+            they are not all of one scale and angle.
 
     Returns:
         The matches, by ascending row of the first set. There are none when the second set has

@@ -66,12 +66,18 @@ def patchmatch_neighbours(
     A `Matcher` of bytes on whole pixels; the result is the same for any number of threads.
 
     Raises:
-        OptionError: the descriptors are not bytes, or the keypoints are not on whole pixels.
+        OptionError: the descriptors are not bytes, or the keypoints are not on whole pixels or have
+            scales of their own.
     """
-    if queries.dtype != np.uint8 or base.dtype != np.uint8 or positions is None:
+    if queries.dtype != np.uint8 or base.dtype != np.uint8:
         raise OptionError(
-            "the matcher patchmatch needs descriptors of bytes, such as sift and rootsift, with "
-            "their positions: use flann, faiss or exact"
+            "the matcher patchmatch needs descriptors of bytes, such as sift and rootsift: use "
+            "flann, faiss or exact"
+        )
+    if positions is None:
+        raise OptionError(
+            "the matcher patchmatch needs dense keypoints of one scale and angle, not points with "
+            "their own: use auto, flann, faiss or exact"
         )
     if count > 2 or len(base) < 2:
         raise OptionError("the matcher patchmatch finds one or two neighbours, of two or more")
