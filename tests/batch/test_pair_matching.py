@@ -171,6 +171,66 @@ def test_more_keypoints_than_int16_holds() -> None:
     assert scores.tolist() == [1, 1]
 
 
+def write_foreign(path: Path, **images: tuple[np.ndarray, np.ndarray]) -> None:
+    """Write keypoints and descriptors of images as hloc does."""
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for name, (keypoints, descriptors) in images.items():
+            file[f"{name}/keypoints"], file[f"{name}/descriptors"] = keypoints, descriptors
+
+
+def test_features_of_other_programs_that_have_changed(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    features = {
+        name: (generator.uniform(0, 99, (40, 2)), generator.normal(size=(8, 40))) for name in "xyz"
+    }
+    path, pairs = tmp_path / "f.h5", [("x", "y"), ("y", "z")]
+    write_foreign(path, **features)
+    match_pairs(path, pairs, tmp_path / "m.h5", workers=1)
+    write_foreign(path, **features)
+    assert match_pairs(path, pairs, tmp_path / "m.h5", workers=1).skipped == 2
+    features["x"] = features["x"][0], features["x"][1][:, ::-1]
+    write_foreign(path, **features)
+    report = match_pairs(path, pairs, tmp_path / "m.h5", workers=1)
+    assert (list(report.matches), report.skipped) == ([("x", "y")], 1)
+
+
+def test_features_that_do_not_fit_do_not_stop_the_others(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    whole = generator.uniform(0, 99, (40, 2)), generator.normal(size=(8, 40))
+    write_foreign(
+        tmp_path / "f.h5",
+        good=whole,
+        same=whole,
+        wide=(whole[0], generator.normal(size=(9, 40))),
+        few=(whole[0], whole[1][:, :20]),
+        flat=(whole[0][:, 0], whole[1]),
+    )
+    pairs = [("good", name) for name in ("same", "wide", "few", "flat", "same/keypoints")]
+    report = match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5", workers=1)
+    assert report.matches == {("good", "same"): 40}
+    told = {failure.split(": ")[0]: failure for failure in report.failures}
+    assert "descriptors of good have 8 numbers, those of wide have 9" in told["good wide"]
+    assert "(40, 2) and descriptors of shape (8, 20)" in told["good few"]
+    assert "keypoints of shape (40,)" in told["good flat"]
+    assert "no features of same/keypoints" in told["good same/keypoints"]
+
+
+def test_pairs_from_python(features: Path, tmp_path: Path) -> None:
+    pairs = [PAIR, PAIR[::-1], list(PAIR)]
+    report = match_pairs(features, pairs, tmp_path / "m.h5", workers=1)
+    assert (list(report.matches), report.skipped) == ([PAIR], 0)
+
+
+@pytest.mark.parametrize(
+    "pairs", [["a.jpg"], ["ab"], [("a", "b", "c")], [(1, 2)], [1], 1, [("a", "a")], [("a", "")]]
+)
+def test_wrong_pairs_from_python(pairs: object, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match="in `pairs` is no pair"):
+        match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5")
+
+
 @pytest.mark.parametrize("matcher", ["auto", "patchmatch"])
 def test_many_points_are_not_matched_by_patchmatch(matcher: str, tmp_path: Path) -> None:
     """It needs a grid: `auto` takes FLANN there, which finds the matches."""
@@ -214,7 +274,7 @@ def test_lists_of_pairs(tmp_path: Path) -> None:
         ("a.jpg b.jpg c.jpg\n", "line 1 of .* is no pair"),
         ("a.jpg a.jpg\n", "line 1 of .* is no pair"),
         ("\n", "has no pairs"),
-        (None, "cannot be read"),
+        (None, "there is no file .*pairs.txt: check the path"),
     ],
 )
 def test_wrong_lists_of_pairs(text: str | None, message: str, tmp_path: Path) -> None:
@@ -230,6 +290,7 @@ def test_wrong_lists_of_pairs(text: str | None, message: str, tmp_path: Path) ->
     [
         ({"ratio": 1.5}, "`ratio` must lie in"),
         ({"matcher": "exakt"}, "did you mean 'exact'"),
+        ({"matcher": "hamming"}, r"unknown matcher 'hamming' .*\(known: auto, flann"),
         ({"verify": "fundamentle"}, "did you mean 'fundamental'"),
         ({"verify": "essential"}, "knows no cameras"),
     ],

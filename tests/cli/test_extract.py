@@ -73,7 +73,7 @@ def test_a_bad_image_is_listed_at_the_end(run, photos: Path) -> None:
     [
         (("extract", "nowhere"), "there is no folder"),
         (("extract", "PHOTOS", "--engine", "rai"), "did you mean 'ray'"),
-        (("match-many", "no.h5", "--pairs", "no.txt"), "cannot be read"),
+        (("match-many", "no.h5", "--pairs", "no.txt"), "there is no file no.txt"),
         (("label", "PHOTOS", "-o", "masks", "--engine", "rai"), "did you mean 'ray'"),
     ],
 )

@@ -746,10 +746,4 @@ def test_images_of_opencv_are_matched_as_what_they_show(photo: np.ndarray) -> No
 
 def test_patchmatch_refuses_points_with_scales(photo: np.ndarray) -> None:
     with pytest.raises(OptionError, match="dense keypoints of one scale and angle"):
-        match_images(
-            photo,
-            photo,
-            guided=False,
-            matcher="patchmatch",
-            selection=SelectionOptions(max_keypoints=200),
-        )
+        match_images(photo, photo, guided=False, matcher="patchmatch", max_keypoints=200)

@@ -12,21 +12,39 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from .._shared.errors import BatchError, DeepDetectError, OptionError
+from .._shared.errors import (
+    BatchError,
+    DeepDetectError,
+    InvalidFileError,
+    MissingFileError,
+    OptionError,
+)
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import TaskMap
 from .._shared.progress import progress
-from ..features.matchers import get_matcher, match_descriptors
+from .._shared.registry import look_up
+from ..features.matchers import MATCHERS, get_matcher, match_descriptors
 from ..geometry import GeometryOptions, estimate_geometry
 from .engines import get_engine
 from .extraction import DESCRIPTOR, parts_of
-from .parted_file import SETTINGS, Group, PartedFile, open_hdf5, state_of, write_groups
+from .parted_file import (
+    SETTINGS,
+    Group,
+    PartedFile,
+    import_h5py,
+    open_hdf5,
+    state_of,
+    write_groups,
+)
 
 PAIRS_PER_PART = 64
 """At most."""
 
 ROOT_SIFT_NORM = 512
 """Length of RootSIFT descriptors as bytes."""
+
+MATCHERS_OF_FLOATS = {name: MATCHERS[name] for name in MATCHERS if name != "hamming"}
+"""Features in files are no bits."""
 
 Pair = tuple[str, str]
 
@@ -60,7 +78,7 @@ class PairMatchingOptions:
         check_ranges(
             self, positive=("inlier_threshold",), not_negative=("seed",), fractions=("ratio",)
         )
-        get_matcher(self.matcher)
+        look_up("matcher", self.matcher, MATCHERS_OF_FLOATS)
         if self.verify == "essential":
             raise OptionError("`verify` knows no cameras: use fundamental, homography or auto")
         self.geometry()
@@ -115,11 +133,14 @@ def read_pairs(path: str | Path) -> list[Pair]:
     Raises:
         DeepDetectError: the file is missing or empty, or a line is something else.
     """
-    pairs: dict[Pair, None] = {}
+    pairs: list[Pair] = []
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise MissingFileError(f"there is no file {path}: check the path") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise DeepDetectError(f"{path} cannot be read ({error}): check the file") from None
+        reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
+        raise DeepDetectError(f"{path} cannot be read ({reason}): check the file") from None
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip():
             continue
@@ -129,12 +150,38 @@ def read_pairs(path: str | Path) -> list[Pair]:
                 f"line {number} of {path} is no pair: give the names of two images, with a blank "
                 "between, or a tab where they have blanks themselves"
             )
-        pair = (names[0], names[1])
-        if pair[::-1] not in pairs:
-            pairs[pair] = None
+        pairs.append((names[0], names[1]))
     if not pairs:
         raise DeepDetectError(f"{path} has no pairs: give the names of two images on each line")
-    return list(pairs)
+    return _once_each(pairs)
+
+
+def _checked_pairs(pairs: Any) -> list[Pair]:
+    """Return pairs that were given from Python, once each."""
+    try:
+        found = [(pair if isinstance(pair, str) else tuple(pair)) for pair in pairs]
+    except TypeError:
+        found = [str(pairs)]
+    for pair in found:
+        if (
+            isinstance(pair, str)
+            or len(pair) != 2
+            or not all(isinstance(name, str) and name for name in pair)
+            or pair[0] == pair[1]
+        ):
+            raise OptionError(
+                f"{pair!r} in `pairs` is no pair: give (name, name) of two images, or a text file"
+            )
+    return _once_each(found)
+
+
+def _once_each(pairs: Sequence[Pair]) -> list[Pair]:
+    """Leave out pairs that are there before, or the other way round."""
+    kept: dict[Pair, None] = {}
+    for pair in pairs:
+        if pair[::-1] not in kept:
+            kept[pair] = None
+    return list(kept)
 
 
 @suggest_keywords
@@ -161,7 +208,8 @@ def match_pairs(
 
     Args:
         features: file of `extract_features`, or of hloc.
-        pairs: of names, or a text file with one on each line.
+        pairs: of names, or a text file with one on each line. One that is there twice, or also the
+            other way round, is taken once.
         path: the file.
         options: how they are matched.
         engine: "processes" of this machine, or "ray" for a cluster.
@@ -170,10 +218,12 @@ def match_pairs(
         quiet: show no progress bar.
 
     Returns:
-        What was done. A pair without features does not stop the others: see `failures`.
+        What was done. A pair without features, or whose features do not fit together, does not
+        stop the others: see `failures`.
 
     Raises:
-        OptionError: an option is unknown; or the file exists, made with other settings.
+        OptionError: an option is unknown, or a pair is none; or the file exists, made with other
+            settings.
         MissingExtraError: h5py, or what the engine needs, is not installed.
         DeepDetectError: a file cannot be read or written.
 
@@ -182,7 +232,7 @@ def match_pairs(
         ...     match_pairs("features.h5", "pairs.txt", "matches.h5").check()
     """
     map_tasks: TaskMap = get_engine(engine)
-    listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else list(pairs)
+    listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else _checked_pairs(pairs)
     source, target = Path(features).absolute(), Path(path).absolute()
     if source == target:
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
@@ -191,6 +241,7 @@ def match_pairs(
     file = PartedFile(target, settings, overwrite)
     work = partial(_match_part, features=source, options=options)
     matches: dict[Pair, int] = {}
+    failures = list(wanted.failures)
     with file.opened():
         done = file.done((pair_name(*pair), sum(states, ())) for pair, states in wanted.found)
         done |= file.done(
@@ -207,11 +258,12 @@ def match_pairs(
         ]
         skipped = len(wanted.found) - len(left)
         with progress(len(wanted.found), "matching", "pair", quiet, skipped) as bar:
-            for counts in map_tasks(work, tasks, workers):
-                bar.update(len(counts))
+            for counts, failed in map_tasks(work, tasks, workers):
+                bar.update(len(counts) + len(failed))
                 matches |= counts
+                failures += failed
         file.merge(quiet)
-    return PairMatchingReport(Path(path), matches, skipped, wanted.failures)
+    return PairMatchingReport(Path(path), matches, skipped, tuple(failures))
 
 
 States = tuple[tuple[int, ...], tuple[int, ...]]
@@ -255,35 +307,54 @@ def _find_pairs(features: Path, pairs: Sequence[Pair]) -> _Wanted:
 
 def _state(file: Any, name: str) -> tuple[int, ...] | None:
     """Return what changes when the features of an image do, None where there are none."""
-    if name not in file or not {"keypoints", "descriptors"} <= set(file[name]):
+    h5py = import_h5py()
+    group = file.get(name)
+    if not isinstance(group, h5py.Group):
         return None
-    return state_of(file[name]) or (len(file[name]["keypoints"]),)
+    found = [group.get(kind) for kind in ("keypoints", "descriptors")]
+    if not all(isinstance(each, h5py.Dataset) for each in found):
+        return None
+    state = state_of(group)
+    if state:
+        return state
+    digest = hashlib.sha256()  # other programs note nothing
+    for each in found:
+        digest.update(f"{each.dtype}{each.shape}".encode())
+        digest.update(np.ascontiguousarray(each[()]))
+    return (int.from_bytes(digest.digest()[:8], "big", signed=True),)
 
 
 Task = tuple[Path, tuple[tuple[Pair, tuple[int, ...]], ...]]
 
 
-def _match_part(task: Task, features: Path, options: PairMatchingOptions) -> dict[Pair, int]:
-    """Write a part; return the number of matches of each pair."""
+def _match_part(
+    task: Task, features: Path, options: PairMatchingOptions
+) -> tuple[dict[Pair, int], list[str]]:
+    """Write a part; return the number of matches of each pair, and what could not be done."""
     path, pairs = task
     counts: dict[Pair, int] = {}
+    failures: list[str] = []
 
     def groups() -> Iterator[Group]:
         with open_hdf5(features) as file:
             held: tuple[str, Features] | None = None  # pairs are sorted by their first image
             for (name0, name1), state in pairs:
-                if held is None or held[0] != name0:
-                    held = name0, _read_features(file, name0)
+                try:
+                    if held is None or held[0] != name0:
+                        held = name0, _read_features(file, name0)
+                    both = held[1], _read_features(file, name1)
+                    _check_widths(both, (name0, name1))
+                except InvalidFileError as error:
+                    failures.append(f"{name0} {name1}: {error}")
+                    continue
                 scaled = any("scales" in file[name] for name in (name0, name1))
-                matches, scores = match_features(
-                    held[1], _read_features(file, name1), options, scaled=scaled
-                )
+                matches, scores = match_features(*both, options, scaled=scaled)
                 counts[name0, name1] = int(np.count_nonzero(matches >= 0))
                 arrays = {"matches0": matches, "matching_scores0": scores}
                 yield Group(pair_name(name0, name1), arrays, state)
 
     write_groups(path, groups())
-    return counts
+    return counts, failures
 
 
 Features = tuple[np.ndarray, np.ndarray]
@@ -292,10 +363,31 @@ Features = tuple[np.ndarray, np.ndarray]
 def _read_features(file: Any, name: str) -> Features:
     """Return positions (N, 2) and descriptors (N, D), as bytes where that is what they were."""
     group = file[name]
+    shapes = group["keypoints"].shape, group["descriptors"].shape
+    kinds = group["keypoints"].dtype.kind + group["descriptors"].dtype.kind
+    if (
+        not set(kinds) <= set("fiu")
+        or [len(shape) for shape in shapes] != [2, 2]
+        or shapes[0][1] != 2
+        or shapes[0][0] != shapes[1][1]
+    ):
+        raise InvalidFileError(
+            f"the features of {name} are keypoints of shape {shapes[0]} and descriptors of shape "
+            f"{shapes[1]}, not (N, 2) and (D, N) numbers: extract them again"
+        )
     descriptors = np.ascontiguousarray(group["descriptors"][()].T, np.float32)
     if DESCRIPTOR in str(file.attrs.get(SETTINGS, "")):
         descriptors = np.rint(descriptors * ROOT_SIFT_NORM).clip(0, 255).astype(np.uint8)
     return group["keypoints"][()].astype(np.float32), descriptors
+
+
+def _check_widths(features: tuple[Features, Features], names: Pair) -> None:
+    width0, width1 = (descriptors.shape[1] for _, descriptors in features)
+    if width0 != width1:
+        raise InvalidFileError(
+            f"the descriptors of {names[0]} have {width0} numbers, those of {names[1]} have "
+            f"{width1}: extract both alike"
+        )
 
 
 def match_features(
