@@ -147,6 +147,77 @@ def test_several_processes_give_the_same(
     assert same_content(tmp_path / "1.h5", tmp_path / "2.h5")
 
 
+def test_images_that_are_gone_lose_their_features(
+    collection: Callable[..., Path], tmp_path: Path
+) -> None:
+    import h5py
+
+    def names() -> list[str]:
+        with h5py.File(tmp_path / "f.h5") as file:
+            return [f"{top}/{name}" for top in file for name in file[top]]
+
+    folder = collection(4)
+    extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=1)
+    (folder / "a/00.png").write_bytes(b"not a photograph")
+    report = extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=1)
+    assert (report.images, report.skipped, len(report.failures)) == ((), 3, 1)
+    assert names() == ["a/02.png", "b/01.png", "b/03.png"]
+    (folder / "b/03.png").unlink()
+    extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=1)
+    assert names() == ["a/02.png", "b/01.png"]
+
+
+def test_what_the_network_is_fed_is_a_setting(
+    collection: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder = collection(1)
+    listed = {"providers": ["CPUExecutionProvider"], "backend": "onnxruntime"}
+    for _ in range(2):
+        extract_features(folder, tmp_path / "f.h5", selection=FEW, detector=listed, workers=1)
+    other = {**listed, "network_channels": "bgr"}
+    with pytest.raises(OptionError, match=r"other settings \(`network_channels`\)"):
+        extract_features(folder, tmp_path / "f.h5", selection=FEW, detector=other, workers=1)
+
+
+def test_weights_that_have_changed_are_loaded_again(
+    collection: Callable[..., Path], tmp_path: Path
+) -> None:
+    import h5py
+
+    folder, weights = collection(1), tmp_path / "mine.onnx"
+    dense = SelectionOptions(mode="dense", max_keypoints=50)
+    for name in ("default", "dense"):
+        original = DeepDetect(name, backend="onnxruntime", threads=1)
+        weights.write_bytes(original.weights.read_bytes())
+        extract_features(
+            folder,
+            tmp_path / f"{name}.h5",
+            selection=dense,
+            detector={"weights": weights, "backend": "onnxruntime"},
+            workers=1,
+        )
+        expected = original.detect(folder / "a/00.png", mode="dense", max_keypoints=50)
+        with h5py.File(tmp_path / f"{name}.h5") as file:
+            np.testing.assert_array_equal(file["a/00.png/keypoints"], expected.xy)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_too_large_images_are_failures(
+    workers: int, collection: Callable[..., Path], tmp_path: Path
+) -> None:
+    from PIL import Image
+
+    folder = collection(2)
+    Image.new("RGB", (200, 200)).save(folder / "large.png")
+    report = extract_features(
+        folder, tmp_path / "f.h5", selection=FEW, max_megapixels=0.03, workers=workers
+    )
+    assert len(report.images) == 2
+    assert "large.png has 200x200 pixels, which is over 0.03 megapixels" in report.failures[0]
+    with pytest.raises(OptionError, match="`max_megapixels` must be above 0"):
+        extract_features(folder, tmp_path / "f.h5", max_megapixels=0)
+
+
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 600, 5000])
 def test_parts(count: int) -> None:
     parts = parts_of(range(count), IMAGES_PER_PART)

@@ -77,11 +77,11 @@ def test_a_merge_that_fails_loses_nothing(tmp_path: Path, monkeypatch: pytest.Mo
     copy = parted_file._copy_groups
     calls: list[Path] = []
 
-    def fail_at_the_second(part: Path, merged: object) -> None:
+    def fail_at_the_second(part: Path, merged: object, names: object) -> None:
         calls.append(part)
         if len(calls) == 2:
             raise OSError(28, "No space left on device")
-        copy(part, merged)
+        copy(part, merged, names)
 
     monkeypatch.setattr(parted_file, "_copy_groups", fail_at_the_second)
     with PartedFile(path, {}).opened() as file:
@@ -189,3 +189,55 @@ def test_without_h5py(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+def test_replacing_goes_on_after_a_kill(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    with PartedFile(path, {"ratio": 0.8}).opened() as file:
+        write_groups(file.part(["x"]), [group("x", 1)])
+        file.merge()
+    new = {"ratio": 0.9}
+    with PartedFile(path, new, overwrite=True).opened() as file:
+        write_groups(file.part(["x"]), [group("x", 2)])
+    with PartedFile(path, new, overwrite=True).opened() as file:  # as after a kill
+        assert file.done([("x", (1,)), ("y", (1,))]) == {"x"}
+    with PartedFile(path, {"ratio": 1}, overwrite=True).opened() as file:
+        assert file.done([("x", (1,))]) == set()
+        write_groups(file.part(["x"]), [group("x", 3)])
+        file.merge()
+    assert values(path) == {"x": 3}
+
+
+def test_a_start_that_failed_does_not_fix_the_settings(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    with PartedFile(path, {"ratio": 0.8}).opened():
+        pass
+    with PartedFile(path, {"ratio": 0.9}).opened() as file:
+        write_groups(file.part(["x"]), [group("x", 1)])
+    with pytest.raises(OptionError, match="`ratio`"), PartedFile(path, {"ratio": 0.8}).opened():
+        pass
+
+
+def test_only_named_groups_stay(tmp_path: Path) -> None:
+    path = tmp_path / "out.h5"
+    with PartedFile(path, {}).opened() as file:
+        write_groups(file.part(["x", "y"]), [group("x", 1), group("y/1", 1), group("y/2", 1)])
+        file.merge(names={"x", "y/1", "y/2"})
+    with PartedFile(path, {}).opened() as file:
+        file.merge(names={"x", "y/2"})
+    assert values(path) == {"x": 1, "y/2": 1}
+    with PartedFile(path, {}).opened() as file:
+        write_groups(file.part(["z"]), [group("y/2", 2), group("z", 2)])
+        file.merge(names={"y/2"})
+    assert values(path) == {"y/2": 2}
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_folder_is_no_file(overwrite: bool, tmp_path: Path) -> None:
+    with (
+        pytest.raises(OptionError, match="is a folder: name a file in it with -o"),
+        PartedFile(tmp_path, {}, overwrite).opened(),
+    ):
+        pass
+    with pytest.raises(DeepDetectError, match="is a folder"), open_hdf5(tmp_path):
+        pass

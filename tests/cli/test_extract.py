@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -68,10 +69,37 @@ def test_a_bad_image_is_listed_at_the_end(run, photos: Path) -> None:
     assert failure.strip() == "good.png bad.jpg: features.h5 has no features of bad.jpg"
 
 
+def test_no_file_is_named_that_is_not_there(run, photos: Path) -> None:
+    Path("in").mkdir()
+    Path("in/left.png").write_bytes((photos / "left.png").read_bytes())
+    result = run("extract", "in", "--max-megapixels", "0.001", "--workers", 1)
+    assert result.exit_code == 1
+    assert "megapixels" in result.stderr
+    assert result.stdout == "0 images with 0 keypoints, 0 already done\n"
+    assert not Path("features.h5").exists()
+    # The failed start does not stand in the way of another one.
+    assert run("extract", "in", "--max-keypoints", 9, "--workers", 1).exit_code == 0
+    Path("pairs.txt").write_text("left.png no.png\n")
+    result = run("match-many", "features.h5", "--pairs", "pairs.txt", "--workers", 1)
+    assert result.exit_code == 1
+    assert result.stdout == "0 pairs with 0 matches, 0 already done\n"
+
+
+def test_a_start_without_ray_leaves_nothing(
+    run, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    result = run("extract", photos, "--engine", "ray")
+    assert result.exit_code == 2
+    assert "deepdetect[ray]" in result.stderr
+    assert list(Path().iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("extract", "nowhere"), "there is no folder"),
+        (("extract", __file__), "test_extract.py is a file: name the folder"),
         (("extract", "PHOTOS", "--engine", "rai"), "did you mean 'ray'"),
         (("match-many", "no.h5", "--pairs", "no.txt"), "there is no file no.txt"),
         (("label", "PHOTOS", "-o", "masks", "--engine", "rai"), "did you mean 'ray'"),

@@ -642,7 +642,11 @@ def test_find_images_below_a_hidden_folder(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("none", "there is no folder"), ("file.png", "there is no folder"), ("void", "no image in")],
+    [
+        ("none", "there is no folder"),
+        ("file.png", "file.png is a file: name the folder"),
+        ("void", "no image in"),
+    ],
 )
 def test_find_images_errors(name: str, words: str, tmp_path: Path, one_line: OneLine) -> None:
     (tmp_path / "file.png").touch()

@@ -33,6 +33,7 @@ from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
 from ..features.sift import described_at_own_size, root_sift_descriptors
 from ..io.image import find_images, load_image, luma
+from ..io.image_file import megapixel_limit
 from .engines import get_engine
 from .parted_file import Group, PartedFile, write_groups
 
@@ -82,6 +83,7 @@ def extract_features(
     *,
     selection: SelectionOptions = SelectionOptions(max_keypoints=MAX_KEYPOINTS),
     detector: Mapping[str, Any] | None = None,
+    max_megapixels: float | None = None,
     engine: str = "processes",
     workers: int | None = None,
     overwrite: bool = False,
@@ -97,14 +99,16 @@ def extract_features(
     `oris` (N,) float32 in degrees.
 
     A call that is interrupted or killed goes on when it is made again; images that are done and
-    have not changed are skipped, new ones are added. A script must call this under
-    `if __name__ == "__main__":`, since processes are started.
+    have not changed are skipped, new ones are added, and features of images that are no longer
+    there, or can no longer be read, are removed: one file is for one folder. A script must call
+    this under `if __name__ == "__main__":`, since processes are started.
 
     Args:
         folder: of the images.
         path: the file.
         selection: which keypoints.
         detector: arguments of `DeepDetect`. Its threads are 1 unless they are given.
+        max_megapixels: of an image, as of `load_image`; larger ones are failures.
         engine: "processes" of this machine, or "ray" for a cluster.
         workers: number of processes; default one per processor.
         overwrite: replace the file.
@@ -131,8 +135,18 @@ def extract_features(
     names = [image.relative_to(root).as_posix() for image in find_images(root)]
     failures = [f"{name}: its name is not UTF-8: rename it" for name in names if not _is_utf8(name)]
     states = {name: _state(root / name) for name in names if _is_utf8(name)}
-    file = PartedFile(target, _settings(selection, arguments), overwrite)
-    work = partial(_extract_part, root=root, selection=selection, detector=tuple(arguments.items()))
+    settings = _settings(selection, arguments)
+    file = PartedFile(target, settings, overwrite)
+    work = partial(
+        _extract_part,
+        root=root,
+        selection=selection,
+        detector=tuple(arguments.items()),
+        digests=(settings["weights"], settings["ranker"]),
+        # Other processes do not know that of the command.
+        max_megapixels=megapixel_limit(max_megapixels),
+    )
+    list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
     done_now: list[str] = []
     keypoints = 0
     with file.opened():
@@ -148,7 +162,7 @@ def extract_features(
                 done_now += counts
                 keypoints += sum(counts.values())
                 failures += failed
-        file.merge(quiet)
+        file.merge(quiet, {*done, *done_now})
     return ExtractionReport(
         Path(path), tuple(sorted(done_now)), len(done), keypoints, tuple(sorted(failures))
     )
@@ -161,13 +175,17 @@ def parts_of(names: Sequence[Any], most: int) -> list[Sequence[Any]]:
 
 
 def _portable(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Make paths in the arguments of a detector absolute; names are the same on all machines."""
-    return {
-        name: str(Path(value).absolute())
-        if name in ("weights", "ranker") and value is not None and is_path(value)
-        else value
-        for name, value in arguments.items()
-    }
+    """Make paths in the arguments of a detector absolute, and lists hashable.
+
+    Names of weights are the same on all machines.
+    """
+    portable = dict(arguments)
+    for name, value in arguments.items():
+        if name in ("weights", "ranker") and value is not None and is_path(value):
+            portable[name] = str(Path(value).absolute())
+        elif isinstance(value, list):
+            portable[name] = tuple(value)
+    return portable
 
 
 def _settings(selection: SelectionOptions, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -180,6 +198,7 @@ def _settings(selection: SelectionOptions, arguments: Mapping[str, Any]) -> dict
         "weights": _digest(detector.weights),
         "ranker": _digest(detector.ranker),
         "resolution": detector.heatmap_options.resolution,
+        "network_channels": detector.heatmap_options.network_channels,
         "tta": detector.heatmap_options.tta,
         "backend": detector.backend,
         "version": __version__,
@@ -212,7 +231,12 @@ Task = tuple[Path, tuple[tuple[str, tuple[int, ...]], ...]]
 
 
 def _extract_part(
-    task: Task, root: Path, selection: SelectionOptions, detector: tuple[tuple[str, Any], ...]
+    task: Task,
+    root: Path,
+    selection: SelectionOptions,
+    detector: tuple[tuple[str, Any], ...],
+    digests: tuple[str, str],
+    max_megapixels: float,
 ) -> tuple[dict[str, int], list[str]]:
     """Write a part; return the number of keypoints by image, and what could not be done."""
     path, images = task
@@ -222,7 +246,10 @@ def _extract_part(
     def groups() -> Iterator[Group]:
         for name, state in images:
             try:
-                keypoints, uncertainty = _features_of(root / name, selection, _detector(detector))
+                opened = _detector(detector, digests)
+                keypoints, uncertainty = _features_of(
+                    root / name, selection, opened, max_megapixels
+                )
             except (MissingExtraError, WeightsError):  # concern all images
                 raise
             except DeepDetectError as error:
@@ -239,19 +266,20 @@ def _extract_part(
 
 
 @lru_cache(maxsize=1)
-def _detector(arguments: tuple[tuple[str, Any], ...]) -> DeepDetect:
+def _detector(arguments: tuple[tuple[str, Any], ...], digests: tuple[str, str]) -> DeepDetect:
+    """Open a detector; other content of its files is another one."""
     return DeepDetect(**dict(arguments))
 
 
 def _features_of(
-    path: Path, selection: SelectionOptions, detector: DeepDetect
+    path: Path, selection: SelectionOptions, detector: DeepDetect, max_megapixels: float
 ) -> tuple[Keypoints, float]:
     """Return described keypoints of an image file, and the size of a pixel that they were found on.
 
     Raises:
         DeepDetectError: the image cannot be worked on.
     """
-    rgb = load_image(path)
+    rgb = load_image(path, max_megapixels=max_megapixels)
     options = {name: value for name, value in vars(selection).items() if name != "ignore"}
     keypoints = detector.detect(rgb, **options)
     gray = luma(rgb)

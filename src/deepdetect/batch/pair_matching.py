@@ -19,6 +19,7 @@ from .._shared.errors import (
     MissingFileError,
     OptionError,
 )
+from .._shared.kernels import require_compiler
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import TaskMap
 from .._shared.progress import progress
@@ -159,7 +160,7 @@ def read_pairs(path: str | Path) -> list[Pair]:
 def _checked_pairs(pairs: Any) -> list[Pair]:
     """Return pairs that were given from Python, once each."""
     try:
-        found = [(pair if isinstance(pair, str) else tuple(pair)) for pair in pairs]
+        found: list[Any] = [pair if isinstance(pair, str) else tuple(pair) for pair in pairs]
     except TypeError:
         found = [str(pairs)]
     for pair in found:
@@ -240,6 +241,8 @@ def match_pairs(
     settings = {**vars(options), "features": wanted.settings, "version": __version__}
     file = PartedFile(target, settings, overwrite)
     work = partial(_match_part, features=source, options=options)
+    list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
+    _require_matcher(options.matcher)
     matches: dict[Pair, int] = {}
     failures = list(wanted.failures)
     with file.opened():
@@ -262,8 +265,19 @@ def match_pairs(
                 bar.update(len(counts) + len(failed))
                 matches |= counts
                 failures += failed
-        file.merge(quiet)
+        # What an interrupted attempt to replace the file has matched besides is not asked for.
+        asked = {*done, *(pair_name(*pair) for pair in matches)} if overwrite else None
+        file.merge(quiet, asked)
     return PairMatchingReport(Path(path), matches, skipped, tuple(failures))
+
+
+def _require_matcher(name: str) -> None:
+    """Raise a MissingExtraError where what a matcher needs is not installed."""
+    if name == "patchmatch":
+        require_compiler("the matcher patchmatch", ", or take the matcher flann or exact")
+    elif name == "faiss":
+        some = np.eye(2, dtype=np.float32)
+        get_matcher(name)(some, some, 1, 0)
 
 
 States = tuple[tuple[int, ...], tuple[int, ...]]
@@ -320,7 +334,7 @@ def _state(file: Any, name: str) -> tuple[int, ...] | None:
     digest = hashlib.sha256()  # other programs note nothing
     for each in found:
         digest.update(f"{each.dtype}{each.shape}".encode())
-        digest.update(np.ascontiguousarray(each[()]))
+        digest.update(np.ascontiguousarray(each[()]).tobytes())
     return (int.from_bytes(digest.digest()[:8], "big", signed=True),)
 
 

@@ -14,7 +14,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +23,13 @@ from typing import Any
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import DeepDetectError, MissingExtraError, OptionError
+from .._shared.errors import (
+    DeepDetectError,
+    InvalidFileError,
+    MissingExtraError,
+    MissingFileError,
+    OptionError,
+)
 from .._shared.progress import progress
 
 SETTINGS = "deepdetect"
@@ -80,8 +86,10 @@ def open_hdf5(path: Path) -> Iterator[Any]:
         MissingExtraError: h5py is not installed.
     """
     h5py = import_h5py()
+    if path.is_dir():
+        raise InvalidFileError(f"{path} is a folder: name a file of features or matches")
     if not path.is_file():
-        raise DeepDetectError(f"there is no file {path}: check the path")
+        raise MissingFileError(f"there is no file {path}: check the path")
     try:
         # Nobody writes to a file under its final name, and network folders may know no locks.
         file = h5py.File(path, "r", locking=False)
@@ -156,7 +164,8 @@ class PartedFile:
     Args:
         path: the file; the parts are in PATH.parts beside it.
         settings: all that the content depends on besides the inputs, as JSON would give it back.
-        overwrite: replace whatever there is.
+        overwrite: replace the file; parts made with the same settings are those of an attempt to
+            do so, and stay.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any], overwrite: bool = False) -> None:
@@ -176,6 +185,8 @@ class PartedFile:
             DeepDetectError: the folder cannot be written, or the file is damaged.
         """
         import_h5py()
+        if self.path.is_dir():
+            raise OptionError(f"{self.path} is a folder: name a file in it with -o")
         if self.path.exists() and not self.overwrite:
             with open_hdf5(self.path) as file:
                 self._check(self.path, file.attrs.get(SETTINGS))
@@ -187,11 +198,12 @@ class PartedFile:
             ) from error
         with _locked(self.parts / LOCK_FILE, self.path):
             noted = self.parts / SETTINGS_FILE
-            if self.overwrite:
-                for part in [noted, *self._part_files()]:
+            before = noted.read_text(encoding="utf-8") if noted.exists() else None
+            if self.overwrite and self._differences(before) != []:
+                for part in self._part_files():
                     part.unlink(missing_ok=True)
-            if noted.exists():
-                self._check(self.parts, noted.read_text(encoding="utf-8"))
+            if before is not None and self._part_files():
+                self._check(self.parts, before)
             else:
                 with atomic_path(noted) as temporary:
                     temporary.write_text(json.dumps(self.settings), encoding="utf-8")
@@ -218,19 +230,24 @@ class PartedFile:
         digest = hashlib.sha256("\n".join(names).encode("utf-8", "surrogateescape")).hexdigest()
         return self.parts / f"{digest[:32]}.h5"
 
-    def merge(self, quiet: bool = True) -> None:
+    def merge(self, quiet: bool = True, names: Collection[str] | None = None) -> None:
         """Merge all parts into the file, and remove them.
 
         Args:
             quiet: show no progress bar.
+            names: groups that may stay or be added; others are removed. None: all.
 
         Raises:
             DeepDetectError: the file cannot be written; the parts stay.
         """
         parts = self._part_files()
-        if parts:
+        keep = self.path.exists() and not self.overwrite
+        removed: list[str] = []
+        if keep and names is not None:
+            with open_hdf5(self.path) as file:
+                removed = [name for name, _ in _leaves(file) if name not in names]
+        if parts or removed:
             with atomic_path(self.path) as temporary:
-                keep = self.path.exists() and not self.overwrite
                 if keep:
                     shutil.copyfile(self.path, temporary)
                 with (
@@ -238,8 +255,10 @@ class PartedFile:
                     _written(temporary, "r+" if keep else "w") as merged,
                 ):
                     merged.attrs[SETTINGS] = json.dumps(self.settings)
+                    for name in removed:
+                        del merged[name]
                     for part in parts:
-                        _copy_groups(part, merged)
+                        _copy_groups(part, merged, names)
                         bar.update(1)
         with contextlib.suppress(OSError):  # what stays is merged again, to no effect
             shutil.rmtree(self.parts)
@@ -249,16 +268,22 @@ class PartedFile:
         parts = [path for path in self.parts.glob("*.h5") if not path.name.startswith(".")]
         return sorted(parts, key=lambda path: (path.stat().st_mtime_ns, path.name))
 
-    def _check(self, place: Path, noted: object) -> None:
+    def _differences(self, noted: object) -> list[str] | None:
+        """Return which settings differ from those that were noted; None where none were."""
         try:
             before = json.loads(str(noted))
         except (ValueError, RecursionError):
-            before = None
-        advice = "choose another file with -o, or replace it with --overwrite"
+            return None
         if not isinstance(before, dict):
-            raise OptionError(f"{place} exists already, written by something else: {advice}")
+            return None
         names = {*before, *self.settings}
-        other = sorted(n for n in names if before.get(n, ...) != self.settings.get(n, ...))
+        return sorted(n for n in names if before.get(n, ...) != self.settings.get(n, ...))
+
+    def _check(self, place: Path, noted: object) -> None:
+        other = self._differences(noted)
+        advice = "choose another file with -o, or replace it with --overwrite"
+        if other is None:
+            raise OptionError(f"{place} exists already, written by something else: {advice}")
         if other:
             listed = ", ".join(f"`{name}`" for name in other)
             raise OptionError(
@@ -266,10 +291,12 @@ class PartedFile:
             )
 
 
-def _copy_groups(part: Path, merged: Any) -> None:
+def _copy_groups(part: Path, merged: Any, names: Collection[str] | None) -> None:
     """Copy the groups of a part, in the place of those of the same name."""
     with open_hdf5(part) as file:
         for name, group in _leaves(file):
+            if names is not None and name not in names:
+                continue
             if name in merged:
                 del merged[name]
             file.copy(group, merged, name=name)

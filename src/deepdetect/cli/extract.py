@@ -14,6 +14,7 @@ from ._options import (
     SELECTION,
     engine_option,
     json_option,
+    max_megapixels_option,
     overwrite_option,
     print_json,
     processes_option,
@@ -36,6 +37,7 @@ EXTRACTED = FieldOptions(
     show_default=True,
     help="File for the features.",
 )
+@max_megapixels_option
 @engine_option
 @processes_option
 @overwrite_option
@@ -52,7 +54,8 @@ def extract(
     """Extract the keypoints and RootSIFT descriptors of all images below FOLDER.
 
     Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
-    interrupted or killed, the same command goes on; new and changed images are added later.
+    interrupted or killed, the same command goes on; new and changed images are added later, and
+    the features of images that are gone are removed.
     An image that cannot be read does not stop the others: they are listed at the end, with exit
     code 1.
 
@@ -83,6 +86,6 @@ def extract(
     else:
         click.echo(
             f"{len(report.images)} images with {report.keypoints:,} keypoints, "
-            f"{report.skipped} already done -> {output}"
+            f"{report.skipped} already done" + (f" -> {output}" if output.exists() else "")
         )
     report.check()

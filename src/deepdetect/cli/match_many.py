@@ -78,7 +78,7 @@ def match_many(
         print_json({**vars(report), "matches": matched})
     else:
         click.echo(
-            f"{len(report.matches)} pairs with {total:,} matches, {report.skipped} already done "
-            f"-> {output}"
+            f"{len(report.matches)} pairs with {total:,} matches, {report.skipped} already done"
+            + (f" -> {output}" if output.exists() else "")
         )
     report.check()

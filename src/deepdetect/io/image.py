@@ -116,9 +116,11 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
         exclude: folders below it that are left out, such as the output folder.
 
     Raises:
-        ImageError: the folder is missing, or holds no image.
+        ImageError: the folder is missing, is a file, or holds no image.
     """
     root = Path(folder)
+    if root.is_file():
+        raise ImageError(f"{root} is a file: name the folder that it is in")
     if not root.is_dir():
         raise MissingImageError(f"there is no folder {root}: check the path")
     left_out = [path.resolve() for path in exclude if path.resolve() != root.resolve()]

@@ -51,6 +51,15 @@ def limit_megapixels(max_megapixels: float) -> Iterator[None]:
         _limit.reset(token)
 
 
+def megapixel_limit(max_megapixels: float | None) -> float:
+    """Return the limit that is given, or what `--max-megapixels` says, for other processes.
+
+    Raises:
+        OptionError: `max_megapixels` is not above 0.
+    """
+    return _limit.get() if max_megapixels is None else _check_limit(max_megapixels)
+
+
 def _check_limit(max_megapixels: float) -> float:
     if not (isinstance(max_megapixels, (int, float)) and max_megapixels > 0):
         raise OptionError(f"`max_megapixels` must be above 0, not {max_megapixels}")
@@ -78,7 +87,7 @@ def open_image(
             too large or no image.
         OptionError: `max_megapixels` is not above 0.
     """
-    limit = _limit.get() if max_megapixels is None else _check_limit(max_megapixels)
+    limit = megapixel_limit(max_megapixels)
     name = file_name(source, what)
     try:
         with _binary_file(source, name) as file:

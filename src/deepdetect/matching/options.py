@@ -41,8 +41,9 @@ class MatchingOptions:
         descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case.
         keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3).
         angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
-        matcher: "auto" ("exact" for few keypoints, else "patchmatch"), "flann", "exact", "faiss" or
-            "patchmatch" ("hamming" is for binary descriptors).
+        matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
+            others), "flann", "exact", "faiss" or "patchmatch" ("hamming" is for binary
+            descriptors).
         ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
         mutual: keep only pairs that are each other's nearest; guided, of those that share a
             keypoint of the second image only the best, and swapped images give the same matches.
