@@ -580,7 +580,7 @@ BAD_ARRAYS = {
     "int8": (np.zeros((20, 20), np.int8), "int8"),
     "complex": (np.zeros((20, 20), complex), "complex"),
     "words": (np.full((20, 20), "a"), "not understood"),
-    "nothing": (None, "shape ()"),
+    "nothing": (None, "the image is None"),
     "a number": (5, "shape ()"),
 }
 
