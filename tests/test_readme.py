@@ -100,7 +100,9 @@ SLOW = (
         for line in TABLE
     ],
 )
-def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
+def test_the_commands_of_the_table_run(
+    folder: Path, line: str, request: pytest.FixtureRequest
+) -> None:
     words = shlex.split(line)
     if "train" in words:
         pytest.importorskip("torch", reason="needs torch, which is for training only")
@@ -156,7 +158,23 @@ def test_the_commands_of_the_table_run(folder: Path, line: str) -> None:
         "SCENES": "scene",
         "NAME": "foreground",
         "DATA": "masked",
+        "FOLDER": "photos",
+        "PAIRS": "pairs.txt",
+        "FILE": "network.onnx",
     }
+    if "reconstruct" in words and "PHOTOS" in words:  # three photographs of one scene
+        pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra sfm")
+        fountain = request.getfixturevalue("shared") / "data" / "fountain"
+        for number in (4, 5, 6, 7):
+            with Image.open(fountain / f"{number:04d}.jpg") as photograph:
+                photograph.resize((768, 512)).save(folder / "photos" / f"{number}.jpg")
+    if "extract" in words or "match-many" in words:
+        pytest.importorskip("h5py", reason="needs h5py, of the extra hdf5")
+    if "match-many" in words:
+        run(["deepdetect", "extract", "photos", "-o", "features.h5"])
+        Path("pairs.txt").write_text("left.png another.png\n")
+    if "export" in words:
+        pytest.importorskip("onnx", reason="needs onnx, of the extra onnx")
     run([places.get(word, word) for word in words])
 
 
@@ -186,10 +204,10 @@ def test_make_demo_runs(tmp_path: Path) -> None:
         assert word in done.stdout
     pictures = {path.name.removeprefix("motorcycle_") for path in tmp_path.glob("*.jpg")}
     assert pictures == {
-        "left_keypoints.png",
-        "right_keypoints.png",
-        "left_heatmap.png",
-        "matches.png",
+        "left_keypoints.jpg",
+        "right_keypoints.jpg",
+        "left_heatmap.jpg",
+        "matches.jpg",
     }
 
 
