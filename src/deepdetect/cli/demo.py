@@ -168,7 +168,7 @@ def _draw(
         ),
         "matches": add_caption(lines, caption),
     }
-    paths = {name: folder / f"{pair.name}_{name}.png" for name in pictures}
+    paths = {name: folder / f"{pair.name}_{name}.jpg" for name in pictures}
     for name, picture in pictures.items():
         save_picture(picture, paths[name])
     return list(paths.values())
