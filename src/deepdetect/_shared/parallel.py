@@ -89,13 +89,15 @@ def map_in_processes(
         with _one_opencv_thread():
             yield from map(function, tasks)
         return
+    import importlib.util
     import multiprocessing
     from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
     from concurrent.futures.process import BrokenProcessPool
 
     from .opencv import import_opencv
 
-    import_opencv()  # what is missing is said here, and not by workers that cannot start
+    if importlib.util.find_spec("cv2") is None:
+        import_opencv()  # says so here, and not in workers that cannot start
     # Spawned, not forked: a fork copies the locks of the parent's threads.
     context = multiprocessing.get_context("spawn")
     ended = context.Event()
