@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--share", type=float, default=1.0, help="of the inputs of each target")
     parser.add_argument("--seconds", type=float, help="no further inputs after them")
-    parser.add_argument("--kills", type=int, default=60, help="number of killed commands")
+    parser.add_argument("--kills", type=int, default=90, help="number of killed commands")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--show", type=int, default=5, help="defects to print of each target")
     parser.add_argument("--input", type=int, help="number of one input to repeat here")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,6 +15,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -29,7 +32,7 @@ class Command:
     """A command over a folder of images.
 
     Attributes:
-        words: its arguments; IN and OUT stand for the folders.
+        words: its arguments; IN and OUT stand for the folders, FEATURES and PAIRS for files.
         compared: patterns of files that must be the same after a rerun; others hold times.
     """
 
@@ -40,6 +43,14 @@ class Command:
 COMMANDS = {
     "label": Command(("label", "IN", "-o", "OUT", "--workers", "2"), ("*.png",)),
     "detect": Command(("detect", "IN", "-o", "OUT"), ("*.npz", "*.png")),
+    "extract": Command(
+        ("extract", "IN", "-o", "OUT/features.h5", "--workers", "2", "--max-keypoints", "500"),
+        ("*.h5",),
+    ),
+    "match-many": Command(
+        ("match-many", "FEATURES", "--pairs", "PAIRS", "-o", "OUT/matches.h5", "--workers", "2"),
+        ("*.h5",),
+    ),
     "train": Command(
         (
             *("train", "IN", "-o", "OUT", "--stage", "64x4x2", "--short-side", "96"),
@@ -75,11 +86,9 @@ def run_kills(count: int, *, seed: int) -> dict[str, dict[str, int]]:
     found = {}
     with tempfile.TemporaryDirectory() as temporary:
         root = Path(temporary)
-        images = write_images(root)
+        inputs = write_inputs(root)
         for name, command in COMMANDS.items():
-            words = [
-                {"IN": str(images), "DATA": str(root)}.get(word, word) for word in command.words
-            ]
+            words = [inputs.get(word, word) for word in command.words]
             begin = time.monotonic()
             unbroken = root / f"{name}-unbroken"
             finish(words, unbroken)
@@ -96,6 +105,16 @@ def run_kills(count: int, *, seed: int) -> dict[str, dict[str, int]]:
                 row["left over"] += sum(".part" in path.name for path in output.rglob(".*"))
             found[name] = row
     return found
+
+
+def write_inputs(root: Path) -> dict[str, str]:
+    """Write what the commands work on; return the paths, by the words that stand for them."""
+    images, features, pairs = write_images(root), root / "features.h5", root / "pairs.txt"
+    finish(("extract", str(images), "-o", str(features), "--max-keypoints", "500"), root)
+    names = sorted(path.name for path in images.iterdir())
+    pairs.write_text("".join(f"{a} {b}\n" for a, b in itertools.combinations(names, 2)))
+    paths = {"IN": images, "DATA": root, "FEATURES": features, "PAIRS": pairs}
+    return {word: str(path) for word, path in paths.items()}
 
 
 def write_images(root: Path) -> Path:
@@ -118,7 +137,7 @@ def start(words: Sequence[str], output: Path) -> subprocess.Popen[bytes]:
     """Start a command in a process group of its own."""
     line = [sys.executable, "-m", "deepdetect", *words]
     return subprocess.Popen(
-        [str(output) if word == "OUT" else word for word in line],
+        [re.sub("^OUT(?=$|/)", str(output), word) for word in line],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -172,6 +191,8 @@ def readable(path: Path) -> bool:
             with np.load(path) as arrays:
                 for name in arrays:
                     _ = arrays[name]
+        elif path.suffix == ".h5":
+            contents(path)
         elif path.suffix == ".json":
             json.loads(path.read_text())
         elif path.suffix == ".safetensors":
@@ -189,10 +210,27 @@ def readable(path: Path) -> bool:
     return True
 
 
+def contents(path: Path) -> bytes:
+    """Return the numbers of an HDF5 file; its bytes depend on the order in which it was filled."""
+    import h5py
+
+    found: list[bytes] = []
+
+    def note(name: str, member: Any) -> None:
+        if isinstance(member, h5py.Dataset):
+            found.append(f"{name} {member.dtype} {member.shape}".encode() + member[()].tobytes())
+
+    with h5py.File(path) as file:
+        file.visititems(note)
+    return b"".join(sorted(found))
+
+
 def digests(output: Path, patterns: Sequence[str]) -> dict[str, str]:
     """Return the digests of the files that a rerun must give again."""
     return {
-        path.relative_to(output).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        path.relative_to(output).as_posix(): hashlib.sha256(
+            contents(path) if path.suffix == ".h5" else path.read_bytes()
+        ).hexdigest()
         for pattern in patterns
         for path in sorted(output.rglob(pattern) if "/" not in pattern else output.glob(pattern))
     }

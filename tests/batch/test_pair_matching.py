@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -298,3 +300,53 @@ def test_wrong_lists_of_pairs(text: str | None, message: str, tmp_path: Path) ->
 def test_wrong_options(values: dict, message: str) -> None:
     with pytest.raises(OptionError, match=message):
         PairMatchingOptions(**values)
+
+
+def test_matches_of_features_that_are_gone_go_too(features: Path, tmp_path: Path) -> None:
+    import h5py
+
+    path = tmp_path / "matches.h5"
+    match_pairs(features, [PAIR], path, workers=1)
+    less = tmp_path / "less.h5"
+    shutil.copyfile(features, less)
+    with h5py.File(less, "r+") as file:
+        del file[PAIR[1]]
+    report = match_pairs(less, [PAIR], path, workers=1)
+    assert (report.matches, len(report.failures)) == ({}, 1)
+    with h5py.File(path) as file:
+        assert pair_name(*PAIR) not in file
+
+
+def test_features_that_are_no_numbers_do_not_stop_the_others(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    whole = generator.uniform(0, 99, (40, 2)), generator.normal(size=(8, 40))
+    unknown = np.where(np.arange(80).reshape(40, 2) == 7, np.nan, whole[0])
+    write_foreign(tmp_path / "f.h5", good=whole, same=whole, unknown=(unknown, whole[1]))
+    pairs = [("good", name) for name in ("same", "unknown")]
+    report = match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5", workers=1)
+    assert report.matches == {("good", "same"): 40}
+    assert "the features of unknown are not all finite numbers" in report.failures[0]
+
+
+def test_damaged_features_do_not_stop_the_others(tmp_path: Path) -> None:
+    import h5py
+
+    generator = np.random.default_rng(0)
+    whole = generator.uniform(0, 99, (40, 2)), generator.normal(size=(8, 40))
+    path = tmp_path / "f.h5"
+    write_foreign(path, good=whole, same=whole)
+    with h5py.File(path, "r+") as file:  # a file with checksums knows that it is damaged
+        file.create_dataset("bad/descriptors", data=whole[1])
+        stored = file.create_dataset(
+            "bad/keypoints", data=whole[0], chunks=(40, 2), fletcher32=True
+        )
+        stored.parent.attrs["source_state"] = [1]
+        at = stored.id.get_chunk_info(0).byte_offset
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1
+    path.write_bytes(content)
+    report = match_pairs(path, [("good", "bad"), ("good", "same")], tmp_path / "m.h5", workers=1)
+    assert report.matches == {("good", "same"): 40}
+    assert re.fullmatch(
+        r"good bad: .*f\.h5, bad is damaged \(.*\): write it again", *report.failures
+    )

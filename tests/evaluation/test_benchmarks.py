@@ -9,9 +9,16 @@ import pytest
 
 from deepdetect import DeepDetect
 from deepdetect.datasets.hpatches import in_d2net_subset
+from deepdetect.datasets.pair_selection import PairSelectionOptions
 from deepdetect.datasets.types import PlanarScene
 from deepdetect.evaluation import benchmarks
-from deepdetect.evaluation.benchmarks import _table_3, hpatches_subsets, plan_hpatches
+from deepdetect.evaluation.benchmarks import (
+    _table_3,
+    hpatches_subsets,
+    plan_hpatches,
+    plan_oxford,
+    select_pairs,
+)
 from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.report import Column, Table
@@ -78,3 +85,28 @@ def test_table_3_averages_by_kind_of_scene_and_says_how_many() -> None:
         ("SIFT", 0.5, None),
     )
     assert "illumination, 2 scenes 0.5000 (0.8960); the paper's are of 57 and 59" in found.note
+
+
+def test_a_small_oxford_is_measured_and_what_it_lacks_is_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(benchmarks, "load_oxford", lambda *_: [scene("graf"), scene("leuven")])
+    for name in ("graf", "leuven"):
+        (tmp_path / name).mkdir()
+        for number in range(2, 7):
+            (tmp_path / name / f"H1to{number}p").touch()
+    (tmp_path / "graf" / "H1to6p.refined").touch()
+    options = BenchmarkOptions(
+        DeepDetect(), ("standard", "guided"), (), pair_selection=PairSelectionOptions(1)
+    )
+    context = BenchmarkContext(tmp_path)
+    plans = plan_oxford(context, options)
+    methods = len(options.standard_features())
+    assert [(plan.title, len(plan)) for plan in plans[:2]] == [
+        ("Oxford, published homographies, the standard protocol", 2 * methods),
+        ("Oxford, refined homographies, the standard protocol", 2 * methods),
+    ]
+    assert context.skipped[0].startswith("Oxford's bark, bikes, boat, trees, ubc, wall: not in")
+    assert context.skipped[1].startswith("refined homographies of leuven 1-6: there is no file")
+    chosen = select_pairs([scene("graf").with_max_pairs(2)], [("graf", 6), ("graf", 4)])
+    assert [pair.name for pair in chosen] == ["graf 1-6"]

@@ -114,3 +114,5 @@ def test_wrong_use(bgr: np.ndarray) -> None:
         DeepDetectFeature2D().detectAndCompute(bgr, useProvidedKeypoints=True)
     with pytest.raises(OptionError, match="sizes above 0"):
         DeepDetectFeature2D().compute(bgr, [cv2.KeyPoint(9, 9, 0)])
+    with pytest.raises(OptionError, match=r"`mask` has the shape \(3, 3\), the image"):
+        DeepDetectFeature2D().detect(bgr, np.ones((3, 3), np.uint8))

@@ -109,3 +109,9 @@ def test_wrong_use(views: Views) -> None:
         features.extract(views.first, np.array([[5, 5]]))
     with pytest.raises(OptionError, match="belong to keypoints"):
         features.extract(views.first, scales=4.0)
+    with pytest.raises(OptionError, match=r"`keypoints` has the shape \(2, 3\)"):
+        features.extract(views.first, np.ones((2, 3)), 4.0)
+    with pytest.raises(OptionError, match=r"`scales` has the shape \(3,\)"):
+        features.extract(views.first, np.ones((2, 2)), np.ones(3))
+    with pytest.raises(OptionError, match=r"`orientations` .* each of the 2 keypoints"):
+        features.extract(views.first, np.ones((2, 2)), 4.0, np.ones(1))

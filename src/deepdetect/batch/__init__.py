@@ -2,7 +2,13 @@
 
 from .engines import ENGINES, get_engine
 from .extraction import ExtractionReport, extract_features
-from .pair_matching import PairMatchingOptions, PairMatchingReport, match_pairs
+from .pair_matching import (
+    PairMatchingOptions,
+    PairMatchingReport,
+    match_pairs,
+    pair_name,
+    read_pairs,
+)
 
 __all__ = [
     "ENGINES",
@@ -12,4 +18,6 @@ __all__ = [
     "extract_features",
     "get_engine",
     "match_pairs",
+    "pair_name",
+    "read_pairs",
 ]

@@ -32,6 +32,7 @@ from .parted_file import (
     SETTINGS,
     Group,
     PartedFile,
+    damaged,
     import_h5py,
     open_hdf5,
     state_of,
@@ -267,7 +268,7 @@ def match_pairs(
                 failures += failed
         # What an interrupted attempt to replace the file has matched besides is not asked for.
         asked = {*done, *(pair_name(*pair) for pair in matches)} if overwrite else None
-        file.merge(quiet, asked)
+        file.merge(quiet, asked, wanted.gone)
     return PairMatchingReport(Path(path), matches, skipped, tuple(failures))
 
 
@@ -290,6 +291,8 @@ class _Wanted:
     settings: str
     found: tuple[tuple[Pair, States], ...]
     failures: tuple[str, ...]
+    gone: frozenset[str]
+    """Groups of pairs without features, whose matches would point nowhere."""
 
 
 def _find_pairs(features: Path, pairs: Sequence[Pair]) -> _Wanted:
@@ -297,6 +300,7 @@ def _find_pairs(features: Path, pairs: Sequence[Pair]) -> _Wanted:
     known: dict[str, tuple[int, ...] | None] = {}
     found: list[tuple[Pair, States]] = []
     failures: list[str] = []
+    gone: set[str] = set()
     taken: dict[str, Pair] = {}
     with open_hdf5(features) as file:
         settings = hashlib.sha256(str(file.attrs.get(SETTINGS)).encode()).hexdigest()[:16]
@@ -309,6 +313,7 @@ def _find_pairs(features: Path, pairs: Sequence[Pair]) -> _Wanted:
             if states[0] is None or states[1] is None:
                 lacking = pair[0] if states[0] is None else pair[1]
                 failures.append(f"{' '.join(pair)}: {features.name} has no features of {lacking}")
+                gone |= {name, pair_name(*pair[::-1])}
             elif taken.setdefault(name, pair) != pair:
                 failures.append(
                     f"{' '.join(pair)}: its group {name} is that of {' '.join(taken[name])}, too: "
@@ -316,7 +321,8 @@ def _find_pairs(features: Path, pairs: Sequence[Pair]) -> _Wanted:
                 )
             else:
                 found.append((pair, (states[0], states[1])))
-    return _Wanted(settings, tuple(found), tuple(failures))
+    # Another pair may have a group of that name.
+    return _Wanted(settings, tuple(found), tuple(failures), frozenset(gone - taken.keys()))
 
 
 def _state(file: Any, name: str) -> tuple[int, ...] | None:
@@ -376,6 +382,16 @@ Features = tuple[np.ndarray, np.ndarray]
 
 def _read_features(file: Any, name: str) -> Features:
     """Return positions (N, 2) and descriptors (N, D), as bytes where that is what they were."""
+    try:
+        return _checked_features(file, name)
+    except InvalidFileError:
+        raise
+    # h5py raises any of these, by what is damaged; a wrong shape asks for too much memory.
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError) as error:
+        raise damaged(Path(f"{file.filename}, {name}"), error) from error
+
+
+def _checked_features(file: Any, name: str) -> Features:
     group = file[name]
     shapes = group["keypoints"].shape, group["descriptors"].shape
     kinds = group["keypoints"].dtype.kind + group["descriptors"].dtype.kind
@@ -389,10 +405,15 @@ def _read_features(file: Any, name: str) -> Features:
             f"the features of {name} are keypoints of shape {shapes[0]} and descriptors of shape "
             f"{shapes[1]}, not (N, 2) and (D, N) numbers: extract them again"
         )
+    keypoints = group["keypoints"][()].astype(np.float32)
     descriptors = np.ascontiguousarray(group["descriptors"][()].T, np.float32)
+    if not (np.isfinite(keypoints).all() and np.isfinite(descriptors).all()):
+        raise InvalidFileError(
+            f"the features of {name} are not all finite numbers: extract them again"
+        )
     if DESCRIPTOR in str(file.attrs.get(SETTINGS, "")):
         descriptors = np.rint(descriptors * ROOT_SIFT_NORM).clip(0, 255).astype(np.uint8)
-    return group["keypoints"][()].astype(np.float32), descriptors
+    return keypoints, descriptors
 
 
 def _check_widths(features: tuple[Features, Features], names: Pair) -> None:

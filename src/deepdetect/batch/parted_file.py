@@ -82,7 +82,7 @@ def open_hdf5(path: Path) -> Iterator[Any]:
     """Open an HDF5 file to read it.
 
     Raises:
-        DeepDetectError: it is missing or damaged.
+        DeepDetectError: it is missing or damaged, which may be found while it is read.
         MissingExtraError: h5py is not installed.
     """
     h5py = import_h5py()
@@ -98,7 +98,18 @@ def open_hdf5(path: Path) -> Iterator[Any]:
             f"{path} is no HDF5 file, or is damaged ({str(error).splitlines()[0]}): write it again"
         ) from error
     with file:
-        yield file
+        try:
+            yield file
+        except DeepDetectError:
+            raise
+        except (OSError, RuntimeError, KeyError) as error:  # what h5py raises, by what is damaged
+            raise damaged(path, error) from error
+
+
+def damaged(path: Path, error: Exception) -> InvalidFileError:
+    """Return the error of a file, or of a part of it, that cannot be read."""
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    return InvalidFileError(f"{path} is damaged ({reason}): write it again")
 
 
 @contextmanager
@@ -230,12 +241,18 @@ class PartedFile:
         digest = hashlib.sha256("\n".join(names).encode("utf-8", "surrogateescape")).hexdigest()
         return self.parts / f"{digest[:32]}.h5"
 
-    def merge(self, quiet: bool = True, names: Collection[str] | None = None) -> None:
+    def merge(
+        self,
+        quiet: bool = True,
+        names: Collection[str] | None = None,
+        gone: Collection[str] = (),
+    ) -> None:
         """Merge all parts into the file, and remove them.
 
         Args:
             quiet: show no progress bar.
             names: groups that may stay or be added; others are removed. None: all.
+            gone: groups that are removed.
 
         Raises:
             DeepDetectError: the file cannot be written; the parts stay.
@@ -243,9 +260,13 @@ class PartedFile:
         parts = self._part_files()
         keep = self.path.exists() and not self.overwrite
         removed: list[str] = []
-        if keep and names is not None:
+        if keep and (names is not None or gone):
             with open_hdf5(self.path) as file:
-                removed = [name for name, _ in _leaves(file) if name not in names]
+                removed = [
+                    name
+                    for name, _ in _leaves(file)
+                    if name in gone or (names is not None and name not in names)
+                ]
         if parts or removed:
             with atomic_path(self.path) as temporary:
                 if keep:

@@ -25,7 +25,7 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
     deepdetect average first/best.safetensors second/best.safetensors -o mean
     deepdetect evaluate samples/ --weights mean/deepdetect.onnx
     """
-    from .._shared.errors import MissingExtraError, OptionError
+    from .._shared.errors import MissingExtraError, MissingWeightsError, OptionError
 
     for package in ("torch", "safetensors", "onnx"):
         if importlib.util.find_spec(package) is None:
@@ -33,6 +33,15 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
                 f"averaging weights needs the package {package}, which is not installed: "
                 "run pip install torch safetensors onnx"
             )
+    from ..detector.pretrained import resolve_weights
+
+    if len(weights) < 2:
+        raise OptionError("give at least two weights: the mean of one is itself")
+    paths = [resolve_weights(name, ".safetensors") for name in weights]
+    for path in paths:  # before torch is imported, which takes a second
+        if not path.exists():
+            raise MissingWeightsError(f"there is no weights file {path}: check the path")
+
     from .._shared.provenance import provenance
     from ..detector.network.onnx_export import export_onnx
     from ..detector.network.weights import (
@@ -42,11 +51,7 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
         save_weights,
         weights_digest,
     )
-    from ..detector.pretrained import resolve_weights
 
-    if len(weights) < 2:
-        raise OptionError("give at least two weights: the mean of one is itself")
-    paths = [resolve_weights(name, ".safetensors") for name in weights]
     network = average_weights(paths)
     parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]
     files = {"weights": output / "best.safetensors", "onnx": output / "deepdetect.onnx"}

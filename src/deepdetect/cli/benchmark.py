@@ -73,7 +73,7 @@ NAMES = (
     type=int,
     default=60,
     show_default=True,
-    help="pose: of each scene at most this many pairs, evenly spaced.",
+    help="Of each scene at most this many pairs, evenly spaced; 1 for a first look.",
 )
 @json_option
 def benchmark(
@@ -99,6 +99,7 @@ def benchmark(
 
     \b
     deepdetect benchmark oxford --data data -o report
+    deepdetect benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
     deepdetect benchmark oxford --data data -o report --method xfeat.onnx
     deepdetect benchmark foreground --data data --baselines sift,fast-low -o report
     deepdetect benchmark pose --data data/fountain -o report

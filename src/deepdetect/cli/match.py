@@ -149,7 +149,7 @@ def match(
             ("keypoints", f"{numbers['keypoints0']:,} and {numbers['keypoints1']:,}"),
             ("density", f"{numbers['density0']:.3f} and {numbers['density1']:.3f}"),
             ("matches", f"{len(matches):,}"),
-            (f"inliers ({matches.model})", f"{numbers['inliers']:,}"),
+            (_inliers_label(matches.model, homography is not None), f"{numbers['inliers']:,}"),
             ("guided by", matches.guide.model if matches.guide and matches.guided else "nothing"),
             *seconds_rows(matches.seconds),
             ("written", ", ".join(str(path) for path in files)),
@@ -174,6 +174,10 @@ UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
 
 NO_GEOMETRY = 3
 """Exit code where no geometry can be trusted."""
+
+
+def _inliers_label(model: str, given: bool) -> str:
+    return "within the threshold of --homography" if given else f"inliers ({model})"
 
 
 def _guide_numbers(matches: Any) -> dict[str, Any] | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import ImageError, OptionError, unknown_name
 from .download import RemoteDataset, RemoteFile
 from .types import PlanarScene, load_planar_scene
 
@@ -26,25 +26,29 @@ KINDS = {
 
 SCENES = tuple(KINDS)
 SUFFIXES = (".png", ".ppm", ".pgm")
+LAYOUT = f"the data set has the scenes {', '.join(SCENES)} with img1 to img6 each"
 
 
 def load_oxford(
     folder: str | Path, truth: Literal["published", "refined"] = "published"
 ) -> list[PlanarScene]:
-    """List the eight scenes.
+    """List the eight scenes, or those of them that are there.
 
     Args:
         folder: the data set.
         truth: "published" reads H1toKp; "refined" reads H1toKp.refined where there is one.
 
     Raises:
-        ImageError: a file is missing.
+        ImageError: there is no scene, or a file of one is missing.
         OptionError: the truth is unknown.
     """
     if truth not in ("published", "refined"):
         raise unknown_name("truth", truth, ("published", "refined"))
     root = Path(folder)
-    return [_load_scene(root / name, truth) for name in SCENES]
+    there = [name for name in SCENES if (root / name).is_dir()]
+    if not there:
+        raise ImageError(f"there are no Oxford scenes in {folder}: {LAYOUT}")
+    return [_load_scene(root / name, truth) for name in there]
 
 
 def find_scene(scenes: list[PlanarScene], name: str) -> PlanarScene:
@@ -68,9 +72,8 @@ def _load_scene(folder: Path, truth: str) -> PlanarScene:
             for name, new in zip(homographies, refined, strict=True)
         ]
     images = [f"img{number}" for number in range(1, 7)]
-    layout = f"the data set has the scenes {', '.join(SCENES)} with img1 to img6 each"
     return load_planar_scene(
-        folder, images, homographies, SUFFIXES, layout, KINDS.get(folder.name, "")
+        folder, images, homographies, SUFFIXES, LAYOUT, KINDS.get(folder.name, "")
     )
 
 

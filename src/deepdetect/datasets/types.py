@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from .._shared.errors import ImageError
 from ..geometry.camera import Calibration
+from .pair_selection import evenly_spaced
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,18 +48,34 @@ class PlanarScene:
         images: the files, the first one first.
         homographies: one for each image but the first.
         kind: what changes between its images; "" where the data set does not say.
+        numbers: of the images but the first; empty for 2, 3 and so on.
     """
 
     name: str
     images: tuple[Path, ...]
     homographies: tuple[np.ndarray, ...]
     kind: str = ""
+    numbers: tuple[int, ...] = ()
 
     def pairs(self) -> Iterator[PlanarPair]:
         """Yield the pairs of the first image with each other one."""
-        for k, homography in enumerate(self.homographies, start=2):
-            images = self.images[0], self.images[k - 1]
-            yield PlanarPair(self.name, k, *images, homography, self.kind)
+        numbers = self.numbers or range(2, 2 + len(self.homographies))
+        rows = zip(numbers, self.images[1:], self.homographies, strict=True)
+        for number, image, homography in rows:
+            yield PlanarPair(self.name, number, self.images[0], image, homography, self.kind)
+
+    def with_max_pairs(self, max_pairs: int) -> PlanarScene:
+        """Return the scene with evenly spaced ones of its pairs, at most so many; one: the last."""
+        every = list(self.pairs())
+        kept = every[-1:] if max_pairs == 1 else evenly_spaced(every, max_pairs)
+        if len(kept) == len(every):
+            return self
+        return replace(
+            self,
+            images=(self.images[0], *(pair.second for pair in kept)),
+            homographies=tuple(pair.homography for pair in kept),
+            numbers=tuple(pair.number for pair in kept),
+        )
 
 
 @dataclass(frozen=True, eq=False)

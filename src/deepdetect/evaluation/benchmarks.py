@@ -14,7 +14,7 @@ from .._shared.errors import ImageError
 from ..datasets.foreground import load_foreground
 from ..datasets.hpatches import in_d2net_subset, is_illumination, load_hpatches
 from ..datasets.low_visibility import load_low_visibility
-from ..datasets.oxford import find_scene, load_oxford
+from ..datasets.oxford import SCENES, load_oxford
 from ..datasets.posed_images import load_posed_scenes
 from ..datasets.types import PlanarPair, PlanarScene
 from .baselines.method import LocalFeature
@@ -57,8 +57,6 @@ KEYPOINT_SCENES = ("graf", "bikes", "leuven")
 """Of Figure 2."""
 
 GUIDED_PAIRS = (*OXFORD_PAIRS, ("boat", 6), ("bark", 6))
-
-NUM_OXFORD_PAIRS = 40
 
 FIGURE_7_SCENES = 4
 """Half of each kind."""
@@ -106,21 +104,30 @@ class Benchmark:
 def plan_oxford(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
     """Tables I and II, the Oxford half of III, Figures 1, 2, 4 and 6; the other protocols."""
     folder = context.folder("oxford")
-    scenes = load_oxford(folder)
+    max_pairs = options.pair_selection.max_pairs
+
+    def load(truth: Truth) -> list[PlanarScene]:
+        return [scene.with_max_pairs(max_pairs) for scene in load_oxford(folder, truth)]
+
+    scenes = load("published")
+    if missing := [name for name in SCENES if name not in {scene.name for scene in scenes}]:
+        context.skipped.append(f"Oxford's {', '.join(missing)}: not in {folder}")
+    names = [pair.name for scene in scenes for pair in scene.pairs()]
     unrefined = [
-        f"{path.parent.name} 1-{path.name[4]}"
+        name
         for path in sorted(folder.glob("*/H1to?p"))
-        if not path.with_name(f"{path.name}.refined").exists()
+        if (name := f"{path.parent.name} 1-{path.name[4]}") in names
+        and not path.with_name(f"{path.name}.refined").exists()
     ]
     truths: list[Truth] = ["published"]
-    if len(unrefined) < NUM_OXFORD_PAIRS:
+    if len(unrefined) < len(names):
         truths.append("refined")
     plans = []
     if "paper" in options.protocols:
         plans.append(_oxford_paper(context, options, scenes))
     if "standard" in options.protocols:
         for truth in truths:
-            title, by_truth = f"Oxford, {truth} homographies", load_oxford(folder, truth)
+            title, by_truth = f"Oxford, {truth} homographies", load(truth)
             text = OXFORD_TRUTHS[truth]
             plans.append(
                 _standard_section(context, options, by_truth, f"oxford_{truth}", title, text)
@@ -137,13 +144,12 @@ def plan_oxford(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
             )
     if "guided" in options.protocols:
         pairs: dict[str, list[PlanarPair]] = {
-            truth: select_pairs(load_oxford(folder, truth), GUIDED_PAIRS)
-            for truth in reversed(truths)
+            truth: select_pairs(load(truth), GUIDED_PAIRS) for truth in reversed(truths)
         }
         plans.append(guided_section(context, options, pairs, "oxford_guided", "Oxford"))
     if "degraded" in options.protocols:
         truth = truths[-1]
-        by_truth, title = load_oxford(folder, truth), f"Oxford, {truth} homographies"
+        by_truth, title = load(truth), f"Oxford, {truth} homographies"
         plans.append(_degraded_section(context, options, by_truth, "oxford_degraded", title))
     return plans
 
@@ -228,7 +234,8 @@ def _match_figures(
 
 def plan_hpatches(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
     """Table III and Figure 7, and the other protocols on 116 scenes and on the D2-Net subset."""
-    scenes = load_hpatches(context.folder("hpatches"))
+    found = load_hpatches(context.folder("hpatches"))
+    scenes = [scene.with_max_pairs(options.pair_selection.max_pairs) for scene in found]
     last = [list(scene.pairs())[-1] for scene in scenes]
     plans = []
     if "paper" in options.protocols:
@@ -372,8 +379,9 @@ def _degraded_section(
 def select_pairs(
     scenes: Sequence[PlanarScene], chosen: Sequence[tuple[str, int]]
 ) -> list[PlanarPair]:
-    """Return the pairs of scenes and numbers, as those of Table II."""
-    return [list(find_scene(list(scenes), name).pairs())[number - 2] for name, number in chosen]
+    """Return the pairs of scenes and numbers, as those of Table II; those that are there."""
+    there = {(pair.scene, pair.number): pair for scene in scenes for pair in scene.pairs()}
+    return [there[key] for key in chosen if key in there]
 
 
 def plan_middlebury(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
@@ -403,7 +411,11 @@ def plan_foreground(context: BenchmarkContext, options: BenchmarkOptions) -> Pla
 
 def plan_speed(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
     """Time the stages on one pair of Oxford."""
-    (pair,) = select_pairs(load_oxford(context.folder("oxford")), [PAIR])
+    folder = context.folder("oxford")
+    pairs = select_pairs(load_oxford(folder), [PAIR])
+    if not pairs:
+        raise ImageError(f"speed is measured on {PAIR[0]} of Oxford, which is not in {folder}")
+    (pair,) = pairs
     return [SectionPlan("Speed", (), [speed_part(options.matching_features(), pair)])]
 
 

@@ -50,7 +50,7 @@ class BenchmarkOptions:
         channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
             feeds its own weights.
         geometry_weights: the weights for stereo pairs, one or more.
-        pair_selection: which pairs of images with cameras are matched.
+        pair_selection: which pairs of a scene are measured, and at which frame distances.
         degraded_images: which images of a pair the protocol "degraded" degrades.
 
     Raises:

@@ -104,13 +104,26 @@ class DeepDetectFeatures:
         if scales is None:
             raise OptionError("keypoints need scales to be described: give their sigmas in pixels")
         rgb = load_image(image)
-        xy = np.asarray(keypoints, np.float32).reshape(-1, 2)[:, ::-1]
-        angles = None if orientations is None else np.rad2deg(np.asarray(orientations)) % 360
+        points = np.asarray(keypoints, np.float32)
+        if points.size and (points.ndim != 2 or points.shape[1] != 2):
+            raise OptionError(
+                f"`keypoints` has the shape {points.shape}: give (N, 2) positions (row, column)"
+            )
+        xy = points.reshape(-1, 2)[:, ::-1]
+        for name, values in (("scales", scales), ("orientations", orientations)):
+            if values is not None and np.shape(values) not in ((), (len(xy),)):
+                raise OptionError(
+                    f"`{name}` has the shape {np.shape(values)}: give one number for each of the "
+                    f"{len(xy)} keypoints"
+                )
+        angles = None
+        if orientations is not None:
+            angles = np.broadcast_to(np.rad2deg(np.asarray(orientations)) % 360, len(xy))
         sizes = np.broadcast_to(np.asarray(scales) * SIZE_PER_SIGMA, len(xy))
-        points = Keypoints(
+        given = Keypoints(
             xy, np.zeros(len(xy)), (rgb.shape[1], rgb.shape[0]), sizes=sizes, angles=angles
         )
-        self.descriptors = self._points.describe(rgb, points).descriptors
+        self.descriptors = self._points.describe(rgb, given).descriptors
 
     def detect_and_extract(self, image: Any) -> None:
         """Detect and describe keypoints, and set all attributes; argument as of `detect`."""

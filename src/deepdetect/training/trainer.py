@@ -161,6 +161,11 @@ class Trainer:
         saved = started
         if state.step < self.schedule.steps and self.log is not None:
             self.log(f"training on {self.engine.describe()}")
+            if self.engine.compiled:
+                self.log(
+                    "the first step of each stage compiles the network, which takes minutes on two "
+                    "cores; --no-compile starts at once, and each step takes longer"
+                )
         if state.step in milestones and state.step not in {point.step for point in state.points}:
             self._validate()  # the run was interrupted while it validated
         if state.step == self.schedule.steps and self.best is None and self.context.is_main:

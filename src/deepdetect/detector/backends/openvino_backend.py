@@ -115,26 +115,33 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     if options.threads is not None:
         settings["INFERENCE_NUM_THREADS"] = options.threads
 
-    def compile_model() -> Any:
+    def read() -> Any:
         # Named, not guessed: guessing tries all formats and prints each one's complaint.
         reader = FrontEndManager().load_by_framework("onnx")
-        graph = reader.convert(reader.load(str(path)))
+        return reader.convert(reader.load(str(path)))
+
+    def compile_model(graph: Any = None) -> Any:
+        graph = read() if graph is None else graph
         _take_out_padding(graph)
         return openvino.Core().compile_model(graph, "CPU", settings)
 
     try:
-        model = compile_model()
+        graph = read()
+        # A network of one size has no padding to take out.
+        check_network(
+            path,
+            [_shape(value) for value in graph.inputs],
+            [_shape(value) for value in graph.outputs],
+            {str(value.get_element_type().to_dtype()) for value in [*graph.inputs, *graph.outputs]},
+        )
+        model = compile_model(graph)
+    except WeightsError:
+        raise
     except Exception as error:  # its exceptions share no base class
         reason = str(error).strip().splitlines()[-1]
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({reason}): download it again"
         ) from None
-    check_network(
-        path,
-        [_shape(value) for value in model.inputs],
-        [_shape(value) for value in model.outputs],
-        {str(value.get_element_type().to_dtype()) for value in [*model.inputs, *model.outputs]},
-    )
     output = output_to_read([value.get_any_name() for value in model.outputs])
     return OpenVinoNetwork(model, compile_model, output, path, options.threads)
 
