@@ -218,7 +218,7 @@ def test_points_need_no_network(
 def test_points_of_large_images_are_found_on_two_megapixels(
     detector: DeepDetect, image: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deepdetect.detector.detector.MAX_AUTO_PIXELS", image[..., 0].size // 4)
+    monkeypatch.setattr("deepdetect.detector.image_points.MAX_AUTO_PIXELS", image[..., 0].size // 4)
     whole = detector.configured(HeatmapOptions("native")).detect(image, max_keypoints=200)
     half = detector.configured(HeatmapOptions("auto")).detect(image, max_keypoints=100)
     assert half.image_size == whole.image_size

@@ -16,7 +16,7 @@ from .._shared.image_array import Channels, check_channels
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import available_memory, release_freed_memory
-from ..features.selection import Maps, Rows, bands, sigmoid
+from ..features.maps import Maps, Rows, bands, sigmoid
 from .backends import Network
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from .._shared.errors import OptionError
-from ..detector.detector import DeepDetect, find_points
+from ..detector.detector import DeepDetect
+from ..detector.image_points import find_points
 from ..features.keypoints import Keypoints
 from ..features.orientation import dominant_angles
 from ..features.selection import SelectionOptions

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError
-from ...detector.detector import DeepDetect, find_keypoints, find_points
+from ...detector.detector import DeepDetect, find_keypoints
 from ...detector.heatmap import HeatmapOptions
+from ...detector.image_points import find_points
 from ...detector.points.detection import PointOptions
 from ...detector.points.ranker import load_ranker
 from ...detector.pretrained import RANKER
