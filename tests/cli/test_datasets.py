@@ -16,7 +16,8 @@ def test_list_names_size_and_licence(run) -> None:
     assert "19.3 GB" in result.output
     assert "licence" in result.output
     entries = {e["name"]: e for e in json.loads(run("datasets", "list", "--json").output)}
-    assert set(entries) == {"coco", "oxford", "hpatches", "middlebury"}
+    names = {"coco", "photographs", "photographs-free", "oxford", "hpatches", "middlebury"}
+    assert set(entries) == names
     assert entries["coco"]["images"] == 118_287
     assert entries["coco"]["bytes"] == 19_336_861_798
 

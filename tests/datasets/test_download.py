@@ -507,3 +507,28 @@ def test_no_member_leads_outside_also_before_python_had_a_filter(
     assert not (target / "link").is_symlink()
     assert not list(tmp_path.glob("outside*"))
     assert not Path("/outside.txt").exists()
+
+
+def test_an_archive_may_be_unpacked_in_part_and_prepared(server: Server, tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
+        for name in ("repo-1/a.JPG", "repo-1/b.txt", "repo-1/sub/c.jpg"):
+            member = tarfile.TarInfo(name)
+            member.size = len(name)
+            tar.addfile(member, io.BytesIO(name.encode()))
+    server.contents["/archive/1.tar.gz"] = buffer.getvalue()
+    url = server.url.replace("/train.zip", "/archive/1.tar.gz")
+    file = RemoteFile((url,), 1000, into="sources", inside="repo-1", suffixes=(".jpg",))
+    seen: list[str] = []
+
+    def prepare(folder: Path, quiet: bool) -> None:
+        seen.extend(
+            path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
+        )
+        (folder / "sources" / "sub" / "c.jpg").rename(folder / "c.jpg")
+        (folder / "sources" / "a.JPG").unlink()
+
+    made = RemoteDataset("tiny", "a test", (file,), 1, "none", prepare=prepare)
+    folder = get_dataset(made, tmp_path / "tiny")
+    assert sorted(seen) == ["sources/a.JPG", "sources/sub/c.jpg"]
+    assert unpacked(folder) == ["c.jpg"]

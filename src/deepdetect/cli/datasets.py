@@ -56,6 +56,7 @@ def get(name: str, output: Path | None, as_json: bool) -> None:
     \b
     deepdetect datasets get coco
     deepdetect train --preset paper data/coco -o run
+    deepdetect datasets get photographs-free
     deepdetect datasets get oxford
     deepdetect benchmark oxford --data data -o report
     """

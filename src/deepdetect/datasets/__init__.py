@@ -8,6 +8,7 @@ from .download import RemoteDataset, RemoteFile, get_dataset
 from .hpatches import HPATCHES
 from .middlebury import MIDDLEBURY, load_motorcycle
 from .oxford import OXFORD
+from .photographs import PHOTOGRAPHS, PHOTOGRAPHS_FREE
 from .posed_images import PosedImage, PosedScene, load_posed_scenes
 from .types import StereoPair
 
@@ -16,7 +17,8 @@ STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {
 }
 
 REMOTE_DATASETS: dict[str, RemoteDataset] = {
-    dataset.name: dataset for dataset in (COCO, OXFORD, HPATCHES, MIDDLEBURY)
+    dataset.name: dataset
+    for dataset in (COCO, PHOTOGRAPHS, PHOTOGRAPHS_FREE, OXFORD, HPATCHES, MIDDLEBURY)
 }
 
 

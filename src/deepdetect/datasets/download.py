@@ -54,6 +54,7 @@ class RemoteFile:
         into: in the data set, the folder that an archive is unpacked into, or the path of a
             single file.
         inside: folder of the archive whose contents are taken.
+        suffixes: endings of the files that are taken from a tar archive; empty for all files.
     """
 
     urls: tuple[str, ...]
@@ -61,6 +62,7 @@ class RemoteFile:
     checksum: str | None = None
     into: str = "."
     inside: str = ""
+    suffixes: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -82,6 +84,8 @@ class RemoteDataset:
             on the archive or the image format they came in; None for those that the package
             has in `known/NAME.json`, if any.
         texts: files that are written, not downloaded, by path in the data set.
+        prepare: turns what was unpacked into the data set, in the folder that it is given; its
+            second argument says whether it shows no progress.
     """
 
     name: str
@@ -91,6 +95,7 @@ class RemoteDataset:
     licence: str
     contents: Mapping[str, str] | None = field(default=None, repr=False)
     texts: Mapping[str, str] = field(default_factory=dict, repr=False)
+    prepare: Callable[[Path, bool], None] | None = field(default=None, repr=False)
 
     @property
     def size(self) -> int:
@@ -328,6 +333,8 @@ def _assemble(dataset: RemoteDataset, paths: Sequence[Path], final: Path, quiet:
         for name, text in dataset.texts.items():
             (unfinished / name).parent.mkdir(parents=True, exist_ok=True)
             (unfinished / name).write_text(text, encoding="utf-8")
+        if dataset.prepare is not None:
+            dataset.prepare(unfinished, quiet)
         _check(dataset, unfinished, "the download")
     except DeepDetectError:
         shutil.rmtree(unfinished)
@@ -349,7 +356,11 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
         else:
             _check_gzip(archive)
             with tarfile.open(archive) as tar:
-                members = tar.getmembers()
+                members = [
+                    member
+                    for member in tar.getmembers()
+                    if not file.suffixes or member.name.lower().endswith(file.suffixes)
+                ]
                 _extract(members, lambda one: _extract_member(tar, one, target), quiet)
     except Exception as error:  # zip, tar and their compressions raise many kinds
         if isinstance(error, OSError) and error.errno in WRITE_ERRORS:

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetectError
+from deepdetect.datasets.photographs import (
+    CROP_SIDE_PX,
+    FREE_SOURCES,
+    PHOTOGRAPHS,
+    PHOTOGRAPHS_FREE,
+    SOURCES,
+    Crop,
+    cut,
+    listed_crops,
+    write_crops,
+)
+
+
+def smooth_picture(width: int, height: int) -> Image.Image:
+    """A picture whose pixels say where they are."""
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    red, green = 255 * x / (width - 1), 255 * y / (height - 1)
+    rgb = np.stack([red, green, np.full_like(red, 90)], axis=2)
+    return Image.fromarray(rgb.round().astype(np.uint8))
+
+
+def png(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, "png")
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def unpacked(tmp_path: Path) -> tuple[Path, list[Crop]]:
+    """Two repositories with a picture each, and three crops of them."""
+    contents = {"gb82": png(smooth_picture(1000, 500)), "osie": png(smooth_picture(600, 900))}
+    paths = {"gb82": "png/a b.png", "osie": "data/stimuli/1.png"}
+    for source, content in contents.items():
+        file = tmp_path / "sources" / source / paths[source]
+        file.parent.mkdir(parents=True)
+        file.write_bytes(content)
+    crops = [
+        Crop(source, paths[source], hashlib.sha256(contents[source]).hexdigest(), licence, *place)
+        for source, licence, place in (
+            ("gb82", "CC0", (480, 240, 0)),
+            ("gb82", "CC0", (960, 100, 300)),
+            ("osie", "MIT (repository)", (480, 0, 100)),
+        )
+    ]
+    return tmp_path, crops
+
+
+def test_there_are_8000_photographs_and_more() -> None:
+    crops = listed_crops()
+    pictures = {crop.sha256: (crop.source, crop.path) for crop in crops}
+    assert len(pictures) >= 8000
+    assert len({(crop.source, crop.path) for crop in crops}) == len(pictures)
+    assert PHOTOGRAPHS.images == len(crops)
+    free = [crop for crop in crops if crop.is_free]
+    assert PHOTOGRAPHS_FREE.images == len(free)
+    assert {crop.source for crop in free} == set(FREE_SOURCES)
+    assert {crop.source for crop in crops} == {source.name for source in SOURCES}
+    # A picture is read once for all of its crops.
+    runs = [digest for digest, _ in itertools.groupby(crop.sha256 for crop in crops)]
+    assert len(runs) == len(set(runs))
+    share = np.mean([crop.part == "val" for crop in crops])
+    assert 0.03 < share < 0.07
+    assert len(PHOTOGRAPHS.files) == len(SOURCES)
+    assert len(PHOTOGRAPHS_FREE.files) == len(FREE_SOURCES)
+
+
+def test_licences_that_allow_any_use_are_told_from_others() -> None:
+    licences = {crop.licence: crop.is_free for crop in listed_crops()}
+    assert licences["CC BY-SA 4.0"]
+    assert licences["Unsplash"]
+    assert not licences["free, Kodak"]
+    assert not licences["ImageNet, research"]
+    assert not any(free for name, free in licences.items() if "NC" in name or "ND" in name)
+
+
+def test_crops_replace_the_repositories(unpacked: tuple[Path, list[Crop]]) -> None:
+    folder, crops = unpacked
+    write_crops(folder, crops)
+    assert not (folder / "sources").exists()
+    with (folder / "licences.csv").open() as file:
+        head, *rows = csv.reader(file)
+    assert head == ["file", "picture", "licence", "sha256"]
+    assert [row[0] for row in rows] == [
+        f"{crop.part}/{crop.source}_{number:05d}.jpg" for number, crop in enumerate(crops)
+    ]
+    assert rows[0][1].startswith("https://github.com/gianni-rosato/gb82-image-set/blob/502f9f94")
+    assert rows[2][2:] == ["MIT (repository)", crops[2].sha256]
+    for row in rows:
+        with Image.open(folder / row[0]) as image:
+            assert image.size == (CROP_SIDE_PX, CROP_SIDE_PX)
+
+
+def test_a_crop_shows_its_place(unpacked: tuple[Path, list[Crop]]) -> None:
+    folder, crops = unpacked
+    write_crops(folder, crops)
+    with Image.open(folder / crops[0].part / "gb82_00000.jpg") as image:
+        middle = np.asarray(image).astype(float)
+    # 960x480 pixels, of which 240 to 719: red runs from a quarter to three quarters.
+    assert middle[240, [0, -1], 0] == pytest.approx([255 / 4, 255 * 3 / 4], abs=3)
+    assert middle[[0, -1], 240, 1] == pytest.approx([0, 255], abs=3)
+
+
+@pytest.mark.parametrize("place", [(480, 240, 0), (960, 1440, 480), (700, 33, 7)])
+def test_a_cut_is_that_of_the_scaled_picture(place: tuple[int, int, int]) -> None:
+    picture = smooth_picture(1000, 500)
+    side, x, y = place
+    scaled = picture.resize((2 * side, side), Image.Resampling.LANCZOS)
+    expected = scaled.crop((x, y, x + CROP_SIDE_PX, y + CROP_SIDE_PX))
+    difference = np.asarray(cut(picture, *place)).astype(int) - np.asarray(expected)
+    assert np.abs(difference).max() <= 2
+
+
+def test_what_is_not_listed_is_refused(unpacked: tuple[Path, list[Crop]]) -> None:
+    folder, crops = unpacked
+    file = folder / "sources" / "osie" / crops[2].path
+    file.write_bytes(file.read_bytes() + b"more")
+    with pytest.raises(DeepDetectError, match="is not the picture that is listed"):
+        write_crops(folder, crops)
+    file.unlink()
+    with pytest.raises(DeepDetectError, match=r"osie has no data/stimuli/1\.png"):
+        write_crops(folder, crops)
