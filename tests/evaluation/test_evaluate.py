@@ -217,3 +217,23 @@ def test_samples_that_cannot_be_read_are_listed_and_not_scored(
     assert "mask_image_b.png" in second
     (tmp_path / "image_c.png").unlink()
     assert CliRunner().invoke(main, ["evaluate", str(tmp_path)]).exit_code == 2
+
+
+def test_probabilities_are_calibrated_against_masks_and_labels(tmp_path: Path, photo) -> None:
+    import json
+
+    from click.testing import CliRunner
+
+    from deepdetect.cli import main
+
+    Image.fromarray(photo).save(tmp_path / "a.png")
+    found = evaluate(samples=tmp_path, scales=[0.5])
+    assert found.masks == {}
+    (row,) = found.scales
+    assert 0 < row.calibration.expected_error < 0.2
+    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--scale", "0.5", "--json"])
+    (told,) = json.loads(result.stdout)["scales"]
+    assert told["calibration_error"] == row.calibration.expected_error
+    assert told["label_density"] == row.label_density
+    refused = CliRunner().invoke(main, ["evaluate", str(tmp_path)])
+    assert "there are no samples in" in refused.output

@@ -15,7 +15,7 @@ from ._options import DETECTOR, PATH, json_option, make_detector, print_json
 if TYPE_CHECKING:
     from ..evaluation.evaluate import Evaluation, OxfordScore
 
-WIDTH = 12
+WIDTH = 14
 
 
 @generated_command(DETECTOR, short_help="How good weights are.")
@@ -57,11 +57,13 @@ def evaluate(
 ) -> None:
     """Score the network on a folder SAMPLES of image_NAME.png with mask_image_NAME.png.
 
-    Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), separately
-    for normal and for low-visibility images; with --oxford also what the paper's protocol
-    gives: images squashed to 480x480, FLANN (mean of three seeds, of 64 where fewer than
+    Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), the expected
+    calibration error over all pixels, and the density of keypoints at 0.5 and of the masks,
+    separately for normal and for low-visibility images; with --oxford also what the paper's
+    protocol gives: images squashed to 480x480, FLANN (mean of three seeds, of 64 where fewer than
     1,000 matches are correct), ratio 0.99, correct under 1 px; with --labels also what the
-    labels give there. With --scale, whether the quality holds on larger and smaller images.
+    labels give there. With --scale, whether the quality holds on larger and smaller images;
+    SAMPLES may then be photographs without masks.
 
     Samples that cannot be read are listed at the end, with exit code 1, and are in no score.
 
@@ -69,6 +71,7 @@ def evaluate(
     deepdetect evaluate samples/
     deepdetect evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
     deepdetect evaluate samples/ --scale 0.5 --scale 1 --scale 2
+    deepdetect evaluate photos/ --scale 1
     """
     from .._shared.errors import BatchError, OptionError
     from ..datasets.oxford import load_oxford
@@ -104,7 +107,8 @@ def evaluate(
     else:
         _print_scores(names, found)
         if scales:
-            click.echo()
+            if found[0].masks:
+                click.echo()
             _print_scales(names, found)
         if on_oxford:
             click.echo()
@@ -116,9 +120,20 @@ def evaluate(
 
 def _values(evaluation: Evaluation) -> dict[str, Any]:
     """Return an evaluation as plain values for JSON."""
-    values: dict[str, Any] = {name: asdict(score) for name, score in evaluation.masks.items()}
+    values: dict[str, Any] = {
+        name: {**asdict(score), **evaluation.calibration[name].values()}
+        for name, score in evaluation.masks.items()
+    }
     if evaluation.scales:
-        values["scales"] = [asdict(row) for row in evaluation.scales]
+        values["scales"] = [
+            {
+                "scale": row.scale,
+                "visibility": row.visibility,
+                "score": asdict(row.score),
+                **row.calibration.values(),
+            }
+            for row in evaluation.scales
+        ]
     if evaluation.oxford is not None:
         values["oxford"] = asdict(evaluation.oxford)
     return values
@@ -138,23 +153,41 @@ def _row(title: str, values: Sequence[str]) -> None:
 
 
 def _print_scores(names: Sequence[str], found: Sequence[Evaluation]) -> None:
+    if not found[0].masks:
+        return
     if len(names) == 1:
-        click.echo(f"{'visibility':<12}{'images':>8}{'BCE':>9}{'IoU':>8}")
+        titles = {"images": 8, "BCE": 9, "IoU": 8, "calibration error": 19, "density": 9}
+        head = "".join(f"{title:>{width}}" for title, width in titles.items())
+        click.echo(f"{'visibility':<12}{head}  labels'")
         for name, score in found[0].masks.items():
-            click.echo(f"{name:<12}{score.images:>8}{score.loss:>9.4f}{score.iou:>8.3f}")
+            pixels = found[0].calibration[name]
+            click.echo(
+                f"{name:<12}{score.images:>8}{score.loss:>9.4f}{score.iou:>8.3f}"
+                f"{pixels.expected_error:>19.4f}{pixels.density:>9.4f}{pixels.label_density:>9.4f}"
+            )
         return
     _row("known masks, BCE / IoU", names)
     for name, score in found[0].masks.items():
         scores = [each.masks[name] for each in found]
         cells = [f"{score.loss:.4f} / {score.iou:.3f}" for score in scores]
         _row(f"  {name} ({score.images} images)", cells)
+    _row("calibration error (density)", names)
+    for name in found[0].masks:
+        calibrations = [each.calibration[name] for each in found]
+        title = f"  {name} ({calibrations[0].label_density:.4f})"
+        _row(title, [f"{each.expected_error:.4f} ({each.density:.4f})" for each in calibrations])
 
 
 def _print_scales(names: Sequence[str], found: Sequence[Evaluation]) -> None:
-    _row("scales, BCE / IoU (density)", names)
+    _row("scales, BCE / IoU, calibration error (density)", names)
     for rows in zip(*(each.scales for each in found), strict=True):
         title = f"  x{rows[0].scale:g} {rows[0].visibility} ({rows[0].label_density:.3f})"
-        _row(title, [f"{r.score.loss:.3f} / {r.score.iou:.3f} ({r.density:.3f})" for r in rows])
+        cells = [
+            f"{r.score.loss:.3f} / {r.score.iou:.3f}, {r.calibration.expected_error:.3f} "
+            f"({r.density:.3f})"
+            for r in rows
+        ]
+        _row(title, cells)
 
 
 def _print_oxford(names: Sequence[str], found: Sequence[OxfordScore]) -> None:

@@ -17,15 +17,17 @@ from ..datasets.types import PlanarScene
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
 from ..features.selection import SelectionOptions
-from ..io.image import load_image
+from ..io.image import find_images, load_image
 from .baselines.method import heatmap_feature
 from .benchmarks import select_pairs
 from .context import BenchmarkContext
+from .metrics.calibration import Calibration
 from .metrics.masks import MaskScore
 from .options import PAPER_RESOLUTION_PX, THRESHOLDS
 from .protocols.masks import (
     ScaleScore,
     check_scales,
+    has_samples,
     readable_samples,
     sample_images,
     score_at_scale,
@@ -59,6 +61,7 @@ class Evaluation:
 
     Attributes:
         masks: against the known masks of samples, by visibility, "normal" and "low".
+        calibration: of the probabilities on all pixels of these samples, likewise.
         scales: against the labels of scaled images, a row for each scale and visibility.
         oxford: by the paper's protocol.
         failures: a sentence on each sample that cannot be read and is not in the scores.
@@ -68,6 +71,7 @@ class Evaluation:
     scales: tuple[ScaleScore, ...] = ()
     oxford: OxfordScore | None = None
     failures: tuple[str, ...] = ()
+    calibration: dict[str, Calibration] = field(default_factory=dict)
 
 
 @suggest_keywords
@@ -84,7 +88,8 @@ def evaluate(
     Args:
         detector: with the weights; default `DeepDetect()`. The known masks are compared at the
             detector's own resolution, the rest at the resolution of the protocol.
-        samples: folder of images `image_NAME.png` with known masks `mask_image_NAME.png`.
+        samples: folder of images `image_NAME.png` with known masks `mask_image_NAME.png`; with
+            `scales` any images, without masks.
         scales: factors above 0: the samples scaled by each are compared with labels of their own.
         oxford: folder of the eight Oxford scenes: density, repeatability and correct matches by
             the paper's protocol.
@@ -111,11 +116,17 @@ def evaluate(
     masks: dict[str, MaskScore] = {}
     rows: list[ScaleScore] = []
     failures: tuple[str, ...] = ()
+    calibration: dict[str, Calibration] = {}
     if samples is not None:
-        images, failures = readable_samples(sample_images(samples))
-        if not images:
-            raise ImageError(failures[0])
-        masks = score_samples(detector.heatmap, _shown(images, "scoring", quiet))
+        if scales and not has_samples(samples):
+            images = find_images(samples)
+        else:
+            images, failures = readable_samples(sample_images(samples))
+            if not images:
+                raise ImageError(failures[0])
+            scored = score_samples(detector.heatmap, _shown(images, "scoring", quiet))
+            masks = {name: score for name, (score, _) in scored.items()}
+            calibration = {name: found for name, (_, found) in scored.items()}
         for scale in scales:
             rows += score_at_scale(detector, _shown(images, f"scale {scale:g}", quiet), scale)
     return Evaluation(
@@ -123,6 +134,7 @@ def evaluate(
         tuple(rows),
         None if oxford is None else evaluate_oxford(detector, load_oxford(oxford), quiet=quiet),
         failures,
+        calibration,
     )
 
 

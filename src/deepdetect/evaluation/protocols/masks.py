@@ -16,7 +16,10 @@ from ...detector.heatmap import HeatmapOptions, compute_heatmap
 from ...io.image import MINIMUM_SIDE, load_image, luma, scale_short_side
 from ...io.masks import load_mask
 from ...labels import LabelOptions, fuse, visibility_of
+from ..metrics.calibration import Calibration, calibration_of, pooled
 from ..metrics.masks import MaskScore, mean_score, score_heatmap
+
+Scored = tuple[MaskScore, Calibration]
 
 
 def sample_images(folder: str | Path) -> list[Path]:
@@ -33,9 +36,14 @@ def sample_images(folder: str | Path) -> list[Path]:
     return images
 
 
+def has_samples(folder: str | Path) -> bool:
+    """Whether a folder holds an image `image_*.png` with a mask, not photographs alone."""
+    return any(True for _ in Path(folder).glob("mask_image_*.png"))
+
+
 def score_samples(
     heatmap: Callable[[np.ndarray], np.ndarray], images: Iterable[Path]
-) -> dict[str, MaskScore]:
+) -> dict[str, Scored]:
     """Score a detector on samples with known masks.
 
     Args:
@@ -43,16 +51,24 @@ def score_samples(
         images: of `sample_images`.
 
     Returns:
-        The means by visibility, "normal" and "low", where there are images of it.
+        By visibility, "normal" and "low", where there are images of it: the means over the images,
+        and the calibration over all their pixels.
 
     Raises:
         ImageError: a mask is missing or of another size.
     """
-    scores: dict[str, list[MaskScore]] = {"normal": [], "low": []}
+    scores: dict[str, list[Scored]] = {"normal": [], "low": []}
     for path in images:
         rgb, mask = load_sample(path)
-        scores[visibility_of(luma(rgb))].append(score_heatmap(heatmap(rgb), mask))
-    return {name: mean_score(listed) for name, listed in scores.items() if listed}
+        found = heatmap(rgb)
+        scores[visibility_of(luma(rgb))].append(
+            (score_heatmap(found, mask), calibration_of(found, mask))
+        )
+    return {name: _over_images(listed) for name, listed in scores.items() if listed}
+
+
+def _over_images(scores: Sequence[Scored]) -> Scored:
+    return mean_score(score for score, _ in scores), pooled(found for _, found in scores)
 
 
 def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -132,15 +148,23 @@ class ScaleScore:
         scale: factor that the images were scaled by.
         visibility: of the images, "normal" or "low".
         score: against the labels of the scaled images.
-        label_density: marked pixels of the labels per pixel, mean over images.
-        density: keypoints per pixel at threshold 0.5, mean over images.
+        calibration: over all their pixels.
     """
 
     scale: float
     visibility: str
     score: MaskScore
-    label_density: float
-    density: float
+    calibration: Calibration
+
+    @property
+    def label_density(self) -> float:
+        """Marked pixels of the labels per pixel."""
+        return self.calibration.label_density
+
+    @property
+    def density(self) -> float:
+        """Keypoints per pixel at threshold 0.5."""
+        return self.calibration.density
 
 
 def check_scales(scales: Sequence[float]) -> None:
@@ -184,22 +208,15 @@ def score_at_scale(
     """
     check_scales([scale])
     native = detector.configured(HeatmapOptions("native"))
-    found: dict[str, list[tuple[MaskScore, float, float]]] = {}
+    found: dict[str, list[Scored]] = {}
     for image in images:
         rgb = _scaled(load_image(image), scale)
         label = fuse(luma(rgb), options)
         heatmap = native.heatmap(rgb)
-        densities = float(label.mask.mean()), float((heatmap > 0.5).mean())
-        score = score_heatmap(heatmap, label.mask)
-        found.setdefault(label.visibility, []).append((score, *densities))
+        scored = score_heatmap(heatmap, label.mask), calibration_of(heatmap, label.mask)
+        found.setdefault(label.visibility, []).append(scored)
     return [
-        ScaleScore(
-            scale,
-            visibility,
-            mean_score(score for score, _, _ in found[visibility]),
-            float(np.mean([density for _, density, _ in found[visibility]])),
-            float(np.mean([density for _, _, density in found[visibility]])),
-        )
+        ScaleScore(scale, visibility, *_over_images(found[visibility]))
         for visibility in sorted(found, reverse=True)
     ]
 
