@@ -17,6 +17,7 @@ from .benchmark import benchmark
 from .datasets import datasets
 from .demo import demo
 from .detect import detect
+from .doctor import doctor
 from .evaluate import evaluate
 from .evaluate_stereo import evaluate_stereo
 from .export import export
@@ -130,5 +131,6 @@ for command in (
     evaluate_stereo,
     benchmark,
     demo,
+    doctor,
 ):
     main.add_command(command)
