@@ -1,0 +1,123 @@
+"""The pages of the Python interface: which names are on which; mkdocstrings writes the rest.
+
+A test demands that each name that `import deepdetect` exports is on one of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ApiPage:
+    """A page: its title, what it says first, and the names on it."""
+
+    uri: str
+    title: str
+    introduction: str
+    names: tuple[str, ...]
+
+    def text(self) -> str:
+        """Return the page in Markdown."""
+        blocks = "\n\n".join(f"::: deepdetect.{name}" for name in self.names)
+        return f"# {self.title}\n\n{self.introduction}\n\n{blocks}\n"
+
+
+PAGES = (
+    ApiPage(
+        "api/detection.md",
+        "Detection",
+        "Keypoints of photographs. In code that runs: [Python](../python.md#detect).",
+        (
+            "DeepDetect",
+            "HeatmapOptions",
+            "Keypoints",
+            "SelectionOptions",
+            "select_keypoints",
+            "load_image",
+        ),
+    ),
+    ApiPage(
+        "api/matching.md",
+        "Matching",
+        "Matches between two photographs: [how](../matching.md).",
+        (
+            "match_images",
+            "Matches",
+            "MatchingOptions",
+            "Guide",
+            "estimate_geometry",
+            "Geometry",
+            "GeometryOptions",
+        ),
+    ),
+    ApiPage(
+        "api/registration.md",
+        "Registration and panoramas",
+        "Photographs of a plane, or from one place: [how](../matching.md#panoramas).",
+        ("register", "Registration", "stitch", "Panorama", "StitchingOptions"),
+    ),
+    ApiPage(
+        "api/reconstruction.md",
+        "3D reconstruction",
+        "From [two photographs](../reconstruction.md), or from "
+        "[three and more](../many-photographs.md).",
+        (
+            "reconstruct",
+            "Reconstruction",
+            "ReconstructionOptions",
+            "disparity_map",
+            "DisparityMap",
+            "DisparityOptions",
+            "Calibration",
+            "Camera",
+            "PointCloud",
+            "reconstruct_many",
+            "MultiViewReconstruction",
+            "MultiViewOptions",
+        ),
+    ),
+    ApiPage(
+        "api/files.md",
+        "Files",
+        "What results are written to and read from; never pickles.",
+        ("save_keypoints", "load_keypoints", "save_matches", "load_matches", "save_point_cloud"),
+    ),
+    ApiPage(
+        "api/training.md",
+        "Labels, training, evaluation",
+        "The masks that the network learns ([labels](../labels.md)), and how it does "
+        "([training](../training.md)).",
+        ("fuse", "Label", "LabelOptions", "train", "TrainingOptions", "evaluate", "Evaluation"),
+    ),
+    ApiPage(
+        "api/integrations.md",
+        "Drop-ins for other programs",
+        "With snippets that run: [DeepDetect in other programs](../integrations.md).",
+        (
+            "integrations.opencv",
+            "integrations.kornia",
+            "integrations.lightglue",
+            "integrations.hloc",
+            "integrations.vismatch",
+            "integrations.skimage",
+            "integrations.transformers",
+        ),
+    ),
+    ApiPage(
+        "api/errors.md",
+        "Errors",
+        "Every error that you can cause is one sentence and a `DeepDetectError`: "
+        "[how to catch them](../python.md#errors).",
+        (
+            "DeepDetectError",
+            "ImageError",
+            "OptionError",
+            "WeightsError",
+            "MissingExtraError",
+            "ReconstructionError",
+            "NoDepthError",
+            "RegistrationError",
+        ),
+    ),
+)

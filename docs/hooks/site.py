@@ -1,0 +1,136 @@
+"""What mkdocs does not do by itself: pages made from the code, and from files beside `docs`.
+
+The pages of `docs` link each other and files of the repository, so that GitHub shows them right. For
+the site such links are turned to the page that a file has become, or else to the file on GitHub.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(Path(__file__).parent))
+
+import api_pages  # noqa: E402
+import cli_page  # noqa: E402
+
+REPOSITORY = "https://github.com/deepdetect/deepdetect/blob/main/"
+
+COPIED = {
+    "README.md": "readme.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "src/deepdetect/detector/weights/MODEL_CARD.md": "cards/default.md",
+    "src/deepdetect/detector/weights/DENSE_CARD.md": "cards/dense.md",
+    "src/deepdetect/detector/points/MODEL_CARD.md": "cards/points.md",
+}
+"""Files of the repository that are pages of the site, by their paths."""
+
+OPTIONAL = frozenset({"app.md", "interchange.md", "tracking.md"})
+"""Pages of the navigation that are left out where they are not there."""
+
+APP = ROOT / "web" / "dist"
+"""The page that detects and matches in the browser, once it is built."""
+
+APP_FOLDER = "try"
+APP_MARK = "<!-- The page in the browser is embedded here. -->"
+EMBEDDED = f"""\
+<iframe src="{APP_FOLDER}/index.html" class="app" title="DeepDetect in the browser" loading="lazy">
+</iframe>
+
+It runs in this page, on your computer: your pictures stay there. \
+<a href="{APP_FOLDER}/index.html">The page by itself</a>.
+"""
+
+ORIGINS: dict[str, str] = {site: repository for repository, site in COPIED.items()}
+
+
+def on_config(config: Any) -> Any:
+    """Leave pages out of the navigation that are not there, and put in the pages of the API."""
+    config.nav = _navigation(config.nav, Path(config.docs_dir))
+    return config
+
+
+def _navigation(entries: list[Any], folder: Path) -> list[Any]:
+    kept = []
+    for entry in entries:
+        ((title, target),) = entry.items()
+        if isinstance(target, list):
+            kept.append({title: _navigation(target, folder)})
+        elif target == "api/":
+            kept.append({title: [{page.title: page.uri} for page in api_pages.PAGES]})
+        elif target not in OPTIONAL or (folder / target).is_file():
+            kept.append(entry)
+    return kept
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pages that are made from the code or from files beside `docs`, and the app."""
+    from mkdocs.structure.files import File
+
+    for repository, site in COPIED.items():
+        text = (ROOT / repository).read_text("utf-8")
+        files.append(File.generated(config, site, content=without_badges(text)))
+    files.append(File.generated(config, "cli.md", content=cli_page.make_page()))
+    for page in api_pages.PAGES:
+        files.append(File.generated(config, page.uri, content=page.text()))
+    if (APP / "index.html").is_file():
+        for path in sorted(APP.rglob("*")):
+            if path.is_file() and path.suffix != ".md":
+                uri = f"{APP_FOLDER}/{path.relative_to(APP).as_posix()}"
+                files.append(File.generated(config, uri, abs_src_path=str(path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Turn links, and put in the app."""
+    uri = page.file.src_uri
+    embedded = EMBEDDED if (APP / "index.html").is_file() else ""
+    markdown = markdown.replace(APP_MARK, embedded)
+    return turn_links(markdown, ORIGINS.get(uri, f"docs/{uri}"), uri)
+
+
+def turn_links(markdown: str, origin: str, uri: str) -> str:
+    """Turn a page's links to files of the repository.
+
+    Args:
+        markdown: of the page.
+        origin: its path in the repository, which its links are relative to.
+        uri: its path in the site.
+
+    Returns:
+        The page with links to pages of the site, and to GitHub for all other files.
+
+    Example:
+        >>> turn_links("[a](../README.md#use), [b](../Makefile)", "docs/a.md", "a.md")
+        '[a](readme.md#use), [b](https://github.com/deepdetect/deepdetect/blob/main/Makefile)'
+    """
+
+    def turn(match: re.Match[str]) -> str:
+        path, hash_sign, anchor = match["target"].partition("#")
+        if not path or re.match(r"[a-z]+:", path):
+            return match[0]
+        file = posixpath.normpath(posixpath.join(posixpath.dirname(origin), path))
+        site = COPIED.get(file)
+        if site is None and file.startswith("docs/"):
+            site = file.removeprefix("docs/")
+        if site is None:
+            return f"{match['before']}{REPOSITORY}{file}{hash_sign}{anchor}"
+        near = posixpath.relpath(site, posixpath.dirname(uri) or ".")
+        return f"{match['before']}{near}{hash_sign}{anchor}"
+
+    link = re.compile(r"(?P<before>\]\(|^\[[^\]^]+\]: )(?P<target>[^)\s]+)", re.M)
+    # Code is left as it is.
+    parts = re.split(r"(^```.*?^```$|`[^`\n]+`)", markdown, flags=re.S | re.M)
+    parts[::2] = [link.sub(turn, part) for part in parts[::2]]
+    return "".join(parts)
+
+
+def without_badges(text: str) -> str:
+    """Leave out the badges of the README: their pictures are on another server."""
+    return re.sub(r"^\[!\[.*\n", "", text, count=1, flags=re.M)
