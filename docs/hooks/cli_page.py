@@ -11,8 +11,9 @@ import click
 INTRODUCTION = """\
 # Command line
 
-Made from the commands: it says what `deepdetect COMMAND --help` says. How results are written, when a
-command goes on where it stopped, and what the exit codes mean is in the [README](../README.md#use).
+Made from the commands: it says what `deepdetect COMMAND --help` says. How results are written,
+when a command goes on where it stopped, and what the exit codes mean is in the
+[README](../README.md#use).
 
 `-h` or `--help` helps with each command, `--version` prints the version.
 
@@ -23,7 +24,8 @@ command goes on where it stopped, and what the exit codes mean is in the [README
 COMPLETION = """
 ## Completion by Tab
 
-The shell completes commands and options when it is told how, once. Bash (4.4 or later), in `~/.bashrc`:
+The shell completes commands and options when it is told how, once. Bash (4.4 or later), in
+`~/.bashrc`:
 
 ```sh
 eval "$(_DEEPDETECT_COMPLETE=bash_source deepdetect)"
@@ -41,9 +43,12 @@ Fish, in `~/.config/fish/completions/deepdetect.fish`:
 _DEEPDETECT_COMPLETE=fish_source deepdetect | source
 ```
 
-Each new shell then starts `deepdetect` once. To spare that, write what it prints to a file
-(`_DEEPDETECT_COMPLETE=bash_source deepdetect > ~/.deepdetect-completion.bash`) and `source` the file instead; make
-it again after an update.
+Each new shell then starts `deepdetect` once. To spare that, write what it prints to a file, and
+`source` the file instead; make it again after an update:
+
+```sh
+_DEEPDETECT_COMPLETE=bash_source deepdetect > ~/.deepdetect-completion.bash
+```
 """
 
 

@@ -1,7 +1,7 @@
 """What mkdocs does not do by itself: pages made from the code, and from files beside `docs`.
 
-The pages of `docs` link each other and files of the repository, so that GitHub shows them right. For
-the site such links are turned to the page that a file has become, or else to the file on GitHub.
+The pages of `docs` link each other and files of the repository, so that GitHub shows them right.
+For the site such links are turned to the page that a file has become, or to the file on GitHub.
 """
 
 from __future__ import annotations

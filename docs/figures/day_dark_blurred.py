@@ -1,0 +1,138 @@
+"""The picture of the README: one pair in daylight, dark and blurred, from photograph to 3D.
+
+python docs/figures/day_dark_blurred.py    # writes docs/images/day-dark-blurred.jpg
+
+The photographs are the Motorcycle pair of Middlebury 2014 (Scharstein et al., GCPR 2014; free to
+use and publish with citation), which comes with scikit-image. Darkness and blur are those of
+`deepdetect benchmark --protocol degraded`; the numbers are counted here, by the true disparity.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from layout import caption, header, write_jpeg
+
+from deepdetect import (
+    Calibration,
+    Camera,
+    DeepDetect,
+    Keypoints,
+    Reconstruction,
+    match_images,
+    reconstruct,
+)
+from deepdetect.datasets import load_stereo_pair
+from deepdetect.datasets.degradation import DEGRADATIONS, degrade
+from deepdetect.geometry import disparity_errors
+from deepdetect.viz.draw import _circle, _dimmed, draw_heatmap
+from deepdetect.viz.render import orbit_camera, render
+
+OUTPUT = Path(__file__).parents[1] / "images" / "day-dark-blurred.jpg"
+LIGHTS = {"daylight": None, "an eighth of the light": "dark-8", "out of focus": "blur-2"}
+COLUMNS = (
+    "photograph, with 300 points",
+    "dense: probability of a keypoint",
+    "matches, left above right; red: wrong",
+    "3D points, from another side",
+)
+FOCAL_PX, CENTRE_LEFT_PX, CENTRE_RIGHT_PX = 994.978, (311.193, 254.877), (342.279, 254.877)
+BASELINE_MM = 193.001
+"""Of the Motorcycle pair, as `help(skimage.data.stereo_motorcycle)` says."""
+
+AZIMUTH, ELEVATION = -14, 12
+"""Degrees, of the view of the 3D points."""
+
+POINTS, LINES = 300, 80
+CELL = (368, 248)
+ROWS_SHOWN = slice(140, 390)
+"""Of both photographs in the picture of matches: the motorcycle."""
+
+QUALITY = 66
+
+
+def main() -> None:
+    """Write the picture."""
+    pair = load_stereo_pair("motorcycle")
+    detector = DeepDetect()
+    rows = [header(COLUMNS, CELL[0])]
+    for title, name in LIGHTS.items():
+        left, right = (
+            view if name is None else degrade(view, DEGRADATIONS[name])
+            for view in (pair.left, pair.right)
+        )
+        rows.append(row(title, left, right, pair.disparity, detector))
+    write_jpeg(np.concatenate(rows), OUTPUT, QUALITY)
+
+
+def row(
+    title: str, left: np.ndarray, right: np.ndarray, truth: np.ndarray, detector: DeepDetect
+) -> np.ndarray:
+    """Detect, match and reconstruct; return four captioned panels."""
+    points = detector.detect(left, max_keypoints=POINTS, spread="grid")
+    heatmap = detector.heatmap(left)
+    matches = match_images(left, right, detector)
+    errors = disparity_errors(matches.points0, matches.points1, truth)
+    known = np.isfinite(errors)
+    right_ones = errors[known] < 1
+    size = (left.shape[1], left.shape[0])
+    cameras = (Camera(size, FOCAL_PX, centre) for centre in (CENTRE_LEFT_PX, CENTRE_RIGHT_PX))
+    model = reconstruct(left, right, calibration=Calibration(*cameras, BASELINE_MM))
+    panels = [
+        (draw_points(left, points), f"{title}: the best points in yellow"),
+        (draw_heatmap(heatmap), f"{len(matches.keypoints0):,} dense keypoints"),
+        (
+            stacked(left, right, matches.points0[known], matches.points1[known], right_ones),
+            f"{len(matches):,} matches, {right_ones.mean():.1%} within 1 px",
+        ),
+        (draw_model(model), f"{len(model):,} 3D points"),
+    ]
+    return np.concatenate([caption(panel, text, CELL) for panel, text in panels], axis=1)
+
+
+def draw_points(rgb: np.ndarray, points: Keypoints) -> np.ndarray:
+    """Draw points as circles of their size, the best in yellow, the last in blue."""
+    canvas = rgb.copy()
+    rank = np.argsort(np.argsort(-points.scores))
+    colors = draw_heatmap(1 - 0.75 * rank[None] / len(points))[0].tolist()
+    for k in np.argsort(-rank):
+        radius = max(points.sizes[k] / 2, 3)
+        _circle(canvas, points.xy[k], radius, (0, 0, 0), 4)
+        _circle(canvas, points.xy[k], radius, colors[k], 2)
+    return canvas
+
+
+def stacked(
+    left: np.ndarray, right: np.ndarray, first: np.ndarray, second: np.ndarray, good: np.ndarray
+) -> np.ndarray:
+    """Draw a part of both views above one another, with lines between a sample of the matches."""
+    from deepdetect._shared.opencv import cv2
+
+    upper, lower = _dimmed(left[ROWS_SHOWN]), _dimmed(right[ROWS_SHOWN])
+    canvas = np.concatenate([upper, lower])
+    rows = first[:, 1]
+    inside = np.flatnonzero((rows > ROWS_SHOWN.start + 4) & (rows < ROWS_SHOWN.stop - 4))
+    shown = np.random.default_rng(0).permutation(inside)[:LINES]
+    shown = shown[np.argsort(good[shown], kind="stable")]
+    hues = np.stack([20 + 120 * first[shown, 0] / left.shape[1], *np.full((2, len(shown)), 235.0)])
+    colors = cv2.cvtColor(np.rint(hues.T).astype(np.uint8)[None], cv2.COLOR_HSV2RGB)[0].tolist()
+    for k, color in zip(shown, colors, strict=True):
+        start = np.rint(first[k] - [0, ROWS_SHOWN.start]).astype(int).tolist()
+        end = np.rint(second[k] - [0, ROWS_SHOWN.start] + [0, len(upper)]).astype(int).tolist()
+        color = color if good[k] else (255, 0, 0)
+        cv2.line(canvas, start, end, color, 1, cv2.LINE_AA)
+        for place in (start, end):
+            cv2.circle(canvas, place, 3, color, -1, cv2.LINE_AA)
+    return canvas
+
+
+def draw_model(model: Reconstruction) -> np.ndarray:
+    """Draw a cloud from the right and from above."""
+    cloud = model.cloud
+    size = (CELL[0] * 2, CELL[1] * 2)
+    return render(cloud, orbit_camera(cloud, AZIMUTH, ELEVATION, size))
+
+
+if __name__ == "__main__":
+    main()

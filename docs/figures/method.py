@@ -1,0 +1,80 @@
+"""The pictures of docs/method.md.
+
+python docs/figures/method.py    # writes docs/images/method-*.jpg
+
+The photographs come with scikit-image: the astronaut (NASA, public domain) and the Motorcycle pair
+of Middlebury 2014 (Scharstein et al.; free to use and publish with citation).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from layout import caption, write_jpeg
+
+from deepdetect import DeepDetect, LabelOptions, Matches, fuse, match_images
+from deepdetect.datasets import StereoPair, load_stereo_pair
+from deepdetect.geometry import disparity_errors
+from deepdetect.viz.draw import draw_heatmap, draw_matches
+
+FOLDER = Path(__file__).parents[1] / "images"
+DETECTORS = {"sift": "SIFT", "fast": "FAST", "harris": "Harris", "canny": "Canny", "sobel": "Sobel"}
+CELL = (270, 270)
+PAIR_CELL = (560, 189)
+QUALITY = 75
+
+
+def main() -> None:
+    """Write all pictures."""
+    from skimage import data
+
+    photograph = data.astronaut()[:360, 60:420]
+    write_jpeg(draw_labels(photograph), FOLDER / "method-labels.jpg", QUALITY)
+    write_jpeg(draw_guidance(load_stereo_pair("motorcycle")), FOLDER / "method-guided.jpg", QUALITY)
+
+
+def draw_labels(rgb: np.ndarray) -> np.ndarray:
+    """Draw what some detectors mark, the union of all nine, and what the network answers."""
+    panels = [(rgb, "a photograph")]
+    for name, title in DETECTORS.items():
+        mask = fuse(rgb, LabelOptions(detectors=(name,))).mask
+        panels.append((_white(mask), f"{title} marks {mask.mean():.1%}"))
+    union = fuse(rgb).mask
+    heatmap = DeepDetect().heatmap(rgb)
+    panels.append((_white(union), f"all nine together: {union.mean():.1%}"))
+    panels.append((draw_heatmap(heatmap), f"the network: over 0.5 at {(heatmap > 0.5).mean():.1%}"))
+    cells = [caption(panel, text, CELL) for panel, text in panels]
+    return np.concatenate(
+        [np.concatenate(cells[start : start + 4], axis=1) for start in range(0, len(cells), 4)]
+    )
+
+
+def draw_guidance(pair: StereoPair) -> np.ndarray:
+    """Draw matches by descriptors alone above those that a geometry guided."""
+    detector = DeepDetect()
+    kinds = {"by descriptors alone": False, "guided by a geometry": True}
+    cells = []
+    for title, guided in kinds.items():
+        matches = match_images(pair.left, pair.right, detector, guided=guided)
+        cells.append(_matches(pair, matches, title))
+    return np.concatenate(cells, axis=1)
+
+
+def _matches(pair: StereoPair, matches: Matches, title: str) -> np.ndarray:
+    errors = disparity_errors(matches.points0, matches.points1, pair.disparity)
+    known = np.isfinite(errors)
+    right = errors[known] <= 1
+    picture = draw_matches(
+        pair.left, pair.right, matches.points0[known], matches.points1[known], right, lines=120
+    )
+    text = f"{title}: {len(matches):,} matches, {right.mean():.1%} within 1 px (green)"
+    return caption(picture, text, PAIR_CELL)
+
+
+def _white(mask: np.ndarray) -> np.ndarray:
+    return np.repeat((mask * np.uint8(255))[..., None], 3, axis=2)
+
+
+if __name__ == "__main__":
+    main()
