@@ -11,17 +11,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from day_dark_blurred import POINTS, draw_points
 from layout import caption, write_jpeg
 
 from deepdetect import DeepDetect, LabelOptions, Matches, fuse, match_images
 from deepdetect.datasets import StereoPair, load_stereo_pair
 from deepdetect.geometry import disparity_errors
-from deepdetect.viz.draw import draw_heatmap, draw_matches
+from deepdetect.viz.draw import draw_heatmap, draw_keypoints, draw_matches
 
 FOLDER = Path(__file__).parents[1] / "images"
 DETECTORS = {"sift": "SIFT", "fast": "FAST", "harris": "Harris", "canny": "Canny", "sobel": "Sobel"}
 CELL = (270, 270)
 PAIR_CELL = (560, 189)
+KIND_CELL = (560, 378)
 QUALITY = 75
 
 
@@ -31,7 +33,9 @@ def main() -> None:
 
     photograph = data.astronaut()[:360, 60:420]
     write_jpeg(draw_labels(photograph), FOLDER / "method-labels.jpg", QUALITY)
-    write_jpeg(draw_guidance(load_stereo_pair("motorcycle")), FOLDER / "method-guided.jpg", QUALITY)
+    pair = load_stereo_pair("motorcycle")
+    write_jpeg(draw_kinds(pair.left), FOLDER / "method-kinds.jpg", QUALITY)
+    write_jpeg(draw_guidance(pair), FOLDER / "method-guided.jpg", QUALITY)
 
 
 def draw_labels(rgb: np.ndarray) -> np.ndarray:
@@ -48,6 +52,18 @@ def draw_labels(rgb: np.ndarray) -> np.ndarray:
     return np.concatenate(
         [np.concatenate(cells[start : start + 4], axis=1) for start in range(0, len(cells), 4)]
     )
+
+
+def draw_kinds(rgb: np.ndarray) -> np.ndarray:
+    """Draw dense keypoints beside points."""
+    detector = DeepDetect()
+    dense = detector.detect(rgb)
+    points = detector.detect(rgb, max_keypoints=POINTS, spread="grid")
+    cells = [
+        caption(draw_keypoints(rgb, dense), f"dense: {len(dense):,} keypoints", KIND_CELL),
+        caption(draw_points(rgb, points), f"{len(points)} points, the best in yellow", KIND_CELL),
+    ]
+    return np.concatenate(cells, axis=1)
 
 
 def draw_guidance(pair: StereoPair) -> np.ndarray:
