@@ -5,6 +5,7 @@ VENV_OPENCV4 ?= .venv-opencv4
 VENV_LOWEST ?= .venv-lowest
 VENV_RAY ?= .venv-ray
 VENV_INTEGRATIONS ?= .venv-integrations
+VENV_DOCS ?= .venv-docs
 DEMO_OUTPUT ?= demo-output
 # What installs the lock files: uv is eight times as fast as pip, which does the same.
 INSTALLER ?= uv
@@ -33,7 +34,7 @@ install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requ
 install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
 
 .PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest coverage lint spelling types contracts check \
-	format lock upgrade check-lock audit sbom dist clean
+	format lock upgrade check-lock audit sbom docs test-docs notebooks figures dist release-check clean
 
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
@@ -114,12 +115,34 @@ sbom: $(VENV)/bin/uv
 	$(VENV)/bin/uvx --from cyclonedx-bom==7.5.0 cyclonedx-py requirements requirements/lock.txt \
 		--pyproject pyproject.toml --output-format JSON --output-reproducible --output-file sbom.json
 
+# The site, in build/site; what is wrong with a link or a docstring ends it.
+docs: $(VENV_DOCS)/.test
+	NO_MKDOCS_2_WARNING=1 $(VENV_DOCS)/bin/mkdocs build
+
+# The site asks for nothing on other servers, and the notebooks run: five minutes on two cores.
+test-docs: $(VENV_DOCS)/.test
+	$(VENV_DOCS)/bin/python -m pytest -p no:cacheprovider --runslow tests/docs
+
+# Runs the notebooks and keeps their output.
+notebooks: $(VENV_DOCS)/.test
+	$(VENV_DOCS)/bin/python docs/notebooks/run.py
+
+# Draws the pictures of the README and of docs/method.md again.
+figures: $(VENV)/.test
+	$(VENV)/bin/python docs/figures/day_dark_blurred.py
+	$(VENV)/bin/python docs/figures/method.py
+
 dist: $(VENV)/.test
 	rm -rf dist
 	$(VENV)/bin/python -m build --no-isolation
 
+# The wheel and the source archive are made, looked at, and installed without a network into empty
+# environments of each Python that is here.
+release-check: $(VENV_DOCS)/.test
+	$(VENV_DOCS)/bin/python .ci/check_release.py
+
 clean:
-	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(VENV_RAY) $(VENV_INTEGRATIONS) $(DEMO_OUTPUT)
+	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(VENV_RAY) $(VENV_INTEGRATIONS) $(VENV_DOCS) $(DEMO_OUTPUT)
 	rm -rf build dist sbom.json htmlcov .coverage .coverage.* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 
 %/bin/uv: requirements/uv.txt
@@ -159,4 +182,9 @@ $(VENV_INTEGRATIONS)/.test: $(VENV_INTEGRATIONS)/bin/uv requirements/integration
 	$(call install_locked,$(VENV_INTEGRATIONS),requirements/integrations.txt)
 	$(call install_torch,$(VENV_INTEGRATIONS))
 	$(call install_package,$(VENV_INTEGRATIONS))
+	touch $@
+
+$(VENV_DOCS)/.test: $(VENV_DOCS)/bin/uv requirements/docs.txt pyproject.toml
+	$(call install_locked,$(VENV_DOCS),requirements/docs.txt)
+	$(call install_package,$(VENV_DOCS))
 	touch $@

@@ -70,6 +70,11 @@ LOCK_FILES = (
         groups=("build", "test", "integrations"),
         extras=("demo", "labels", "match", "train"),
     ),
+    LockFile(
+        "docs.txt",
+        groups=("build", "docs", "release", "test"),
+        extras=("demo", "labels", "match"),
+    ),
     LockFile("lowest.txt", groups=("build", "test"), extras=ALL_EXTRAS, lowest=True),
 )
 

@@ -31,6 +31,7 @@ def run(path: Path, folder: Path) -> nbformat.NotebookNode:
         timeout=TIMEOUT_S,
         kernel_name="python3",
         record_timing=False,
+        coalesce_streams=True,
         resources={"metadata": {"path": str(folder)}},
         extra_arguments=[JPEG],
     )

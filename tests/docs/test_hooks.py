@@ -1,0 +1,167 @@
+"""What is made for the site from the code and from files beside docs/."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import click
+import pytest
+
+import deepdetect
+from deepdetect.cli import main
+
+ROOT = Path(__file__).parents[2]
+GITHUB = "https://github.com/deepdetect/deepdetect/blob/main/"
+
+
+@pytest.mark.parametrize(
+    ("origin", "uri", "link", "turned"),
+    [
+        ("docs/index.md", "index.md", "../README.md#use", "readme.md#use"),
+        ("docs/index.md", "index.md", "matching.md#limits", "matching.md#limits"),
+        ("docs/index.md", "index.md", "#here", "#here"),
+        ("docs/index.md", "index.md", "https://arxiv.org/abs/1", "https://arxiv.org/abs/1"),
+        ("docs/onnx.md", "onnx.md", "../examples/onnx_cpp", f"{GITHUB}examples/onnx_cpp"),
+        ("README.md", "readme.md", "docs/scale.md", "scale.md"),
+        ("README.md", "readme.md", "docs/images/demo.jpg", "images/demo.jpg"),
+        ("README.md", "readme.md", "LICENSE", f"{GITHUB}LICENSE"),
+        (
+            "src/deepdetect/detector/weights/MODEL_CARD.md",
+            "cards/default.md",
+            "../../../../docs/history.md",
+            "../history.md",
+        ),
+        (
+            "docs/points.md",
+            "points.md",
+            "../src/deepdetect/detector/points/MODEL_CARD.md",
+            "cards/points.md",
+        ),
+        ("docs/api/detection.md", "api/detection.md", "../python.md#detect", "../python.md#detect"),
+    ],
+)
+def test_links_lead_to_pages_of_the_site_or_to_github(
+    hooks: ModuleType, origin: str, uri: str, link: str, turned: str
+) -> None:
+    assert hooks.turn_links(f"see [this]({link}).", origin, uri) == f"see [this]({turned})."
+    assert hooks.turn_links(f"x\n\n[name]: {link}\n", origin, uri) == f"x\n\n[name]: {turned}\n"
+
+
+def test_links_in_code_stay(hooks: ModuleType) -> None:
+    text = "`[a](../b.md)`\n\n```md\n[a](../b.md)\n```\n"
+    assert hooks.turn_links(text, "docs/index.md", "index.md") == text
+
+
+def test_badges_are_left_out(hooks: ModuleType) -> None:
+    readme = hooks.without_badges((ROOT / "README.md").read_text("utf-8"))
+    assert not re.search(r"!\[[^\]]*\]\[", readme)
+    assert "# DeepDetect" in readme
+    assert "## Results" in readme
+
+
+def test_the_page_in_the_browser_is_embedded_where_it_is_there(
+    hooks: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (ROOT / "docs/index.md").read_text("utf-8")
+    assert hooks.APP_MARK in text
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="index.md"))
+    monkeypatch.setattr(hooks, "APP", tmp_path)
+    assert "iframe" not in hooks.on_page_markdown(text, page)
+    (tmp_path / "index.html").write_text("<p>app</p>")
+    assert '<iframe src="try/index.html"' in hooks.on_page_markdown(text, page)
+
+
+def test_optional_pages_leave_the_navigation(hooks: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "tracking.md").write_text("# Tracking")
+    entries = [
+        {"Use": [{"Tracking": "tracking.md"}, {"Files": "interchange.md"}]},
+        {"Typo": "instalation.md"},
+    ]
+    assert hooks._navigation(entries, tmp_path) == [
+        {"Use": [{"Tracking": "tracking.md"}]},
+        {"Typo": "instalation.md"},  # an error of the strict build
+    ]
+
+
+def test_every_page_is_in_the_navigation(hooks: ModuleType) -> None:
+    listed = set(re.findall(r": ([\w/-]+\.(?:md|ipynb))$", navigation(), re.M))
+    docs = ROOT / "docs"
+    pages = {path.name for path in docs.glob("*.md")} | set(hooks.COPIED.values()) | {"cli.md"}
+    pages |= {f"notebooks/{path.name}" for path in docs.glob("notebooks/*.ipynb")}
+    assert listed - hooks.OPTIONAL == pages - hooks.OPTIONAL
+
+
+def navigation() -> str:
+    return (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:\n")[2]
+
+
+def test_every_exported_name_is_on_one_page_of_the_interface(hooks: ModuleType) -> None:
+    names = [name for page in hooks.api_pages.PAGES for name in page.names]
+    assert len(names) == len(set(names))
+    exported = set(deepdetect.__all__) - {"__version__"}
+    assert exported == {name for name in names if "." not in name}
+    drop_ins = {
+        path.stem
+        for path in (ROOT / "src/deepdetect/integrations").glob("*.py")
+        if re.search(rf"^## {path.stem}$", INTEGRATIONS, re.M | re.I)
+    } | {"skimage"}
+    assert {name.partition(".")[2] for name in names if "." in name} == drop_ins
+
+
+INTEGRATIONS = (ROOT / "docs/integrations.md").read_text("utf-8")
+
+
+def commands(group: click.Group, name: str = "deepdetect") -> list[tuple[str, click.Command]]:
+    found = []
+    for word, command in group.commands.items():
+        if isinstance(command, click.Group):
+            found += commands(command, f"{name} {word}")
+        else:
+            found.append((f"{name} {word}", command))
+    return found
+
+
+def test_the_page_of_commands_has_all_of_them_with_all_options(hooks: ModuleType) -> None:
+    page = hooks.cli_page.make_page()
+    sections = dict(re.findall(r"^## (deepdetect .+)\n(.*?)(?=^## |\Z)", page, re.S | re.M))
+    assert list(sections) == [name for name, _ in commands(main)]
+    for name, command in commands(main):
+        rows = re.findall(r"^\| `(.+?)` \| (.+) \|$", sections[name], re.M)
+        options = [
+            one
+            for one in command.get_params(click.Context(command))
+            if isinstance(one, click.Option) and one.name != "help" and not one.hidden
+        ]
+        assert len(rows) == len(options), name
+        for option, (flags, text) in zip(options, rows, strict=True):
+            assert option.opts[-1] in flags
+            assert text.strip()
+    for shell in ("bash", "zsh", "fish"):
+        assert f"_DEEPDETECT_COMPLETE={shell}_source deepdetect" in page
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_scripts_of_completion_are_there(
+    shell: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What the page of commands says of completion: the variable's name, and the shells."""
+    monkeypatch.setenv("_DEEPDETECT_COMPLETE", f"{shell}_source")
+    if shell == "bash":
+        from click.shell_completion import BashComplete
+
+        monkeypatch.setattr(BashComplete, "_check_version", staticmethod(lambda: None))
+    with pytest.raises(SystemExit) as ended:
+        main(prog_name="deepdetect")
+    assert ended.value.code == 0
+    assert f"_DEEPDETECT_COMPLETE={shell}_complete" in capsys.readouterr().out
+
+
+def test_completion_names_commands_and_options() -> None:
+    from click.shell_completion import ShellComplete
+
+    complete = ShellComplete(main, {}, "deepdetect", "_DEEPDETECT_COMPLETE")
+    assert {"detect", "doctor"} <= {one.value for one in complete.get_completions([], "d")}
+    options = {one.value for one in complete.get_completions(["match"], "--max-")}
+    assert "--max-keypoints" in options
