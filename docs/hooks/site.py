@@ -95,6 +95,13 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return turn_links(markdown, ORIGINS.get(uri, f"docs/{uri}"), uri)
 
 
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Leave scripts out of notebooks: they are for formulas and diagrams, from other servers."""
+    if not page.file.src_uri.endswith(".ipynb"):
+        return html
+    return re.sub(r"<script.*?</script>", "", html, flags=re.S)
+
+
 def turn_links(markdown: str, origin: str, uri: str) -> str:
     """Turn a page's links to files of the repository.
 

@@ -73,6 +73,15 @@ def test_the_page_in_the_browser_is_embedded_where_it_is_there(
     assert '<iframe src="try/index.html"' in hooks.on_page_markdown(text, page)
 
 
+def test_notebooks_have_no_scripts(hooks: ModuleType) -> None:
+    html = '<p>a</p><script type="module">\nimport("https://example.org/a.js")\n</script><p>b</p>'
+    page, notebook = (
+        SimpleNamespace(file=SimpleNamespace(src_uri=uri)) for uri in ("a.md", "a.ipynb")
+    )
+    assert hooks.on_page_content(html, page) == html
+    assert hooks.on_page_content(html, notebook) == "<p>a</p><p>b</p>"
+
+
 def test_optional_pages_leave_the_navigation(hooks: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "tracking.md").write_text("# Tracking")
     entries = [
@@ -125,7 +134,7 @@ def commands(group: click.Group, name: str = "deepdetect") -> list[tuple[str, cl
 
 def test_the_page_of_commands_has_all_of_them_with_all_options(hooks: ModuleType) -> None:
     page = hooks.cli_page.make_page()
-    sections = dict(re.findall(r"^## (deepdetect .+)\n(.*?)(?=^## |\Z)", page, re.S | re.M))
+    sections = dict(re.findall(r"^## (deepdetect [^\n]+)\n(.*?)(?=^## |\Z)", page, re.S | re.M))
     assert list(sections) == [name for name, _ in commands(main)]
     for name, command in commands(main):
         rows = re.findall(r"^\| `(.+?)` \| (.+) \|$", sections[name], re.M)
