@@ -137,9 +137,9 @@ dist: $(VENV)/.test
 	$(VENV)/bin/python -m build --no-isolation
 
 # The wheel and the source archive are made, looked at, and installed without a network into empty
-# environments of each Python that is here.
+# environments of each Python that is here. With VERSION=0.2.0 all files must name this version.
 release-check: $(VENV_DOCS)/.test
-	$(VENV_DOCS)/bin/python .ci/check_release.py
+	$(VENV_DOCS)/bin/python .ci/check_release.py $(if $(VERSION),--version $(VERSION))
 
 clean:
 	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(VENV_RAY) $(VENV_INTEGRATIONS) $(VENV_DOCS) $(DEMO_OUTPUT)

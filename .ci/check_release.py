@@ -184,8 +184,8 @@ def make_environment(python: str, folder: Path) -> str:
 
 
 def install_offline(python: str, fetched: Path, wanted: str) -> None:
-    """Install from a folder alone."""
-    options = ["--quiet", "--disable-pip-version-check", "install", "--no-index"]
+    """Install from a folder alone: not from another one that pip's settings name, either."""
+    options = ["--isolated", "--quiet", "--disable-pip-version-check", "install", "--no-index"]
     run([python, "-m", "pip", *options, "--find-links", str(fetched), wanted])
 
 
