@@ -26,11 +26,11 @@ RUN pip install --no-cache-dir "$(ls /wheels/*.whl)[${EXTRAS},demo]" \
     && install -d -o deepdetect /opt/deepdetect/numba /photos
 USER 1000
 WORKDIR /photos
-# The demonstration matches a scene with depth, the self-test of doctor a plane.
+# The demonstration matches a scene with depth, the self-test of doctor a plane. Whoever runs the
+# container may read and extend what is compiled.
 RUN deepdetect doctor \
     && deepdetect demo -o /tmp/demo \
     && rm -r /tmp/demo \
-    # Whoever runs the container may read and extend it.
     && chmod -R a+rwX /opt/deepdetect/numba
 ENTRYPOINT ["deepdetect"]
 CMD ["--help"]

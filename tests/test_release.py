@@ -61,9 +61,7 @@ def test_versions_that_differ_are_found(check: ModuleType, tmp_path: Path) -> No
     assert check.version_problems("0.2.0", tmp_path) == []
     assert len(check.version_problems("0.2.1", tmp_path)) == 3
     (tmp_path / "CHANGELOG.md").write_text("## [Unreleased]\n\n## [0.1.0] - 2026-11-22\n")
-    assert check.version_problems("0.2.0", tmp_path) == [
-        "CHANGELOG.md does not name version 0.2.0"
-    ]
+    assert check.version_problems("0.2.0", tmp_path) == ["CHANGELOG.md does not name version 0.2.0"]
 
 
 def test_the_package_and_the_citation_name_one_version(check: ModuleType) -> None:

@@ -60,6 +60,7 @@ def test_a_working_installation(run: Run) -> None:
         "load the network",
         "dense keypoints",
         "256 points",
+        "guided matching, the first time",
         "guided matching",
     }
     backends = {each["name"] for each in found["findings"] if each["name"].startswith("back end ")}
@@ -115,6 +116,10 @@ def test_contrib_modules_are_said(monkeypatch: pytest.MonkeyPatch, fresh_opencv:
     assert found.status == "ok"
     assert found.details["labels"] is False
     assert "without the contrib modules" in found.value
+    rows = {each.name: each for each in checks.findings_of(checks.check_extras)}
+    assert rows["extra labels"].details["install"] == (  # never two of them
+        'pip uninstall -y opencv-python-headless, then pip install "deepdetect[labels]"'
+    )
 
 
 def test_a_backend_that_cannot_be_loaded(

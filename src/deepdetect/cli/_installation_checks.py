@@ -24,6 +24,8 @@ from .._shared.errors import DeepDetectError
 if TYPE_CHECKING:
     import numpy as np
 
+    from ..features.matches import Matches
+
 Status = Literal["ok", "missing", "warning", "problem"]
 
 PURPOSES = {
@@ -311,7 +313,7 @@ def check_processors() -> Iterator[Finding]:
 
 def check_extras() -> Iterator[Finding]:
     """Which optional packages are missing, for what, and which are too old."""
-    from .._shared.opencv import import_opencv, opencv_factory
+    from .._shared.opencv import import_opencv, installed_distributions, opencv_factory
 
     try:
         requirements = importlib.metadata.requires("deepdetect") or []
@@ -349,7 +351,10 @@ def check_extras() -> Iterator[Finding]:
         if not lacking:
             yield Finding(name, "ok", f"for {purpose}", details=details)
             continue
-        details["install"] = f'pip install "deepdetect[{extra}]"'
+        install = f'pip install "deepdetect[{extra}]"'
+        if extra == "labels" and (others := installed_distributions()):  # it would be a second one
+            install = f"pip uninstall -y {' '.join(others)}, then {install}"
+        details["install"] = install
         yield Finding(
             name, "missing", f"for {purpose}; lacks {', '.join(lacking)}", details=details
         )
@@ -381,10 +386,13 @@ def run_self_test() -> Iterator[Finding]:
         dense = timed("dense keypoints", lambda: detector.detect(first))
         points = timed("256 points", lambda: detector.detect(first, max_keypoints=256))
         guided = has_compiler()
-        matches = timed(
-            "guided matching" if guided else "matching by descriptors",
-            lambda: match_images(first, second, detector, guided=guided, mutual=not guided),
-        )
+
+        def match() -> Matches:
+            return match_images(first, second, detector, guided=guided, mutual=not guided)
+
+        if guided:
+            timed("guided matching, the first time", match)  # may compile
+        matches = timed("guided matching" if guided else "matching by descriptors", match)
     except Exception as error:  # whatever is wrong here, the others are to be reported, too
         yield Finding("self-test", "problem", "failed", _sentence(error), {"seconds": seconds})
         return
