@@ -242,8 +242,6 @@ def test_the_self_test_knows_a_wrong_answer(
     """Its answer is compared with the true shift: with another truth the same matches are wrong."""
     pytest.importorskip("numba", reason="needs numba for guided matching")
     right = checks.SELF_TEST_SHIFT_PX
-    first, *_ = checks.findings_of(checks.run_self_test)
-    assert (first.status == "ok") is (right == (6, 4))
     from deepdetect.matching import pipeline
 
     real = pipeline.match_images

@@ -86,11 +86,11 @@ def test_optional_pages_leave_the_navigation(hooks: ModuleType, tmp_path: Path) 
     (tmp_path / "tracking.md").write_text("# Tracking")
     entries = [
         {"Use": [{"Tracking": "tracking.md"}, {"Files": "interchange.md"}]},
-        {"Typo": "instalation.md"},
+        {"Typo": "nowhere.md"},
     ]
     assert hooks._navigation(entries, tmp_path) == [
         {"Use": [{"Tracking": "tracking.md"}]},
-        {"Typo": "instalation.md"},  # an error of the strict build
+        {"Typo": "nowhere.md"},  # an error of the strict build
     ]
 
 

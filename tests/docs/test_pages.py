@@ -1,0 +1,91 @@
+"""The code and the commands of pages for newcomers run, and print what the pages say."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from deepdetect.cli import main
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def blocks(name: str, language: str) -> list[str]:
+    text = (DOCS / name).read_text("utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.M | re.S)
+
+
+def numbers(text: str) -> list[float]:
+    return [float(part) for part in re.findall(r"\d+", text.replace(",", ""))]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    pytest.importorskip("numba", reason="needs numba for guided matching")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_first_steps(folder: Path) -> None:
+    fetch, use = blocks("first-steps.md", "python")
+    exec(compile(fetch, "first-steps.md", "exec"), {})
+    commands = [
+        line.partition("#")[0].strip()
+        for block in blocks("first-steps.md", "sh")
+        for line in block.splitlines()
+        if line.startswith("deepdetect ")
+    ]
+    assert [command.split()[1] for command in commands] == [
+        "doctor",
+        "detect",
+        "match",
+        "reconstruct",
+    ]
+    printed = {}
+    for command in commands:
+        result = CliRunner().invoke(main, shlex.split(command)[1:])
+        assert result.exit_code == 0, result.output
+        printed[command.split()[1]] = result.output
+    detected, matched = blocks("first-steps.md", "text")
+    assert numbers(detected)[:1] == pytest.approx(numbers(printed["detect"])[:1], rel=0.01)
+    for name in ("matches", "inliers"):
+        row = rf"^ +{name}\b.*$"
+        promised, found = (
+            numbers(re.search(row, text, re.M)[0]) for text in (matched, printed["match"])
+        )
+        assert promised == pytest.approx(found, rel=0.01)
+    page = (DOCS / "first-steps.md").read_text("utf-8")
+    for name in re.findall(r"^\| `(left\S+)` \|", page, re.M):
+        assert (folder / "deepdetect-output" / name).is_file()
+    for name in re.findall(r"`(?:deepdetect-output/)?(model[\w.]+)`", page):
+        assert (folder / "deepdetect-output" / name).is_file()
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        exec(compile(use, "first-steps.md", "exec"), {})
+    promised = re.search(r"^It prints `([\d ]+)`", page, re.M)[1]
+    assert numbers(out.getvalue()) == pytest.approx(numbers(promised), rel=0.01)
+
+
+@pytest.mark.slow
+def test_dense_or_points(folder: Path) -> None:
+    from skimage import data
+
+    Image.fromarray(data.stereo_motorcycle()[0]).save("left.png")
+    (block,) = blocks("dense-or-points.md", "python")
+    found: dict[str, object] = {}
+    exec(compile(block, "dense-or-points.md", "exec"), found)
+    assert len(found["surer"]) < len(found["detector"].detect("left.png"))
+    assert len(found["thinner"]) == pytest.approx(0.05 * 741 * 500, rel=0.02)
+    assert found["spaced"].sizes is None
+    assert len(found["spread"]) == 1000
+    assert found["spread"].sizes is not None
+    assert 0 <= found["spread"].scores.min() <= found["spread"].scores.max() <= 1
