@@ -6,6 +6,7 @@ For the site such links are turned to the page that a file has become, or to the
 
 from __future__ import annotations
 
+import os
 import posixpath
 import re
 import sys
@@ -51,7 +52,15 @@ ORIGINS: dict[str, str] = {site: repository for repository, site in COPIED.items
 
 
 def on_config(config: Any) -> Any:
-    """Leave pages out of the navigation that are not there, and put in the pages of the API."""
+    """Complete what mkdocs.yml says: the address, anchors, and the navigation.
+
+    Pages that are not there are left out of it, and those of the API are put in.
+    """
+    from pymdownx.slugs import slugify
+
+    config.site_url = os.environ.get("SITE_URL", "")
+    # Anchors as GitHub makes them, where the same pages are read.
+    config.mdx_configs["toc"]["slugify"] = slugify(case="lower")
     config.nav = _navigation(config.nav, Path(config.docs_dir))
     return config
 
