@@ -86,7 +86,7 @@ def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
     for page in pages:
         found = Resources()
         found.feed(page.read_text("utf-8"))
-        assert len(found.targets) > 3, page
+        assert len(found.targets) > 3 or page.parent.name == "try", page
         outside = [each for each in found.targets if re.match(r"\s*(https?:)?//", each)]
         assert not outside, (page, outside)
         # With these the theme's script would load a library, or ask GitHub for stars.
