@@ -15,6 +15,8 @@ from click.testing import Result
 import deepdetect
 from deepdetect._shared import opencv
 from deepdetect.cli import _installation_checks as checks
+from deepdetect.cli._findings import findings_of
+from deepdetect.cli._self_test import SHIFT_PX, run_self_test
 
 Run = Callable[..., Result]
 ROOT = Path(__file__).parents[2]
@@ -112,11 +114,11 @@ def test_contrib_modules_are_said(monkeypatch: pytest.MonkeyPatch, fresh_opencv:
     vars(other).update(__version__="5.0.0", __file__="cv2.so")
     monkeypatch.setitem(sys.modules, "cv2", other)
     with_packages(monkeypatch, opencv_python_headless="5.0.0.93")
-    (found,) = checks.findings_of(checks.check_opencv)
+    (found,) = findings_of(checks.check_opencv)
     assert found.status == "ok"
     assert found.details["labels"] is False
     assert "without the contrib modules" in found.value
-    rows = {each.name: each for each in checks.findings_of(checks.check_extras)}
+    rows = {each.name: each for each in findings_of(checks.check_extras)}
     assert rows["extra labels"].details["install"] == (  # never two of them
         'pip uninstall -y opencv-python-headless, then pip install "deepdetect[labels]"'
     )
@@ -150,7 +152,7 @@ def test_a_backend_of_other_answers(monkeypatch: pytest.MonkeyPatch) -> None:
         return lambda image: np.full((1, 1, *image.shape[2:]), answer, np.float32), ""
 
     monkeypatch.setattr(registry, "open_network", open_network)
-    found = {each.name: each for each in checks.findings_of(checks.check_backends)}
+    found = {each.name: each for each in findings_of(checks.check_backends)}
     assert found["back end openvino"].status == "problem"
     assert "differ from the others' by up to 0.23" in found["back end openvino"].value
     assert found["back end in use"].value == "onnxruntime"
@@ -160,7 +162,7 @@ def test_weights_that_are_gone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     from deepdetect.detector import pretrained
 
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path)
-    (found,) = checks.findings_of(checks.check_weights)
+    (found,) = findings_of(checks.check_weights)
     assert found.status == "problem"
     assert found.details["absent"] == [
         f"{name}{suffix}" for name in ("default", "dense") for suffix in (".onnx", ".safetensors")
@@ -175,7 +177,7 @@ def test_a_folder_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(checks.tempfile, "TemporaryFile", refuse)
-    here, temporary = checks.findings_of(checks.check_folders)
+    here, temporary = findings_of(checks.check_folders)
     assert (here.status, temporary.status) == ("warning", "warning")
     assert "cannot be written (Permission denied)" in here.value
     assert temporary.remedy == "Set TMPDIR to a folder that can be written."
@@ -190,7 +192,7 @@ def test_no_cache_for_compiled_code(monkeypatch: pytest.MonkeyPatch) -> None:
         stats = type("Stats", (), {"cache_path": None})
 
     monkeypatch.setattr(suppression_kernel, "keep_distant", Uncached)
-    (found,) = checks.findings_of(checks.check_compiler)
+    (found,) = findings_of(checks.check_compiler)
     assert found.status == "warning"
     assert "NUMBA_CACHE_DIR" in found.remedy
 
@@ -201,7 +203,7 @@ def test_threads_and_a_limit_of_a_container(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(parallel, "processor_count", lambda: 8)
     monkeypatch.setattr(checks, "_processor_quota", lambda: 2.5)
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
-    processors, memory = checks.findings_of(checks.check_processors)
+    processors, memory = findings_of(checks.check_processors)
     assert processors.status == "warning"
     assert processors.remedy.startswith("Give --threads 2: ")
     assert processors.details["variables"]["OMP_NUM_THREADS"] == "4"
@@ -221,7 +223,7 @@ def test_packages_that_are_too_old_or_absent(monkeypatch: pytest.MonkeyPatch) ->
     )
     versions = {"h5py": "3.9.0", "onnx": "1.17"}
     monkeypatch.setattr(checks, "_version", versions.get)
-    found = {each.details["extra"]: each for each in checks.findings_of(checks.check_extras)}
+    found = {each.details["extra"]: each for each in findings_of(checks.check_extras)}
     assert found["hdf5"].details["lacking"] == ["h5py 3.11 or later (not 3.9.0)"]
     assert found["faiss"].details["lacking"] == ["faiss-cpu"]
     assert found["faiss"].details["install"] == 'pip install "deepdetect[faiss]"'
@@ -241,7 +243,7 @@ def test_the_self_test_knows_a_wrong_answer(
 ) -> None:
     """Its answer is compared with the true shift: with another truth the same matches are wrong."""
     pytest.importorskip("numba", reason="needs numba for guided matching")
-    right = checks.SELF_TEST_SHIFT_PX
+    right = SHIFT_PX
     from deepdetect.matching import pipeline
 
     real = pipeline.match_images
@@ -252,7 +254,7 @@ def test_the_self_test_knows_a_wrong_answer(
         return matches
 
     monkeypatch.setattr(pipeline, "match_images", moved)
-    found, *_ = checks.findings_of(checks.run_self_test)
+    found, *_ = findings_of(run_self_test)
     assert found.status == status
 
 

@@ -15,18 +15,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from .._shared.errors import DeepDetectError
+from ._findings import Finding, as_sentence
 
 if TYPE_CHECKING:
     import numpy as np
-
-    from ..features.matches import Matches
-
-Status = Literal["ok", "missing", "warning", "problem"]
 
 PURPOSES = {
     "benchmark": "`benchmark`, and `evaluate` with the Oxford scenes",
@@ -56,33 +52,6 @@ MAX_BACKEND_DIFFERENCE = 5e-3
 """Between the probabilities of two back ends; five times what is usual."""
 
 SAFETENSORS = ".safetensors"
-
-SELF_TEST_SIZE = (320, 240)
-SELF_TEST_SHIFT_PX = (6, 4)
-"""What the second picture of the self-test is moved by, (x, y)."""
-
-MIN_SELF_TEST_PRECISION = 0.95
-"""Of its matches within 1 px of the shift; all of them are where nothing is wrong."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What a check found.
-
-    Attributes:
-        name: what was looked at, as "OpenCV".
-        status: "ok"; "missing" where something optional is not installed; "warning" where
-            something works, but slower or not as usual; "problem" where something does not work.
-        value: what is there, for people.
-        remedy: what to do in a sentence; empty where nothing is to be done.
-        details: the same in plain values, for programs.
-    """
-
-    name: str
-    status: Status
-    value: str
-    remedy: str = ""
-    details: dict[str, Any] = field(default_factory=dict)
 
 
 def check_package() -> Iterator[Finding]:
@@ -121,7 +90,7 @@ def check_opencv() -> Iterator[Finding]:
     try:
         opencv = import_opencv()
     except (DeepDetectError, MemoryError) as error:
-        yield Finding("OpenCV", "problem", "cannot be used", _sentence(error), details)
+        yield Finding("OpenCV", "problem", "cannot be used", as_sentence(error), details)
         return
     details |= {"version": opencv.__version__, "file": opencv.__file__}
     for name, version in found.items():
@@ -172,6 +141,7 @@ def check_backends() -> Iterator[Finding]:
     from ..detector.backends.options import BACKENDS, RuntimeOptions
     from ..detector.backends.registry import open_network
     from ..detector.pretrained import pretrained_weights
+    from ._self_test import PICTURE_SIZE, textured_picture
 
     chosen = None
     reference = None
@@ -186,7 +156,9 @@ def check_backends() -> Iterator[Finding]:
         try:
             start = time.perf_counter()
             network, _ = open_network(pretrained_weights(suffix=suffix), RuntimeOptions(name))
-            image = _textured(SELF_TEST_SIZE)[None].transpose(0, 3, 1, 2).astype("float32") / 255
+            image = (
+                textured_picture(PICTURE_SIZE)[None].transpose(0, 3, 1, 2).astype("float32") / 255
+            )
             logits = network(image)
         except Exception as error:  # a broken installation raises anything
             yield Finding(label, "problem", "does not run", _repair(name, error))
@@ -360,74 +332,6 @@ def check_extras() -> Iterator[Finding]:
         )
 
 
-def run_self_test() -> Iterator[Finding]:
-    """Detect and match two pictures whose shift is known."""
-    import numpy as np
-
-    from .._shared.kernels import has_compiler
-    from ..detector.detector import DeepDetect
-    from ..matching.pipeline import match_images
-
-    seconds: dict[str, float] = {}
-
-    def timed(stage: str, work: Callable[[], Any]) -> Any:
-        start = time.perf_counter()
-        result = work()
-        seconds[stage] = round(time.perf_counter() - start, 3)
-        return result
-
-    width, height = SELF_TEST_SIZE
-    right, down = SELF_TEST_SHIFT_PX
-    whole = _textured((width + right, height + down))
-    whole[: height // 4] = 128  # nothing to be found there
-    first, second = whole[:height, :width], whole[down:, right:]
-    try:
-        detector = timed("load the network", DeepDetect)
-        dense = timed("dense keypoints", lambda: detector.detect(first))
-        points = timed("256 points", lambda: detector.detect(first, max_keypoints=256))
-        guided = has_compiler()
-
-        def match() -> Matches:
-            return match_images(first, second, detector, guided=guided, mutual=not guided)
-
-        if guided:
-            timed("guided matching, the first time", match)  # may compile
-        matches = timed("guided matching" if guided else "matching by descriptors", match)
-    except Exception as error:  # whatever is wrong here, the others are to be reported, too
-        yield Finding("self-test", "problem", "failed", _sentence(error), {"seconds": seconds})
-        return
-    in_flat = (dense.xy[:, 1] < height // 4 - 16).mean() if len(dense) else 1.0
-    errors = matches.points0 - matches.points1 - np.array([right, down])
-    precision = float((np.hypot(*errors.T) < 1).mean()) if len(matches) else 0.0
-    details = {
-        "seconds": seconds,
-        "dense_keypoints": len(dense),
-        "points": len(points),
-        "matches": len(matches),
-        "precision": precision,
-        "guided": guided,
-    }
-    value = (
-        f"{len(dense):,} dense keypoints, {len(points)} points, {len(matches):,} matches, "
-        f"{precision:.1%} of them right"
-    )
-    lowest = MIN_SELF_TEST_PRECISION if guided else MIN_SELF_TEST_PRECISION / 2
-    right_answer = len(dense) > 5_000 and in_flat < 0.01 and precision >= lowest
-    if right_answer and len(points) > 100:
-        yield Finding("self-test", "ok", value, details=details)
-        for stage, taken in seconds.items():
-            yield Finding(f"seconds: {stage}", "ok", f"{taken:.3f}")
-        return
-    yield Finding(
-        "self-test",
-        "problem",
-        f"wrong results: {value}",
-        "Try --backend of another name, and report this with what `deepdetect doctor --json` "
-        "prints.",
-        details,
-    )
-
-
 CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     check_package,
     check_processors,
@@ -439,33 +343,6 @@ CHECKS: tuple[Callable[[], Iterator[Finding]], ...] = (
     check_extras,
 )
 """All but the self-test, in their order."""
-
-
-def findings_of(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
-    """Run a check; what it raises becomes a finding, so that the others are made."""
-    found: list[Finding] = []
-    try:
-        found.extend(check())
-    except Exception as error:
-        name = check.__name__.removeprefix("check_").replace("_", " ")
-        found.append(Finding(name, "problem", "the check itself failed", _sentence(error)))
-    return found
-
-
-def _textured(size: tuple[int, int]) -> np.ndarray:
-    """Draw a picture, (H, W, 3) uint8, the same every time: soft noise, which is structure."""
-    import numpy as np
-
-    width, height = size
-    # Linear interpolation by hand: OpenCV may be what is broken.
-    coarse = np.random.default_rng(0).random((height // 4 + 2, width // 4 + 2, 3))
-    y, x = np.arange(height) / 4, np.arange(width) / 4
-    row, column = y.astype(int), x.astype(int)
-    down, right = (y - row)[:, None, None], (x - column)[None, :, None]
-    above = coarse[row][:, column] * (1 - right) + coarse[row][:, column + 1] * right
-    below = coarse[row + 1][:, column] * (1 - right) + coarse[row + 1][:, column + 1] * right
-    picture: np.ndarray = np.rint(255 * (above * (1 - down) + below * down)).astype(np.uint8)
-    return picture
 
 
 def _sigmoid(logits: np.ndarray) -> np.ndarray:
@@ -502,17 +379,10 @@ def _processor_quota() -> float | None:
         return None
 
 
-def _sentence(error: BaseException) -> str:
-    """Return an error in one line; its kind, where it is none of ours."""
-    line = (str(error).splitlines() or [""])[0]
-    text = line if isinstance(error, DeepDetectError) else f"{type(error).__name__}: {line}"
-    return text[:1].upper() + text[1:] + "."
-
-
 def _repair(package: str, error: BaseException) -> str:
     if isinstance(error, DeepDetectError):
-        return _sentence(error)
-    return f"Install it again (pip install --force-reinstall {package}): {_sentence(error)}"
+        return as_sentence(error)
+    return f"Install it again (pip install --force-reinstall {package}): {as_sentence(error)}"
 
 
 def _numbers(version: str) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ import click
 from ._options import json_option, print_json, print_table
 
 if TYPE_CHECKING:
-    from ._installation_checks import Finding
+    from ._findings import Finding
 
 MARKS = {"ok": "", "warning": "WARNING: ", "problem": "PROBLEM: "}
 
@@ -36,7 +36,9 @@ def doctor(context: click.Context, self_test: bool, as_json: bool) -> None:
     deepdetect doctor --json > doctor.json
     """
     from .._shared.progress import stage_progress
-    from ._installation_checks import CHECKS, findings_of, run_self_test
+    from ._findings import findings_of
+    from ._installation_checks import CHECKS
+    from ._self_test import run_self_test
 
     checks = [*CHECKS, *([run_self_test] if self_test else [])]
     names = [check.__name__.removeprefix("check_").replace("_", " ") for check in checks]
