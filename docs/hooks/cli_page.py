@@ -90,7 +90,7 @@ def _section(name: str, command: click.Command) -> str:
     rows = [
         record
         for parameter in parameters
-        if isinstance(parameter, click.Option) and parameter.name != "help"
+        if isinstance(parameter, click.Option) and "--help" not in parameter.opts
         if (record := parameter.get_help_record(context)) is not None
     ]
     if rows:
@@ -111,8 +111,10 @@ def _help(command: click.Command) -> str:
 
 
 def _text(text: str) -> str:
-    """Return plain text as Markdown: names with underscores and stars stay as they are."""
-    return re.sub(r"(?<!`)([*_<\[])(?!`)", r"\\\1", text)
+    """Return plain text as Markdown: outside of code, underscores and stars mean themselves."""
+    parts = re.split(r"(`[^`]+`)", text)
+    parts[::2] = [re.sub(r"([*_<\[])", r"\\\1", part) for part in parts[::2]]
+    return "".join(parts)
 
 
 def _cell(text: str) -> str:
