@@ -1,6 +1,7 @@
 """The picture of the README: one pair in daylight, dark and blurred, from photograph to 3D.
 
-python docs/figures/day_dark_blurred.py    # writes docs/images/day-dark-blurred.jpg
+python docs/figures/day_dark_blurred.py           # writes docs/images/day-dark-blurred.jpg
+python docs/figures/day_dark_blurred.py motion-9  # another degradation, to three-lights.jpg
 
 The photographs are the Motorcycle pair of Middlebury 2014 (Scharstein et al., GCPR 2014; free to
 use and publish with citation), which comes with scikit-image. Darkness and blur are those of
@@ -9,6 +10,7 @@ use and publish with citation), which comes with scikit-image. Darkness and blur
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from deepdetect import (
     Camera,
     DeepDetect,
     Keypoints,
+    NoDepthError,
     Reconstruction,
     match_images,
     reconstruct,
@@ -54,16 +57,17 @@ QUALITY = 66
 
 def main() -> None:
     """Write the picture."""
+    others = {DEGRADATIONS[name].title: name for name in sys.argv[1:]}
     pair = load_stereo_pair("motorcycle")
     detector = DeepDetect()
     rows = [header(COLUMNS, CELL[0])]
-    for title, name in LIGHTS.items():
+    for title, name in (others or LIGHTS).items():
         left, right = (
             view if name is None else degrade(view, DEGRADATIONS[name])
             for view in (pair.left, pair.right)
         )
         rows.append(row(title, left, right, pair.disparity, detector))
-    write_jpeg(np.concatenate(rows), OUTPUT, QUALITY)
+    write_jpeg(np.concatenate(rows), Path("three-lights.jpg") if others else OUTPUT, QUALITY)
 
 
 def row(
@@ -78,7 +82,11 @@ def row(
     right_ones = errors[known] < 1
     size = (left.shape[1], left.shape[0])
     cameras = (Camera(size, FOCAL_PX, centre) for centre in (CENTRE_LEFT_PX, CENTRE_RIGHT_PX))
-    model = reconstruct(left, right, calibration=Calibration(*cameras, BASELINE_MM))
+    try:
+        model = reconstruct(left, right, calibration=Calibration(*cameras, BASELINE_MM))
+        space, found = draw_model(model), f"{len(model):,} 3D points"
+    except NoDepthError:
+        space, found = np.full_like(left, 255), "no depth that can be trusted"
     panels = [
         (draw_points(left, points), f"{title}: the best points in yellow"),
         (draw_heatmap(heatmap), f"{len(matches.keypoints0):,} dense keypoints"),
@@ -86,7 +94,7 @@ def row(
             stacked(left, right, matches.points0[known], matches.points1[known], right_ones),
             f"{len(matches):,} matches, {right_ones.mean():.1%} within 1 px",
         ),
-        (draw_model(model), f"{len(model):,} 3D points"),
+        (space, found),
     ]
     return np.concatenate([caption(panel, text, CELL) for panel, text in panels], axis=1)
 
