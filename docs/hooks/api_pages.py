@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+WHOLE_NAME = "\n    options:\n      show_root_full_path: true"
+"""Of modules, which are imported by it."""
+
 
 @dataclass(frozen=True)
 class ApiPage:
@@ -19,7 +22,9 @@ class ApiPage:
 
     def text(self) -> str:
         """Return the page in Markdown."""
-        blocks = "\n\n".join(f"::: deepdetect.{name}" for name in self.names)
+        blocks = "\n\n".join(
+            f"::: deepdetect.{name}" + (WHOLE_NAME if "." in name else "") for name in self.names
+        )
         return f"# {self.title}\n\n{self.introduction}\n\n{blocks}\n"
 
 

@@ -123,6 +123,10 @@ def test_pages_hold_what_they_are_made_from(site: Path) -> None:
     assert 'id="deepdetect-doctor"' in text("cli.html")
     assert 'id="deepdetect.DeepDetect"' in text("api/detection.html")
     assert "sub-pixel" in text("api/detection.html")
+    for page in site.glob("api/*.html"):  # examples are code, and no quotations in quotations
+        assert "<blockquote>" not in page.read_text("utf-8"), page
+    assert len(re.findall("Examples:", text("api/detection.html"))) > 3
+    assert "deepdetect.integrations.opencv</span>" in text("api/integrations.html")
     assert "jp-OutputArea-output" in text("notebooks/match.html") or "jp-RenderedImage" in text(
         "notebooks/match.html"
     )
