@@ -6,6 +6,9 @@ A test demands that each name that `import deepdetect` exports is on one of them
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[2] / "src" / "deepdetect"
 
 WHOLE_NAME = "\n    options:\n      show_root_full_path: true"
 """Of modules, which are imported by it."""
@@ -23,12 +26,19 @@ class ApiPage:
     def text(self) -> str:
         """Return the page in Markdown."""
         blocks = "\n\n".join(
-            f"::: deepdetect.{name}" + (WHOLE_NAME if "." in name else "") for name in self.names
+            f"::: deepdetect.{name}" + (WHOLE_NAME if is_module(name) else "")
+            for name in self.names
         )
         return f"# {self.title}\n\n{self.introduction}\n\n{blocks}\n"
 
 
-PAGES = (
+def is_module(name: str) -> bool:
+    """Return whether a name is that of a module or package, and not of what is in it."""
+    path = PACKAGE.joinpath(*name.split("."))
+    return (path / "__init__.py").is_file() or path.with_suffix(".py").is_file()
+
+
+_PAGES = (
     ApiPage(
         "api/detection.md",
         "Detection",
@@ -83,6 +93,18 @@ PAGES = (
         ),
     ),
     ApiPage(
+        "api/tracking.md",
+        "Tracking and odometry",
+        "Points followed through a video, and the path of the camera.",
+        ("tracking",),
+    ),
+    ApiPage(
+        "api/interchange.md",
+        "Files of other programs",
+        "Keypoints and matches as other programs write and read them.",
+        ("interchange",),
+    ),
+    ApiPage(
         "api/files.md",
         "Files",
         "What results are written to and read from; never pickles.",
@@ -125,4 +147,10 @@ PAGES = (
             "RegistrationError",
         ),
     ),
+)
+
+# Packages that are not there have no page.
+WHOLE_PACKAGES = {"tracking", "interchange"}
+PAGES = tuple(
+    page for page in _PAGES if not WHOLE_PACKAGES & set(page.names) or is_module(page.names[0])
 )
