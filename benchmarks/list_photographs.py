@@ -16,6 +16,7 @@ import csv
 import gzip
 import hashlib
 import io
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -163,7 +164,7 @@ def file_licences(source: Source, clone: Path) -> dict[str, str]:
 def plain_licence(words: str) -> str:
     """Return the short name of a licence; as it is where it is not known to be free."""
     plain = words.lower()
-    if "nc" in plain.split() or "noncommercial" in plain or "nd" in plain.split():
+    if re.search(r"\b(n[cd]|noncommercial|noderiv\w*)\b", plain):
         return words
     for mark, name in (
         ("cc0", "CC0"),
