@@ -1,0 +1,247 @@
+"""Points followed from frame to frame by pyramidal Lucas-Kanade.
+
+Lucas and Kanade, "An iterative image registration technique", 1981; Bouguet's pyramid; tracks that
+do not come back to where they started are dropped (Kalal et al., "Forward-backward error", 2010).
+Where a cell of the image has no track, the best keypoint of that cell begins one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .._shared.errors import OptionError
+from .._shared.image_array import Channels
+from .._shared.opencv import cv2
+from .._shared.options import check_ranges, suggest_keywords
+from ..features.keypoints import Keypoints
+from ..io.image import load_image, luma
+from .tracks import TrackedFrame
+
+Detect = Callable[[np.ndarray], Keypoints]
+"""Keypoints of a (H, W, 3) uint8 RGB image."""
+
+
+@suggest_keywords
+@dataclass(frozen=True)
+class TrackingOptions:
+    """How points are followed.
+
+    Attributes:
+        max_keypoints: tracks at a time, and keypoints that are looked for.
+        detect_every: frames between two searches for new points, at most: fewer where many tracks
+            are lost.
+        min_kept: share of the wanted tracks; with fewer, new points are looked for at once.
+        min_distance_px: between a new point and all tracks.
+        window_px: side of the patch that is followed.
+        pyramid_levels: that are half as large each: a point is found up to about
+            window_px * 2**(pyramid_levels - 1) pixels away.
+        max_iterations: on each level.
+        min_step_px: a smaller one ends the iterations.
+        max_return_error_px: between a point and where it is found when it is followed back.
+        min_eigenvalue: of the patch's gradients, per pixel, grey values from 0 to 255: flat patches
+            cannot be followed.
+        border_px: points nearer to the border of the image are dropped.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    max_keypoints: int = 1000
+    detect_every: int = 5
+    min_kept: float = 0.6
+    min_distance_px: float = 8.0
+    window_px: int = 21
+    pyramid_levels: int = 4
+    max_iterations: int = 30
+    min_step_px: float = 0.01
+    max_return_error_px: float = 0.5
+    min_eigenvalue: float = 1e-4
+    border_px: float = 2.0
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("max_keypoints", "detect_every", "max_iterations", "min_step_px"),
+            not_negative=("min_distance_px", "max_return_error_px", "min_eigenvalue", "border_px"),
+            fractions=("min_kept",),
+            between={"window_px": (3, 101), "pyramid_levels": (1, 10)},
+        )
+        for name in ("max_keypoints", "detect_every", "max_iterations", "pyramid_levels"):
+            if getattr(self, name) % 1:
+                raise OptionError(f"`{name}` must be a whole number, not {getattr(self, name)}")
+        if self.window_px % 2 != 1:
+            raise OptionError(f"`window_px` must be odd, not {self.window_px}")
+
+
+class Tracker:
+    """Follows points through the frames of a video.
+
+    Args:
+        detect: finds keypoints in a (H, W, 3) uint8 RGB image; a `DeepDetect` has its own method
+            for it: `lambda rgb: detector.detect(rgb, max_keypoints=1000)`.
+        options: how points are followed.
+
+    Example:
+        >>> grid = np.stack(np.meshgrid(range(10, 90, 10), range(10, 60, 10)), -1).reshape(-1, 2)
+        >>> detect = lambda rgb: Keypoints(grid, np.ones(len(grid)), (96, 64))
+        >>> rgb = np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8)
+        >>> rgb = cv2.GaussianBlur(rgb, None, 2)
+        >>> tracker = Tracker(detect)
+        >>> first, second = tracker.update(rgb), tracker.update(np.roll(rgb, 3, axis=1))
+        >>> len(first), (second.xy[0] - first.xy[0]).round(1).tolist()
+        (40, [3.0, 0.0])
+    """
+
+    @suggest_keywords
+    def __init__(self, detect: Detect, options: TrackingOptions = TrackingOptions()) -> None:
+        self.detect = detect
+        self.options = options
+        self._gray: np.ndarray | None = None
+        self._size: tuple[int, int] | None = None
+        self._frames = 0
+        self._since_detection = 0
+        self._next_track = 0
+        self._tracks = np.empty(0, np.int64)
+        self._xy = np.empty((0, 2), np.float32)
+        self._scores = np.empty(0, np.float32)
+        self._ages = np.empty(0, np.int64)
+
+    @suggest_keywords
+    def update(
+        self, image: Any, *, number: int | None = None, channels: Channels = "rgb"
+    ) -> TrackedFrame:
+        """Follow all points into the next frame, and begin new tracks where there are few.
+
+        Args:
+            image: as for `DeepDetect.detect`, of the same size as the frames before.
+            number: of the frame; None: how many there were before.
+            channels: the order of the colours.
+
+        Raises:
+            ImageError: the image cannot be read or is not fit.
+            OptionError: it has another size than the frames before.
+        """
+        rgb = load_image(image, channels=channels)
+        size = rgb.shape[1], rgb.shape[0]
+        if self._size not in (None, size):
+            raise OptionError(
+                f"a frame has {size[0]}x{size[1]} pixels, those before have "
+                f"{self._size[0]}x{self._size[1]}: use a tracker for each size"  # type: ignore[index]
+            )
+        self._size = size
+        options = self.options
+        gray = luma(rgb)
+        if self._gray is not None and len(self._xy):
+            self._follow(gray)
+        wanted = options.min_kept * options.max_keypoints
+        if (
+            self._frames == 0
+            or self._since_detection >= options.detect_every
+            or len(self._xy) < min(wanted, options.min_kept * self._most)
+        ):
+            self._add(self.detect(rgb))
+            self._most = len(self._xy)
+            self._since_detection = 0
+        self._since_detection += 1
+        self._gray = gray
+        found = TrackedFrame(
+            self._frames if number is None else number,
+            self._tracks.copy(),
+            self._xy.copy(),
+            self._scores.copy(),
+            self._ages.copy(),
+        )
+        self._ages += 1
+        self._frames += 1
+        return found
+
+    _most = 0
+
+    def _follow(self, gray: np.ndarray) -> None:
+        """Move the points to where the next frame shows them; drop those that are lost."""
+        options = self.options
+        settings = {
+            "winSize": (options.window_px, options.window_px),
+            "maxLevel": options.pyramid_levels - 1,
+            "criteria": (
+                cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
+                options.max_iterations,
+                options.min_step_px,
+            ),
+            "minEigThreshold": options.min_eigenvalue,
+        }
+        before = np.ascontiguousarray(self._xy, np.float32).reshape(-1, 1, 2)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(
+            self._gray, gray, before, None, **settings
+        )
+        back, returned, _ = cv2.calcOpticalFlowPyrLK(
+            gray, self._gray, there, before.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            **settings,
+        )
+        there, back = there.reshape(-1, 2), back.reshape(-1, 2)
+        errors = np.linalg.norm(back - self._xy, axis=1)
+        assert self._size is not None
+        low, high = options.border_px, np.array(self._size) - 1 - options.border_px
+        kept = (
+            (found.ravel() == 1)
+            & (returned.ravel() == 1)
+            & (errors <= options.max_return_error_px)
+            & (there >= low).all(axis=1)
+            & (there <= high).all(axis=1)
+        )
+        self._xy = there[kept]
+        self._tracks, self._scores = self._tracks[kept], self._scores[kept]
+        self._ages = self._ages[kept]
+
+    def _add(self, keypoints: Keypoints) -> None:
+        """Begin tracks with the best keypoints that are far enough from all tracks."""
+        options = self.options
+        assert self._size is not None
+        room = options.max_keypoints - len(self._xy)
+        rows = free_keypoints(keypoints, self._xy, options.min_distance_px, room)
+        count = len(rows)
+        self._tracks = np.append(self._tracks, np.arange(count) + self._next_track)
+        self._next_track += count
+        self._xy = np.concatenate([self._xy, keypoints.xy[rows]])
+        self._scores = np.append(self._scores, keypoints.scores[rows]).astype(np.float32)
+        self._ages = np.append(self._ages, np.zeros(count, np.int64))
+
+
+def free_keypoints(
+    keypoints: Keypoints, taken: np.ndarray, distance_px: float, count: int
+) -> np.ndarray:
+    """Choose the best keypoints that are far from positions that are taken, and from each other.
+
+    Args:
+        keypoints: of an image.
+        taken: (M, 2) positions.
+        distance_px: smallest distance, of the nearest pixels.
+        count: at most so many.
+
+    Returns:
+        (K,) rows of the keypoints, best first.
+
+    Example:
+        >>> points = Keypoints([[2, 2], [3, 2], [9, 2], [15, 2]], [0.5, 0.9, 0.8, 0.7], (20, 5))
+        >>> free_keypoints(points, np.array([[14, 2]]), 3, 10).tolist()
+        [1, 2]
+    """
+    width, height = keypoints.image_size
+    radius = int(distance_px)
+    blocked = np.zeros((height, width), np.uint8)
+    for x, y in np.rint(taken).astype(int).tolist():
+        cv2.circle(blocked, (x, y), radius, 1, -1)
+    chosen: list[int] = []
+    pixels = np.rint(keypoints.xy).astype(int).clip(0, (width - 1, height - 1)).tolist()
+    for row in np.argsort(-keypoints.scores, kind="stable").tolist():
+        if len(chosen) >= count:
+            break
+        x, y = pixels[row]
+        if not blocked[y, x]:
+            chosen.append(row)
+            cv2.circle(blocked, (x, y), radius, 1, -1)
+    return np.array(chosen, np.int64)

@@ -1,0 +1,172 @@
+"""Where points are in the frames of a video, and their table in a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import InvalidFileError, MissingFileError, OptionError
+from .._shared.options import suggest_keywords
+
+HEADER = "frame,track,x,y,score"
+
+
+@suggest_keywords
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """The tracked points of one frame.
+
+    Attributes:
+        number: of the frame, from 0 on, in the source.
+        tracks: (N,) int64 numbers of the tracks, rising: a point keeps its number.
+        xy: (N, 2) float32 positions, centre of the first pixel (0, 0).
+        scores: (N,) float32 of the keypoints with which the tracks began.
+        ages: (N,) int64 frames since then, 0 where a track begins here.
+
+    Raises:
+        OptionError: the arrays do not have one row for each track.
+    """
+
+    number: int
+    tracks: np.ndarray
+    xy: np.ndarray
+    scores: np.ndarray
+    ages: np.ndarray
+
+    def __post_init__(self) -> None:
+        count = len(self.tracks)
+        shapes = [np.shape(values) for values in (self.xy, self.scores, self.ages)]
+        if shapes != [(count, 2), (count,), (count,)]:
+            raise OptionError(
+                f"{count} tracks need (N, 2) positions, and scores and ages (N,), not {shapes}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.tracks)
+
+    @property
+    def begun(self) -> int:
+        """Number of tracks that begin in this frame."""
+        return int(np.count_nonzero(self.ages == 0))
+
+
+def common_rows(first: TrackedFrame, second: TrackedFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of the tracks that two frames share.
+
+    Example:
+        >>> frames = [
+        ...     TrackedFrame(k, np.array(t), np.zeros((2, 2)), np.ones(2), np.zeros(2))
+        ...     for k, t in enumerate(([3, 5], [5, 8]))
+        ... ]
+        >>> common_rows(*frames)
+        (array([1]), array([0]))
+    """
+    _, rows0, rows1 = np.intersect1d(
+        first.tracks, second.tracks, assume_unique=True, return_indices=True
+    )
+    return rows0, rows1
+
+
+class TracksWriter:
+    """Writes the table of tracks frame by frame: columns frame, track, x, y and score."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file = file
+        file.write(f"{HEADER}\n")
+
+    def write(self, frame: TrackedFrame) -> None:
+        """Write the rows of a frame."""
+        columns = zip(frame.tracks.tolist(), frame.xy.tolist(), frame.scores.tolist(), strict=True)
+        self._file.writelines(
+            f"{frame.number},{track},{x:.3f},{y:.3f},{score:.6g}\n"
+            for track, (x, y), score in columns
+        )
+
+
+@contextmanager
+def write_tracks(path: str | Path) -> Iterator[TracksWriter]:
+    """Open a CSV file of tracks, which appears when the block ends, whole or not at all.
+
+    Args:
+        path: ending in .csv.
+
+    Raises:
+        OptionError: the ending is another.
+        DeepDetectError: the file cannot be written.
+    """
+    if Path(path).suffix.lower() != ".csv":
+        raise OptionError(f"{path} must end in .csv")
+    with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
+        yield TracksWriter(file)
+
+
+@suggest_keywords
+def save_tracks(frames: Iterable[TrackedFrame], path: str | Path) -> None:
+    """Write the tracks of frames as CSV: columns frame, track, x, y and score.
+
+    Args:
+        frames: in their order.
+        path: ending in .csv.
+
+    Raises:
+        OptionError: the ending is another.
+        DeepDetectError: the file cannot be written.
+    """
+    with write_tracks(path) as writer:
+        for frame in frames:
+            writer.write(frame)
+
+
+@suggest_keywords
+def load_tracks(path: str | Path) -> list[TrackedFrame]:
+    """Read the CSV file that `save_tracks` or `deepdetect track` wrote.
+
+    Returns:
+        The frames that have tracks, in their order.
+
+    Raises:
+        DeepDetectError: the file is missing or is no such file.
+
+    Example:
+        >>> import tempfile
+        >>> frame = TrackedFrame(4, np.array([7]), np.array([[1.5, 2]]), np.ones(1), np.zeros(1))
+        >>> path = Path(tempfile.mkdtemp()) / "tracks.csv"
+        >>> save_tracks([frame], path)
+        >>> load_tracks(path)[0].xy.tolist()
+        [[1.5, 2.0]]
+    """
+    try:
+        with Path(path).open(encoding="ascii") as file:
+            if file.readline().strip() != HEADER:
+                raise ValueError(f"its first line is not {HEADER}")
+            table = np.loadtxt(file, delimiter=",", ndmin=2).reshape(-1, 5)
+            if not np.isfinite(table).all():
+                raise ValueError("a number is not finite")
+    except FileNotFoundError:
+        raise MissingFileError(f"there is no file {path}: check the path") from None
+    except (OSError, ValueError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InvalidFileError(f"{path} holds no tracks ({reason}): write the file again") from None
+    table = table[np.lexsort((table[:, 1], table[:, 0]))]
+    numbers, begins = np.unique(table[:, 0].astype(np.int64), return_index=True)
+    born: dict[int, int] = {}
+    frames = []
+    for place, (number, rows) in enumerate(zip(numbers, np.split(table, begins[1:]), strict=True)):
+        tracks = rows[:, 1].astype(np.int64)
+        ages = np.array([place - born.setdefault(track, place) for track in tracks.tolist()])
+        frames.append(
+            TrackedFrame(
+                int(number),
+                tracks,
+                rows[:, 2:4].astype(np.float32),
+                rows[:, 4].astype(np.float32),
+                ages,
+            )
+        )
+    return frames
