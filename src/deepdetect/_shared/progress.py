@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from typing import Any
 
 
-def progress(total: int, title: str, unit: str, quiet: bool = False, done: int = 0) -> Any:
+def progress(total: int | None, title: str, unit: str, quiet: bool = False, done: int = 0) -> Any:
     """Return a progress bar on standard error.
 
     Args:
-        total: number of units.
+        total: number of units; None where it is not known.
         title: the word before the bar.
         unit: name of one unit, such as "image".
         quiet: show nothing.

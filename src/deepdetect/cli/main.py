@@ -29,6 +29,7 @@ from .reconstruct import reconstruct
 from .register import register
 from .shards import shards
 from .stitch import stitch
+from .track import track
 from .train import train
 from .train_points import train_points
 
@@ -120,6 +121,7 @@ for command in (
     reconstruct,
     extract,
     match_many,
+    track,
     label,
     shards,
     train,

@@ -22,11 +22,17 @@ class DatabaseImage:
         name: its path below the folder of the photographs.
         lens: its camera; photographs with the same object share one.
         xy: (N, 2) keypoints, centre of the first pixel (0, 0).
+        scales: (N,) sigma in pixels, or None.
+        orientations: (N,) radians, clockwise; with scales only.
+        descriptors: (N, 128) uint8 of SIFT, or None.
     """
 
     name: str
     lens: Lens
     xy: np.ndarray
+    scales: np.ndarray | None = None
+    orientations: np.ndarray | None = None
+    descriptors: np.ndarray | None = None
 
 
 def write_database(
@@ -61,8 +67,16 @@ def write_database(
             frame.rig_id = rig_id
             frame.add_data_id(row.data_id)
             database.write_frame(frame)
-            keypoints = np.ascontiguousarray(image.xy + PIXEL_CENTRE, np.float32)
+            columns = [image.xy + PIXEL_CENTRE]
+            if image.scales is not None and image.orientations is not None:
+                columns += [image.scales[:, None], image.orientations[:, None]]
+            keypoints = np.ascontiguousarray(np.hstack(columns), np.float32)
             database.write_keypoints(row.image_id, keypoints)
+            if image.descriptors is not None:
+                described = pycolmap.FeatureDescriptors(
+                    pycolmap.FeatureExtractorType.SIFT, np.ascontiguousarray(image.descriptors)
+                )
+                database.write_descriptors(row.image_id, described)
         for (name0, name1), rows in matches.items():
             found = np.ascontiguousarray(rows, np.uint32).reshape(-1, 2)
             database.write_matches(numbers[name0], numbers[name1], found)

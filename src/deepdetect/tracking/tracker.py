@@ -52,7 +52,7 @@ class TrackingOptions:
 
     max_keypoints: int = 1000
     detect_every: int = 5
-    min_kept: float = 0.6
+    min_kept: float = 0.4
     min_distance_px: float = 8.0
     window_px: int = 21
     pyramid_levels: int = 4

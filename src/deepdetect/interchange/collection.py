@@ -1,0 +1,147 @@
+"""Photographs with their keypoints and matches: what all formats are written from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from .._shared.errors import ImageError, OptionError
+from .._shared.options import suggest_keywords
+from .._shared.progress import progress
+from ..features.keypoints import Keypoints
+from ..features.sift import described_at_own_size, root_sift_descriptors
+from ..io.image import load_image, luma
+
+Pair = tuple[str, str]
+
+ROOT_SIFT_NORM = 512
+"""Length of RootSIFT descriptors as bytes."""
+
+SIFT_NUMBERS = 128
+
+
+@suggest_keywords
+@dataclass(frozen=True, eq=False)
+class PairMatches:
+    """Matches of two photographs.
+
+    Attributes:
+        rows: (K, 2) int32 keypoints of the first and of the second; each at most once.
+        scores: (K,) float32 in [0, 1], higher is better.
+    """
+
+    rows: np.ndarray
+    scores: np.ndarray
+
+    @classmethod
+    def one_to_one(cls, rows: np.ndarray, scores: np.ndarray) -> PairMatches:
+        """Keep the best match of each keypoint; rows below 0 are no keypoints.
+
+        Example:
+            >>> PairMatches.one_to_one([[0, 5], [1, 5], [2, -1], [3, 0]], [.2, .9, 1, .5]).rows
+            array([[1, 5],
+                   [3, 0]], dtype=int32)
+        """
+        rows = np.asarray(rows, np.int32).reshape(-1, 2)
+        scores = np.asarray(scores, np.float32)
+        kept = np.flatnonzero((rows >= 0).all(axis=1))
+        for side in (0, 1):
+            best_first = kept[np.lexsort((kept, -scores[kept]))]
+            _, first = np.unique(rows[best_first, side], return_index=True)
+            kept = np.sort(best_first[first])
+        return cls(rows[kept], scores[kept])
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+@suggest_keywords
+@dataclass(frozen=True, eq=False)
+class Collection:
+    """Photographs with their keypoints and matches.
+
+    Attributes:
+        keypoints: by the name of the photograph: its path below their folder, with "/".
+        matches: by the names of two photographs.
+        folder: of the photographs, where it is known.
+
+    Raises:
+        OptionError: a match is of a photograph or a keypoint that is not there.
+    """
+
+    keypoints: Mapping[str, Keypoints]
+    matches: Mapping[Pair, PairMatches] = field(default_factory=dict)
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        for pair, found in self.matches.items():
+            for side, name in enumerate(pair):
+                if name not in self.keypoints:
+                    raise OptionError(
+                        f"the matches of {pair[0]} and {pair[1]} need the keypoints of {name}, "
+                        "which are not there: give its features, too"
+                    )
+                most = int(found.rows[:, side].max(initial=-1))
+                if most >= len(self.keypoints[name]):
+                    raise OptionError(
+                        f"the matches of {pair[0]} and {pair[1]} name keypoint {most} of {name}, "
+                        f"which has {len(self.keypoints[name])}: they are of other features"
+                    )
+
+    def path(self, name: str) -> Path | None:
+        """Return the file of a photograph, or None where it is not known."""
+        path = None if self.folder is None else self.folder / name
+        return path if path is not None and path.is_file() else None
+
+
+def describe_collection(collection: Collection, quiet: bool = True) -> Collection:
+    """Return a collection whose keypoints have RootSIFT descriptors, as far as photographs allow.
+
+    Keypoints with sizes and angles are described at these, others as dense keypoints are: upright,
+    with a diameter of 3 pixels.
+
+    Args:
+        collection: whose photographs without descriptors are read.
+        quiet: show no progress bar.
+
+    Raises:
+        ImageError: a photograph has another size than its keypoints.
+    """
+    described = dict(collection.keypoints)
+    left = [name for name, points in described.items() if points.descriptors is None]
+    left = [name for name in left if collection.path(name) is not None]
+    with progress(len(left), "describing", "image", quiet) as bar:
+        for name in left:
+            points, path = described[name], collection.path(name)
+            gray = luma(load_image(path))
+            if gray.shape[::-1] != points.image_size:
+                raise ImageError(
+                    f"{path} has {gray.shape[1]}x{gray.shape[0]} pixels, its keypoints are of an "
+                    f"image of {points.image_size[0]}x{points.image_size[1]}: name the folder of "
+                    "the photographs that they were found in"
+                )
+            if points.sizes is not None and points.angles is not None:
+                described[name] = described_at_own_size(gray, points)
+            else:
+                found = root_sift_descriptors(gray, points.xy)
+                described[name] = replace(points, descriptors=found)
+            bar.update()
+    return replace(collection, keypoints=described)
+
+
+def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
+    """Return descriptors as SIFT's (N, 128) uint8, or None where they are of another kind.
+
+    Descriptors of length 1 are multiplied by 512, as SIFT does it.
+    """
+    found = keypoints.descriptors
+    if found is None or found.shape[1] != SIFT_NUMBERS:
+        return None
+    if found.dtype == np.uint8:
+        return found
+    if found.size and found.min() < 0:
+        return None
+    return np.rint(found * ROOT_SIFT_NORM).clip(0, 255).astype(np.uint8)

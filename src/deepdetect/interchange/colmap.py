@@ -1,0 +1,130 @@
+"""COLMAP: a database, or its text files of features and matches.
+
+COLMAP's centre of the first pixel is (0.5, 0.5): half a pixel is added to all positions. Its scale
+is sigma, half of OpenCV's diameter, and its orientation is in radians, clockwise as OpenCV's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
+from ..features.keypoints import UNSET_ANGLE, Keypoints
+from ..sfm.colmap import PIXEL_CENTRE
+from ..sfm.database import DatabaseImage, write_database
+from ..sfm.lens import Lens
+from ..sfm.mapping import MappingOptions, verify_pairs
+from .collection import Collection, sift_bytes
+
+DEFAULT_SIZE_PX = 3.0
+"""Diameter of keypoints without a size: that of dense keypoints."""
+
+
+@suggest_keywords
+def write_colmap(
+    collection: Collection,
+    output: str | Path,
+    *,
+    lenses: Mapping[str, Lens],
+    verify: bool = True,
+    options: MappingOptions = MappingOptions(),
+) -> tuple[Path, ...]:
+    """Write COLMAP's database, whole or not at all; it is replaced where it exists.
+
+    Keypoints with sizes have four columns (x, y, scale, orientation), others two. Descriptors are
+    written where they are SIFT's.
+
+    Args:
+        collection: the photographs.
+        output: ending in .db.
+        lenses: camera of each photograph; those with the same object share one.
+        verify: estimate the two-view geometry of each pair, without which COLMAP maps nothing.
+        options: of this verification.
+
+    Returns:
+        The file.
+
+    Raises:
+        OptionError: the ending is another, or a photograph has no camera.
+        MissingExtraError: pycolmap is not installed.
+        DeepDetectError: the file cannot be written.
+    """
+    path = Path(output)
+    if path.suffix.lower() != ".db":
+        raise OptionError(f"{path} must end in .db")
+    images = []
+    for name, points in collection.keypoints.items():
+        if name not in lenses:
+            raise OptionError(f"{name} has no camera: give one in `lenses`")
+        scales, orientations = _frames(points)
+        images.append(
+            DatabaseImage(name, lenses[name], points.xy, scales, orientations, sift_bytes(points))
+        )
+    with atomic_path(path) as temporary:
+        rows = {pair: found.rows for pair, found in collection.matches.items()}
+        write_database(temporary, images, rows)
+        if verify and rows:
+            verify_pairs(temporary, options)
+    return (path,)
+
+
+def _frames(points: Keypoints) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Return sigma in pixels and orientation in radians, or None twice without sizes."""
+    if points.sizes is None:
+        return None, None
+    return points.sizes / 2, orientations_of(points)
+
+
+def orientations_of(points: Keypoints) -> np.ndarray:
+    """Return (N,) orientations in radians, clockwise; 0 where there are none."""
+    if points.angles is None:
+        return np.zeros(len(points), np.float32)
+    return np.deg2rad(np.where(points.angles == UNSET_ANGLE, 0, points.angles))
+
+
+@suggest_keywords
+def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path, ...]:
+    """Write the text files of `colmap feature_importer` and `colmap matches_importer`.
+
+    Args:
+        collection: the photographs, whose keypoints have SIFT descriptors.
+        output: folder: NAME.txt for each photograph, and matches.txt (`--match_type raw`).
+
+    Returns:
+        The files.
+
+    Raises:
+        OptionError: keypoints have no SIFT descriptors, which this format always has.
+        DeepDetectError: a file cannot be written.
+    """
+    folder = Path(output)
+    written = []
+    for name, points in collection.keypoints.items():
+        descriptors = sift_bytes(points)
+        if descriptors is None:
+            raise OptionError(
+                f"the keypoints of {name} have no SIFT descriptors, which COLMAP's text files "
+                "need: name the folder of the photographs as `images`, or write a database"
+            )
+        sizes = np.full(len(points), DEFAULT_SIZE_PX) if points.sizes is None else points.sizes
+        frames = np.column_stack([points.xy + PIXEL_CENTRE, sizes / 2, orientations_of(points)])
+        path = folder / f"{name}.txt"
+        with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
+            file.write(f"{len(points)} {descriptors.shape[1]}\n")
+            np.savetxt(
+                file,
+                np.column_stack([frames, descriptors]),
+                fmt=["%.4f"] * 4 + ["%d"] * descriptors.shape[1],
+            )
+        written.append(path)
+    path = folder / "matches.txt"
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        for (name0, name1), found in collection.matches.items():
+            lines = "".join(f"{row0} {row1}\n" for row0, row1 in found.rows.tolist())
+            file.write(f"{name0} {name1}\n{lines}\n")
+    return (*written, path)

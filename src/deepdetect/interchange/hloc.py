@@ -1,0 +1,85 @@
+"""hloc: features, matches and pairs, in float32 and int32.
+
+Its pixels are ours: hloc adds the half pixel of COLMAP itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
+from ..batch.extraction import feature_group
+from ..batch.pair_matching import pair_name
+from ..batch.parted_file import Group, write_groups
+from .collection import Collection
+
+FILES = ("features.h5", "matches.h5", "pairs.txt")
+
+
+@suggest_keywords
+def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
+    """Write features.h5 (keypoints, scores, descriptors (D, N)), matches.h5 and pairs.txt.
+
+    They are the arguments of `hloc.reconstruction.main`. Each file appears whole, or not at all.
+
+    Args:
+        collection: the photographs. Those without descriptors get none, which hloc needs to match,
+            not to map.
+        output: folder.
+
+    Returns:
+        The files. Without matches there are no matches.h5 and pairs.txt.
+
+    Raises:
+        OptionError: two pairs would have one group in the file.
+        DeepDetectError: a file cannot be written.
+        MissingExtraError: h5py is not installed.
+    """
+    features, matches, pairs = (Path(output) / name for name in FILES)
+
+    def feature_groups() -> Iterator[Group]:
+        for name, points in collection.keypoints.items():
+            if points.descriptors is not None:
+                yield feature_group(name, points)
+                continue
+            arrays = {
+                "keypoints": points.xy,
+                "scores": points.scores,
+                "image_size": np.array(points.image_size, np.int32),
+            }
+            if points.sizes is not None and points.angles is not None:
+                arrays |= {"scales": points.sizes / 2, "oris": points.angles}
+            yield Group(name, arrays, (), {"keypoints": {"uncertainty": np.float32(1)}})
+
+    taken: dict[str, tuple[str, str]] = {}
+    for pair in collection.matches:
+        other = taken.setdefault(pair_name(*pair), pair)
+        if other != pair:
+            raise OptionError(
+                f"hloc would have one group for the matches of {' '.join(pair)} and of "
+                f"{' '.join(other)}: rename an image"
+            )
+
+    def match_groups() -> Iterator[Group]:
+        for (name0, name1), found in collection.matches.items():
+            count = len(collection.keypoints[name0])
+            matches0 = np.full(count, -1, np.int32)
+            scores = np.zeros(count, np.float32)
+            matches0[found.rows[:, 0]] = found.rows[:, 1]
+            scores[found.rows[:, 0]] = found.scores
+            arrays = {"matches0": matches0, "matching_scores0": scores}
+            yield Group(pair_name(name0, name1), arrays)
+
+    write_groups(features, feature_groups())
+    if not collection.matches:
+        return (features,)
+    write_groups(matches, match_groups())
+    with atomic_path(pairs) as temporary:
+        lines = (" ".join(pair) + "\n" for pair in collection.matches)
+        temporary.write_text("".join(lines), encoding="utf-8")
+    return features, matches, pairs

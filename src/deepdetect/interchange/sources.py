@@ -1,0 +1,299 @@
+"""Collections from files that the commands `extract`, `match-many`, `detect` and `match` write."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._shared.errors import InvalidFileError, OptionError
+from .._shared.options import suggest_keywords
+from ..batch.extraction import MAX_KEYPOINTS, extract_features
+from ..batch.pair_matching import PairMatchingOptions, match_pairs
+from ..batch.parted_file import import_h5py, open_hdf5
+from ..features.keypoints import Keypoints
+from ..features.matches import Matches
+from ..features.selection import SelectionOptions
+from ..io.image import find_images
+from ..io.tables import load_keypoints, load_matches
+from .collection import Collection, Pair, PairMatches
+
+MAX_ALL_PAIRS = 50
+"""Photographs that are all matched with each other where no pairs are named."""
+
+MATCHES_SUFFIX = "_matches"
+"""With which names of files of `deepdetect match` end."""
+
+
+@suggest_keywords
+def read_collection(
+    files: Sequence[str | Path],
+    *,
+    matches: str | Path | None = None,
+    images: str | Path | None = None,
+) -> Collection:
+    """Read saved keypoints and matches.
+
+    Args:
+        files: one HDF5 file of `deepdetect extract` or hloc; or npz files of `deepdetect detect`
+            (STEM.npz) and `deepdetect match` (STEM0_STEM1_matches.npz), which are read all.
+        matches: HDF5 file of `deepdetect match-many` or hloc.
+        images: folder of the photographs: names of npz files are completed by it, and what needs
+            the photographs finds them.
+
+    Returns:
+        The collection. Matches of npz files are those that agree with their geometry, at the
+        keypoints' own positions, so that matches of several pairs hang together.
+
+    Raises:
+        DeepDetectError: a file is missing or holds something else, or names do not fit.
+        MissingExtraError: h5py is not installed.
+    """
+    paths = [Path(path) for path in files]
+    folder = None if images is None else Path(images)
+    archives = [path for path in paths if path.suffix.lower() == ".npz"]
+    if not paths or (archives and len(archives) < len(paths)) or (not archives and len(paths) > 1):
+        raise OptionError(
+            "give one HDF5 file of features, or npz files of keypoints and matches, or a folder "
+            "of photographs"
+        )
+    if archives:
+        if matches is not None:
+            raise OptionError("npz files of matches are named with the others: leave out `matches`")
+        return _read_archives(archives, folder)
+    keypoints = read_features_file(paths[0])
+    found = {} if matches is None else read_matches_file(Path(matches), keypoints)
+    return Collection(keypoints, found, folder)
+
+
+def read_features_file(path: Path) -> dict[str, Keypoints]:
+    """Read all features of an HDF5 file of hloc's layout, by the name of the image.
+
+    Raises:
+        DeepDetectError: the file is missing or damaged, or holds no features.
+    """
+    h5py = import_h5py()
+    names: list[str] = []
+    found: dict[str, Keypoints] = {}
+    with open_hdf5(path) as file:
+
+        def note(name: str, each: Any) -> None:
+            if isinstance(each, h5py.Dataset) and name.endswith("/keypoints"):
+                names.append(name.removesuffix("/keypoints"))
+
+        file.visititems(note)
+        for name in sorted(names):
+            try:
+                found[name] = _features(file[name])
+            except (OptionError, ValueError, TypeError) as error:
+                reason = str(error).splitlines()[0]
+                raise InvalidFileError(
+                    f"{path} holds no features of {name} ({reason}): extract them again"
+                ) from None
+    if not found:
+        raise InvalidFileError(f"{path} holds no features: give a file of deepdetect extract")
+    return found
+
+
+def _features(group: Any) -> Keypoints:
+    """Return the keypoints in hloc's group of an image."""
+    arrays = {name: group[name][()] for name in group}
+    xy = np.asarray(arrays["keypoints"], np.float32).reshape(-1, 2)
+    scores = arrays.get("scores")
+    size = arrays.get("image_size")
+    if size is None:  # the smallest that holds them
+        size = np.ceil(xy.max(axis=0, initial=0)) + 1
+    descriptors, scales = arrays.get("descriptors"), arrays.get("scales")
+    angles = arrays.get("oris")
+    return Keypoints(
+        xy,
+        np.ones(len(xy), np.float32) if scores is None else scores,
+        (int(size[0]), int(size[1])),
+        sizes=None if scales is None else 2 * np.asarray(scales, np.float32),
+        angles=None if angles is None else np.asarray(angles, np.float32) % 360,
+        descriptors=None if descriptors is None else np.ascontiguousarray(descriptors.T),
+    )
+
+
+def read_matches_file(path: Path, names: Iterable[str]) -> dict[Pair, PairMatches]:
+    """Read all matches of an HDF5 file of hloc's layout.
+
+    Args:
+        path: the file.
+        names: of the images, which the file writes with "-" for "/".
+
+    Raises:
+        DeepDetectError: the file is missing or damaged, holds no matches, or it is not known of
+            which images.
+    """
+    known: dict[str, list[str]] = {}
+    for name in names:
+        known.setdefault(name.replace("/", "-"), []).append(name)
+    found: dict[Pair, PairMatches] = {}
+    with open_hdf5(path) as file:
+        for first in file:
+            for second in file[first]:
+                group = file[first][second]
+                if "matches0" not in group:
+                    continue
+                pair = []
+                for written in (first, second):
+                    if len(known.get(written, ())) != 1:
+                        reason = "several" if written in known else "none"
+                        raise InvalidFileError(
+                            f"{path} has matches of {written}, and {reason} of the images with "
+                            "features have this name: give the features that were matched"
+                        )
+                    pair.append(known[written][0])
+                rows1 = np.asarray(group["matches0"][()], np.int64)
+                rows0 = np.flatnonzero(rows1 >= 0)
+                scores = group.get("matching_scores0")
+                kept = np.ones(len(rows0)) if scores is None else scores[()][rows0]
+                rows = np.column_stack([rows0, rows1[rows0]])
+                found[pair[0], pair[1]] = PairMatches.one_to_one(rows, kept)
+    if not found:
+        raise InvalidFileError(f"{path} holds no matches: give a file of deepdetect match-many")
+    return found
+
+
+def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
+    """Read npz files of keypoints and of matches."""
+    names = _names_by_stem(folder)
+    keypoints: dict[str, Keypoints] = {}
+    matches: dict[Pair, PairMatches] = {}
+    for path in paths:
+        if not path.stem.endswith(MATCHES_SUFFIX):
+            keypoints[_name(path.stem, names, path)] = load_keypoints(path)
+    for path in paths:
+        if not path.stem.endswith(MATCHES_SUFFIX):
+            continue
+        loaded = load_matches(path)
+        pair = _pair_of_stem(path.stem.removesuffix(MATCHES_SUFFIX), names, path)
+        for name, own in zip(pair, (loaded.keypoints0, loaded.keypoints1), strict=True):
+            there = keypoints.setdefault(name, own)
+            if not (np.array_equal(there.xy, own.xy) and there.image_size == own.image_size):
+                raise InvalidFileError(
+                    f"{path} has other keypoints of {name} than another file: make all files with "
+                    "the same options"
+                )
+        matches[pair] = _pair_matches(loaded)
+    return Collection(keypoints, matches, folder)
+
+
+def _pair_matches(matches: Matches) -> PairMatches:
+    """Return the matches that agree with their geometry, by the rows of the keypoints."""
+    kept = matches.inliers
+    rows = np.column_stack([matches.indices0[kept], matches.indices1[kept]])
+    return PairMatches.one_to_one(rows, matches.scores[kept])
+
+
+def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
+    """Return the names of the images below a folder by their stems; None without a folder."""
+    if folder is None:
+        return None
+    names: dict[str, str] = {}
+    for path in find_images(folder):
+        name = path.relative_to(folder).as_posix()
+        if path.stem in names:
+            raise OptionError(
+                f"{names[path.stem]} and {name} have the same stem, by which npz files are named: "
+                "rename one, or give an HDF5 file of features"
+            )
+        names[path.stem] = name
+    return names
+
+
+def _name(stem: str, names: Mapping[str, str] | None, path: Path) -> str:
+    if names is None:
+        return stem
+    if stem not in names:
+        raise OptionError(f"{path} is of no image in the folder of `images`: give its folder")
+    return names[stem]
+
+
+def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pair:
+    """Return the names of the two images whose stems are joined in one."""
+    parts = stem.split("_")
+    joined = [("_".join(parts[:k]), "_".join(parts[k:])) for k in range(1, len(parts))]
+    if names is not None:
+        joined = [pair for pair in joined if all(each in names for each in pair)]
+    if len(joined) != 1:
+        raise OptionError(
+            f"it is not clear of which two images {path} is: name their folder as `images`"
+            if names is None
+            else f"{path} is of no two images in the folder of `images`, or of several: name "
+            "another folder"
+        )
+    first, second = (_name(each, names, path) for each in joined[0])
+    return first, second
+
+
+@suggest_keywords
+def match_photographs(
+    folder: str | Path,
+    *,
+    pairs: str | Path | Sequence[Pair] | None = None,
+    sequential: int | None = None,
+    max_keypoints: int = MAX_KEYPOINTS,
+    detector: Mapping[str, Any] | None = None,
+    matching: PairMatchingOptions = PairMatchingOptions(),
+    workers: int | None = None,
+    quiet: bool = True,
+) -> Collection:
+    """Find and match the keypoints of all photographs below a folder.
+
+    As `extract_features` and `match_pairs` do, which keep what they made for large collections. A
+    script must call this under `if __name__ == "__main__":`, since processes are started.
+
+    Args:
+        folder: of the photographs.
+        pairs: of names, or a text file with one on each line; None: all, of up to 50 photographs.
+        sequential: number of following photographs that each is matched with, instead of `pairs`.
+        max_keypoints: of each photograph, the best ones.
+        detector: arguments of `DeepDetect`.
+        matching: how pairs are matched.
+        workers: number of processes; default one per processor.
+        quiet: show no progress bars.
+
+    Raises:
+        ImageError: the folder is missing, or holds no image.
+        OptionError: an option is out of its range, or there are too many photographs for all pairs.
+        BatchError: an image cannot be read, or a pair not be matched.
+        MissingExtraError: h5py is not installed.
+    """
+    root = Path(folder)
+    names = [path.relative_to(root).as_posix() for path in find_images(root)]
+    if pairs is not None and sequential is not None:
+        raise OptionError("give `pairs` or `sequential`, not both")
+    if sequential is not None and sequential < 1:
+        raise OptionError(f"`sequential` must be at least 1, not {sequential}")
+    if pairs is None:
+        if sequential is None and len(names) > MAX_ALL_PAIRS:
+            raise OptionError(
+                f"all pairs of {len(names)} photographs would take long: name them by `pairs`, or "
+                "give `sequential`"
+            )
+        reach = len(names) if sequential is None else sequential
+        pairs = [
+            (first, second)
+            for k, first in enumerate(names)
+            for second in names[k + 1 : k + 1 + reach]
+        ]
+    selection = SelectionOptions(max_keypoints=max_keypoints)
+    with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
+        features, found = Path(temporary, "features.h5"), Path(temporary, "matches.h5")
+        extract_features(
+            root, features, selection=selection, detector=detector, workers=workers, quiet=quiet
+        ).check()
+        keypoints = read_features_file(features)
+        if not pairs:
+            return Collection(keypoints, {}, root)
+        match_pairs(
+            features, pairs, found, options=matching, workers=workers, quiet=quiet
+        ).check()
+        return Collection(keypoints, read_matches_file(found, keypoints), root)
+
+

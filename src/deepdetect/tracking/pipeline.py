@@ -1,0 +1,219 @@
+"""From a video, a folder or a camera to a video of the tracks and their table."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._shared.errors import OptionError
+from .._shared.opencv import cv2
+from .._shared.options import suggest_keywords
+from .._shared.progress import progress
+from ..detector.detector import DeepDetect
+from ..features.keypoints import Keypoints
+from .frames import FrameSource
+from .tracker import Detect, Tracker, TrackingOptions
+from .tracks import TrackedFrame, write_tracks
+from .video import TrackDrawer, check_video_name, write_video
+
+RATE_FRAMES = 10
+"""Frames of which the number per second is shown."""
+
+
+@dataclass(frozen=True)
+class TrackingReport:
+    """What was tracked.
+
+    Attributes:
+        frames: number of frames.
+        tracks: number of tracks.
+        tracks_per_frame: on average.
+        frames_per_track: on average.
+        fps: frames per second of the work, drawing and writing included.
+        seconds: of all the work.
+        files: that were written.
+    """
+
+    frames: int
+    tracks: int
+    tracks_per_frame: float
+    frames_per_track: float
+    fps: float
+    seconds: float
+    files: tuple[Path, ...]
+
+
+def spread_points(detector: DeepDetect, max_keypoints: int) -> Detect:
+    """Return what finds the best points of a frame that are well apart, as a `Tracker` wants it.
+
+    Args:
+        detector: a detector.
+        max_keypoints: how many.
+    """
+
+    def detect(rgb: np.ndarray) -> Keypoints:
+        return detector.detect(rgb, max_keypoints=max_keypoints, spread="anms")
+
+    return detect
+
+
+@suggest_keywords
+def track_frames(
+    source: FrameSource, tracker: Tracker, *, max_side: int | None = None
+) -> Iterator[tuple[np.ndarray, TrackedFrame]]:
+    """Follow points through all frames of a source.
+
+    Args:
+        source: opened in a `with` block.
+        tracker: a new one.
+        max_side: longer sides of frames are scaled down to this for the tracker, in pixels.
+
+    Yields:
+        Each frame, (H, W, 3) uint8 RGB, and its tracks, in pixels of this frame.
+
+    Raises:
+        OptionError: `max_side` is too small, or frames differ in size.
+        ImageError: a frame cannot be read.
+    """
+    if max_side is not None and max_side < 32:
+        raise OptionError(f"`max_side` must be at least 32 pixels, not {max_side}")
+    for frame in source:
+        height, width = frame.rgb.shape[:2]
+        if max_side is None or max(height, width) <= max_side:
+            yield frame.rgb, tracker.update(frame.rgb, number=frame.number)
+            continue
+        factor = max_side / max(height, width)
+        size = max(1, round(width * factor)), max(1, round(height * factor))
+        small = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+        found = tracker.update(small, number=frame.number)
+        xy = (found.xy + 0.5) * np.divide((width, height), size) - 0.5
+        yield frame.rgb, replace(found, xy=xy.astype(np.float32))
+
+
+@suggest_keywords
+def track(
+    source: str | Path | int,
+    output: str | Path,
+    *,
+    detector: DeepDetect | None = None,
+    options: TrackingOptions = TrackingOptions(),
+    every: int = 1,
+    max_frames: int | None = None,
+    max_side: int | None = None,
+    tail: int = 10,
+    quiet: bool = True,
+) -> TrackingReport:
+    """Follow the points of a video, and write a video with the tracks, and their table.
+
+    Ctrl-C on a camera ends the recording; both files are written.
+
+    Args:
+        source: a video file, a folder of images, or the number of a camera.
+        output: ending in .mp4, .mov, .mkv or .avi; the table beside it ends in .csv, with columns
+            frame, track, x, y and score. With .csv itself there is no video.
+        detector: that finds the points; None: a new one.
+        options: how they are followed.
+        every: take each frame with a number that this divides.
+        max_frames: that are taken; None: all.
+        max_side: longer sides of frames are scaled down to this for the search, in pixels.
+        tail: number of positions of a track that are drawn.
+        quiet: show no progress bar.
+
+    Returns:
+        What was tracked.
+
+    Raises:
+        DeepDetectError: the source cannot be read, an option is out of its range, or the files
+            cannot be written.
+
+    Example:
+        >>> track("drive.mp4", "tracks.mp4")  # doctest: +SKIP
+    """
+    video, table = output_files(output)
+    if tail < 1:
+        raise OptionError(f"`tail` must be at least 1, not {tail}")
+    lengths = np.zeros(0, np.int64)
+    frames = 0
+    begun = time.perf_counter()
+    with ExitStack() as stack:
+        opened = stack.enter_context(FrameSource(source, every=every, max_frames=max_frames))
+        found = DeepDetect() if detector is None else detector
+        tracker = Tracker(spread_points(found, options.max_keypoints), options)
+        writer = stack.enter_context(write_tracks(table))
+        drawn: Any = None
+        if video is not None:
+            drawn = stack.enter_context(write_video(video, opened.fps))
+        drawer, ticks = TrackDrawer(tail), deque([begun], RATE_FRAMES + 1)
+        bar = stack.enter_context(progress(opened.count, "tracking", "frame", quiet))
+        stopped = stack.enter_context(_interruptible(opened.live))
+        for rgb, frame in track_frames(opened, tracker, max_side=max_side):
+            writer.write(frame)
+            ticks.append(time.perf_counter())
+            rate = (len(ticks) - 1) / max(1e-9, ticks[-1] - ticks[0])
+            if drawn is not None:
+                caption = f"{rate:.1f} frames/s   {len(frame)} tracks"
+                drawn.write(drawer.draw(rgb, frame, caption))
+            frames += 1
+            most = int(frame.tracks.max(initial=-1)) + 1
+            lengths = np.append(lengths, np.zeros(max(0, most - len(lengths)), np.int64))
+            lengths[frame.tracks] += 1
+            bar.update()
+            bar.set_postfix_str(f"{len(frame)} tracks", refresh=False)
+            if stopped():
+                break
+    seconds = time.perf_counter() - begun
+    return TrackingReport(
+        frames,
+        len(lengths),
+        float(lengths.sum() / max(1, frames)),
+        float(lengths.mean()) if len(lengths) else 0.0,
+        frames / seconds,
+        seconds,
+        tuple(path for path in (video, table) if path is not None),
+    )
+
+
+def output_files(output: str | Path) -> tuple[Path | None, Path]:
+    """Return the files of the video, None where there is none, and of the table.
+
+    Raises:
+        OptionError: the ending is no video's.
+
+    Example:
+        >>> [str(path) for path in output_files("walk.mp4")]
+        ['walk.mp4', 'walk.csv']
+    """
+    path = Path(output)
+    if path.suffix.lower() == ".csv":
+        return None, path
+    check_video_name(path)
+    return path, path.with_suffix(".csv")
+
+
+@contextmanager
+def _interruptible(live: bool) -> Iterator[Callable[[], bool]]:
+    """Note the first Ctrl-C of a live source, so that the frame under way is finished."""
+    noted: list[int] = []
+    if not live or threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    usual = signal.getsignal(signal.SIGINT)
+
+    def note(number: int, _: Any) -> None:
+        noted.append(number)
+        signal.signal(signal.SIGINT, usual)  # a second one ends all at once
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(noted)
+    finally:
+        signal.signal(signal.SIGINT, usual)

@@ -1,0 +1,157 @@
+"""Video files of the tracked points."""
+
+from __future__ import annotations
+
+import colorsys
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import DeepDetectError, OptionError
+from .._shared.opencv import cv2
+from .tracks import TrackedFrame
+
+CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
+"""Of the files, by their suffix."""
+
+READABLE_WIDTH_PX = 800
+"""Lines and letters grow with frames that are wider than this."""
+
+HUE_STEP = 0.61803
+"""Of the colours of following tracks: neighbours are far apart (the golden ratio)."""
+
+
+class VideoWriter:
+    """Writes frames; the first one decides the size."""
+
+    def __init__(self, path: Path, codec: str, fps: float, name: Path) -> None:
+        self._path, self._codec, self._fps, self._name = path, codec, fps, name
+        self._writer: Any = None
+        self._size = (0, 0)
+
+    def write(self, rgb: np.ndarray) -> None:
+        """Write a (H, W, 3) uint8 RGB frame.
+
+        Raises:
+            DeepDetectError: OpenCV has no encoder, or the frame has another size than the first.
+        """
+        size = rgb.shape[1], rgb.shape[0]
+        if self._writer is None:
+            code = cv2.VideoWriter_fourcc(*self._codec)
+            self._writer, self._size = cv2.VideoWriter(str(self._path), code, self._fps, size), size
+            if not self._writer.isOpened():
+                raise DeepDetectError(
+                    f"the installed OpenCV has no encoder ({self._codec}) for {self._name}: give a "
+                    "name that ends in .avi, or in .csv for the tracks alone"
+                )
+        if size != self._size:
+            raise DeepDetectError(f"a frame has {size} pixels, the first one had {self._size}")
+        self._writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            self._writer.release()
+
+    @property
+    def empty(self) -> bool:
+        """Whether no frame was written."""
+        return self._writer is None
+
+
+def check_video_name(path: str | Path) -> str:
+    """Return the codec of a video file by its suffix; call it before any expensive work.
+
+    Raises:
+        OptionError: the ending is another.
+
+    Example:
+        >>> check_video_name("walk.MP4")
+        'mp4v'
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in CODECS:
+        raise OptionError(f"{path} must end in {', '.join(CODECS)}, or .csv")
+    return CODECS[suffix]
+
+
+@contextmanager
+def write_video(path: str | Path, fps: float) -> Iterator[VideoWriter]:
+    """Open a video file, which appears when the block ends, whole or not at all.
+
+    Args:
+        path: ending in .mp4, .mov, .mkv or .avi.
+        fps: frames per second when it is shown.
+
+    Raises:
+        OptionError: the ending is another.
+        DeepDetectError: the file cannot be written, or no frame was.
+    """
+    codec = check_video_name(path)
+    with atomic_path(path) as temporary:
+        writer = VideoWriter(temporary, codec, fps, Path(path))
+        try:
+            yield writer
+        finally:
+            writer.close()
+        if writer.empty or not temporary.stat().st_size:
+            raise DeepDetectError(f"there is no frame to be written to {path}: check the source")
+
+
+class TrackDrawer:
+    """Draws tracks with their last positions over frames.
+
+    Args:
+        tail: number of positions that are drawn of each track.
+    """
+
+    def __init__(self, tail: int = 10) -> None:
+        self._frames: deque[TrackedFrame] = deque(maxlen=max(1, tail))
+
+    def draw(self, rgb: np.ndarray, frame: TrackedFrame, caption: str = "") -> np.ndarray:
+        """Return a copy of a frame with its tracks and a caption.
+
+        Args:
+            rgb: (H, W, 3) uint8.
+            frame: its tracks.
+            caption: a line, as the number of frames per second.
+        """
+        self._frames.append(frame)
+        canvas = np.ascontiguousarray(rgb.copy())
+        unit = max(1.0, rgb.shape[1] / READABLE_WIDTH_PX)
+        colors = {track: track_color(track) for track in frame.tracks.tolist()}
+        tails: dict[int, list[list[float]]] = {}
+        for past in self._frames:
+            for track, place in zip(past.tracks.tolist(), past.xy.tolist(), strict=True):
+                if track in colors:
+                    tails.setdefault(track, []).append(place)
+        for track, places in tails.items():
+            line = np.rint(np.array(places)).astype(np.int32).reshape(-1, 1, 2)
+            cv2.polylines(canvas, [line], False, colors[track], max(1, round(unit)), cv2.LINE_AA)
+            end = (int(line[-1, 0, 0]), int(line[-1, 0, 1]))
+            cv2.circle(canvas, end, round(2 * unit), colors[track], -1, cv2.LINE_AA)
+        if caption:
+            place, size = (round(8 * unit), round(22 * unit)), 0.6 * unit
+            for color, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
+                cv2.putText(
+                    *(canvas, caption, place, cv2.FONT_HERSHEY_SIMPLEX, size, color),
+                    round(width * unit),
+                    cv2.LINE_AA,
+                )
+        return canvas
+
+
+def track_color(track: int) -> tuple[int, int, int]:
+    """Return a bright RGB colour that a track keeps.
+
+    Example:
+        >>> track_color(0)
+        (255, 51, 51)
+    """
+    red, green, blue = colorsys.hsv_to_rgb(track * HUE_STEP % 1, 0.8, 1.0)
+    return round(255 * red), round(255 * green), round(255 * blue)
