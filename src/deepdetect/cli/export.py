@@ -8,9 +8,10 @@ import click
 
 from .._shared.errors import DeepDetectError
 from ._generated import with_flags
+from .export_matches import EXPORTS_OF_MATCHES
 from .export_onnx import export_onnx
 
-EXPORTS: tuple[click.Command, ...] = (export_onnx,)
+EXPORTS: tuple[click.Command, ...] = (export_onnx, *EXPORTS_OF_MATCHES)
 """To add a kind of file, write its command in a module beside this one, and add it here."""
 
 

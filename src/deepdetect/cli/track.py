@@ -79,9 +79,7 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
             check_inputs_survive(files, inputs, "choose another name with -o")
         claim_outputs("track", inputs, files, overwrite)
     detector = make_detector({**dict.fromkeys(DETECTOR.names), **detection})
-    report = track_points(
-        source, output, detector=detector, options=options, quiet=False, **frames
-    )
+    report = track_points(source, output, detector=detector, options=options, quiet=False, **frames)
     print_result(
         as_json,
         vars(report),

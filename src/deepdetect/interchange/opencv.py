@@ -51,7 +51,7 @@ def write_opencv(
     Example:
         >>> import tempfile
         >>> points = Keypoints([[3, 4.5]], [0.5], (8, 6), sizes=[7], angles=[90])
-        >>> (path,) = write_opencv(Collection({"a.jpg": points}), tempfile.mkdtemp())
+        >>> path, _ = write_opencv(Collection({"a.jpg": points}), tempfile.mkdtemp())
         >>> storage = cv2.FileStorage(str(path), cv2.FileStorage_READ)
         >>> row = storage.getNode("keypoints").at(0)
         >>> [row.at(k).real() for k in range(5)]
@@ -69,8 +69,6 @@ def write_opencv(
             if points.descriptors is not None and len(points):
                 storage.write("descriptors", points.descriptors)
         written.append(path)
-    if not collection.matches:
-        return tuple(written)
     path = folder / f"matches{suffix}"
     with _storage(path, suffix) as storage:
         storage.startWriteStruct("pairs", cv2.FileNode_SEQ)

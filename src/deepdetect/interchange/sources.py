@@ -291,9 +291,5 @@ def match_photographs(
         keypoints = read_features_file(features)
         if not pairs:
             return Collection(keypoints, {}, root)
-        match_pairs(
-            features, pairs, found, options=matching, workers=workers, quiet=quiet
-        ).check()
+        match_pairs(features, pairs, found, options=matching, workers=workers, quiet=quiet).check()
         return Collection(keypoints, read_matches_file(found, keypoints), root)
-
-

@@ -2,7 +2,7 @@
 
 from .frames import Frame, FrameSource
 from .odometry import OdometryOptions, VisualOdometry
-from .pipeline import TrackingReport, spread_points, track, track_frames
+from .pipeline import TrackingReport, point_candidates, track, track_frames
 from .tracker import Tracker, TrackingOptions
 from .tracks import TrackedFrame, load_tracks, save_tracks
 from .trajectory import Trajectory, load_poses, save_poses
@@ -19,9 +19,9 @@ __all__ = [
     "VisualOdometry",
     "load_poses",
     "load_tracks",
+    "point_candidates",
     "save_poses",
     "save_tracks",
-    "spread_points",
     "track",
     "track_frames",
 ]

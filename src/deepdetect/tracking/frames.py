@@ -79,11 +79,12 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         self._images: list[Path] = []
         total: int | None = None
         fps = FOLDER_FPS
-        if not self.live and Path(source).is_dir():
-            self._images = find_images(source)
+        path = Path(str(source))
+        if not self.live and path.is_dir():
+            self._images = find_images(path)
             total = len(self._images)
         else:
-            self._open(source)
+            self._capture = self._opened(path)
             stated = float(self._capture.get(cv2.CAP_PROP_FPS))
             if 0 < stated <= MAX_FPS:
                 fps = stated
@@ -94,27 +95,27 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         known = [number for number in (taken, max_frames) if number is not None]
         self.count = min(known) if known else None
 
-    def _open(self, source: str | Path | int) -> None:
+    def _opened(self, path: Path) -> Any:
         """Open a file or a camera by OpenCV."""
         if self.live:
-            self._capture = cv2.VideoCapture(self.camera)
-            if not self._capture.isOpened():
+            capture = cv2.VideoCapture(self.camera)
+            if not capture.isOpened():
                 raise MissingFileError(
                     f"there is no camera {self.camera}, or another program uses it: try another "
                     "number, or close that program"
                 )
-            return
-        path = Path(source)
+            return capture
         if not path.is_file():
-            raise MissingFileError(f"there is no video, folder or camera {source}: check the path")
+            raise MissingFileError(f"there is no video, folder or camera {path}: check the path")
         if path.suffix.lower() in IMAGE_SUFFIXES:
             raise ImageError(f"{path} is one image: give a video, or the folder of the frames")
-        self._capture = cv2.VideoCapture(str(path))
-        if not self._capture.isOpened():
+        capture = cv2.VideoCapture(str(path))
+        if not capture.isOpened():
             raise InvalidFileError(
                 f"{path} is no video that the installed OpenCV can read: convert it to MP4 "
                 "(H.264), or give a folder of its frames"
             )
+        return capture
 
     def __iter__(self) -> Iterator[Frame]:
         frames = self._from_images() if self._capture is None else self._from_capture()

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..geometry.camera import Calibration, Camera
@@ -60,7 +59,7 @@ class OdometryOptions:
     window: int = 10
     anchors: int = 5
     robust_scale_px: float = 0.5
-    max_iterations: int = 20
+    max_iterations: int = 10
     max_strikes: int = 2
     seed: int = 0
 
@@ -233,16 +232,14 @@ class VisualOdometry:
         )[1:]
         motion = np.linalg.norm(last.xy[rows0] - frame.xy[rows1], axis=1)
         known = np.isfinite(self._points[last.tracks]).all(axis=1)
-        kept = np.count_nonzero(known[rows0]) / max(1, np.count_nonzero(known))
+        kept = np.count_nonzero(known[rows0]) / max(1, int(np.count_nonzero(known)))
         if kept >= options.min_tracked and np.median(motion) < options.min_motion_px:
             turn = rotation @ last.rotation.T
             relative = turn, translation - turn @ last.translation
             self._placed.append(_Placed(frame.number, len(self._keyframes) - 1, *relative))
             return True
         self._add_keyframe(frame, rotation, translation)
-        self._placed.append(
-            _Placed(frame.number, len(self._keyframes) - 1, np.eye(3), np.zeros(3))
-        )
+        self._placed.append(_Placed(frame.number, len(self._keyframes) - 1, np.eye(3), np.zeros(3)))
         self._triangulate()
         self._adjust()
         self._pose = self._keyframes[-1].rotation, self._keyframes[-1].translation
@@ -342,14 +339,18 @@ class VisualOdometry:
         window = self._keyframes[-options.window - options.anchors :]
         free = min(options.window, len(self._keyframes) - 1)
         fixed = len(window) - free
-        if fixed == 1 and len(window) > 1:
-            scale = np.linalg.norm(window[1].centre - window[0].centre)
+        first = window[:2]
+        scale = _distance(*first)
         adjust_keyframes(
-            self.camera, window, self._points, fixed, options.robust_scale_px,
+            self.camera,
+            window,
+            self._points,
+            fixed,
+            options.robust_scale_px,
             options.max_iterations,
         )
-        if fixed == 1 and len(window) > 1:
-            self._rescale(window, scale / np.linalg.norm(window[1].centre - window[0].centre))
+        if fixed == 1:  # a single fixed camera leaves the scale free
+            self._rescale(window, scale / _distance(*first))
         for keyframe in window:
             self._check(keyframe)
         seen = np.zeros(len(self._points), np.int64)
@@ -363,3 +364,8 @@ class VisualOdometry:
         for keyframe in keyframes:
             keyframe.translation = keyframe.translation * factor
         self._points *= factor
+
+
+def _distance(first: Keyframe, second: Keyframe) -> float:
+    """Return the distance between two cameras."""
+    return float(np.linalg.norm(second.centre - first.centre))

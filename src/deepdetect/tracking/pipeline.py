@@ -52,16 +52,16 @@ class TrackingReport:
     files: tuple[Path, ...]
 
 
-def spread_points(detector: DeepDetect, max_keypoints: int) -> Detect:
-    """Return what finds the best points of a frame that are well apart, as a `Tracker` wants it.
+def point_candidates(detector: DeepDetect, options: TrackingOptions = TrackingOptions()) -> Detect:
+    """Return what finds the best points of a frame, as a `Tracker` wants it.
 
     Args:
         detector: a detector.
-        max_keypoints: how many.
+        options: how many.
     """
 
     def detect(rgb: np.ndarray) -> Keypoints:
-        return detector.detect(rgb, max_keypoints=max_keypoints, spread="anms")
+        return detector.detect(rgb, max_keypoints=options.candidates * options.max_keypoints)
 
     return detect
 
@@ -147,7 +147,7 @@ def track(
     with ExitStack() as stack:
         opened = stack.enter_context(FrameSource(source, every=every, max_frames=max_frames))
         found = DeepDetect() if detector is None else detector
-        tracker = Tracker(spread_points(found, options.max_keypoints), options)
+        tracker = Tracker(point_candidates(found, options), options)
         writer = stack.enter_context(write_tracks(table))
         drawn: Any = None
         if video is not None:

@@ -31,10 +31,13 @@ class TrackingOptions:
     """How points are followed.
 
     Attributes:
-        max_keypoints: tracks at a time, and keypoints that are looked for.
+        max_keypoints: tracks at a time.
+        candidates: keypoints that are detected for each track that is wanted: the best of them that
+            are well apart are taken.
         detect_every: frames between two searches for new points, at most: fewer where many tracks
             are lost.
-        min_kept: share of the wanted tracks; with fewer, new points are looked for at once.
+        min_kept: share of the tracks after the last search; with fewer, new points are looked for
+            at once.
         min_distance_px: between a new point and all tracks.
         window_px: side of the patch that is followed.
         pyramid_levels: that are half as large each: a point is found up to about
@@ -51,6 +54,7 @@ class TrackingOptions:
     """
 
     max_keypoints: int = 1000
+    candidates: int = 3
     detect_every: int = 5
     min_kept: float = 0.4
     min_distance_px: float = 8.0
@@ -65,12 +69,15 @@ class TrackingOptions:
     def __post_init__(self) -> None:
         check_ranges(
             self,
-            positive=("max_keypoints", "detect_every", "max_iterations", "min_step_px"),
+            positive=(
+                *("max_keypoints", "candidates", "detect_every", "max_iterations", "min_step_px"),
+            ),
             not_negative=("min_distance_px", "max_return_error_px", "min_eigenvalue", "border_px"),
             fractions=("min_kept",),
             between={"window_px": (3, 101), "pyramid_levels": (1, 10)},
         )
-        for name in ("max_keypoints", "detect_every", "max_iterations", "pyramid_levels"):
+        whole = ("max_keypoints", "candidates", "detect_every", "max_iterations", "pyramid_levels")
+        for name in whole:
             if getattr(self, name) % 1:
                 raise OptionError(f"`{name}` must be a whole number, not {getattr(self, name)}")
         if self.window_px % 2 != 1:
@@ -105,6 +112,7 @@ class Tracker:
         self._frames = 0
         self._since_detection = 0
         self._next_track = 0
+        self._most = 0  # tracks after the last detection
         self._tracks = np.empty(0, np.int64)
         self._xy = np.empty((0, 2), np.float32)
         self._scores = np.empty(0, np.float32)
@@ -127,21 +135,20 @@ class Tracker:
         """
         rgb = load_image(image, channels=channels)
         size = rgb.shape[1], rgb.shape[0]
-        if self._size not in (None, size):
+        if self._size is not None and self._size != size:
             raise OptionError(
                 f"a frame has {size[0]}x{size[1]} pixels, those before have "
-                f"{self._size[0]}x{self._size[1]}: use a tracker for each size"  # type: ignore[index]
+                f"{self._size[0]}x{self._size[1]}: use a tracker for each size"
             )
         self._size = size
         options = self.options
         gray = luma(rgb)
         if self._gray is not None and len(self._xy):
             self._follow(gray)
-        wanted = options.min_kept * options.max_keypoints
         if (
-            self._frames == 0
+            not len(self._xy)
             or self._since_detection >= options.detect_every
-            or len(self._xy) < min(wanted, options.min_kept * self._most)
+            or len(self._xy) < options.min_kept * self._most
         ):
             self._add(self.detect(rgb))
             self._most = len(self._xy)
@@ -159,8 +166,6 @@ class Tracker:
         self._frames += 1
         return found
 
-    _most = 0
-
     def _follow(self, gray: np.ndarray) -> None:
         """Move the points to where the next frame shows them; drop those that are lost."""
         options = self.options
@@ -175,11 +180,13 @@ class Tracker:
             "minEigThreshold": options.min_eigenvalue,
         }
         before = np.ascontiguousarray(self._xy, np.float32).reshape(-1, 1, 2)
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
-            self._gray, gray, before, None, **settings
-        )
+        there, found, _ = cv2.calcOpticalFlowPyrLK(self._gray, gray, before, None, **settings)
         back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            gray, self._gray, there, before.copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            gray,
+            self._gray,
+            there,
+            before.copy(),
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             **settings,
         )
         there, back = there.reshape(-1, 2), back.reshape(-1, 2)

@@ -1,0 +1,325 @@
+"""`deepdetect export colmap`, `hloc`, `opencv` and `bundler`: keypoints and matches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from .._shared.errors import OptionError
+from ._options import (
+    PATH,
+    check_inputs_survive,
+    json_option,
+    max_megapixels_option,
+    overwrite_option,
+    print_result,
+    processes_option,
+)
+from ._records import claim_outputs
+
+if TYPE_CHECKING:
+    from ..interchange import Collection
+    from ..sfm.lens import Lens
+
+Command = Callable[..., Any]
+
+_COMMON: tuple[Callable[[Command], Command], ...] = (
+    click.argument("sources", type=PATH, nargs=-1, required=True, metavar="SOURCE..."),
+    click.option(
+        "--matches", type=PATH, help="File of deepdetect match-many, with a file of features."
+    ),
+    click.option(
+        "--images",
+        type=PATH,
+        metavar="FOLDER",
+        help="Folder of the photographs: completes names of npz files; descriptors, where the "
+        "files have none, and EXIF come from it.",
+    ),
+    click.option(
+        "--pairs", type=PATH, help="Text file of the pairs to be matched, of a folder as SOURCE."
+    ),
+    click.option(
+        "--sequential",
+        type=click.IntRange(min=1),
+        help="Match each photograph of the folder with that many next ones by name.",
+    ),
+    click.option(
+        "--max-keypoints",
+        type=click.IntRange(min=1),
+        help="Of each photograph of the folder.  [default: 2048]",
+    ),
+    processes_option,
+    max_megapixels_option,
+    overwrite_option,
+    json_option,
+)
+
+_CAMERAS: tuple[Callable[[Command], Command], ...] = (
+    click.option(
+        "--calibration",
+        type=PATH,
+        metavar="FILE",
+        help="JSON file of the camera (docs/reconstruction.md), taken to be exact.",
+    ),
+    click.option(
+        "--focal",
+        "focal_px",
+        type=float,
+        help="Focal length in pixels, roughly.  [default: of EXIF, or a guess]",
+    ),
+    click.option(
+        "--single-camera/--camera-each",
+        default=None,
+        help="Whether photographs of one size share a camera.  [default: where the focal lengths "
+        "are equal]",
+    ),
+)
+
+CAMERA_FLAGS = {
+    "calibration": "--calibration",
+    "focal_px": "--focal",
+    "single_camera": "--single-camera",
+}
+
+
+def _with(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Add options to a command, in this order."""
+
+    def decorate(function: Command) -> Command:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return decorate
+
+
+def _folder_output(default: str) -> Callable[[Command], Command]:
+    return click.option(
+        "-o",
+        "--output",
+        type=PATH,
+        default=Path(default),
+        show_default=True,
+        help="Folder for the files.",
+    )
+
+
+@click.command("colmap", short_help="Keypoints and matches as a database of COLMAP.")
+@_with(*_COMMON, *_CAMERAS)
+@click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    default=Path("database.db"),
+    show_default=True,
+    help="Database (.db), or a folder for text files.",
+)
+@click.option(
+    "--verify/--no-verify",
+    default=True,
+    show_default=True,
+    help="Estimate two-view geometries, which COLMAP's mapper needs.",
+)
+def export_colmap(sources: tuple[Path, ...], output: Path, verify: bool, **values: Any) -> None:
+    """Write keypoints, descriptors and matches as a database of COLMAP 4.
+
+    SOURCE is features.h5 of deepdetect extract (with --matches matches.h5), or npz files of
+    deepdetect detect and match, or a folder of photographs, which are matched first. With a folder
+    as -o, the text files of colmap feature_importer and matches_importer are written.
+
+    \b
+    deepdetect export colmap photos/ -o database.db
+    deepdetect export colmap features.h5 --matches matches.h5 --images photos/ -o database.db
+    deepdetect export colmap out/*.npz --images photos/ -o database.db
+    colmap mapper --database_path database.db --image_path photos/ --output_path sparse/
+    """
+    if output.suffix.lower() != ".db":
+        if output.suffix:
+            raise OptionError(f"{output} must end in .db, or be the name of a folder")
+        for name, flag in CAMERA_FLAGS.items():
+            if values.pop(name) is not None:
+                raise OptionError(f"text files hold no cameras: leave out {flag}, or write a .db")
+        _export("colmap-text", sources, output, True, values)
+        return
+    _export("colmap", sources, output, None, values, verify=verify)
+
+
+@click.command("hloc", short_help="Keypoints and matches as files of hloc.")
+@_with(*_COMMON)
+@_folder_output("hloc-files")
+@click.option(
+    "--descriptors/--no-descriptors",
+    default=True,
+    show_default=True,
+    help="Describe keypoints that have no descriptors (needs --images).",
+)
+def export_hloc(sources: tuple[Path, ...], output: Path, descriptors: bool, **values: Any) -> None:
+    """Write features.h5, matches.h5 and pairs.txt, the arguments of hloc.reconstruction.main.
+
+    SOURCE as of deepdetect export colmap. Numbers are float32 and int32.
+
+    \b
+    deepdetect export hloc photos/ -o hloc/
+    deepdetect export hloc out/*.npz --images photos/ -o hloc/
+    """
+    _export("hloc", sources, output, descriptors, values)
+
+
+@click.command("opencv", short_help="Keypoints and matches for cv::FileStorage.")
+@_with(*_COMMON)
+@_folder_output("opencv-files")
+@click.option(
+    "--format",
+    "file_format",
+    type=click.Choice(["yml", "yml.gz", "xml", "json"]),
+    default="yml",
+    show_default=True,
+    help="Of the files.",
+)
+@click.option(
+    "--descriptors/--no-descriptors",
+    default=True,
+    show_default=True,
+    help="Describe keypoints that have no descriptors (needs --images).",
+)
+def export_opencv(
+    sources: tuple[Path, ...], output: Path, file_format: str, descriptors: bool, **values: Any
+) -> None:
+    """Write files that cv::FileStorage reads into vectors of KeyPoint and DMatch, and a Mat.
+
+    SOURCE as of deepdetect export colmap.
+
+    \b
+    deepdetect export opencv photo.npz -o points/
+    deepdetect export opencv features.h5 --matches matches.h5 -o points/ --format json
+    """
+    _export("opencv", sources, output, descriptors, values, file_format=file_format)
+
+
+@click.command("bundler", short_help="Keypoints and matches as files of Bundler.")
+@_with(*_COMMON, *_CAMERAS)
+@_folder_output("bundler-files")
+def export_bundler(sources: tuple[Path, ...], output: Path, **values: Any) -> None:
+    """Write list.txt, Lowe's .key files and matches.init.txt, for Bundler and VisualSFM.
+
+    SOURCE as of deepdetect export colmap.
+
+    \b
+    deepdetect export bundler photos/ -o bundler/
+    """
+    _export("bundler", sources, output, True, values)
+
+
+def _export(
+    form: str,
+    sources: tuple[Path, ...],
+    output: Path,
+    describe: bool | None,
+    values: dict[str, Any],
+    **settings: Any,
+) -> None:
+    """Read or make a collection, and write it.
+
+    Args:
+        form: name of the format.
+        sources: files, or a folder of photographs.
+        output: file or folder.
+        describe: whether keypoints without descriptors are described; None: points with sizes.
+        values: of the options that several commands share.
+        settings: of the format.
+    """
+    from ..interchange import describe_collection, get_format
+
+    as_json, overwrite = values.pop("as_json"), values.pop("overwrite")
+    camera = {name: values.pop(name) for name in CAMERA_FLAGS if name in values}
+    inputs = [*sources, *(path for path in (values["matches"], values["pairs"]) if path)]
+    one_file = form == "colmap"
+    marker = output if one_file else output / MARKERS[form].format(**settings)
+    if not (one_file or overwrite or marker.exists()) and _has_files(output):
+        raise OptionError(
+            f"{output} is a folder that is not empty: choose another with -o, or write into it "
+            "with --overwrite"
+        )
+    check_inputs_survive([marker], inputs, "choose another name with -o")
+    claim_outputs(f"export-{form}", inputs, [marker], overwrite)
+    collection = _collection(sources, values)
+    if describe:
+        collection = describe_collection(collection, quiet=False)
+    if camera:
+        settings["lenses"] = _lenses(collection, camera)
+    files = get_format(form)(collection, output, **settings)
+    keypoints = sum(len(points) for points in collection.keypoints.values())
+    matches = sum(len(found) for found in collection.matches.values())
+    print_result(
+        as_json,
+        {
+            "format": form,
+            "images": len(collection.keypoints),
+            "keypoints": keypoints,
+            "pairs": len(collection.matches),
+            "matches": matches,
+            "files": files,
+        },
+        [
+            ("images", f"{len(collection.keypoints):,} with {keypoints:,} keypoints"),
+            ("pairs", f"{len(collection.matches):,} with {matches:,} matches"),
+            ("written", str(output) if len(files) == 1 else f"{len(files)} files in {output}"),
+        ],
+    )
+
+
+def _has_files(folder: Path) -> bool:
+    """Return whether a folder is there and holds more than hidden files."""
+    return folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())
+
+
+MARKERS = {
+    "colmap-text": "matches.txt",
+    "hloc": "features.h5",
+    "opencv": "matches.{file_format}",
+    "bundler": "list.txt",
+}
+"""File of a folder by which it is known whose it is."""
+
+
+def _collection(sources: tuple[Path, ...], values: Mapping[str, Any]) -> Collection:
+    """Read saved keypoints and matches, or find and match those of a folder."""
+    from ..interchange import match_photographs, read_collection
+
+    of_folder = {name: values[name] for name in ("pairs", "sequential", "max_keypoints")}
+    if len(sources) == 1 and sources[0].is_dir():
+        if values["matches"] is not None or values["images"] is not None:
+            raise OptionError(
+                f"{sources[0]} is a folder of photographs: leave out --matches and --images"
+            )
+        given = {name: value for name, value in of_folder.items() if value is not None}
+        return match_photographs(sources[0], workers=values["workers"], quiet=False, **given)
+    unused = [name for name, value in of_folder.items() if value is not None]
+    if unused:
+        flag = "--" + unused[0].replace("_", "-")
+        raise OptionError(f"{flag} is for a folder of photographs: leave it out")
+    return read_collection(sources, matches=values["matches"], images=values["images"])
+
+
+def _lenses(collection: Collection, camera: Mapping[str, Any]) -> dict[str, Lens]:
+    """Return the cameras of all photographs."""
+    from ..sfm.intrinsics import known_cameras, photograph_lenses
+
+    sizes = {name: points.image_size for name, points in collection.keypoints.items()}
+    calibration, focal_px = camera["calibration"], camera["focal_px"]
+    if calibration is not None and focal_px is not None:
+        raise OptionError("give --calibration or --focal, not both")
+    found = known_cameras(calibration, sizes)
+    if found.refused:
+        name, reason = next(iter(found.refused.items()))
+        raise OptionError(f"{name}: {reason}")
+    folder = collection.folder or Path("no-such-folder")
+    return photograph_lenses(
+        folder, list(sizes), sizes, found.known, focal_px, camera["single_camera"]
+    )
+
+
+EXPORTS_OF_MATCHES = (export_colmap, export_hloc, export_opencv, export_bundler)

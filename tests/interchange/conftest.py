@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
+
+from deepdetect import Keypoints
+from deepdetect.interchange import Collection, PairMatches, match_photographs
+
+FOUNTAIN = ("0003", "0004", "0005", "0006")
+
+
+@pytest.fixture
+def small_collection() -> Collection:
+    """Three photographs with a few keypoints, of known values."""
+    rng = np.random.default_rng(0)
+    keypoints = {
+        name: Keypoints(
+            rng.uniform(0, 100, (6, 2)),
+            rng.random(6),
+            (120, 110),
+            sizes=rng.uniform(2, 9, 6),
+            angles=rng.uniform(0, 360, 6),
+            descriptors=rng.integers(0, 200, (6, 128)).astype(np.uint8),
+        )
+        for name in ("a.jpg", "sub/b.jpg", "c.jpg")
+    }
+    matches = {
+        ("a.jpg", "sub/b.jpg"): PairMatches(np.array([[0, 3], [5, 1]]), np.array([0.75, 0.5])),
+        ("c.jpg", "a.jpg"): PairMatches(np.array([[2, 2]]), np.array([0.25])),
+    }
+    return Collection(keypoints, matches)
+
+
+@pytest.fixture(scope="session")
+def fountain(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Small copies of four photographs of a fountain."""
+    from PIL import Image
+
+    folder = tmp_path_factory.mktemp("fountain") / "photos"
+    folder.mkdir()
+    for name in FOUNTAIN:
+        with Image.open(shared / "data" / "fountain" / f"{name}.jpg") as image:
+            size = (448, round(image.height * 448 / image.width))
+            image.resize(size, Image.Resampling.LANCZOS).save(folder / f"{name}.jpg", quality=95)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def fountain_collection(fountain: Path) -> Collection:
+    """Their keypoints and matches, all pairs."""
+    return match_photographs(fountain, max_keypoints=1500, workers=1)
+
+
+@pytest.fixture(scope="session")
+def map_database() -> Callable[[Path, Path, Path], object]:
+    """Map a database by COLMAP, and return the largest model."""
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    from deepdetect.sfm.colmap import quiet_pycolmap
+
+    def run(database: Path, photographs: Path, folder: Path) -> object:
+        folder.mkdir(parents=True)
+        with quiet_pycolmap() as pycolmap:
+            options = pycolmap.IncrementalPipelineOptions()
+            options.random_seed = 0
+            options.min_model_size = 3
+            models = pycolmap.incremental_mapping(database, photographs, folder, options)
+        return max(models.values(), key=lambda model: model.num_reg_images())
+
+    return run

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, ImageError, Keypoints, OptionError
+from deepdetect.features.sift import described_at_own_size
+from deepdetect.interchange import Collection, PairMatches, describe_collection
+from deepdetect.interchange.collection import sift_bytes
+from deepdetect.io.image import luma
+
+
+def test_each_keypoint_is_matched_once() -> None:
+    rng = np.random.default_rng(0)
+    rows, scores = rng.integers(-1, 20, (200, 2)), rng.random(200)
+    found = PairMatches.one_to_one(rows, scores)
+    for side in (0, 1):
+        assert len(np.unique(found.rows[:, side])) == len(found)
+    assert (found.rows >= 0).all()
+    best = np.flatnonzero((rows >= 0).all(1))
+    best = best[scores[best].argmax()]
+    assert rows[best].tolist() in found.rows.tolist()
+
+
+def test_matches_of_other_keypoints_are_refused(one_line) -> None:
+    points = Keypoints([[1, 2]], [1], (8, 8))
+    for rows, name in (([[0, 1]], "b"), ([[0, 0]], "c")):
+        with pytest.raises(OptionError) as caught:
+            Collection({"a": points, "b": points}, {("a", name): PairMatches(np.array(rows), [1])})
+        assert name in one_line(caught.value)
+
+
+def test_descriptors_come_from_the_photographs(photo: np.ndarray, tmp_path: Path) -> None:
+    from PIL import Image
+
+    Image.fromarray(photo).save(tmp_path / "p.png")
+    points = DeepDetect().detect(photo, max_keypoints=50)
+    pixels = Keypoints(np.rint(points.xy), points.scores, points.image_size)
+    found = describe_collection(Collection({"p.png": points}, {}, tmp_path)).keypoints["p.png"]
+    expected = described_at_own_size(luma(photo), points).descriptors
+    np.testing.assert_array_equal(found.descriptors, expected)
+    dense = describe_collection(Collection({"p.png": pixels}, {}, tmp_path)).keypoints["p.png"]
+    assert dense.descriptors.shape == (len(points), 128)
+    other = Keypoints([[1, 1]], [1], (99, 99))
+    with pytest.raises(ImageError, match="99x99"):
+        describe_collection(Collection({"p.png": other}, {}, tmp_path))
+    assert describe_collection(Collection({"q.png": points})).keypoints["q.png"].descriptors is None
+
+
+def test_descriptors_as_bytes() -> None:
+    rng = np.random.default_rng(0)
+    bytes_ = rng.integers(0, 255, (4, 128)).astype(np.uint8)
+    sizes = {"xy": np.zeros((4, 2)), "scores": np.ones(4), "image_size": (9, 9)}
+    assert sift_bytes(Keypoints(**sizes, descriptors=bytes_)) is not None
+    unit = bytes_ / np.linalg.norm(bytes_, axis=1, keepdims=True)
+    found = sift_bytes(Keypoints(**sizes, descriptors=unit))
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 512, atol=3)
+    assert sift_bytes(Keypoints(**sizes, descriptors=-unit)) is None
+    assert sift_bytes(Keypoints(**sizes, descriptors=unit[:, :64])) is None
+    assert sift_bytes(Keypoints(**sizes)) is None

@@ -1,0 +1,114 @@
+"""The files are read by the rules of hloc's source (`utils/io.py`, `triangulation.py`), which is
+not on PyPI; from there they go into a database, and are mapped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import Keypoints, OptionError
+from deepdetect.interchange import Collection, PairMatches
+from deepdetect.interchange.hloc import write_hloc
+
+
+def hloc_keypoints(path: Path, name: str) -> np.ndarray:
+    """As `hloc.utils.io.get_keypoints`."""
+    import h5py
+
+    with h5py.File(str(path), "r", libver="latest") as file:
+        return file[name]["keypoints"].__array__()
+
+
+def hloc_matches(path: Path, name0: str, name1: str) -> tuple[np.ndarray, np.ndarray]:
+    """As `hloc.utils.io.get_matches` with `find_pair`, which looks both ways round."""
+    import h5py
+
+    def group(first: str, second: str) -> str:
+        return "/".join((first.replace("/", "-"), second.replace("/", "-")))
+
+    with h5py.File(str(path), "r", libver="latest") as file:
+        reverse = group(name0, name1) not in file
+        pair = group(name1, name0) if reverse else group(name0, name1)
+        matches = file[pair]["matches0"].__array__()
+        scores = file[pair]["matching_scores0"].__array__()
+    rows = np.where(matches != -1)[0]
+    matches = np.stack([rows, matches[rows]], -1)
+    return (np.flip(matches, -1) if reverse else matches), scores[rows]
+
+
+def test_hloc_reads_what_is_written(small_collection: Collection, tmp_path: Path) -> None:
+    import h5py
+
+    features, matches, pairs = write_hloc(small_collection, tmp_path)
+    for name, points in small_collection.keypoints.items():
+        np.testing.assert_array_equal(hloc_keypoints(features, name), points.xy)
+    with h5py.File(features) as file:
+        group = file["sub/b.jpg"]
+        points = small_collection.keypoints["sub/b.jpg"]
+        assert group["descriptors"].shape == (128, 6)
+        np.testing.assert_allclose(np.linalg.norm(group["descriptors"], axis=0), 1, rtol=1e-6)
+        for kind in ("keypoints", "scores", "descriptors"):
+            assert group[kind].dtype == np.float32
+        assert group["image_size"][()].tolist() == [120, 110]
+        assert group["keypoints"].attrs["uncertainty"] == 1
+        np.testing.assert_allclose(group["scales"], points.sizes / 2)
+        np.testing.assert_allclose(group["oris"], points.angles)
+    for (name0, name1), expected in small_collection.matches.items():
+        rows, scores = hloc_matches(matches, name0, name1)
+        np.testing.assert_array_equal(rows, expected.rows)
+        np.testing.assert_allclose(scores, expected.scores)
+        np.testing.assert_array_equal(
+            hloc_matches(matches, name1, name0)[0], expected.rows[:, ::-1]
+        )
+    assert pairs.read_text() == "a.jpg sub/b.jpg\nc.jpg a.jpg\n"
+
+
+def test_more_keypoints_than_int16_holds(tmp_path: Path) -> None:
+    points = Keypoints(
+        np.random.default_rng(0).uniform(0, 4000, (40_000, 2)), np.ones(40_000), (4000, 4000)
+    )
+    many = Collection(
+        {"a": points, "b": points},
+        {("a", "b"): PairMatches(np.array([[39_999, 39_998]]), np.ones(1))},
+    )
+    features, matches, _ = write_hloc(many, tmp_path)
+    assert hloc_matches(matches, "a", "b")[0].tolist() == [[39_999, 39_998]]
+    np.testing.assert_array_equal(hloc_keypoints(features, "a"), points.xy)  # no half precision
+
+
+def test_two_pairs_of_one_group_are_refused(tmp_path: Path) -> None:
+    points = Keypoints([[1, 1]], [1], (8, 8))
+    match = PairMatches(np.array([[0, 0]]), np.ones(1))
+    twice = Collection(
+        dict.fromkeys(("a/b", "a-b", "c"), points), {("a/b", "c"): match, ("a-b", "c"): match}
+    )
+    with pytest.raises(OptionError, match="rename an image"):
+        write_hloc(twice, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_it_is_mapped(fountain, fountain_collection, map_database, tmp_path: Path) -> None:
+    """As `hloc.reconstruction.main`: keypoints with hloc's half pixel, matches, verification."""
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    from deepdetect.sfm.colmap import quiet_pycolmap
+
+    features, matches, pairs = write_hloc(fountain_collection, tmp_path / "hloc")
+    database = tmp_path / "d.db"
+    with quiet_pycolmap() as pycolmap:
+        with pycolmap.Database.open(database):
+            pass
+        pycolmap.import_images(database, fountain, camera_mode=pycolmap.CameraMode.SINGLE)
+        with pycolmap.Database.open(database) as opened:
+            ids = {image.name: image.image_id for image in opened.read_all_images()}
+            for name, number in ids.items():
+                opened.write_keypoints(number, hloc_keypoints(features, name) + np.float32(0.5))
+            for line in pairs.read_text().splitlines():
+                name0, name1 = line.split()
+                rows, _ = hloc_matches(matches, name0, name1)
+                opened.write_matches(ids[name0], ids[name1], rows.astype(np.uint32))
+        pycolmap.verify_matches(database, pairs)
+    model = map_database(database, fountain, tmp_path / "sparse")
+    assert model.num_reg_images() == 4
+    assert model.num_points3D() > 300

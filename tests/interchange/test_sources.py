@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetectError, OptionError, match_images, save_keypoints, save_matches
+from deepdetect.batch import extract_features, match_pairs
+from deepdetect.interchange import match_photographs, read_collection
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Path:
+    """Two views of one scene in a folder."""
+    from PIL import Image
+    from skimage import data
+
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    left, right, _ = data.stereo_motorcycle()
+    for name, image in (("left_1", left), ("right", right)):
+        Image.fromarray(image[100:260, 300:500]).save(folder / f"{name}.png")
+    return folder
+
+
+def test_files_of_extract_and_match_many(pair: Path, tmp_path: Path) -> None:
+    extract_features(pair, tmp_path / "f.h5", workers=1)
+    match_pairs(tmp_path / "f.h5", [("left_1.png", "right.png")], tmp_path / "m.h5", workers=1)
+    found = read_collection([tmp_path / "f.h5"], matches=tmp_path / "m.h5", images=pair)
+    again = match_photographs(pair, workers=1)
+    assert list(found.keypoints) == ["left_1.png", "right.png"]
+    assert found.path("right.png") == pair / "right.png"
+    for name, points in found.keypoints.items():
+        assert points.image_size == (200, 160)
+        for kind in ("xy", "scores", "sizes", "angles", "descriptors"):
+            np.testing.assert_array_equal(
+                getattr(points, kind), getattr(again.keypoints[name], kind)
+            )
+    from deepdetect import DeepDetect
+
+    direct = DeepDetect().detect(pair / "right.png", max_keypoints=2048)
+    np.testing.assert_allclose(found.keypoints["right.png"].xy, direct.xy)
+    np.testing.assert_allclose(found.keypoints["right.png"].sizes, direct.sizes, rtol=1e-6)
+    ((names, matches),) = found.matches.items()
+    assert names == ("left_1.png", "right.png")
+    assert len(matches) > 50
+    np.testing.assert_array_equal(matches.rows, again.matches[names].rows)
+
+
+def test_files_of_detect_and_match(pair: Path, tmp_path: Path) -> None:
+    matches = match_images(pair / "left_1.png", pair / "right.png", mutual=True)
+    save_matches(matches, tmp_path / "left_1_right_matches.npz")
+    save_keypoints(matches.keypoints0, tmp_path / "left_1.npz")
+    files = [tmp_path / "left_1.npz", tmp_path / "left_1_right_matches.npz"]
+    found = read_collection(files, images=pair)
+    assert set(found.keypoints) == {"left_1.png", "right.png"}
+    ((names, rows),) = ((names, each.rows) for names, each in found.matches.items())
+    assert names == ("left_1.png", "right.png")
+    kept = matches.inliers & (matches.indices0 >= 0) & (matches.indices1 >= 0)
+    assert 0.5 * np.count_nonzero(kept) < len(rows) <= np.count_nonzero(kept)
+    expected = set(
+        zip(matches.indices0[kept].tolist(), matches.indices1[kept].tolist(), strict=True)
+    )
+    assert {tuple(row) for row in rows.tolist()} <= expected
+    with pytest.raises(OptionError, match="of which two images"):
+        read_collection(files)
+    (tmp_path / "a_b_matches.npz").write_bytes(files[1].read_bytes())
+    assert set(read_collection([tmp_path / "a_b_matches.npz"]).keypoints) == {"a", "b"}
+    save_keypoints(matches.keypoints0[:5], tmp_path / "left_1.npz")
+    with pytest.raises(DeepDetectError, match="other keypoints"):
+        read_collection(files, images=pair)
+
+
+def test_names_with_folders_and_what_does_not_fit(tmp_path: Path, one_line) -> None:
+    import h5py
+
+    rng = np.random.default_rng(0)
+    with h5py.File(tmp_path / "f.h5", "w") as file:  # as hloc writes it: half precision
+        for name in ("db/1.jpg", "db/2.jpg"):
+            file[f"{name}/keypoints"] = rng.uniform(0, 99, (5, 2)).astype(np.float16)
+            file[f"{name}/descriptors"] = rng.random((256, 5)).astype(np.float16)
+            file[f"{name}/scores"] = rng.random(5).astype(np.float16)
+            file[f"{name}/image_size"] = np.array([120, 100])
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file["db-1.jpg/db-2.jpg/matches0"] = np.array([-1, 3, -1, 0, -1], np.int16)
+        file["db-1.jpg/db-2.jpg/matching_scores0"] = np.array([0, 0.5, 0, 0.75, 0], np.float16)
+    found = read_collection([tmp_path / "f.h5"], matches=tmp_path / "m.h5")
+    ((pair, matches),) = found.matches.items()
+    assert pair == ("db/1.jpg", "db/2.jpg")
+    assert matches.rows.tolist() == [[1, 3], [3, 0]]
+    assert matches.scores.tolist() == [0.5, 0.75]
+    assert found.keypoints["db/1.jpg"].descriptors.shape == (5, 256)
+    assert found.keypoints["db/1.jpg"].sizes is None
+    with h5py.File(tmp_path / "m.h5", "a") as file:
+        file["db-1.jpg/db-9.jpg/matches0"] = np.array([-1, 3, -1, 0, -1], np.int16)
+    for arguments in (
+        {"files": [tmp_path / "f.h5"], "matches": tmp_path / "m.h5"},
+        {"files": [tmp_path / "m.h5"]},
+        {"files": [tmp_path / "f.h5"], "matches": tmp_path / "f.h5"},
+        {"files": [tmp_path / "none.h5"]},
+        {"files": [tmp_path / "f.h5", tmp_path / "a.npz"]},
+        {"files": []},
+    ):
+        with pytest.raises(DeepDetectError) as caught:
+            read_collection(**arguments)
+        one_line(caught.value)
+
+
+def test_pairs_of_a_folder(pair: Path) -> None:
+    one = match_photographs(pair, sequential=1, max_keypoints=100, workers=1)
+    assert list(one.matches) == [("left_1.png", "right.png")]
+    assert max(len(points) for points in one.keypoints.values()) == 100
+    with pytest.raises(OptionError, match="not both"):
+        match_photographs(pair, sequential=1, pairs=[("left_1.png", "right.png")])
+    with pytest.raises(OptionError, match="sequential"):
+        match_photographs(pair, sequential=0)

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetectError, ImageError, OptionError
+from deepdetect._shared.errors import MissingFileError
+from deepdetect.tracking import FrameSource
+from deepdetect.tracking.video import write_video
+
+
+def test_a_folder_gives_its_images_by_name(frame_folder, moving_photo) -> None:
+    with FrameSource(frame_folder, every=2) as source:
+        assert (source.count, source.live, source.fps) == (3, False, 5.0)
+        frames = list(source)
+    assert [frame.number for frame in frames] == [0, 2, 4]
+    np.testing.assert_array_equal(frames[1].rgb, moving_photo(2))
+
+
+def test_a_video_gives_what_was_written(moving_photo, tmp_path: Path) -> None:
+    with write_video(tmp_path / "v.mp4", 12.0) as writer:
+        for k in range(6):
+            writer.write(moving_photo(k))
+    with FrameSource(tmp_path / "v.mp4") as source:
+        assert source.count == 6
+        assert source.fps == pytest.approx(12)
+        frames = list(source)
+    assert len(frames) == 6
+    # Compressed, and red is not blue.
+    for k, frame in enumerate(frames):
+        assert np.abs(frame.rgb.astype(int) - moving_photo(k)).mean() < 6
+    with FrameSource(tmp_path / "v.mp4", every=4, max_frames=5) as source:
+        assert source.count == 2
+        assert [frame.number for frame in source] == [0, 4]
+    with FrameSource(tmp_path / "v.mp4", max_frames=2) as source:
+        assert source.count == len(list(source)) == 2
+
+
+class Camera:
+    """What OpenCV gives for a camera, of three frames."""
+
+    opened = True
+    released = 0
+
+    def __init__(self, number: int) -> None:
+        self.number, self.left = number, 3
+
+    def isOpened(self) -> bool:
+        return self.opened
+
+    def get(self, _: int) -> float:
+        return 0.0
+
+    def grab(self) -> bool:
+        self.left -= 1
+        return self.left >= 0
+
+    def read(self):
+        blue = np.zeros((48, 64, 3), np.uint8)
+        blue[..., 0] = 200
+        return self.grab(), blue
+
+    def release(self) -> None:
+        Camera.released += 1
+
+
+def test_a_camera_by_its_number(monkeypatch) -> None:
+    import cv2
+
+    monkeypatch.setattr(cv2, "VideoCapture", Camera)
+    for given in (1, "1"):
+        Camera.released = 0
+        with FrameSource(given) as source:
+            assert (source.camera, source.live, source.count) == (1, True, None)
+            frames = list(source)
+        assert len(frames) == 3
+        assert frames[0].rgb[0, 0].tolist() == [0, 0, 200]
+        assert Camera.released == 1
+    monkeypatch.setattr(Camera, "opened", False)
+    with pytest.raises(MissingFileError, match="no camera 1"):
+        FrameSource(1)
+
+
+def test_a_folder_named_like_a_camera_is_a_folder(frame_folder, tmp_path, monkeypatch) -> None:
+    frame_folder.rename(tmp_path / "7")
+    monkeypatch.chdir(tmp_path)
+    with FrameSource("7") as source:
+        assert not source.live
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "words"),
+    [
+        ("none.mp4", MissingFileError, "no video, folder or camera"),
+        ("text.mp4", DeepDetectError, "no video"),
+        ("empty", ImageError, "no image"),
+        ("one.png", ImageError, "one image"),
+    ],
+)
+def test_a_mistake_is_one_sentence(
+    name: str, kind: type[Exception], words: str, moving_photo, tmp_path: Path, one_line
+) -> None:
+    from PIL import Image
+
+    (tmp_path / "text.mp4").write_text("I am no video")
+    (tmp_path / "empty").mkdir()
+    Image.fromarray(moving_photo(0)).save(tmp_path / "one.png")
+    with pytest.raises(kind) as caught:
+        FrameSource(tmp_path / name)
+    assert words in one_line(caught.value)
+
+
+@pytest.mark.parametrize("values", [{"every": 0}, {"every": 1.5}, {"max_frames": 0}])
+def test_wrong_options(values, frame_folder) -> None:
+    with pytest.raises(OptionError, match=next(iter(values))):
+        FrameSource(frame_folder, **values)
+    with pytest.raises(OptionError, match="number of a camera"):
+        FrameSource(-1)

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, OptionError
+from deepdetect.tracking import FrameSource, Tracker, TrackingOptions, load_tracks, track
+from deepdetect.tracking.pipeline import track_frames
+
+FEW = TrackingOptions(max_keypoints=100)
+
+
+def test_video_and_table_of_a_folder(frame_folder, tmp_path: Path) -> None:
+    report = track(frame_folder, tmp_path / "out" / "t.mp4", options=FEW)
+    assert report.files == (tmp_path / "out" / "t.mp4", tmp_path / "out" / "t.csv")
+    frames = load_tracks(tmp_path / "out" / "t.csv")
+    assert report.frames == len(frames) == 6
+    assert report.tracks == len({track for frame in frames for track in frame.tracks.tolist()})
+    assert report.tracks_per_frame == pytest.approx(np.mean([len(frame) for frame in frames]))
+    with FrameSource(tmp_path / "out" / "t.mp4") as drawn:
+        shown = list(drawn)
+    assert len(shown) == 6
+    assert shown[0].rgb.shape == (240, 320, 3)
+    assert sorted(os.listdir(tmp_path / "out")) == ["t.csv", "t.mp4"]
+
+
+def test_a_table_alone(frame_folder, tmp_path: Path) -> None:
+    report = track(frame_folder, tmp_path / "t.csv", options=FEW, max_frames=2, every=3)
+    assert report.files == (tmp_path / "t.csv",)
+    assert [frame.number for frame in load_tracks(tmp_path / "t.csv")] == [0, 3]
+
+
+def test_positions_are_of_the_frame_not_of_the_small_one(frame_folder) -> None:
+    """The centre of the first pixel is (0, 0) in both: (x + .5) / s - .5."""
+    from deepdetect import Keypoints
+
+    def corners(rgb: np.ndarray) -> Keypoints:
+        height, width = rgb.shape[:2]
+        return Keypoints([[0, 0], [width - 1, height - 1]], [1, 1], (width, height))
+
+    with FrameSource(frame_folder, max_frames=1) as source:
+        options = TrackingOptions(border_px=0)
+        ((_, found),) = track_frames(source, Tracker(corners, options), max_side=160)
+    np.testing.assert_allclose(found.xy, [[0.5, 0.5], [318.5, 238.5]])
+
+
+def test_an_interrupt_ends_a_camera_properly(moving_photo, tmp_path: Path, monkeypatch) -> None:
+    """Ctrl-C after the third frame: its files are whole, and the usual handler is back."""
+    import cv2
+
+    real = cv2.VideoCapture
+
+    class Camera:
+        def __init__(self, number: int) -> None:
+            self.frames = 0
+
+        def isOpened(self) -> bool:
+            return True
+
+        def get(self, _: int) -> float:
+            return 0.0
+
+        def read(self):
+            self.frames += 1
+            if self.frames == 3:
+                signal.raise_signal(signal.SIGINT)
+            return True, moving_photo(self.frames % 6)[..., ::-1]
+
+        def release(self) -> None:
+            pass
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(cv2, "VideoCapture", Camera)
+    report = track(0, tmp_path / "t.mp4", options=FEW)
+    assert report.frames == 3
+    assert signal.getsignal(signal.SIGINT) is before
+    monkeypatch.setattr(cv2, "VideoCapture", real)
+    assert len(load_tracks(tmp_path / "t.csv")) == 3
+    with FrameSource(tmp_path / "t.mp4") as written:
+        assert len(list(written)) == 3
+
+
+def test_an_interrupt_of_a_video_leaves_nothing(frame_folder, tmp_path: Path) -> None:
+    class Interrupted(DeepDetect):
+        def detect(self, *arguments: object, **options: object):
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        track(frame_folder, tmp_path / "t.mp4", detector=Interrupted(), options=FEW)
+    assert [path.name for path in tmp_path.iterdir()] == ["frames"]
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "word"),
+    [
+        ("t.gif", {}, "must end in"),
+        ("t.mp4", {"tail": 0}, "tail"),
+        ("t.mp4", {"max_side": 8}, "max_side"),
+        ("t.mp4", {"every": 0}, "every"),
+    ],
+)
+def test_wrong_options(name: str, values, word: str, frame_folder, tmp_path: Path) -> None:
+    with pytest.raises(OptionError, match=word):
+        track(frame_folder, tmp_path / name, options=FEW, **values)
+    assert [path.name for path in tmp_path.iterdir()] == ["frames"]

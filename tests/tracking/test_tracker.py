@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetect, Keypoints, OptionError
+from deepdetect.tracking import Tracker, TrackingOptions, point_candidates
+from deepdetect.tracking.tracker import free_keypoints
+
+
+def grid_keypoints(rgb: np.ndarray) -> Keypoints:
+    """Every twelfth pixel of a grid: where they are does not depend on the image."""
+    height, width = rgb.shape[:2]
+    xy = np.stack(np.meshgrid(range(20, width - 20, 12), range(20, height - 20, 12)), -1)
+    xy = xy.reshape(-1, 2)
+    return Keypoints(xy, np.linspace(1, 0.5, len(xy)), (width, height))
+
+
+def test_tracks_move_as_the_photograph_does(moving_photo) -> None:
+    """Known answer: the camera moves by (3, 2) pixels, so every point moves by (-3, -2)."""
+    tracker = Tracker(grid_keypoints, TrackingOptions(detect_every=99, min_kept=0))
+    frames = [tracker.update(moving_photo(k)) for k in range(6)]
+    first, last = frames[0], frames[-1]
+    assert len(last) > 0.8 * len(first)
+    rows = np.searchsorted(first.tracks, last.tracks)
+    errors = np.linalg.norm(last.xy - first.xy[rows] - 5 * np.array([-3, -2]), axis=1)
+    assert np.median(errors) < 0.05
+    assert np.percentile(errors, 95) < 0.3
+    assert (last.ages == 5).all()
+    np.testing.assert_array_equal(last.scores, first.scores[rows])
+
+
+def test_positions_agree_with_another_implementation(moving_photo) -> None:
+    """Template matching of whole patches finds the same places."""
+    import cv2
+
+    from deepdetect.io.image import luma
+
+    tracker = Tracker(grid_keypoints, TrackingOptions(detect_every=99, min_kept=0))
+    first, second = tracker.update(moving_photo(0)), tracker.update(moving_photo(1))
+    images = luma(moving_photo(0)), luma(moving_photo(1))
+    rows = np.searchsorted(first.tracks, second.tracks)
+    for place, found in list(zip(first.xy[rows], second.xy, strict=True))[::25]:
+        x, y = np.rint(place).astype(int)
+        patch = images[0][y - 10 : y + 11, x - 10 : x + 11]
+        scores = cv2.matchTemplate(images[1], patch, cv2.TM_CCOEFF_NORMED)
+        row, column = np.unravel_index(scores.argmax(), scores.shape)
+        np.testing.assert_allclose(found, (column + 10, row + 10), atol=0.6)
+
+
+def test_new_points_only_where_there_are_no_tracks(moving_photo) -> None:
+    options = TrackingOptions(detect_every=1, min_distance_px=10, max_keypoints=300)
+    tracker = Tracker(grid_keypoints, options)
+    tracker.update(moving_photo(0))
+    for k in range(1, 4):
+        frame = tracker.update(moving_photo(k))
+        assert len(frame) <= 300
+        assert len(set(frame.tracks.tolist())) == len(frame)
+        new = frame.xy[frame.ages == 0]
+        old = frame.xy[frame.ages > 0]
+        if len(new):
+            gaps = np.linalg.norm(new[:, None] - old, axis=2).min(axis=1)
+            assert gaps.min() > 10 - 1.5  # of the nearest pixels
+
+
+def test_a_point_that_is_covered_is_lost(moving_photo) -> None:
+    tracker = Tracker(grid_keypoints, TrackingOptions(detect_every=99, min_kept=0))
+    tracker.update(moving_photo(0))
+    covered = moving_photo(1).copy()
+    covered[:, :160] = np.random.default_rng(0).integers(0, 256, (240, 160, 3))
+    found = tracker.update(covered)
+    assert np.count_nonzero(found.xy[:, 0] < 140) < 0.05 * np.count_nonzero(found.xy[:, 0] > 180)
+
+
+def test_points_of_deepdetect(moving_photo) -> None:
+    options = TrackingOptions(max_keypoints=200)
+    tracker = Tracker(point_candidates(DeepDetect(), options), options)
+    first = tracker.update(moving_photo(0))
+    second = tracker.update(moving_photo(1))
+    assert 100 < len(first) <= 200
+    assert np.isin(second.tracks, first.tracks).mean() > 0.8
+
+
+def test_a_black_frame_loses_all_and_is_no_error(moving_photo) -> None:
+    options = TrackingOptions(max_keypoints=100)
+    tracker = Tracker(point_candidates(DeepDetect(), options), options)
+    assert len(tracker.update(moving_photo(0)))
+    assert len(tracker.update(np.zeros((240, 320, 3), np.uint8))) == 0
+    again = tracker.update(moving_photo(1))
+    assert len(again)
+    assert (again.ages == 0).all()
+
+
+def test_frames_of_two_sizes_are_refused(moving_photo, one_line) -> None:
+    tracker = Tracker(grid_keypoints)
+    tracker.update(moving_photo(0))
+    with pytest.raises(OptionError) as caught:
+        tracker.update(moving_photo(0)[:200])
+    assert "320x200" in one_line(caught.value)
+
+
+def test_free_keypoints_takes_the_best_first() -> None:
+    points = Keypoints([[5, 5], [7, 5], [30, 5], [50, 5]], [0.1, 0.9, 0.5, 0.7], (60, 10))
+    assert free_keypoints(points, np.empty((0, 2)), 5, 2).tolist() == [1, 3]
+    assert free_keypoints(points, np.array([[51, 6]]), 5, 9).tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"max_keypoints": 0},
+        {"max_keypoints": 1.5},
+        {"window_px": 20},
+        {"window_px": 1},
+        {"min_kept": 1.1},
+        {"max_return_error_px": -1},
+    ],
+)
+def test_wrong_options(values, one_line) -> None:
+    with pytest.raises(OptionError) as caught:
+        TrackingOptions(**values)
+    assert next(iter(values)) in one_line(caught.value)

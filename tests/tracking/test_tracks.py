@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetectError, OptionError
+from deepdetect.tracking import TrackedFrame, load_tracks, save_tracks
+from deepdetect.tracking.tracks import common_rows, write_tracks
+
+
+def frame(number: int, tracks: list[int], ages: list[int]) -> TrackedFrame:
+    xy = np.array([[10 * track + 0.25, number] for track in tracks], np.float32).reshape(-1, 2)
+    return TrackedFrame(
+        number, np.array(tracks), xy, np.full(len(tracks), 0.5, np.float32), np.array(ages)
+    )
+
+
+def test_the_table_is_read_by_other_programs_and_by_us(tmp_path: Path) -> None:
+    frames = [frame(0, [0, 1], [0, 0]), frame(2, [1, 4], [1, 0]), frame(4, [4], [1])]
+    save_tracks(frames, tmp_path / "t.csv")
+    with (tmp_path / "t.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert rows[2] == {"frame": "2", "track": "1", "x": "10.250", "y": "2.000", "score": "0.5"}
+    assert len(rows) == 5
+    for one, other in zip(load_tracks(tmp_path / "t.csv"), frames, strict=True):
+        assert one.number == other.number
+        for name in ("tracks", "xy", "scores", "ages"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_common_rows() -> None:
+    rows0, rows1 = common_rows(frame(0, [2, 5, 9], [0, 0, 0]), frame(1, [1, 5, 9], [0, 1, 1]))
+    assert (rows0.tolist(), rows1.tolist()) == ([1, 2], [1, 2])
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "x,y\n1,2\n", "frame,track,x,y,score\n1,2,3\n", "frame,track,x,y,score\n0,1,nan,2,3\n"],
+)
+def test_another_file_is_one_sentence(text: str, tmp_path: Path, one_line) -> None:
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(DeepDetectError) as caught:
+        load_tracks(tmp_path / "t.csv")
+    assert "t.csv" in one_line(caught.value)
+
+
+def test_a_table_is_whole_or_not_there(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), write_tracks(tmp_path / "t.csv") as writer:
+        writer.write(frame(0, [0], [0]))
+        raise RuntimeError
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(OptionError), write_tracks(tmp_path / "t.txt"):
+        pass
+
+
+def test_shapes_are_checked() -> None:
+    with pytest.raises(OptionError):
+        TrackedFrame(0, np.arange(2), np.zeros((3, 2)), np.zeros(2), np.zeros(2))

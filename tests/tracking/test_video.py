@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetectError, OptionError
+from deepdetect.tracking import TrackedFrame
+from deepdetect.tracking.video import TrackDrawer, track_color, write_video
+
+
+def test_there_is_no_file_unless_it_is_whole(moving_photo, tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), write_video(tmp_path / "v.mp4", 10) as writer:
+        writer.write(moving_photo(0))
+        raise RuntimeError
+    with pytest.raises(DeepDetectError, match="no frame"), write_video(tmp_path / "v.mp4", 10):
+        pass
+    with pytest.raises(OptionError, match="must end in"), write_video(tmp_path / "v.gif", 10):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_encoder_is_one_sentence(moving_photo, tmp_path: Path, monkeypatch, one_line) -> None:
+    import cv2
+
+    class Closed:
+        def __init__(self, *arguments: object) -> None:
+            pass
+
+        def isOpened(self) -> bool:
+            return False
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(cv2, "VideoWriter", Closed)
+    with pytest.raises(DeepDetectError) as caught, write_video(tmp_path / "v.mp4", 10) as writer:
+        writer.write(moving_photo(0))
+    assert "no encoder (mp4v)" in one_line(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_frames_of_another_size_are_refused(moving_photo, tmp_path: Path) -> None:
+    with (
+        pytest.raises(DeepDetectError, match="pixels"),
+        write_video(tmp_path / "v.avi", 10) as writer,
+    ):
+        writer.write(moving_photo(0))
+        writer.write(moving_photo(0)[:100])
+
+
+def test_tracks_are_drawn_where_they_are() -> None:
+    black = np.zeros((60, 80, 3), np.uint8)
+    drawer = TrackDrawer(tail=3)
+    drawn = black
+    for k, x in enumerate((20.0, 30.0, 40.0)):
+        frame = TrackedFrame(k, np.array([5]), np.array([[x, 30]]), np.ones(1), np.array([k]))
+        drawn = drawer.draw(black, frame)
+    color = np.array(track_color(5))
+    for x in (20, 30, 40):
+        assert np.abs(drawn[30, x].astype(int) - color).max() < 40
+    assert not drawn[50:].any()
+    assert not black.any()
+    assert drawer.draw(black, frame, "12 frames/s").astype(int).sum() > drawn.astype(int).sum()
+
+
+def test_colors_differ() -> None:
+    colors = np.array([track_color(k) for k in range(8)], float)
+    gaps = np.linalg.norm(colors[:, None] - colors, axis=2) + 999 * np.eye(8)
+    assert gaps.min() > 30
