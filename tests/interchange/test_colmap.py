@@ -69,7 +69,7 @@ def test_the_centre_of_a_pixel_is_where_colmap_finds_it(tmp_path: Path) -> None:
         with pycolmap.Database.open(tmp_path / name) as database:
             rows = database.read_keypoints(database.read_all_images()[0].image_id)
             places.append(rows[np.linalg.norm(rows[:, :2] - (30, 21), axis=1).argmin(), :2])
-    np.testing.assert_allclose(*places, atol=0.15)
+    np.testing.assert_allclose(*places, atol=0.25)
 
 
 def test_it_is_mapped(fountain, fountain_collection, map_database, tmp_path: Path) -> None:

@@ -48,9 +48,13 @@ def test_another_file_is_one_sentence(text: str, tmp_path: Path, one_line) -> No
 
 
 def test_a_table_is_whole_or_not_there(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), write_tracks(tmp_path / "t.csv") as writer:
-        writer.write(frame(0, [0], [0]))
-        raise RuntimeError
+    def stopped() -> None:
+        with write_tracks(tmp_path / "t.csv") as writer:
+            writer.write(frame(0, [0], [0]))
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        stopped()
     assert not list(tmp_path.iterdir())
     with pytest.raises(OptionError), write_tracks(tmp_path / "t.txt"):
         pass

@@ -25,6 +25,9 @@ from .tracker import Detect, Tracker, TrackingOptions
 from .tracks import TrackedFrame, write_tracks
 from .video import TrackDrawer, check_video_name, write_video
 
+MIN_SIDE_PX = 32
+"""Smallest longer side that frames are scaled down to."""
+
 RATE_FRAMES = 10
 """Frames of which the number per second is shown."""
 
@@ -84,8 +87,7 @@ def track_frames(
         OptionError: `max_side` is too small, or frames differ in size.
         ImageError: a frame cannot be read.
     """
-    if max_side is not None and max_side < 32:
-        raise OptionError(f"`max_side` must be at least 32 pixels, not {max_side}")
+    _check_side(max_side)
     for frame in source:
         height, width = frame.rgb.shape[:2]
         if max_side is None or max(height, width) <= max_side:
@@ -139,6 +141,7 @@ def track(
         >>> track("drive.mp4", "tracks.mp4")  # doctest: +SKIP
     """
     video, table = output_files(output)
+    _check_side(max_side)
     if tail < 1:
         raise OptionError(f"`tail` must be at least 1, not {tail}")
     lengths = np.zeros(0, np.int64)
@@ -180,6 +183,11 @@ def track(
         seconds,
         tuple(path for path in (video, table) if path is not None),
     )
+
+
+def _check_side(max_side: int | None) -> None:
+    if max_side is not None and not max_side >= MIN_SIDE_PX:
+        raise OptionError(f"`max_side` must be at least {MIN_SIDE_PX} pixels, not {max_side}")
 
 
 def output_files(output: str | Path) -> tuple[Path | None, Path]:

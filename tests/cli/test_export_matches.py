@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
+
+from deepdetect.sfm.colmap import import_pycolmap
+from tests.cli.conftest import one_sentence
+
+
+@pytest.fixture
+def saved(run, photos: Path, tmp_path: Path) -> Path:
+    """Files of `extract`, `match-many`, `detect` and `match`, in the folder of the test."""
+    (tmp_path / "pairs.txt").write_text("left.png right.png\n")
+    for words in (
+        ("extract", photos, "-o", "f.h5", "--workers", 1),
+        ("match-many", "f.h5", "--pairs", "pairs.txt", "-o", "m.h5", "--workers", 1),
+        ("match", photos / "left.png", photos / "right.png", "-o", "out", "--no-pictures"),
+        ("detect", photos / "cat.jpg", "-o", "out", "--no-pictures", "--max-keypoints", 99),
+    ):
+        result = run(*words)
+        assert result.exit_code == 0, result.output
+    return tmp_path
+
+
+def summary(result) -> dict[str, object]:
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.mark.parametrize(
+    ("form", "files"),
+    [
+        ("colmap", {"made"}),
+        ("hloc", {"features.h5", "matches.h5", "pairs.txt"}),
+        ("opencv", {"cat.jpg.yml", "left.png.yml", "right.png.yml", "matches.yml"}),
+        ("bundler", {"cat.key", "left.key", "right.key", "list.txt", "matches.init.txt"}),
+    ],
+)
+def test_saved_files_in_all_formats(
+    run, saved: Path, photos: Path, form: str, files: set[str]
+) -> None:
+    if form == "colmap":
+        pytest.importorskip("pycolmap", reason="needs pycolmap")
+        files = {"made.db"}
+    output = "made.db" if form == "colmap" else "made"
+    many = summary(
+        run("export", form, "f.h5", "--matches", "m.h5", "--images", photos, "-o", output, "--json")
+    )
+    assert (many["images"], many["pairs"]) == (3, 1)
+    assert {Path(file).name for file in many["files"]} == files
+    npz = ("out/left_right_matches.npz", "out/cat.npz")
+    one = summary(run("export", form, *npz, "--images", photos, "-o", f"npz-{output}", "--json"))
+    assert (one["images"], one["pairs"]) == (3, 1)
+    assert one["matches"] > many["matches"] > 50
+
+
+def test_straight_from_photographs(run, photos: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
+    words = ("export", "colmap", photos, "-o", "d.db", "--max-keypoints", 500, "--workers", 1)
+    made = summary(run(*words, "--focal", 995, "--json"))
+    assert (made["images"], made["pairs"]) == (3, 3)
+    with import_pycolmap().Database.open(tmp_path / "d.db") as database:
+        assert {camera.params[0] for camera in database.read_all_cameras()} == {995}
+        assert database.num_verified_image_pairs() >= 1
+        assert max(len(database.read_keypoints(k)) for k in (1, 2, 3)) <= 500
+    assert run(*words).exit_code == 0  # the same again
+    result = run("export", "colmap", photos, "-o", "e.db", "--no-verify", "--sequential", 1)
+    assert result.exit_code == 0, result.output
+    with import_pycolmap().Database.open(tmp_path / "e.db") as database:
+        assert database.num_verified_image_pairs() == 0
+        assert database.num_matched_image_pairs() == 2
+
+
+def test_text_files_of_colmap(run, saved: Path, photos: Path) -> None:
+    made = summary(run("export", "colmap", "f.h5", "--matches", "m.h5", "-o", "text", "--json"))
+    assert "text/cat.jpg.txt" in made["files"]
+    header = (saved / "text/left.png.txt").read_text().split("\n")[0]
+    assert header.endswith(" 128")
+    result = run("export", "colmap", "f.h5", "-o", "text2", "--focal", 9)
+    assert result.exit_code == 2
+    assert "leave out --focal" in result.output
+
+
+def test_opencv_reads_the_keypoints_of_detect(run, saved: Path) -> None:
+    import cv2
+
+    made = summary(
+        run("export", "opencv", "out/cat.npz", "-o", "points", "--format", "json", "--json")
+    )
+    assert "points/cat.json" in made["files"]
+    storage = cv2.FileStorage(str(saved / "points/cat.json"), cv2.FileStorage_READ)
+    first = storage.getNode("keypoints").at(0)
+    with np.load(saved / "out/cat.npz") as arrays:
+        expected = arrays["keypoints"][0]
+    np.testing.assert_allclose([first.at(0).real(), first.at(1).real()], expected, rtol=1e-6)
+
+
+def test_nothing_is_replaced_silently(run, saved: Path) -> None:
+    (saved / "full").mkdir()
+    (saved / "full" / "cat.jpg.yml").write_text("mine")
+    result = run("export", "opencv", "f.h5", "-o", "full")
+    assert result.exit_code == 2
+    assert "not empty" in result.output
+    assert (saved / "full" / "cat.jpg.yml").read_text() == "mine"
+    assert run("export", "opencv", "f.h5", "-o", "full", "--overwrite").exit_code == 0
+    assert run("export", "opencv", "f.h5", "-o", "full").exit_code == 0  # our own
+    result = run("export", "opencv", "out/cat.npz", "-o", "full")
+    assert result.exit_code == 2
+    assert "made from" in result.output
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("colmap none.h5 -o a.db", "no file none.h5"),
+        ("colmap pairs.txt -o a.db", "no HDF5 file"),
+        ("colmap f.h5 -o a.txt", "must end in .db"),
+        ("colmap f.h5 -o a.db --focal 9 --calibration c.json", "not both"),
+        ("colmap {photos} -o a.db --matches m.h5", "leave out --matches"),
+        ("hloc f.h5 -o a --pairs pairs.txt", "--pairs is for a folder"),
+        ("hloc f.h5 out/cat.npz -o a", "one HDF5 file of features"),
+        ("hloc out/left_right_matches.npz --matches m.h5 -o a", "leave out --matches"),
+        ("bundler out/cat.npz -o a", "no SIFT descriptors"),
+        ("opencv m.h5 -o a", "holds no features"),
+        ("hloc {photos} -o a --pairs none.txt", "no file none.txt"),
+    ],
+)
+def test_a_mistake_is_one_sentence(
+    run, saved: Path, photos: Path, words: str, message: str
+) -> None:
+    result = run("export", *(word.format(photos=photos) for word in words.split()))
+    assert result.exit_code == 2, result.output
+    assert message in result.output
+    assert one_sentence(
+        "\n".join(line for line in result.stderr.splitlines() if line.startswith("deepdetect"))
+    )
+    assert not (saved / "a.db").exists()

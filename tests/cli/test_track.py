@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect.tracking import FrameSource, load_tracks
+from tests.cli.conftest import one_sentence
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    """Four frames of a camera that moves over a photograph."""
+    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    photograph, folder = data.astronaut(), tmp_path / "frames"
+    folder.mkdir()
+    for k in range(4):
+        Image.fromarray(photograph[40:200, 40 + 3 * k : 240 + 3 * k]).save(folder / f"{k}.png")
+    return folder
+
+
+def test_a_folder(run, frames: Path, tmp_path: Path) -> None:
+    result = run("track", frames, "-o", "out.mp4", "--max-keypoints", 80, "--json")
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.stdout)
+    assert summary["frames"] == 4
+    assert summary["files"] == ["out.mp4", "out.csv"]
+    table = load_tracks(tmp_path / "out.csv")
+    assert [frame.number for frame in table] == [0, 1, 2, 3]
+    assert max(len(frame) for frame in table) <= 80
+    with FrameSource(tmp_path / "out.mp4") as video:
+        assert len(list(video)) == 4
+    # The tracks of the video that was just written, of every second frame, as a table alone.
+    result = run("track", "out.mp4", "-o", "again.csv", "--every", 2)
+    assert result.exit_code == 0, result.output
+    assert "frames per second" in result.stdout
+    assert [frame.number for frame in load_tracks(tmp_path / "again.csv")] == [0, 2]
+    assert not (tmp_path / "again.mp4").exists()
+
+
+def test_nothing_is_replaced_silently(run, frames: Path, tmp_path: Path) -> None:
+    (tmp_path / "out.csv").write_text("mine")
+    result = run("track", frames, "-o", "out.mp4")
+    assert result.exit_code == 2
+    assert "out.csv exists" in result.output
+    assert (tmp_path / "out.csv").read_text() == "mine"
+    words = ("track", frames, "-o", "out.mp4", "--max-frames", 2)
+    assert run(*words, "--overwrite").exit_code == 0
+    assert run(*words).exit_code == 0  # our own, of the same frames
+    result = run("track", "out.mp4", "-o", "out.mp4")
+    assert result.exit_code == 2
+    assert "which is an input" in result.output
+
+
+def test_recordings_of_a_camera_are_kept(run, tmp_path: Path, monkeypatch) -> None:
+    import cv2
+
+    class Camera:
+        def __init__(self, number: int) -> None:
+            self.left = 2
+
+        def isOpened(self) -> bool:
+            return True
+
+        def get(self, _: int) -> float:
+            return 0.0
+
+        def read(self):
+            self.left -= 1
+            return self.left >= 0, np.full((64, 96, 3), 90, np.uint8)
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Camera)
+    assert run("track", 0, "-o", "out.mp4").exit_code == 0
+    assert (tmp_path / "out.mp4").stat().st_size
+    result = run("track", 0, "-o", "out.mp4")
+    assert result.exit_code == 2
+    assert "earlier recording" in result.output
+    assert run("track", 0, "-o", "out.mp4", "--overwrite").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("none.mp4", "no video, folder or camera"),
+        ("text.mp4", "is no video"),
+        ("{frames} -o a.gif", "must end in"),
+        ("{frames} --every 0", "--every"),
+        ("{frames} --window-px 4", "--window-px must be odd"),
+        ("{frames} --max-side 3", "--max-side"),
+        ("{frames}/0.png", "one image"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(
+    run, words: str, message: str, frames: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "text.mp4").write_text("I am no video")
+    result = run("track", *(word.format(frames=frames) for word in words.split()))
+    assert result.exit_code == 2
+    assert message in result.output
+    assert one_sentence(result.stderr)
+    assert not list(tmp_path.glob("*.csv"))
+    assert not (tmp_path / "tracks.mp4").exists()
