@@ -173,8 +173,11 @@ def test_the_commands_of_the_table_run(
     if "match-many" in words:
         run(["deepdetect", "extract", "photos", "-o", "features.h5"])
         Path("pairs.txt").write_text("left.png another.png\n")
-    if "export" in words:
+    if "export" in words and "onnx" in words:
         pytest.importorskip("onnx", reason="needs onnx, of the extra onnx")
+    if "colmap" in words:
+        pytest.importorskip("h5py", reason="needs h5py, of the extra sfm")
+        pytest.importorskip("pycolmap", reason="needs pycolmap, of the extra sfm")
     run([places.get(word, word) for word in words])
 
 
