@@ -232,11 +232,14 @@ def _export(
         settings: of the format.
     """
     from ..interchange import describe_collection, get_format
+    from ..sfm.colmap import import_pycolmap
 
     as_json, overwrite = values.pop("as_json"), values.pop("overwrite")
     camera = {name: values.pop(name) for name in CAMERA_FLAGS if name in values}
     inputs = [*sources, *(path for path in (values["matches"], values["pairs"]) if path)]
     one_file = form == "colmap"
+    if one_file:  # what is missing is said before the work
+        import_pycolmap("a database of COLMAP")
     marker = output if one_file else output / MARKERS[form].format(**settings)
     if not (one_file or overwrite or marker.exists()) and _has_files(output):
         raise OptionError(

@@ -15,7 +15,7 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
 from ..features.keypoints import UNSET_ANGLE, Keypoints
-from ..sfm.colmap import PIXEL_CENTRE
+from ..sfm.colmap import PIXEL_CENTRE, import_pycolmap
 from ..sfm.database import DatabaseImage, write_database
 from ..sfm.lens import Lens
 from ..sfm.mapping import MappingOptions, verify_pairs
@@ -54,6 +54,7 @@ def write_colmap(
         MissingExtraError: pycolmap is not installed.
         DeepDetectError: the file cannot be written.
     """
+    import_pycolmap("a database of COLMAP")
     path = Path(output)
     if path.suffix.lower() != ".db":
         raise OptionError(f"{path} must end in .db")

@@ -15,8 +15,11 @@ PIXEL_CENTRE = 0.5
 """COLMAP's position of the centre of the first pixel; ours is 0."""
 
 
-def import_pycolmap() -> Any:
+def import_pycolmap(purpose: str = "a reconstruction from many photographs") -> Any:
     """Import pycolmap, after OpenCV: the other way round some versions of both crash.
+
+    Args:
+        purpose: what it is needed for.
 
     Raises:
         MissingExtraError: it is not installed, or h5py is not.
@@ -27,8 +30,7 @@ def import_pycolmap() -> Any:
         import pycolmap
     except ImportError:
         raise MissingExtraError(
-            "a reconstruction from many photographs needs pycolmap and h5py: "
-            "pip install 'deepdetect[sfm]'"
+            f"{purpose} needs pycolmap and h5py: pip install 'deepdetect[sfm]'"
         ) from None
     return pycolmap
 

@@ -17,6 +17,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from ..geometry.camera import Calibration, Camera
 from ..geometry.relative_pose import estimate_relative_pose
 from ..geometry.triangulation import triangulate
+from ..sfm.colmap import import_pycolmap
 from .bundle_adjustment import Keyframe, adjust_keyframes
 from .tracks import TrackedFrame, common_rows
 from .trajectory import Trajectory
@@ -105,11 +106,12 @@ class VisualOdometry:
             frames are not estimated: their scale would be another.
 
     Raises:
-        MissingExtraError: from `update`: pycolmap is not installed.
+        MissingExtraError: pycolmap is not installed.
     """
 
     @suggest_keywords
     def __init__(self, camera: Camera, options: OdometryOptions = OdometryOptions()) -> None:
+        import_pycolmap("visual odometry")  # which the adjustment would say much later
         self.camera = camera
         self.options = options
         self.lost: int | None = None
