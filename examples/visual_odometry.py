@@ -20,7 +20,7 @@ import numpy as np
 from deepdetect import Camera, DeepDetect, Keypoints, load_image
 from deepdetect.evaluation.metrics.trajectory import TrajectoryErrors, trajectory_errors
 from deepdetect.features.matchers import get_matcher, match_descriptors
-from deepdetect.features.sift import to_root_sift
+from deepdetect.features.sift import described_at_own_size, to_root_sift
 from deepdetect.io.image import find_images, luma
 from deepdetect.tracking import (
     TrackedFrame,
@@ -32,6 +32,9 @@ from deepdetect.tracking import (
     point_candidates,
     save_poses,
 )
+
+RATIO = 0.85
+"""Of Lowe's test, where described keypoints are matched."""
 
 COLORS = {"DeepDetect": "C0", "SIFT": "C1", "ORB": "C2"}
 
@@ -98,12 +101,18 @@ def methods(count: int) -> dict[str, Callable[[], Update]]:
 
         return detect
 
+    candidates = point_candidates(detector, options)
+
+    def ours(rgb: np.ndarray) -> Keypoints:
+        return described_at_own_size(luma(rgb), candidates(rgb))
+
     return {
-        "DeepDetect": lambda: by_flow(point_candidates(detector, options), options),
+        "DeepDetect": lambda: by_flow(candidates, options),
         "SIFT": lambda: by_flow(opencv(sift, False), options),
         "ORB": lambda: by_flow(opencv(orb, False), options),
-        "SIFT, matched": lambda: by_matching(opencv(sift, True), "exact", 0.85),
-        "ORB, matched": lambda: by_matching(opencv(orb, True), "hamming", 0.85),
+        "DeepDetect, matched": lambda: by_matching(ours, "exact", RATIO),
+        "SIFT, matched": lambda: by_matching(opencv(sift, True), "exact", RATIO),
+        "ORB, matched": lambda: by_matching(opencv(orb, True), "hamming", RATIO),
     }
 
 
@@ -169,18 +178,20 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     numbers, shown = {}, {}
     print(f"{len(paths)} frames, {truth.length:.1f} m")
-    print("method          frames  end %  mean %  end °/m  segments %  °/m     CPU s/frame  wall")
+    print(
+        "method               frames  end %  mean %  end °/m  segments %  °/m     CPU s/frame  wall"
+    )
     for name, make in methods(arguments.max_keypoints).items():
         if arguments.methods and name not in arguments.methods:
             continue
         odometry, wall, cpu = run(make(), paths, camera)
         found = odometry.trajectory()
         if len(found) < 2:
-            print(f"{name:15} no path was found")
+            print(f"{name:20} no path was found")
             continue
         errors = measure(found, truth)
         print(
-            f"{name:15} {len(found):6} {errors.end_percent:6.2f} {errors.mean_percent:7.2f} "
+            f"{name:20} {len(found):6} {errors.end_percent:6.2f} {errors.mean_percent:7.2f} "
             f"{errors.end_deg_per_m:8.4f} {errors.segment_percent:11.2f} "
             f"{errors.segment_deg_per_m:7.4f} {cpu:11.3f} {wall:6.3f}",
             flush=True,

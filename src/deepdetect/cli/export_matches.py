@@ -126,8 +126,8 @@ def _folder_output(default: str) -> Callable[[Command], Command]:
 def export_colmap(sources: tuple[Path, ...], output: Path, verify: bool, **values: Any) -> None:
     """Write keypoints, descriptors and matches as a database of COLMAP 4.
 
-    SOURCE is features.h5 of deepdetect extract (with --matches matches.h5), or npz files of
-    deepdetect detect and match, or a folder of photographs, which are matched first. With a folder
+    SOURCE is features.h5 of deepdetect extract (with --matches matches.h5), or npz files of the
+    commands detect and match, or a folder of photographs, which are matched first. With a folder
     as -o, the text files of colmap feature_importer and matches_importer are written.
 
     \b

@@ -125,8 +125,8 @@ def track(
         detector: that finds the points; None: a new one.
         options: how they are followed.
         every: take each frame with a number that this divides.
-        max_frames: that are taken; None: all.
-        max_side: longer sides of frames are scaled down to this for the search, in pixels.
+        max_frames: largest number of frames that are taken. None: all.
+        max_side: longer sides of frames are scaled down to this many pixels for the search.
         tail: number of positions of a track that are drawn.
         quiet: show no progress bar.
 

@@ -34,19 +34,20 @@ class TrackingOptions:
         max_keypoints: tracks at a time.
         candidates: keypoints that are detected for each track that is wanted: the best of them that
             are well apart are taken.
-        detect_every: frames between two searches for new points, at most: fewer where many tracks
+        detect_every: new points are looked for after this many frames, or earlier where many tracks
             are lost.
         min_kept: share of the tracks after the last search; with fewer, new points are looked for
             at once.
-        min_distance_px: between a new point and all tracks.
-        window_px: side of the patch that is followed.
-        pyramid_levels: that are half as large each: a point is found up to about
-            window_px * 2**(pyramid_levels - 1) pixels away.
-        max_iterations: on each level.
-        min_step_px: a smaller one ends the iterations.
-        max_return_error_px: between a point and where it is found when it is followed back.
-        min_eigenvalue: of the patch's gradients, per pixel, grey values from 0 to 255: flat patches
-            cannot be followed.
+        min_distance_px: smallest distance of a new point from all tracks.
+        window_px: side of the patch that is followed, odd.
+        pyramid_levels: number of images, each half as large as the one before, on which a point is
+            looked for: the more, the farther it may move.
+        max_iterations: largest number of steps on each level.
+        min_step_px: a smaller step ends the iterations.
+        max_return_error_px: largest distance of a point from where it is found when it is followed
+            back.
+        min_eigenvalue: smallest eigenvalue of the patch's gradients, as OpenCV's minEigThreshold:
+            flat patches cannot be followed.
         border_px: points nearer to the border of the image are dropped.
 
     Raises:
@@ -99,7 +100,7 @@ class Tracker:
         >>> rgb = cv2.GaussianBlur(rgb, None, 2)
         >>> tracker = Tracker(detect)
         >>> first, second = tracker.update(rgb), tracker.update(np.roll(rgb, 3, axis=1))
-        >>> len(first), (second.xy[0] - first.xy[0]).round(1).tolist()
+        >>> len(first), np.abs(second.xy[0] - first.xy[0]).round(1).tolist()
         (40, [3.0, 0.0])
     """
 
