@@ -53,6 +53,7 @@ def fountain(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def fountain_collection(fountain: Path) -> Collection:
     """Their keypoints and matches, all pairs."""
+    pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
     return match_photographs(fountain, max_keypoints=1500, workers=1)
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
+
 from deepdetect import Keypoints, OptionError
 from deepdetect.interchange import Collection, PairMatches
 from deepdetect.interchange.hloc import write_hloc

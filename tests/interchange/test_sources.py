@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
+
 from deepdetect import DeepDetectError, OptionError, match_images, save_keypoints, save_matches
 from deepdetect.batch import extract_features, match_pairs
 from deepdetect.interchange import match_photographs, read_collection
