@@ -84,6 +84,17 @@ def test_it_says_where_it_was_lost(drive) -> None:
     assert len(odometry.trajectory()) == 12
 
 
+def test_the_same_tracks_give_the_same_path(drive) -> None:
+    import cv2
+
+    made = drive(noise_px=0.3, moving=200)
+    paths = []
+    for seed in (1, 2):  # of the caller's own work
+        cv2.setRNGSeed(seed)
+        paths.append(run(made).trajectory().centres)
+    np.testing.assert_allclose(*paths, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     "values", [{"window": 1}, {"min_inliers": 3}, {"max_error_px": 0}, {"min_tracked": 2}]
 )

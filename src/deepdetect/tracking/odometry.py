@@ -45,7 +45,7 @@ class OdometryOptions:
         max_iterations: of the adjustment.
         max_strikes: a track whose position has not agreed so many times is left out: it may be on
             something that moves.
-        seed: of the random samples.
+        seed: of the random samples for the first two frames; OpenCV's PnP has one of its own.
 
     Raises:
         OptionError: a value is out of its range.
@@ -257,7 +257,6 @@ class VisualOdometry:
             return None
         points = self._points[frame.tracks[rows]]
         xy = np.asarray(frame.xy[rows], np.float64)
-        cv2.setRNGSeed(options.seed)
         done, turn, move, inliers = cv2.solvePnPRansac(
             points,
             xy,
