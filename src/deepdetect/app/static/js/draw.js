@@ -1,0 +1,127 @@
+// Drawing of pictures, keypoints, heat maps and matches on canvases.
+
+const VIRIDIS = [[68, 1, 84], [72, 40, 120], [62, 74, 137], [49, 104, 142], [38, 130, 142],
+                 [31, 158, 137], [53, 183, 121], [109, 205, 89], [180, 222, 44], [253, 231, 37]];
+const MARK = [60, 255, 60];
+const DIMMED = 0.5;
+const MAX_CIRCLES = 5000; // more keypoints than this are drawn as single pixels
+
+export function newCanvas(width, height) {
+  const canvas = document.createElement("canvas");
+  canvas.width = width;
+  canvas.height = height;
+  return canvas;
+}
+
+/** @param {Uint8ClampedArray} rgba */
+export function canvasOf(rgba, width, height) {
+  const canvas = newCanvas(width, height);
+  canvas.getContext("2d").putImageData(new ImageData(rgba, width, height), 0, 0);
+  return canvas;
+}
+
+function resized(canvas, width, height) {
+  if (canvas.width !== width || canvas.height !== height) {
+    canvas.width = width;
+    canvas.height = height;
+  }
+  return canvas.getContext("2d");
+}
+
+/** Colours of the levels 0 to 255. */
+const COLORS = Array.from({ length: 256 }, (_, level) => {
+  const place = level / 255 * (VIRIDIS.length - 1);
+  const low = Math.min(Math.floor(place), VIRIDIS.length - 2);
+  return VIRIDIS[low].map((value, c) => value + (place - low) * (VIRIDIS[low + 1][c] - value));
+});
+
+/** Draws probabilities as colours, from dark blue (0) to yellow (1). */
+export function drawHeatMap(canvas, map) {
+  const context = resized(canvas, map.width, map.height);
+  const image = context.createImageData(map.width, map.height);
+  map.probability.forEach((value, k) => {
+    const color = COLORS[Math.round(255 * value)];
+    for (let c = 0; c < 3; c++) image.data[4 * k + c] = color[c];
+    image.data[4 * k + 3] = 255;
+  });
+  context.putImageData(image, 0, 0);
+}
+
+/**
+ * Draws keypoints over a transparent canvas: circles when they are few, else pixels.
+ *
+ * @param {number} unit pixels of the picture that make one pixel of the screen
+ */
+export function drawKeypoints(canvas, picture, pixels, xy, unit) {
+  const context = resized(canvas, picture.width, picture.height);
+  context.clearRect(0, 0, canvas.width, canvas.height);
+  if (pixels.length > MAX_CIRCLES) {
+    const image = context.createImageData(picture.width, picture.height);
+    const words = new Uint32Array(image.data.buffer);
+    const mark = new Uint32Array(new Uint8Array([...MARK, 150]).buffer)[0];
+    for (let k = 0; k < pixels.length; k++) words[pixels[k]] = mark;
+    context.putImageData(image, 0, 0);
+    return;
+  }
+  context.beginPath();
+  for (let k = 0; k < pixels.length; k++) {
+    const [x, y] = [xy[2 * k] + 0.5, xy[2 * k + 1] + 0.5]; // a canvas counts from the corner
+    context.moveTo(x + 3 * unit, y);
+    context.arc(x, y, 3 * unit, 0, 2 * Math.PI);
+  }
+  context.lineWidth = 1.2 * unit;
+  context.strokeStyle = `rgb(${MARK})`;
+  context.stroke();
+}
+
+/** The picture, dimmed, with its keypoints: what is saved as PNG. */
+export function composeKeypoints(picture, overlay) {
+  const canvas = newCanvas(picture.width, picture.height);
+  const context = canvas.getContext("2d");
+  context.drawImage(picture.canvas, 0, 0);
+  context.fillStyle = `rgba(0, 0, 0, ${1 - DIMMED})`;
+  context.fillRect(0, 0, canvas.width, canvas.height);
+  context.drawImage(overlay, 0, 0);
+  return canvas;
+}
+
+/**
+ * Draws two pictures beside or above each other, and lines between matches.
+ *
+ * @param {boolean[] | Uint8Array} good matches to draw in colours; others are thin and red
+ */
+export function drawMatches(canvas, pictures, points0, points1, good, { stacked, width }) {
+  const gap = 8;
+  const [first, second] = pictures;
+  const scale = stacked ? width / Math.max(first.width, second.width)
+                        : (width - gap) / (first.width + second.width);
+  const corner = stacked ? [0, Math.round(first.height * scale) + gap]
+                         : [Math.round(first.width * scale) + gap, 0];
+  const height = stacked ? corner[1] + Math.round(second.height * scale)
+                         : Math.round(Math.max(first.height, second.height) * scale);
+  const context = resized(canvas, Math.round(width), Math.max(1, height));
+  context.clearRect(0, 0, canvas.width, canvas.height);
+  context.drawImage(first.canvas, 0, 0, first.width * scale, first.height * scale);
+  context.drawImage(second.canvas, ...corner, second.width * scale, second.height * scale);
+  const place = (points, k, [left, top]) => [(points[2 * k] + 0.5) * scale + left,
+                                             (points[2 * k + 1] + 0.5) * scale + top];
+  const draw = (wanted) => {
+    for (let k = 0; k < good.length; k++) {
+      if (Boolean(good[k]) !== wanted) continue;
+      const [from, to] = [place(points0, k, [0, 0]), place(points1, k, corner)];
+      // Neighbours have like colours, so that one that goes elsewhere stands out.
+      const hue = 360 * points0[2 * k] / first.width;
+      context.strokeStyle = wanted ? `hsl(${hue} 95% ${45 + 25 * points0[2 * k + 1] / first.height}%)`
+                                   : "rgba(230, 40, 40, 0.55)";
+      context.beginPath();
+      context.moveTo(...from);
+      context.lineTo(...to);
+      context.stroke();
+    }
+  };
+  context.lineWidth = Math.max(1, canvas.width / 1400);
+  context.globalAlpha = 0.85;
+  draw(false);
+  draw(true);
+  context.globalAlpha = 1;
+}

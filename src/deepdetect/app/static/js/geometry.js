@@ -1,0 +1,214 @@
+// The geometry that most matches agree with: a homography or a fundamental matrix, by RANSAC, and
+// how surely it is not chance (a contrario: Moisan and Stival, 2004).
+
+const MAX_ERROR_PX = 3;
+const ROUNDS = 3000;
+const MAX_LOG10_NFA = -3; // one such geometry among a thousand pairs that have none
+const PREFER_HOMOGRAPHY = 0.8; // of a fundamental matrix's inliers: it says less about each
+
+const MODELS = {
+  homography: { sample: 4, fit: fitHomography, error: transferError },
+  fundamental: { sample: 8, fit: fitFundamental, error: epipolarError },
+};
+
+/**
+ * @typedef {object} Geometry
+ * @property {"homography" | "fundamental" | "none"} model
+ * @property {number[] | null} matrix 3x3, row by row, from the first picture to the second
+ * @property {Uint8Array} inliers 1 where a match agrees with it
+ */
+
+/** @param {Float32Array} points0 @param {Float32Array} points1 @returns {Geometry} */
+export function estimateGeometry(points0, points1, width, height) {
+  const found = Object.keys(MODELS).map((name) => ransac(name, points0, points1));
+  const likely = found.filter(({ model, inliers }) =>
+    log10Nfa(model, inliers, width, height) < MAX_LOG10_NFA);
+  const none = { model: "none", matrix: null, inliers: new Uint8Array(points0.length / 2) };
+  if (!likely.length) return none;
+  const [first, second] = likely;
+  if (!second) return first;
+  return sum(first.inliers) >= PREFER_HOMOGRAPHY * sum(second.inliers) ? first : second;
+}
+
+const sum = (values) => values.reduce((total, value) => total + value, 0);
+
+/** The expected number of geometries that so many of wrong matches would agree with, log10. */
+export function log10Nfa(model, inliers, width, height) {
+  const [total, agreeing, sample] = [inliers.length, sum(inliers), MODELS[model].sample];
+  if (agreeing <= sample) return Infinity;
+  const chance = model === "homography" ? Math.PI * MAX_ERROR_PX ** 2 / (width * height)
+                                        : 2 * MAX_ERROR_PX * Math.hypot(width, height) / (width * height);
+  return Math.log10(2 * (total - sample)) + log10Choose(total, agreeing)
+    + log10Choose(agreeing, sample) + (agreeing - sample) * Math.log10(Math.min(1, chance));
+}
+
+function log10Choose(total, chosen) {
+  let result = 0;
+  for (let k = 1; k <= chosen; k++) result += Math.log10((total - chosen + k) / k);
+  return result;
+}
+
+function ransac(model, points0, points1) {
+  const { sample, fit, error } = MODELS[model];
+  const count = points0.length / 2;
+  const random = generator(1);
+  let best = { model, matrix: null, inliers: new Uint8Array(count) };
+  let most = 0;
+  const judge = (matrix) => {
+    const inliers = new Uint8Array(count);
+    let agreeing = 0;
+    for (let k = 0; matrix && k < count; k++) {
+      if (error(matrix, points0, points1, k) <= MAX_ERROR_PX) agreeing += inliers[k] = 1;
+    }
+    if (agreeing <= most) return false;
+    [most, best] = [agreeing, { model, matrix, inliers }];
+    return true;
+  };
+  let needed = ROUNDS;
+  for (let round = 0; count > sample && round < needed; round++) {
+    const rows = new Set();
+    while (rows.size < sample) rows.add(Math.floor(random() * count));
+    if (!judge(fit(points0, points1, [...rows]))) continue;
+    for (let k = 0; k < 3; k++) { // all that agree fit better than a sample does
+      if (!judge(fit(points0, points1, rowsOf(best.inliers)))) break;
+    }
+    const miss = Math.log(1 - Math.min(0.999999, (most / count) ** sample));
+    needed = Math.min(ROUNDS, Math.ceil(Math.log(1e-4) / miss));
+  }
+  return best;
+}
+
+const rowsOf = (inliers) => [...inliers.keys()].filter((k) => inliers[k]);
+
+/** Random numbers that are the same each time (mulberry32). */
+function generator(seed) {
+  return () => {
+    seed = (seed + 0x6d2b79f5) | 0;
+    let value = Math.imul(seed ^ (seed >>> 15), 1 | seed);
+    value = (value + Math.imul(value ^ (value >>> 7), 61 | value)) ^ value;
+    return ((value ^ (value >>> 14)) >>> 0) / 2 ** 32;
+  };
+}
+
+/** The place of a point under a homography. */
+export function project(matrix, x, y) {
+  const w = matrix[6] * x + matrix[7] * y + matrix[8];
+  return [(matrix[0] * x + matrix[1] * y + matrix[2]) / w,
+          (matrix[3] * x + matrix[4] * y + matrix[5]) / w];
+}
+
+function transferError(matrix, points0, points1, k) {
+  const [x, y] = project(matrix, points0[2 * k], points0[2 * k + 1]);
+  return Math.hypot(x - points1[2 * k], y - points1[2 * k + 1]);
+}
+
+/** The larger distance of the two points from the epipolar line of the other. */
+function epipolarError(f, points0, points1, k) {
+  const [x, y, u, v] = [points0[2 * k], points0[2 * k + 1], points1[2 * k], points1[2 * k + 1]];
+  const line1 = [f[0] * x + f[1] * y + f[2], f[3] * x + f[4] * y + f[5]];
+  const line0 = [f[0] * u + f[3] * v + f[6], f[1] * u + f[4] * v + f[7]];
+  const residual = Math.abs(u * line1[0] + v * line1[1] + f[6] * x + f[7] * y + f[8]);
+  return residual / Math.max(1e-12, Math.min(Math.hypot(...line0), Math.hypot(...line1)));
+}
+
+/** Moves points to mean 0 and mean distance sqrt 2 (Hartley, 1997). */
+function normalisation(points, rows) {
+  let [x, y, distance] = [0, 0, 0];
+  for (const k of rows) [x, y] = [x + points[2 * k] / rows.length, y + points[2 * k + 1] / rows.length];
+  for (const k of rows) distance += Math.hypot(points[2 * k] - x, points[2 * k + 1] - y) / rows.length;
+  const scale = Math.SQRT2 / Math.max(distance, 1e-9);
+  return [scale, 0, -scale * x, 0, scale, -scale * y, 0, 0, 1];
+}
+
+function fitHomography(points0, points1, rows) {
+  const [t0, t1] = [normalisation(points0, rows), normalisation(points1, rows)];
+  const found = nullVector(rows, (k) => {
+    const [x, y] = project(t0, points0[2 * k], points0[2 * k + 1]);
+    const [u, v] = project(t1, points1[2 * k], points1[2 * k + 1]);
+    return [[x, y, 1, 0, 0, 0, -u * x, -u * y, -u], [0, 0, 0, x, y, 1, -v * x, -v * y, -v]];
+  });
+  const matrix = multiply(invert(t1), multiply(found, t0));
+  return Math.abs(matrix[8]) > 1e-12 ? matrix.map((value) => value / matrix[8]) : null;
+}
+
+function fitFundamental(points0, points1, rows) {
+  const [t0, t1] = [normalisation(points0, rows), normalisation(points1, rows)];
+  const found = nullVector(rows, (k) => {
+    const [x, y] = project(t0, points0[2 * k], points0[2 * k + 1]);
+    const [u, v] = project(t1, points1[2 * k], points1[2 * k + 1]);
+    return [[u * x, u * y, u, v * x, v * y, v, x, y, 1]];
+  });
+  // Its rank is two: what it does to its weakest direction is taken away.
+  const gram = multiply(transpose(found), found);
+  const weak = smallestEigenvector(gram, 3);
+  const image = [0, 1, 2].map((r) => found[3 * r] * weak[0] + found[3 * r + 1] * weak[1] + found[3 * r + 2] * weak[2]);
+  const singular = found.map((value, k) => value - image[Math.floor(k / 3)] * weak[k % 3]);
+  const matrix = multiply(transpose(t1), multiply(singular, t0));
+  const length = Math.hypot(...matrix);
+  return length > 0 ? matrix.map((value) => value / length) : null;
+}
+
+function nullVector(rows, equations) {
+  const gram = new Float64Array(81);
+  for (const k of rows) {
+    for (const row of equations(k)) {
+      for (let i = 0; i < 9; i++) for (let j = 0; j < 9; j++) gram[9 * i + j] += row[i] * row[j];
+    }
+  }
+  return smallestEigenvector([...gram], 9);
+}
+
+/** Of a symmetric matrix, by Jacobi's rotations. */
+export function smallestEigenvector(matrix, size) {
+  const a = [...matrix];
+  const vectors = Array.from(a, (_, k) => (k % (size + 1) ? 0 : 1));
+  for (let sweep = 0; sweep < 30; sweep++) {
+    let off = 0;
+    for (let p = 0; p < size; p++) {
+      for (let q = p + 1; q < size; q++) {
+        const value = a[p * size + q];
+        off += value * value;
+        if (Math.abs(value) < 1e-300) continue;
+        const theta = (a[q * size + q] - a[p * size + p]) / (2 * value);
+        const t = Math.sign(theta || 1) / (Math.abs(theta) + Math.sqrt(theta * theta + 1));
+        const c = 1 / Math.sqrt(t * t + 1);
+        const s = t * c;
+        for (let k = 0; k < size; k++) {
+          const [left, right] = [a[k * size + p], a[k * size + q]];
+          a[k * size + p] = c * left - s * right;
+          a[k * size + q] = s * left + c * right;
+        }
+        for (let k = 0; k < size; k++) {
+          const [upper, lower] = [a[p * size + k], a[q * size + k]];
+          a[p * size + k] = c * upper - s * lower;
+          a[q * size + k] = s * upper + c * lower;
+          const [left, right] = [vectors[k * size + p], vectors[k * size + q]];
+          vectors[k * size + p] = c * left - s * right;
+          vectors[k * size + q] = s * left + c * right;
+        }
+      }
+    }
+    if (off < 1e-22) break;
+  }
+  let least = 0;
+  for (let k = 1; k < size; k++) if (a[k * (size + 1)] < a[least * (size + 1)]) least = k;
+  return Array.from({ length: size }, (_, k) => vectors[k * size + least]);
+}
+
+const transpose = (m) => [m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]];
+
+function multiply(a, b) {
+  return Array.from(a, (_, k) => {
+    const [r, c] = [Math.floor(k / 3) * 3, k % 3];
+    return a[r] * b[c] + a[r + 1] * b[3 + c] + a[r + 2] * b[6 + c];
+  });
+}
+
+function invert(m) {
+  const cofactor = (i, j, k, l) => m[i] * m[j] - m[k] * m[l];
+  const adjugate = [cofactor(4, 8, 5, 7), cofactor(2, 7, 1, 8), cofactor(1, 5, 2, 4),
+                    cofactor(5, 6, 3, 8), cofactor(0, 8, 2, 6), cofactor(2, 3, 0, 5),
+                    cofactor(3, 7, 4, 6), cofactor(1, 6, 0, 7), cofactor(0, 4, 1, 3)];
+  const determinant = m[0] * adjugate[0] + m[1] * adjugate[3] + m[2] * adjugate[6];
+  return adjugate.map((value) => value / determinant);
+}

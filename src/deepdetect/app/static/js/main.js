@@ -1,0 +1,268 @@
+// The page: where pictures come from, which view is shown, and what runs the network.
+import { Background } from "./background.js";
+import { canvasOf, newCanvas } from "./draw.js";
+import { activePicture, counted, during, element, page, showError } from "./page.js";
+import * as heatmap from "./views/heatmap.js";
+import * as keypoints from "./views/keypoints.js";
+import * as matches from "./views/matches.js";
+import * as python from "./views/python.js";
+import * as wipe from "./views/wipe.js";
+
+const MAX_PICTURES = 2;
+const VIEWS = {
+  keypoints: { show: keypoints.draw },
+  heatmap: { show: heatmap.draw },
+  matches: { show: async () => { matches.draw(); await matches.match(); matches.draw(); } },
+  wipe: { show: wipe.prepare },
+  python: { show: python.show },
+};
+
+const background = new Background(new URL("picture_worker.js", import.meta.url));
+let opened = null; // a promise of what runs the network
+let current = "keypoints";
+
+/** How often the network was run: sliders must not change it. */
+let runs = 0;
+
+async function start() {
+  const config = await (await fetch("config.json")).json();
+  page.token = takeToken();
+  page.server = config.engine === "python" ? config : null;
+  const alone = page.server === null;
+  document.body.dataset.engine = config.engine;
+  for (const part of document.querySelectorAll(".with-python")) part.hidden = alone;
+  for (const part of document.querySelectorAll(".without-python")) part.hidden = !alone;
+  element("tab-python").hidden = alone;
+  element("power").textContent = alone ? "In this browser" : "With Python on this computer";
+  element("promise").textContent = alone
+    ? "Your pictures stay on this device: the network runs in this browser."
+    : "Your pictures stay on this computer, and are forgotten after each task.";
+  if (!alone && !page.token) {
+    showError("Open the address that deepdetect app has printed: it ends in a key.");
+    return;
+  }
+  if (alone && "serviceWorker" in navigator && config.offline) {
+    navigator.serviceWorker.register("sw.js").catch(() => {}); // without it, only when online
+  }
+  opened = background.call("open", { engine: config.engine, token: page.token,
+                                     processor: await processor(config) });
+  opened.then((words) => {
+    element("engine").textContent = `The network runs on ${words}.`;
+  }, (error) => showError(error.message));
+  await showExamples();
+}
+
+/** Where the network runs in a browser: what the address asks for, where it is possible. */
+async function processor(config) {
+  const wanted = new URLSearchParams(location.search).get("processor");
+  const graphics = config.webgpu && wanted === "webgpu" && navigator.gpu
+    && await navigator.gpu.requestAdapter().catch(() => null);
+  return graphics ? "webgpu" : "wasm";
+}
+
+/** Takes the key of this start from the address, where nobody should see or copy it. */
+function takeToken() {
+  const given = new URLSearchParams(location.hash.slice(1)).get("key");
+  if (given) {
+    sessionStorage.setItem("key", given);
+    history.replaceState(null, "", location.pathname + location.search);
+  }
+  return sessionStorage.getItem("key") ?? "";
+}
+
+async function showExamples() {
+  const examples = await (await fetch("examples/examples.json")).json();
+  element("examples").replaceChildren(...examples.map(({ title, note, files }) => {
+    const item = document.createElement("li");
+    const button = document.createElement("button");
+    button.type = "button";
+    const image = new Image();
+    image.src = `examples/${files[files.length - 1]}`;
+    image.alt = "";
+    const [name, small] = [document.createElement("span"), document.createElement("small")];
+    [name.textContent, small.textContent] = [title, note];
+    button.append(image, name, small);
+    button.onclick = () => guarded(async () => addPictures(await Promise.all(files.map(async (file) => {
+      const response = await fetch(`examples/${file}`);
+      return new File([await response.blob()], file, { type: "image/jpeg" });
+    }))));
+    item.append(button);
+    return item;
+  }));
+}
+
+/** Does something; what goes wrong is said in one sentence. */
+async function guarded(task) {
+  showError("");
+  try {
+    await task();
+  } catch (error) {
+    showError(error.message);
+  }
+}
+
+/** Reads files and runs the network on them. */
+async function addPictures(files) {
+  if (!opened) return;
+  const room = MAX_PICTURES - page.pictures.length;
+  if (files.length > room) {
+    const advice = page.server ? " or use a folder under Python." : ".";
+    throw new Error(room ? `Give at most ${counted(room, "picture")}${advice}`
+                         : "There are two pictures already: remove one, or start over.");
+  }
+  await during("Loading the network…", opened);
+  for (const file of files) {
+    const read = await during("Reading the picture…",
+                              background.call("read", { file, name: file.name }));
+    const canvas = canvasOf(read.rgba, read.width, read.height);
+    const { map, seconds } = await during("Finding keypoints…", background.call("run", read));
+    document.body.dataset.networkRuns = String(++runs);
+    if (page.pictures.length >= MAX_PICTURES) return; // of two that were given at once
+    page.pictures.push({ name: file.name, file, ...read, canvas, map, seconds });
+    page.active = page.pictures.length - 1;
+    showPictures();
+  }
+  page.active = 0;
+  showPictures();
+  if (page.pictures.length === 2 && current === "keypoints") await showView("matches");
+}
+
+function removePicture(picture) {
+  page.pictures = page.pictures.filter((other) => other !== picture);
+  page.active = 0;
+  showPictures();
+}
+
+/** Shows the page for the pictures that are there. */
+function showPictures() {
+  const { pictures } = page;
+  matches.reset();
+  wipe.reset();
+  python.reset();
+  element("start").hidden = pictures.length > 0;
+  element("work").hidden = pictures.length === 0;
+  element("add").hidden = pictures.length >= MAX_PICTURES;
+  for (const button of document.querySelectorAll('.files [data-action="camera"]')) {
+    button.hidden = pictures.length >= MAX_PICTURES || !hasCamera();
+  }
+  for (const group of document.querySelectorAll(".which")) {
+    group.hidden = pictures.length < 2;
+    group.querySelectorAll("input")[page.active].checked = true;
+  }
+  element("files").replaceChildren(...pictures.map(pictureItem));
+  if (pictures.length) guarded(VIEWS[current].show);
+  else element("start").querySelector("[data-action]").focus();
+}
+
+function pictureItem(picture) {
+  const item = document.createElement("li");
+  const small = newCanvas(80, 64);
+  const scale = Math.max(80 / picture.width, 64 / picture.height);
+  small.getContext("2d").drawImage(picture.canvas, 0, 0, picture.width * scale,
+                                   picture.height * scale);
+  small.setAttribute("aria-hidden", "true");
+  const [name, size] = [document.createElement("b"), document.createElement("small")];
+  name.textContent = picture.name;
+  name.title = picture.name;
+  const { width, height } = picture.original;
+  const reduced = width !== picture.width || height !== picture.height;
+  size.textContent = `${width}×${height}${reduced ? `, seen as ${picture.width}×${picture.height}` : ""}`;
+  const remove = document.createElement("button");
+  remove.type = "button";
+  remove.className = "quiet remove";
+  remove.textContent = "Remove";
+  remove.setAttribute("aria-label", `Remove ${picture.name}`);
+  remove.onclick = () => removePicture(picture);
+  item.append(small, name, size, remove);
+  return item;
+}
+
+async function showView(name) {
+  current = name;
+  for (const tab of element("tabs").children) {
+    const chosen = tab.id === `tab-${name}`;
+    tab.setAttribute("aria-selected", String(chosen));
+    tab.tabIndex = chosen ? 0 : -1;
+    element(tab.getAttribute("aria-controls")).hidden = !chosen;
+  }
+  for (const group of document.querySelectorAll(".which")) {
+    group.querySelectorAll("input")[page.active].checked = true;
+  }
+  if (activePicture()) await guarded(VIEWS[name].show);
+}
+
+const hasCamera = () => matchMedia("(pointer: coarse)").matches;
+
+function setUp() {
+  for (const view of [keypoints, heatmap, matches, wipe, python]) view.setUp();
+  for (const form of document.querySelectorAll("form")) {
+    form.addEventListener("submit", (event) => event.preventDefault());
+  }
+  const take = (input) => {
+    input.onchange = () => {
+      const files = [...input.files];
+      input.value = "";
+      if (files.length) guarded(() => addPictures(files));
+    };
+  };
+  take(element("file"));
+  take(element("shot"));
+  for (const button of document.querySelectorAll('[data-action="choose"]')) {
+    button.onclick = () => element("file").click();
+  }
+  for (const button of document.querySelectorAll('[data-action="camera"]')) {
+    button.hidden = !hasCamera();
+    button.onclick = () => element("shot").click();
+  }
+  element("restart").onclick = () => {
+    page.pictures = [];
+    showError("");
+    showView("keypoints");
+    showPictures();
+  };
+  element("error").querySelector("button").onclick = () => showError("");
+  setUpTabs();
+  setUpDropping();
+}
+
+function setUpTabs() {
+  const tabs = element("tabs");
+  tabs.addEventListener("click", (event) => {
+    const tab = event.target.closest("[role=tab]");
+    if (tab) showView(tab.id.replace("tab-", ""));
+  });
+  tabs.addEventListener("keydown", (event) => {
+    const shown = [...tabs.children].filter((tab) => !tab.hidden);
+    const place = shown.findIndex((tab) => tab.id === `tab-${current}`);
+    const moves = { ArrowRight: place + 1, ArrowLeft: place - 1, Home: 0, End: shown.length - 1 };
+    if (!(event.key in moves)) return;
+    event.preventDefault();
+    const next = shown[(moves[event.key] + shown.length) % shown.length];
+    next.focus();
+    next.click();
+  });
+}
+
+function setUpDropping() {
+  addEventListener("dragover", (event) => {
+    event.preventDefault();
+    document.body.classList.add("dragging");
+  });
+  addEventListener("dragleave", (event) => {
+    if (!event.relatedTarget) document.body.classList.remove("dragging");
+  });
+  addEventListener("drop", (event) => {
+    event.preventDefault();
+    document.body.classList.remove("dragging");
+    const files = [...event.dataTransfer.files];
+    if (files.length) guarded(() => addPictures(files));
+  });
+  addEventListener("paste", (event) => {
+    const files = [...(event.clipboardData?.files ?? [])];
+    if (files.length) guarded(() => addPictures(files));
+  });
+}
+
+setUp();
+showView("keypoints");
+start().catch(() => showError("The page could not be loaded completely: load it again."));

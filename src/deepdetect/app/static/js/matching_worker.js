@@ -1,0 +1,51 @@
+// Describes and matches keypoints of two pictures beside the page.
+import { describe } from "./descriptors.js";
+import { mutualMatches } from "./matching.js";
+import { estimateGeometry, project } from "./geometry.js";
+import { luma } from "./pixels.js";
+
+const tasks = {
+  /** @returns mutual nearest neighbours with their ratios, as positions */
+  match({ pictures }) {
+    const described = pictures.map(({ rgba, width, height, xy }) =>
+      describe(luma(rgba), width, height, xy));
+    const { rows0, rows1, ratios } = mutualMatches(described[0], described[1]);
+    const take = (xy, rows) => Float32Array.from({ length: 2 * rows.length },
+                                                 (_, k) => xy[2 * rows[k >> 1] + (k & 1)]);
+    return { points0: take(pictures[0].xy, rows0), points1: take(pictures[1].xy, rows1), ratios };
+  },
+
+  geometry({ points0, points1, width, height }) {
+    return estimateGeometry(points0, points1, width, height);
+  },
+
+  /** Draws the second picture in the frame of the first; transparent where it shows nothing. */
+  warp({ rgba, size, matrix, target }) {
+    const result = new Uint8ClampedArray(4 * target.width * target.height);
+    for (let y = 0, at = 0; y < target.height; y++) {
+      for (let x = 0; x < target.width; x++, at += 4) {
+        const [u, v] = project(matrix, x, y);
+        if (!(u >= 0 && v >= 0 && u <= size.width - 1 && v <= size.height - 1)) continue;
+        const [left, top] = [Math.min(Math.floor(u), size.width - 2),
+                             Math.min(Math.floor(v), size.height - 2)];
+        const [a, b] = [u - left, v - top];
+        const first = 4 * (top * size.width + left);
+        const below = first + 4 * size.width;
+        for (let c = 0; c < 3; c++) {
+          result[at + c] = (1 - b) * ((1 - a) * rgba[first + c] + a * rgba[first + 4 + c])
+            + b * ((1 - a) * rgba[below + c] + a * rgba[below + 4 + c]);
+        }
+        result[at + 3] = 255;
+      }
+    }
+    return result;
+  },
+};
+
+self.onmessage = ({ data: { id, task, values } }) => {
+  try {
+    self.postMessage({ id, result: tasks[task](values) });
+  } catch (error) {
+    self.postMessage({ id, error: `The pictures could not be matched (${error.message}).` });
+  }
+};

@@ -1,0 +1,73 @@
+// What all parts of the page share: its state, its messages, and small helpers.
+
+export const element = (id) => document.getElementById(id);
+
+/**
+ * @typedef {object} Picture
+ * @property {string} name @property {File} file
+ * @property {number} width @property {number} height as the network sees it
+ * @property {{width: number, height: number}} original
+ * @property {Uint8ClampedArray} rgba @property {HTMLCanvasElement} canvas
+ * @property {import("./selection.js").HeatMap} map
+ */
+
+export const page = {
+  /** @type {Picture[]} */
+  pictures: [],
+  /** Which picture is shown where one is. */
+  active: 0,
+  /** What the server says of itself; null where the browser is alone. */
+  server: null,
+  token: "",
+};
+
+/** The picture that is shown. */
+export const activePicture = () => page.pictures[page.active] ?? page.pictures[0];
+
+export function showError(message) {
+  const box = element("error");
+  box.querySelector("p").textContent = message;
+  box.hidden = !message;
+}
+
+/** Says something to those who hear the page. */
+export function announce(text) {
+  element("status").textContent = text;
+}
+
+let busy = 0;
+
+/** Shows what is being done until a promise settles. */
+export async function during(text, promise) {
+  busy++;
+  element("busy").lastElementChild.textContent = text;
+  element("busy").hidden = false;
+  announce(text);
+  try {
+    return await promise;
+  } finally {
+    element("busy").hidden = --busy === 0;
+  }
+}
+
+export const counted = (number, word) =>
+  `${number.toLocaleString("en")} ${word}${number === 1 ? "" : word.endsWith("ch") ? "es" : "s"}`;
+
+/** Positions in the photograph's own pixels, where the network saw it reduced. */
+export function toOriginal(picture, x, y) {
+  const { width, height, original } = picture;
+  return [(x + 0.5) * original.width / width - 0.5, (y + 0.5) * original.height / height - 0.5];
+}
+
+/** Runs a function at most once a frame, with the last state. */
+export function onceAFrame(draw) {
+  let waiting = false;
+  return () => {
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => {
+      waiting = false;
+      draw();
+    });
+  };
+}

@@ -1,0 +1,103 @@
+// Pixels as the network takes them: the sizes, the reduction and the arithmetic of the package.
+import { roundHalfEven } from "./selection.js";
+
+export const MAX_PIXELS = 2_000_000; // larger photographs are reduced to that, as `detect` does
+export const MIN_SIDE = 16;
+const STRIDE = 8;
+
+/** The size at which the network sees a photograph: its own, or about two megapixels. */
+export function networkSize(width, height) {
+  if (width * height <= MAX_PIXELS) return [width, height];
+  const scale = (MAX_PIXELS / (height * width)) ** 0.5;
+  return [width, height].map(
+    (side) => Math.max(STRIDE, roundHalfEven(side * scale / STRIDE) * STRIDE));
+}
+
+/** RGB planes from 0 to 1, one after the other, of RGBA bytes. */
+export function toPlanes(rgba, pixels) {
+  const planes = new Float32Array(3 * pixels);
+  const unit = Math.fround(1 / 255);
+  for (let k = 0; k < pixels; k++) {
+    for (let c = 0; c < 3; c++) planes[c * pixels + k] = rgba[4 * k + c] * unit;
+  }
+  return planes;
+}
+
+/** Whether all pixels have one colour: there is nothing to detect. */
+export function isConstant(rgba) {
+  for (let k = 4; k < rgba.length; k++) {
+    if (k % 4 !== 3 && rgba[k] !== rgba[k % 4]) return false;
+  }
+  return true;
+}
+
+/** 8-bit luma (ITU-R BT.601), with OpenCV's whole numbers. */
+export function luma(rgba) {
+  const gray = new Uint8Array(rgba.length / 4);
+  for (let k = 0; k < gray.length; k++) {
+    gray[k] = (rgba[4 * k] * 9798 + rgba[4 * k + 1] * 19235 + rgba[4 * k + 2] * 3735 + 16384) >> 15;
+  }
+  return gray;
+}
+
+/** Weights of OpenCV's area averaging along one axis: for each target, its sources. */
+function areaWeights(from, to) {
+  const scale = from / to;
+  return Array.from({ length: to }, (_, target) => {
+    const [start, end] = [target * scale, target * scale + scale];
+    const cell = Math.min(scale, from - start);
+    const last = Math.min(Math.floor(end), from - 1);
+    const first = Math.min(Math.ceil(start), last);
+    const weights = [];
+    if (first - start > 1e-3) weights.push([first - 1, Math.fround((first - start) / cell)]);
+    for (let k = first; k < last; k++) weights.push([k, Math.fround(1 / cell)]);
+    if (end - last > 1e-3) {
+      weights.push([last, Math.fround(Math.min(Math.min(end - last, 1), cell) / cell)]);
+    }
+    return weights;
+  });
+}
+
+/**
+ * Reduces a photograph by area averaging, as `cv2.resize` with INTER_AREA does.
+ *
+ * @param {(top: number, rows: number) => Uint8ClampedArray} readRows gives RGBA bytes of rows
+ */
+export function reduceByArea(readRows, width, height, newWidth, newHeight) {
+  const across = areaWeights(width, newWidth);
+  const down = areaWeights(height, newHeight);
+  const result = new Uint8ClampedArray(4 * newWidth * newHeight).fill(255);
+  const sum = new Float32Array(3 * newWidth);
+  const line = new Float32Array(3 * newWidth);
+  const bandRows = Math.max(1, Math.floor(2 ** 20 / width));
+  let [band, bandTop, reduced] = [null, 0, -1];
+  const reduceRow = (row) => {
+    if (row === reduced) return; // a row at a border counts for two targets
+    if (band === null || row < bandTop || row >= bandTop + bandRows) {
+      bandTop = row - row % bandRows;
+      band = readRows(bandTop, Math.min(bandRows, height - bandTop));
+    }
+    const start = 4 * (row - bandTop) * width;
+    line.fill(0);
+    across.forEach((weights, x) => {
+      for (const [source, weight] of weights) {
+        const at = start + 4 * source;
+        for (let c = 0; c < 3; c++) line[3 * x + c] += Math.fround(band[at + c] * weight);
+      }
+    });
+    reduced = row;
+  };
+  down.forEach((weights, y) => {
+    sum.fill(0);
+    for (const [row, weight] of weights) {
+      reduceRow(row);
+      for (let k = 0; k < sum.length; k++) sum[k] += Math.fround(line[k] * weight);
+    }
+    for (let x = 0; x < newWidth; x++) {
+      for (let c = 0; c < 3; c++) {
+        result[4 * (y * newWidth + x) + c] = roundHalfEven(sum[3 * x + c]);
+      }
+    }
+  });
+  return result;
+}

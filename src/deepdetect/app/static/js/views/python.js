@@ -1,0 +1,3 @@
+export function show() {}
+export function reset() {}
+export function setUp() {}

@@ -1,0 +1,83 @@
+// Before and after: the second picture in the frame of the first, up to a line that moves.
+import { canvasOf, newCanvas } from "../draw.js";
+import { savePng, stem } from "../downloads.js";
+import { during, element, page } from "../page.js";
+import { matched, matchingTask } from "./matches.js";
+
+const view = element("view-wipe");
+const layers = view.querySelector(".layers");
+let shown = null; // the pictures that are compared, and the second one as it is drawn
+
+/** Draws the second picture over the first one, registered where one homography fits. */
+export async function prepare() {
+  const [first, second] = page.pictures;
+  view.querySelector(".empty").hidden = Boolean(second);
+  layers.hidden = !second;
+  if (!second) return;
+  const matches = await matched();
+  if (!matches || (shown?.matches === matches)) return draw();
+  const fits = matches.model === "homography";
+  const stretch = [second.width / first.width, 0, 0, 0, second.height / first.height, 0, 0, 0, 1];
+  const target = { width: first.width, height: first.height };
+  const rgba = await during("Aligning…", matchingTask("warp", {
+    rgba: second.rgba, size: { width: second.width, height: second.height },
+    matrix: fits ? matches.matrix : stretch, target,
+  }));
+  show(first, canvasOf(rgba, first.width, first.height), fits
+    ? "The second picture is registered to the first, by the homography of their matches."
+    : "No homography aligns these pictures, so the second one is only stretched to the same size.");
+  shown.matches = matches;
+}
+
+/** Shows a picture and another one in its frame. */
+function show(first, warped, hint) {
+  shown = { first, warped };
+  const [below, above] = view.querySelectorAll("canvas");
+  for (const [canvas, source] of [[below, first.canvas], [above, warped]]) {
+    [canvas.width, canvas.height] = [first.width, first.height];
+    canvas.getContext("2d").drawImage(source, 0, 0);
+  }
+  element("wipe-hint").textContent = hint;
+  draw();
+}
+
+export function draw() {
+  const share = Number(element("wipe").value);
+  view.querySelector('output[for="wipe"]').textContent = `${Math.round(share)} %`;
+  view.querySelector(".overlay").style.clipPath = `inset(0 0 0 ${share}%)`;
+  view.querySelector(".edge").style.left = `${share}%`;
+}
+
+function composed() {
+  const { first, warped } = shown;
+  const canvas = newCanvas(first.width, first.height);
+  const context = canvas.getContext("2d");
+  const edge = Math.round(first.width * element("wipe").value / 100);
+  context.drawImage(first.canvas, 0, 0);
+  context.beginPath();
+  context.rect(edge, 0, first.width - edge, first.height);
+  context.clip();
+  context.drawImage(warped, 0, 0);
+  return canvas;
+}
+
+export function reset() {
+  shown = null;
+}
+
+export function setUp() {
+  element("wipe").oninput = draw;
+  const drag = (event) => {
+    const box = layers.getBoundingClientRect();
+    element("wipe").value = String(100 * (event.clientX - box.left) / box.width);
+    draw();
+  };
+  layers.onpointerdown = (event) => {
+    layers.setPointerCapture(event.pointerId);
+    drag(event);
+  };
+  layers.onpointermove = (event) => layers.hasPointerCapture(event.pointerId) && drag(event);
+  view.querySelector("[data-download]").onclick = () => {
+    if (shown) savePng(`${stem(shown.first.name)}_wipe.png`, composed());
+  };
+}

@@ -1,0 +1,170 @@
+"""The page's own arithmetic, run by node, beside the package's: keypoints, reduction, luma."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import deepdetect
+from deepdetect import select_keypoints
+
+MODULES = Path(deepdetect.__path__[0]) / "app/static/js"
+
+READ = """
+import { readFileSync, writeFileSync } from "node:fs";
+const [given, made] = process.argv.slice(2);
+const { width, height, ...values } = JSON.parse(readFileSync(given + ".json"));
+const bytes = new Uint8Array(readFileSync(given)).buffer; // small files share a buffer
+"""
+
+
+@pytest.fixture
+def run_node(tmp_path: Path) -> Any:
+    """Run a script with an array and values; return the array of float64 that it writes."""
+    if shutil.which("node") is None:
+        pytest.skip("needs node")
+
+    def run(imports: str, script: str, array: np.ndarray, **values: Any) -> np.ndarray:
+        given, made = tmp_path / "given.bin", tmp_path / "made.bin"
+        array.tofile(given)
+        (tmp_path / "given.bin.json").write_text(json.dumps(values), encoding="utf-8")
+        (tmp_path / "script.mjs").write_text(
+            imports.replace("@", MODULES.as_uri()) + READ + script, encoding="utf-8"
+        )
+        words = ["node", str(tmp_path / "script.mjs"), str(given), str(made)]
+        ended = subprocess.run(words, capture_output=True, text=True)
+        assert ended.returncode == 0, ended.stderr
+        return np.fromfile(made, np.float64)
+
+    return run
+
+
+def select_in_node(run_node: Any, logits: np.ndarray, options: dict[str, Any]) -> np.ndarray:
+    """Return (N, 3): x, y and probability of the page's keypoints."""
+    script = """
+const map = prepare(new Float32Array(bytes), width, height);
+const pixels = select(map, values.options);
+const xy = positions(map, pixels, values.options);
+const rows = Array.from(pixels, (pixel, k) => [xy[2 * k], xy[2 * k + 1], map.probability[pixel]]);
+writeFileSync(made, new Uint8Array(Float64Array.from(rows.flat()).buffer));
+"""
+    imports = 'import { prepare, select, positions } from "@/selection.js";\n'
+    chosen = {"threshold": 0.5, "density": None, "maxKeypoints": None, **options}
+    height, width = logits.shape
+    found = run_node(imports, script, logits, width=width, height=height, options=chosen)
+    return found.reshape(-1, 3)
+
+
+OPTIONS = (
+    {},
+    {"threshold": 0.9},
+    {"threshold": 0},
+    {"threshold": 1},
+    {"density": 0.1},
+    {"density": 1},
+    {"density": 1e-6},
+    {"max_keypoints": 500},
+    {"max_keypoints": 500, "threshold": 0.97},
+    {"max_keypoints": 100_000, "density": 0.02},
+    {"max_keypoints": 1},
+)
+
+
+def compare(run_node: Any, logits: np.ndarray, options: dict[str, Any]) -> int:
+    from deepdetect.features.selection import sigmoid
+
+    expected = select_keypoints(sigmoid(logits), logits=logits, **options)
+    names = {"max_keypoints": "maxKeypoints"}
+    named = {names.get(name, name): value for name, value in options.items()}
+    found = select_in_node(run_node, logits, named)
+    np.testing.assert_array_equal(found[:, :2], expected.xy)
+    np.testing.assert_allclose(found[:, 2], expected.scores, atol=2e-7)
+    return len(expected)
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_the_keypoints_of_a_photograph(
+    options: dict[str, Any], run_node: Any, photo: np.ndarray
+) -> None:
+    logits = deepdetect.DeepDetect(backend="onnxruntime").heatmap_and_logits(photo)[1]
+    compare(run_node, logits, options)
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+@pytest.mark.parametrize(("height", "width"), [(16, 16), (37, 50), (200, 33)])
+def test_keypoints_among_many_equal_ranks(
+    height: int, width: int, options: dict[str, Any], run_node: Any
+) -> None:
+    """Plateaus: which of their pixels are taken is decided by the same order."""
+    logits = np.random.default_rng(0).integers(-2, 3, (height, width)).astype(np.float32)
+    compare(run_node, logits, options)
+
+
+def test_an_impossible_pixel_is_never_taken(run_node: Any) -> None:
+    logits = np.full((20, 24), -1000, np.float32)
+    logits[3, 4] = 2
+    assert compare(run_node, logits, {"density": 0.5}) == 1
+    assert compare(run_node, logits, {"max_keypoints": 9}) == 1
+
+
+@pytest.mark.parametrize("size", [(250, 200), (131, 77), (128, 128), (301, 64)], ids=str)
+def test_reduction_is_that_of_opencv(
+    size: tuple[int, int], run_node: Any, photo: np.ndarray
+) -> None:
+    import cv2
+
+    rgba = np.dstack([photo, np.full(photo.shape[:2], 255, np.uint8)])
+    rgba = np.ascontiguousarray(np.tile(rgba, (2, 2, 1))[:401, :503])
+    script = """
+const rgba = new Uint8ClampedArray(bytes);
+const rows = (top, count) => rgba.subarray(4 * top * width, 4 * (top + count) * width);
+const small = reduceByArea(rows, width, height, ...values.size);
+writeFileSync(made, new Uint8Array(Float64Array.from(small).buffer));
+"""
+    imports = 'import { reduceByArea } from "@/pixels.js";\n'
+    found = run_node(imports, script, rgba, width=503, height=401, size=size)
+    found = found.reshape(size[1], size[0], 4)[..., :3]
+    expected = cv2.resize(rgba[..., :3], size, interpolation=cv2.INTER_AREA).astype(float)
+    assert np.abs(found - expected).max() <= 1
+    assert (found == expected).mean() > 0.999
+
+
+@pytest.mark.parametrize("size", [(1601, 1250), (1250, 1600), (2400, 1000), (5000, 500)], ids=str)
+def test_large_photographs_are_reduced_to_the_size_that_the_package_takes(
+    size: tuple[int, int], run_node: Any
+) -> None:
+    from deepdetect.detector.heatmap import compute_maps
+
+    seen = []
+
+    def network(planes: np.ndarray) -> np.ndarray:
+        seen.append(planes.shape[:1:-1])
+        return planes[:, :1]
+
+    rgb = np.zeros((size[1], size[0], 3), np.uint8)
+    rgb[0, 0] = 1
+    compute_maps(rgb, network)
+    imports = 'import { networkSize } from "@/pixels.js";\n'
+    script = "writeFileSync(made, new Uint8Array(Float64Array.from(networkSize(width, height)).buffer));"
+    found = run_node(imports, script, np.zeros(1), width=size[0], height=size[1])
+    # What the page takes as it is, the network pads.
+    assert [-(-side // 8) * 8 for side in found] == list(seen[0])
+
+
+def test_luma(run_node: Any, photo: np.ndarray) -> None:
+    from deepdetect.io.image import luma
+
+    imports = 'import { luma } from "@/pixels.js";\n'
+    script = """
+const gray = luma(new Uint8Array(bytes));
+writeFileSync(made, new Uint8Array(Float64Array.from(gray).buffer));
+"""
+    rgba = np.dstack([photo, np.full(photo.shape[:2], 255, np.uint8)])
+    found = run_node(imports, script, rgba, width=0, height=0)
+    np.testing.assert_array_equal(found.reshape(photo.shape[:2]), luma(photo))

@@ -1,0 +1,40 @@
+// Makes web/dist: the page with ONNX Runtime and the network, for any web server.
+import { createHash } from "node:crypto";
+import { cpSync, mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
+import { dirname, join, relative } from "node:path";
+import { fileURLToPath } from "node:url";
+
+const here = dirname(fileURLToPath(import.meta.url));
+const dist = join(here, "dist");
+const packaged = join(here, "../src/deepdetect");
+const runtime = join(here, "node_modules/onnxruntime-web/dist");
+
+// The second line is for WebGPU only: nobody else loads it.
+const RUNTIME_FILES = ["ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm"];
+const WEBGPU_FILES = ["ort.webgpu.min.mjs", "ort-wasm-simd-threaded.asyncify.mjs",
+                      "ort-wasm-simd-threaded.asyncify.wasm"];
+
+rmSync(dist, { recursive: true, force: true });
+cpSync(join(packaged, "app/static"), dist, { recursive: true });
+mkdirSync(join(dist, "ort"));
+for (const name of [...RUNTIME_FILES, ...WEBGPU_FILES]) cpSync(join(runtime, name), join(dist, "ort", name));
+mkdirSync(join(dist, "model"));
+cpSync(join(packaged, "detector/weights/default.onnx"), join(dist, "model/default.onnx"));
+writeFileSync(join(dist, "config.json"),
+              JSON.stringify({ engine: "browser", offline: true, webgpu: true }) + "\n");
+
+const files = readdirSync(dist, { recursive: true, withFileTypes: true })
+  .filter((entry) => entry.isFile())
+  .map((entry) => relative(dist, join(entry.parentPath, entry.name)).replaceAll("\\", "/"))
+  .sort();
+const kept = files.filter((name) => !WEBGPU_FILES.includes(name.replace("ort/", "")));
+const digest = createHash("sha256");
+for (const name of kept) digest.update(name).update(readFileSync(join(dist, name)));
+const worker = readFileSync(join(here, "sw.js"), "utf-8")
+  .replace('"VERSION"', JSON.stringify(digest.digest("hex").slice(0, 16)))
+  .replace('["FILES"]', JSON.stringify(["./", ...kept]));
+writeFileSync(join(dist, "sw.js"), worker);
+
+const bytes = (names) => names.reduce((sum, name) => sum + readFileSync(join(dist, name)).length, 0);
+console.log(`web/dist: ${(bytes(kept) / 1e6).toFixed(1)} MB, and ${
+  (bytes(files.filter((name) => !kept.includes(name))) / 1e6).toFixed(1)} MB for WebGPU`);

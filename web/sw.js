@@ -1,0 +1,20 @@
+// Keeps the page's own files, so that it works without a network. The build fills in both lists.
+const version = "VERSION";
+const files = ["FILES"];
+
+self.addEventListener("install", (event) => {
+  event.waitUntil(caches.open(version).then((cache) => cache.addAll(files))
+    .then(() => self.skipWaiting()));
+});
+
+self.addEventListener("activate", (event) => {
+  event.waitUntil(caches.keys()
+    .then((names) => Promise.all(names.filter((name) => name !== version).map((name) => caches.delete(name))))
+    .then(() => self.clients.claim()));
+});
+
+self.addEventListener("fetch", (event) => {
+  if (event.request.method !== "GET") return;
+  event.respondWith(caches.match(event.request, { cacheName: version, ignoreSearch: true })
+    .then((kept) => kept ?? fetch(event.request)));
+});
