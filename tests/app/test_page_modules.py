@@ -151,7 +151,9 @@ def test_large_photographs_are_reduced_to_the_size_that_the_package_takes(
     rgb[0, 0] = 1
     compute_maps(rgb, network)
     imports = 'import { networkSize } from "@/pixels.js";\n'
-    script = "writeFileSync(made, new Uint8Array(Float64Array.from(networkSize(width, height)).buffer));"
+    script = (
+        "writeFileSync(made, new Uint8Array(Float64Array.from(networkSize(width, height)).buffer));"
+    )
     found = run_node(imports, script, np.zeros(1), width=size[0], height=size[1])
     # What the page takes as it is, the network pads.
     assert [-(-side // 8) * 8 for side in found] == list(seen[0])

@@ -12,6 +12,7 @@ from .._shared.errors import BatchError, DeepDetectError, NoDepthError, Registra
 from .._shared.kernels import announce_compilation
 from .._shared.progress import say
 from ._generated import with_flags
+from .app import app
 from .average import average
 from .benchmark import benchmark
 from .datasets import datasets
@@ -134,5 +135,6 @@ for command in (
     benchmark,
     demo,
     doctor,
+    app,
 ):
     main.add_command(command)

@@ -4,6 +4,7 @@ const VIRIDIS = [[68, 1, 84], [72, 40, 120], [62, 74, 137], [49, 104, 142], [38,
                  [31, 158, 137], [53, 183, 121], [109, 205, 89], [180, 222, 44], [253, 231, 37]];
 const MARK = [60, 255, 60];
 const DIMMED = 0.5;
+const MAX_LINES = 200; // of matches that are drawn, evenly among all: more cannot be told apart
 const MAX_CIRCLES = 5000; // more keypoints than this are drawn as single pixels
 
 export function newCanvas(width, height) {
@@ -105,8 +106,10 @@ export function drawMatches(canvas, pictures, points0, points1, good, { stacked,
   context.drawImage(second.canvas, ...corner, second.width * scale, second.height * scale);
   const place = (points, k, [left, top]) => [(points[2 * k] + 0.5) * scale + left,
                                              (points[2 * k + 1] + 0.5) * scale + top];
+  const step = Math.max(1, good.length / MAX_LINES);
+  const drawn = Array.from({ length: Math.min(good.length, MAX_LINES) }, (_, k) => Math.floor(k * step));
   const draw = (wanted) => {
-    for (let k = 0; k < good.length; k++) {
+    for (const k of drawn) {
       if (Boolean(good[k]) !== wanted) continue;
       const [from, to] = [place(points0, k, [0, 0]), place(points1, k, corner)];
       // Neighbours have like colours, so that one that goes elsewhere stands out.
@@ -119,9 +122,10 @@ export function drawMatches(canvas, pictures, points0, points1, good, { stacked,
       context.stroke();
     }
   };
-  context.lineWidth = Math.max(1, canvas.width / 1400);
-  context.globalAlpha = 0.85;
+  context.lineWidth = Math.max(1, canvas.width / 1000);
+  context.globalAlpha = 0.9;
   draw(false);
   draw(true);
   context.globalAlpha = 1;
+  return drawn.length;
 }

@@ -41,6 +41,7 @@ async function start() {
     showError("Open the address that deepdetect app has printed: it ends in a key.");
     return;
   }
+  if (!alone) python.offer(() => showView("wipe"));
   if (alone && "serviceWorker" in navigator && config.offline) {
     navigator.serviceWorker.register("sw.js").catch(() => {}); // without it, only when online
   }

@@ -87,13 +87,15 @@ export function draw() {
   if (!pair || !kept) return;
   const width = Math.max(200, view.querySelector(".stage").clientWidth - 22);
   canvas.style.width = `${width}px`;
-  paint(canvas, width * devicePixelRatio, width < NARROW_PX);
+  const drawn = paint(canvas, width * devicePixelRatio, width < NARROW_PX);
   const agreeing = kept.inliers.reduce((sum, value) => sum + value, 0);
   const text = counted(kept.ratios.length, "match");
   element("match-count").textContent = text;
-  element("match-hint").textContent = kept.model === "none"
+  const hint = kept.model === "none"
     ? "No geometry explains them better than chance: most may be wrong."
     : `${agreeing.toLocaleString("en")} agree with ${MODELS[kept.model]}.`;
+  const sample = drawn < rowsShown().length ? ` ${drawn} of them are drawn.` : "";
+  element("match-hint").textContent = hint + sample;
   canvas.setAttribute("aria-label", `${text} between ${kept.first.name} and ${kept.second.name}`);
 }
 
@@ -102,7 +104,7 @@ function paint(canvas, width, stacked) {
   const take = (points) => Float32Array.from({ length: 2 * rows.length },
                                              (_, k) => points[2 * rows[k >> 1] + (k & 1)]);
   const good = rows.map((k) => kept.model === "none" || kept.inliers[k] === 1);
-  drawMatches(canvas, [kept.first, kept.second], take(kept.points0), take(kept.points1), good,
+  return drawMatches(canvas, [kept.first, kept.second], take(kept.points0), take(kept.points1), good,
               { stacked, width });
 }
 

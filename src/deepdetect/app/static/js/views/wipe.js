@@ -14,6 +14,7 @@ export async function prepare() {
   view.querySelector(".empty").hidden = Boolean(second);
   layers.hidden = !second;
   if (!second) return;
+  if (shown?.given === first) return draw(); // what Python has registered
   const matches = await matched();
   if (!matches || (shown?.matches === matches)) return draw();
   const fits = matches.model === "homography";
@@ -27,6 +28,15 @@ export async function prepare() {
     ? "The second picture is registered to the first, by the homography of their matches."
     : "No homography aligns these pictures, so the second one is only stretched to the same size.");
   shown.matches = matches;
+}
+
+/** Shows the second picture as Python has registered it. */
+export function compare(bitmap) {
+  const [first] = page.pictures;
+  const canvas = newCanvas(first.width, first.height);
+  canvas.getContext("2d").drawImage(bitmap, 0, 0, first.width, first.height);
+  show(first, canvas, "The second picture is registered to the first by guided matching, in Python.");
+  shown.given = first;
 }
 
 /** Shows a picture and another one in its frame. */

@@ -1,0 +1,80 @@
+// Tasks that Python does: sending the pictures, asking how far they are, cancelling.
+import { page } from "./page.js";
+
+const ASK_EVERY_MS = 400;
+
+/** "one sentence" of the server as the page shows it: "One sentence." */
+export const sentence = (text) => text.replace(/^./, (c) => c.toUpperCase()).replace(/[^.!?]$/, "$&.");
+
+/** Asks the server; what it refuses is thrown as its sentence. */
+async function ask(path, options = {}) {
+  let response;
+  try {
+    response = await fetch(path, {
+      ...options, headers: { "Authorization": `Bearer ${page.token}` },
+    });
+  } catch {
+    throw new Error("The program on this computer does not answer: start deepdetect app again.");
+  }
+  if (!response.ok) throw new Error(sentence((await response.json()).error));
+  return response;
+}
+
+/** A length, a description in JSON of that length, and the files. */
+function packed(files, options) {
+  const list = files.map((file) => ({ name: file.webkitRelativePath || file.name, size: file.size }));
+  const description = new TextEncoder().encode(JSON.stringify({ files: list, options }));
+  const length = new DataView(new ArrayBuffer(4));
+  length.setUint32(0, description.length);
+  return new Blob([length.buffer, description, ...files]);
+}
+
+/** A task at work. */
+export class Task {
+  /** Sends the files. @param {string} kind @param {File[]} files @param {object} options */
+  static async start(kind, files, options) {
+    const { file_mb: fileMb, task_mb: taskMb, files: most } = page.server.limits;
+    const large = files.find((file) => file.size > fileMb * 1e6);
+    if (large) throw new Error(`${large.name} is over ${fileMb} MB: use a smaller picture.`);
+    if (files.length > most) throw new Error(`Give at most ${most} pictures at once.`);
+    if (files.reduce((sum, file) => sum + file.size, 0) > taskMb * 1e6) {
+      throw new Error(`The pictures are over ${taskMb} MB together: give fewer.`);
+    }
+    const query = new URLSearchParams({ kind });
+    const answer = await ask(`/api/jobs?${query}`, { method: "POST", body: packed(files, options) });
+    return new Task((await answer.json()).job);
+  }
+
+  constructor(name) {
+    this.address = `/api/jobs/${name}`;
+    this.cancelled = false;
+    // Nothing stays where the page is closed.
+    this.leave = () => fetch(this.address, { method: "DELETE", keepalive: true,
+                                             headers: { "Authorization": `Bearer ${page.token}` } });
+    addEventListener("pagehide", this.leave);
+  }
+
+  /** Waits for the result. @param {(stage: string, done: number, total: number) => void} tell */
+  async result(tell) {
+    while (!this.cancelled) {
+      const state = await (await ask(this.address)).json();
+      if (state.state === "failed") throw new Error(sentence(state.error));
+      if (state.state === "done") return state;
+      tell(state.stage, state.done ?? 0, state.total ?? 0);
+      await new Promise((resolve) => setTimeout(resolve, ASK_EVERY_MS));
+    }
+    return null;
+  }
+
+  /** @returns {Promise<Blob>} a file of the result */
+  async file(name) {
+    return (await ask(`${this.address}/files/${name}`)).blob();
+  }
+
+  /** Ends the task, and has its files removed. */
+  async forget() {
+    this.cancelled = true;
+    removeEventListener("pagehide", this.leave);
+    await ask(this.address, { method: "DELETE" }).catch(() => {}); // it may be gone already
+  }
+}

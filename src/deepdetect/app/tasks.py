@@ -1,0 +1,384 @@
+"""What the page can ask Python for: one function and one line of `TASKS` each.
+
+A task reads photographs, tells its progress, writes files into a folder, and returns what the page
+shows beside them.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .._shared.errors import DeepDetectError, OptionError
+
+if TYPE_CHECKING:
+    from ..reconstruction.result import Reconstruction
+
+FOLDER_KEYPOINTS = 2048
+"""Best keypoints of each photograph of a folder."""
+
+MODEL_STAGES = 9
+"""Of a 3D model at most, with its files."""
+
+Report = Callable[[str, int, int], None]
+"""Is told the stage that begins, how many are done, and how many there are (0: not known)."""
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph that the page has sent.
+
+    Attributes:
+        path: of the file.
+        name: that the user knows it by; never used as a path.
+    """
+
+    path: Path
+    name: str
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """What a task returns.
+
+    Attributes:
+        numbers: names and values, as text.
+        shown: name of the file that the page shows, .html, .jpg or .png.
+        files: names of all files that can be downloaded, in their order.
+    """
+
+    numbers: Mapping[str, str]
+    shown: str
+    files: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A line of the table of tasks.
+
+    Attributes:
+        title, note: for the page.
+        run: does it, with the photographs, the options, the folder, and what is told the progress.
+        files: least and largest number of photographs; None for as many as are allowed.
+        modules: packages that it needs.
+        extra: of DeepDetect that brings them.
+        options: names of the numbers that it takes, and what the page calls them.
+        folder: whether it is for whole folders.
+    """
+
+    title: str
+    note: str
+    run: Callable[[Sequence[Photograph], Mapping[str, float], Path, Report], TaskResult]
+    files: tuple[int, int | None]
+    modules: tuple[str, ...] = ()
+    extra: str = ""
+    options: Mapping[str, str] = field(default_factory=dict)
+    folder: bool = False
+
+    @property
+    def missing(self) -> str:
+        """What has to be installed first; empty where nothing has."""
+        absent = [name for name in self.modules if importlib.util.find_spec(name) is None]
+        return f'pip install "deepdetect[{self.extra}]"' if absent else ""
+
+    def check(self, count: int, options: Mapping[str, object]) -> dict[str, float]:
+        """Return the options as numbers.
+
+        Raises:
+            OptionError: the number of photographs or an option does not fit, or a package is
+                missing.
+        """
+        least, most = self.files
+        if count < least or (most is not None and count > most):
+            number = f"{least}" if most == least else f"at least {least}"
+            raise OptionError(f"{self.title} takes {number} photographs, not {count}")
+        if self.missing:
+            raise OptionError(f"{self.title} needs another package: {self.missing}")
+        for name, value in options.items():
+            real = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if name not in self.options or not real or not 0 < float(value) < 1e6:  # type: ignore[arg-type]
+                raise OptionError(f"{self.title} does not take {name!r:.40} as {value!r:.40}")
+        return {name: float(value) for name, value in options.items()}  # type: ignore[arg-type]
+
+
+def run_match(
+    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+) -> TaskResult:
+    """Match two photographs, guided by a geometry."""
+    from ..io.image import load_image
+    from ..io.tables import save_matches
+    from ..matching.pipeline import match_images
+    from ..viz.draw import add_caption, draw_matches, save_picture
+
+    stages = _stages(("keypoints", "guided matching", "geometry", "files"), report)
+    first, second = (load_image(one.path) for one in photographs)
+    matches = match_images(first, second, progress=stages)
+    if matches.lost:
+        raise DeepDetectError(
+            "no geometry between these photographs can be trusted: they must show the same scene"
+        )
+    save_matches(matches, folder / "matches.csv")
+    save_matches(matches, folder / "matches.npz")
+    points = matches.points0, matches.points1
+    picture = draw_matches(first, second, *points, matches.inliers, by_position=True)
+    inliers = int(matches.inliers.sum())
+    caption = f"{len(matches):,} matches, of equal colour where they belong together"
+    save_picture(add_caption(picture, caption), folder / "matches.jpg")
+    numbers = {
+        "Keypoints": f"{len(matches.keypoints0):,} and {len(matches.keypoints1):,}",
+        "Matches": f"{len(matches):,}",
+        f"Agree ({matches.model})": f"{inliers:,}",
+    }
+    return TaskResult(numbers, "matches.jpg", ("matches.csv", "matches.npz", "matches.jpg"))
+
+
+def run_register(
+    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+) -> TaskResult:
+    """Warp the second photograph into the frame of the first."""
+    import numpy as np
+
+    from ..matching.registration import register
+    from ..viz.draw import save_picture
+
+    stages = _stages(("keypoints", "guided matching", "geometry", "files"), report)
+    found = register(photographs[0].path, photographs[1].path, progress=stages)
+    pictures = {
+        "checkerboard.png": found.checkerboard(),
+        "registered.png": found.warped,
+        "difference.png": found.difference(),
+    }
+    for name, picture in pictures.items():
+        save_picture(picture, folder / name)
+    np.savetxt(folder / "homography.txt", found.homography, fmt="%.12e")
+    numbers = {
+        "Matches": f"{found.matches:,}",
+        "Overlap": f"{found.valid.mean():.0%} of the first",
+        "Correlation": f"{found.zncc:.3f} (1 is the same)",
+    }
+    return TaskResult(numbers, "checkerboard.png", (*pictures, "homography.txt"))
+
+
+def run_stitch(
+    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+) -> TaskResult:
+    """Make a panorama."""
+    from ..matching.stitching import STAGES, stitch
+    from ..viz.draw import save_picture
+
+    stages = _stages((*STAGES, "files"), report)
+    panorama = stitch([one.path for one in photographs], progress=stages)
+    save_picture(panorama.image, folder / "panorama.jpg")
+    height, width = panorama.image.shape[:2]
+    used = len(photographs) - len(panorama.left_out)
+    numbers = {
+        "Photographs": f"{used} of {len(photographs)}",
+        "Size": f"{width}×{height}, {panorama.valid.mean():.0%} covered",
+    }
+    left_out = [photographs[number].name for number in panorama.left_out]
+    if left_out:
+        numbers["Left out"] = ", ".join(left_out)
+    return TaskResult(numbers, "panorama.jpg", ("panorama.jpg",))
+
+
+def run_reconstruct(
+    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+) -> TaskResult:
+    """Make a 3D model of two photographs."""
+    from ..detector.detector import DeepDetect
+    from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
+    from ..reconstruction.pipeline import reconstruct
+    from ..viz.draw import draw_depth, save_picture
+
+    done = 0
+
+    def stage(name: str) -> None:
+        nonlocal done
+        done += 1
+        report(f"after {name}", done, MODEL_STAGES)
+
+    report("starting", 0, MODEL_STAGES)
+    left, right = (one.path for one in photographs)
+    found = reconstruct(
+        left, right, DeepDetect("dense"), focal_px=options.get("focal_px"), progress=stage
+    )
+    report("files", MODEL_STAGES - 1, MODEL_STAGES)
+    title = " and ".join(one.name for one in photographs)
+    names = [f"model{ending}" for ending in POINT_CLOUD_WRITERS]
+    for name in names:
+        save_point_cloud(found.cloud, folder / name, {"title": title})
+    save_picture(draw_depth(found.depth_map(), found.unit), folder / "depth.jpg")
+    summary = json.dumps(found.summary(), indent=2, default=str)
+    (folder / "model.json").write_text(summary + "\n", encoding="utf-8")
+    return TaskResult(_model_numbers(found), "model.html", (*names, "depth.jpg", "model.json"))
+
+
+def _model_numbers(found: Reconstruction) -> dict[str, str]:
+    summary = found.summary()
+    return {
+        "Points": f"{len(found):,}",
+        "Matches": f"{found.matches:,}",
+        "Pair": "rectified" if found.rectified else "not rectified",
+        "Focal length": f"{found.calibration.source}",
+        "Scale": str(summary["scale"]),
+    }
+
+
+def run_reconstruct_many(
+    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+) -> TaskResult:
+    """Make cameras and a dense model of many photographs."""
+    from ..sfm.pipeline import reconstruct_many
+
+    report("cameras and points of all photographs", 0, 0)
+    work = folder / "work"
+    found = reconstruct_many([one.path for one in photographs], work)
+    names = ["model.html", "model.ply", "model.glb", "model.json"]
+    for name in names:
+        (work / name).rename(folder / name)
+    numbers = {
+        "Photographs": f"{len(photographs) - len(found.left_out)} of {len(photographs)}",
+        "Left out": f"{len(found.left_out)}",
+    }
+    return TaskResult(numbers, "model.html", names)
+
+
+def run_folder_keypoints(
+    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+) -> TaskResult:
+    """Write the best keypoints of each photograph, as one CSV file each, into one ZIP file."""
+    from ..detector.detector import DeepDetect
+    from ..io.tables import save_keypoints
+    from ..viz.draw import draw_keypoints, save_picture
+    from ..io.image import load_image
+
+    detector, table, failures = DeepDetect(), folder / "table.csv", []
+    count = int(options.get("max_keypoints", FOLDER_KEYPOINTS))
+    shown, total = "", 0
+    with zipfile.ZipFile(folder / "keypoints.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        names = _entry_names(photographs)
+        for number, (one, name) in enumerate(zip(photographs, names, strict=True)):
+            report(one.name, number, len(photographs))
+            try:
+                rgb = load_image(one.path)
+            except DeepDetectError as error:
+                failures.append(str(error).replace(str(one.path), one.name))
+                continue
+            keypoints = detector.detect(rgb, max_keypoints=count)
+            save_keypoints(keypoints, table)
+            archive.write(table, name)
+            total += len(keypoints)
+            if not shown:
+                shown = "keypoints.jpg"
+                save_picture(draw_keypoints(rgb, keypoints), folder / shown)
+        if failures:
+            archive.writestr("failures.txt", "\n".join(failures) + "\n")
+    table.unlink(missing_ok=True)
+    if not shown:
+        raise DeepDetectError(f"no photograph can be read: {failures[0]}")
+    numbers = {
+        "Photographs": f"{len(photographs) - len(failures)} of {len(photographs)}",
+        "Keypoints": f"{total:,}",
+    }
+    return TaskResult(numbers, shown, ("keypoints.zip",))
+
+
+def _entry_names(photographs: Sequence[Photograph]) -> list[str]:
+    """Return a name in the archive for each photograph, all different, none with a folder.
+
+    Example:
+        >>> _entry_names([Photograph(Path("0"), name) for name in ("a/b.jpg", "b.png", "../c")])
+        ['b.csv', 'b_2.csv', 'c.csv']
+    """
+    names: list[str] = []
+    for one in photographs:
+        stem = Path(one.name.replace("\\", "/")).name.rpartition(".")[0] or one.name
+        stem = "".join(c if c.isalnum() or c in "-_ " else "_" for c in Path(stem).name) or "photo"
+        name, number = f"{stem}.csv", 2
+        while name in names:
+            name, number = f"{stem}_{number}.csv", number + 1
+        names.append(name)
+    return names
+
+
+def _stages(names: Sequence[str], report: Report) -> Callable[[str], None]:
+    """Report the first stage; return what is called when a stage ends."""
+    done = 0
+    report(names[0], 0, len(names))
+
+    def ended(_: str) -> None:
+        nonlocal done
+        done = min(done + 1, len(names) - 1)
+        report(names[done], done, len(names))
+
+    return ended
+
+
+TASKS: dict[str, Task] = {
+    "match": Task(
+        "Guided matching",
+        "all matches that agree with one geometry",
+        run_match,
+        (2, 2),
+        ("cv2", "numba"),
+        "standard",
+    ),
+    "register": Task(
+        "Registration",
+        "the second picture in the frame of the first",
+        run_register,
+        (2, 2),
+        ("cv2", "numba"),
+        "standard",
+    ),
+    "stitch": Task(
+        "Panorama",
+        "of pictures that overlap",
+        run_stitch,
+        (2, None),
+        ("cv2", "numba"),
+        "standard",
+    ),
+    "reconstruct": Task(
+        "3D model",
+        "coloured points, and a depth map",
+        run_reconstruct,
+        (2, 2),
+        ("cv2", "numba"),
+        "standard",
+        {"focal_px": "Focal length in pixels, where the pictures do not say it"},
+    ),
+    "folder-keypoints": Task(
+        "Keypoints",
+        "of each picture, as CSV files",
+        run_folder_keypoints,
+        (1, None),
+        ("cv2",),
+        "standard",
+        folder=True,
+    ),
+    "folder-stitch": Task(
+        "Panorama",
+        "of all pictures",
+        run_stitch,
+        (2, None),
+        ("cv2", "numba"),
+        "standard",
+        folder=True,
+    ),
+    "folder-model": Task(
+        "3D model",
+        "of three or more pictures",
+        run_reconstruct_many,
+        (3, None),
+        ("cv2", "numba", "pycolmap", "h5py"),
+        "standard,sfm",
+        folder=True,
+    ),
+}
+"""By the name that the page asks for."""

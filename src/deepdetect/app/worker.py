@@ -1,0 +1,75 @@
+"""The process that does one task: `python -m deepdetect.app.worker FOLDER`.
+
+It reads task.json of the folder, writes its files to `results`, and tells by lines of JSON on
+standard output how far it is. It ends when its standard input does, with all that it has started.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+from .._shared.errors import DeepDetectError
+from .tasks import TASKS, Photograph
+
+
+def main(folder: Path) -> None:
+    """Do the task of a folder."""
+    # What libraries print must not come between the lines of JSON.
+    out = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    threading.Thread(target=_end_with_the_server, daemon=True).start()
+
+    def tell(**values: Any) -> None:
+        out.write(json.dumps(values) + "\n")
+        out.flush()
+
+    task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
+    photographs = [Photograph(folder / one["file"], one["name"]) for one in task["photographs"]]
+    results = folder / "results"
+    results.mkdir()
+    try:
+        from ..io.image_file import limit_megapixels
+
+        with limit_megapixels(task["max_megapixels"]):
+            found = TASKS[task["kind"]].run(
+                photographs,
+                task["options"],
+                results,
+                lambda stage, done, total: tell(stage=stage, done=done, total=total),
+            )
+        tell(
+            result={
+                "numbers": dict(found.numbers),
+                "shown": found.shown,
+                "files": list(found.files),
+            }
+        )
+    except DeepDetectError as error:
+        tell(error=_with_names(str(error), photographs))
+    except MemoryError:
+        tell(error="there is not enough memory for this: use smaller photographs")
+
+
+def _with_names(message: str, photographs: list[Photograph]) -> str:
+    """Name photographs as the user does."""
+    for number, one in enumerate(photographs):
+        message = message.replace(str(one.path), one.name).replace(f"images[{number}]", one.name)
+    return message
+
+
+def _end_with_the_server() -> None:
+    while os.read(0, 4096):
+        pass
+    if hasattr(os, "killpg") and os.getpid() == os.getpgrp():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

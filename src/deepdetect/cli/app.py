@@ -1,0 +1,44 @@
+"""`deepdetect app`: the page in a browser, on this computer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from ._generated import FieldOptions, generated_command, given_only
+
+LIMITS = FieldOptions("app.options:AppOptions")
+
+
+@generated_command(LIMITS, short_help="A page in the browser, on this computer.")
+@click.option("--open", "open_browser", is_flag=True, help="Open the page in the browser.")
+def app(open_browser: bool, **values: Any) -> None:
+    """Serve a page at 127.0.0.1: keypoints, matches, registration, panoramas and 3D models.
+
+    It prints the address to open, which ends in a key that is new at each start. Photographs stay
+    on this computer, and are removed after each task. Ctrl+C ends it.
+
+    \b
+    deepdetect app
+    deepdetect app --port 0 --open
+    """
+    import signal
+    import threading
+    import webbrowser
+
+    from ..app.options import AppOptions
+    from ..app.server import AppServer
+
+    with AppServer(AppOptions(**given_only(values))) as server:
+        click.echo(f"DeepDetect is at {server.address}")
+        click.echo("Ctrl+C ends it.", err=True)
+        if open_browser:
+            webbrowser.open(server.address)
+        if threading.current_thread() is threading.main_thread():
+            # As Ctrl+C, so that tasks are ended and their files removed.
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            click.echo("deepdetect: ended; nothing was kept", err=True)
