@@ -33,6 +33,7 @@ async function start() {
   for (const part of document.querySelectorAll(".with-python")) part.hidden = alone;
   for (const part of document.querySelectorAll(".without-python")) part.hidden = !alone;
   element("tab-python").hidden = alone;
+  element("use-folder").hidden = alone;
   element("power").textContent = alone ? "In this browser" : "With Python on this computer";
   element("promise").textContent = alone
     ? "Your pictures stay on this device: the network runs in this browser."
@@ -132,6 +133,13 @@ function removePicture(picture) {
   page.pictures = page.pictures.filter((other) => other !== picture);
   page.active = 0;
   showPictures();
+  focusStart();
+}
+
+/** Moves to the start when the button that was pressed is gone. */
+function focusStart() {
+  const next = page.pictures.length ? element("add") : element("start").querySelector("button");
+  next.focus();
 }
 
 /** Shows the page for the pictures that are there. */
@@ -151,8 +159,8 @@ function showPictures() {
     group.querySelectorAll("input")[page.active].checked = true;
   }
   element("files").replaceChildren(...pictures.map(pictureItem));
+  element("add").textContent = pictures.length ? "Add a second picture" : "Add pictures";
   if (pictures.length) guarded(VIEWS[current].show);
-  else element("start").querySelector("[data-action]").focus();
 }
 
 function pictureItem(picture) {
@@ -179,6 +187,7 @@ function pictureItem(picture) {
 }
 
 async function showView(name) {
+  if (!page.pictures.length && name !== "python") showPictures(); // there is nothing to look at
   current = name;
   for (const tab of element("tabs").children) {
     const chosen = tab.id === `tab-${name}`;
@@ -189,7 +198,7 @@ async function showView(name) {
   for (const group of document.querySelectorAll(".which")) {
     group.querySelectorAll("input")[page.active].checked = true;
   }
-  if (activePicture()) await guarded(VIEWS[name].show);
+  if (activePicture() || name === "python") await guarded(VIEWS[name].show);
 }
 
 const hasCamera = () => matchMedia("(pointer: coarse)").matches;
@@ -215,11 +224,15 @@ function setUp() {
     button.hidden = !hasCamera();
     button.onclick = () => element("shot").click();
   }
+  element("use-folder").onclick = () => {
+    [element("start").hidden, element("work").hidden] = [true, false];
+    showView("python");
+  };
   element("restart").onclick = () => {
     page.pictures = [];
     showError("");
     showView("keypoints");
-    showPictures();
+    focusStart();
   };
   element("error").querySelector("button").onclick = () => showError("");
   setUpTabs();

@@ -7,6 +7,7 @@ import { compare } from "./wipe.js";
 const IMAGE = /\.(bmp|jpe?g|pgm|png|ppm|tiff?|webp)$/i;
 
 let task = null; // at work
+let kind = ""; // of the last task
 let given = ""; // the number that a task takes
 let urls = []; // of files of the result that is shown
 
@@ -62,6 +63,7 @@ function askForFolder(use) {
 
 /** Says which tasks can be done with the pictures that are there. */
 export function show() {
+  element("pair-tasks").hidden = page.pictures.length === 0;
   for (const each of page.server?.tasks ?? []) {
     const button = document.querySelector(`[data-kind="${each.kind}"]`);
     const [least, most] = each.files;
@@ -74,6 +76,7 @@ async function run(each, files, showWipe) {
   if (task) return;
   showError("");
   clear();
+  kind = each.kind;
   const options = Number(given) > 0 && "focal_px" in each.options ? { focal_px: Number(given) } : {};
   progress(each.title, "sending the pictures", 0, 0);
   try {
@@ -89,14 +92,26 @@ async function run(each, files, showWipe) {
   } finally {
     const ended = task;
     task = null;
-    element("job-progress").hidden = true;
-    show();
+    if (!element("job-progress").hidden) end(each.kind);
     if (ended?.forget) await ended.forget();
   }
 }
 
+/** Lets the next task begin; those who use the keyboard are back where they were. */
+function end(kind) {
+  const focused = element("job-progress").contains(document.activeElement);
+  element("job-progress").hidden = true;
+  element("job-empty").hidden = !element("job-result").hidden;
+  show();
+  if (focused) document.querySelector(`[data-kind="${kind}"]`).focus();
+}
+
 function progress(title, stage, done, total) {
-  element("job-progress").hidden = false;
+  if (element("job-progress").hidden) {
+    element("job-progress").hidden = false;
+    element("job-empty").hidden = true;
+    element("job-cancel").focus(); // the button that was pressed can no longer be
+  }
   const text = `${title}: ${stage}`;
   if (element("job-stage").textContent !== text) announce(text);
   element("job-stage").textContent = text;
@@ -112,8 +127,7 @@ function progress(title, stage, done, total) {
 async function cancel() {
   const ended = task;
   task = null;
-  element("job-progress").hidden = true;
-  show();
+  end(kind);
   if (ended?.forget) await ended.forget();
   announce("Cancelled");
 }
@@ -143,7 +157,7 @@ async function showResult(each, { numbers, shown, files }, sent, showWipe) {
     button.onclick = () => save(name, blobs.get(name));
     return button;
   }));
-  element("job-files").hidden = false;
+  element("job-summary").hidden = false;
   if (blobs.has("registered.png")) await offerWipe(blobs.get("registered.png"), showWipe);
   announce(`${each.title} is done: ${Object.entries(numbers).map((pair) => pair.join(" ")).join(", ")}`);
 }
@@ -187,7 +201,8 @@ function clear() {
   element("job-result").replaceChildren();
   element("job-result").hidden = true;
   element("job-empty").hidden = false;
-  element("job-files").hidden = true;
+  element("job-summary").hidden = true;
+  element("job-files").replaceChildren();
   element("job-numbers").replaceChildren();
 }
 

@@ -1,0 +1,270 @@
+// The page alone, in a browser: what `npm run build` makes.
+import { readFileSync, writeFileSync } from "node:fs";
+import { join } from "node:path";
+import { NO_BROWSER, askPython, chromium, downloaded, example, examples, expect, expectAccessible,
+         openExample, slide, test } from "./page.mjs";
+
+test.skip(!chromium, NO_BROWSER);
+
+const KEYPOINTS = `
+import json, sys
+from deepdetect import DeepDetect
+path, options = sys.argv[1], json.loads(sys.argv[2])
+found = DeepDetect(backend="onnxruntime").detect(path, mode="dense", **options)
+print(json.dumps({"xy": found.xy.tolist(), "scores": found.scores.tolist()}))
+`;
+
+/** Rows of numbers of a CSV file. */
+const table = (content) => String(content).trim().split("\n").slice(1).map((line) => line.split(",").map(Number));
+
+/** Pixels as text: which ones, whatever their fractions. */
+const pixels = (rows) => rows.map(([x, y]) => `${Math.round(x)},${Math.round(y)}`);
+
+async function choose(page, { kind = "dense", by = "threshold" }) {
+  await page.locator(`input[name=kind][value=${kind}]`).check({ force: true });
+  await page.locator(`input[name=by][value=${by}]`).check({ force: true });
+}
+
+const openFile = async (page, path) => {
+  await page.locator("#file").setInputFiles(path);
+  await expect(page.locator("#count")).toContainText("keypoint");
+};
+
+const CASES = [
+  { name: "dense", controls: {}, options: {} },
+  { name: "threshold", controls: {}, slider: ["threshold", 0.8], options: { threshold: 0.8 } },
+  { name: "density", controls: { by: "density" }, slider: ["density", 12.5], options: { density: 0.125 } },
+  { name: "ranked", controls: { kind: "ranked" }, slider: ["number", 9], options: { max_keypoints: 1500 } },
+];
+
+for (const file of ["coffee.jpg", "motorcycle-left.jpg", "motorcycle-right.jpg", "coffee-turned.jpg"]) {
+  test(`keypoints of ${file} are those of Python, to the pixel`, async ({ page }) => {
+    await page.goto("./");
+    await openFile(page, join(examples, file));
+    for (const { name, controls, slider, options } of CASES) {
+      await choose(page, controls);
+      if (slider) await slide(page, ...slider);
+      const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=csv]"));
+      const found = table(content);
+      const expected = askPython(KEYPOINTS, join(examples, file), JSON.stringify(options));
+      expect(found.length, name).toBeGreaterThan(1000);
+      expect(pixels(found), name).toEqual(pixels(expected.xy));
+      expected.scores.forEach((score, k) => {
+        const off = Math.max(Math.abs(found[k][2] - score), Math.abs(found[k][0] - expected.xy[k][0]),
+                             Math.abs(found[k][1] - expected.xy[k][1]));
+        if (off > 2e-3) throw new Error(`${name}: ${found[k]} instead of ${expected.xy[k]}, ${score}`);
+      });
+      if (slider) await slide(page, slider[0], slider[0] === "threshold" ? 0.5 : slider[1]);
+    }
+  });
+}
+
+test("a large photograph is reduced as Python reduces it", async ({ page }, info) => {
+  const path = info.outputPath("large.png");
+  askPython(`
+import sys
+from PIL import Image
+image = Image.open(sys.argv[1]).convert("RGB").resize((2100, 1400), Image.Resampling.BICUBIC)
+image.save(sys.argv[2], compress_level=1)
+print("null")
+`, join(examples, "coffee.jpg"), path);
+  await page.goto("./");
+  await openFile(page, path);
+  await expect(page.locator("#files small")).toHaveText("2100×1400, seen as 1736×1152");
+  const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=json]"));
+  const found = JSON.parse(content);
+  const expected = askPython(`
+import json, sys, cv2
+from deepdetect import DeepDetect, load_image
+small = cv2.resize(load_image(sys.argv[1]), (1736, 1152), interpolation=cv2.INTER_AREA)
+print(json.dumps(DeepDetect(backend="onnxruntime", resolution="native").detect(small).xy.tolist()))
+`, path);
+  expect(found.seen_as).toEqual([1736, 1152]);
+  const places = new Set(found.keypoints.map(([x, y]) =>
+    `${Math.round((x + 0.5) * 1736 / 2100 - 0.5)},${Math.round((y + 0.5) * 1152 / 1400 - 0.5)}`));
+  const shared = pixels(expected).filter((place) => places.has(place)).length;
+  // One pixel in ten thousand may be rounded otherwise when it is reduced, by one level of grey.
+  expect(shared / Math.max(expected.length, found.keypoints.length)).toBeGreaterThan(0.9995);
+});
+
+test("sliders answer at once, and do not run the network", async ({ page }) => {
+  await openExample(page, "Coffee");
+  const count = async () => Number((await page.locator("#count").textContent()).replace(/\D/g, ""));
+  const dense = await count();
+  await slide(page, "threshold", 0.9);
+  const fewer = await count();
+  expect(fewer).toBeLessThan(dense);
+  await choose(page, { by: "density" });
+  await slide(page, "density", 10);
+  expect(await count()).toBe(24_000);
+  await choose(page, { kind: "ranked" });
+  await slide(page, "number", 4);
+  expect(await count()).toBe(200);
+  expect(await page.locator("body").getAttribute("data-network-runs")).toBe("1");
+  const drawn = await page.locator("#view-keypoints .overlay").evaluate((canvas) =>
+    canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value > 0));
+  expect(drawn).toBe(true);
+});
+
+test("heat map and pictures are saved as PNG", async ({ page }) => {
+  await openExample(page, "Coffee");
+  const size = ({ content }) => [content.readUInt32BE(16), content.readUInt32BE(20)];
+  const keypoints = await downloaded(page, page.locator("#view-keypoints [data-download=png]"));
+  expect([keypoints.name, ...size(keypoints)]).toEqual(["coffee_keypoints.png", 600, 400]);
+  await page.getByRole("tab", { name: "Heat map" }).click();
+  const map = await downloaded(page, page.locator("#view-heatmap [data-download=png]"));
+  expect([map.name, ...size(map)]).toEqual(["coffee_heatmap.png", 600, 400]);
+});
+
+test("matches of two views agree with the true disparity", async ({ page }) => {
+  await openExample(page, "Motorcycle");
+  await expect(page.locator("#match-hint")).toContainText("epipolar geometry");
+  const { name, content } = await downloaded(page, page.locator("#view-matches [data-download=csv]"));
+  expect(name).toBe("motorcycle-left_motorcycle-right_matches.csv");
+  const rows = table(content);
+  expect(rows.length).toBeGreaterThan(500);
+  // The pair is rectified: a right match stays on its row, and moves to the left.
+  const right = rows.filter(([x0, y0, x1, y1]) => Math.abs(y0 - y1) < 2 && x1 <= x0 + 1).length;
+  expect(right / rows.length).toBeGreaterThan(0.95);
+  await slide(page, "ratio", 0.6);
+  const fewer = async () => Number((await page.locator("#match-count").textContent()).replace(/\D/g, ""));
+  await expect.poll(fewer).toBeLessThan(rows.length);
+  const json = await downloaded(page, page.locator("#view-matches [data-download=json]"));
+  expect(JSON.parse(json.content)).toMatchObject({ model: "fundamental", options: { ratio: 0.6 } });
+});
+
+test("pictures that show different things have no geometry", async ({ page }) => {
+  await page.goto("./");
+  await page.locator("#file").setInputFiles([join(examples, "coffee.jpg"), join(examples, "motorcycle-left.jpg")]);
+  await expect(page.locator("#match-hint")).toContainText("most may be wrong");
+});
+
+test("the wipe aligns a plane, and moves by mouse and by keys", async ({ page }) => {
+  await openExample(page, "Coffee, turned");
+  await expect(page.locator("#match-hint")).toContainText("homography");
+  await page.getByRole("tab", { name: "Wipe" }).click();
+  await expect(page.locator("#wipe-hint")).toContainText("registered");
+  const second = page.locator("#view-wipe .overlay");
+  await page.locator("#wipe").focus();
+  await page.keyboard.press("Home");
+  await expect(second).toHaveCSS("clip-path", "inset(0px 0px 0px 0%)");
+  const box = await page.locator("#view-wipe .layers").boundingBox();
+  await page.mouse.move(box.x + 5, box.y + 50);
+  await page.mouse.down();
+  await page.mouse.move(box.x + 0.75 * box.width, box.y + 60);
+  await page.mouse.up();
+  expect(Number(await page.locator("#wipe").inputValue())).toBeCloseTo(75, -0.5);
+  // Aligned, both pictures are alike but for their light.
+  const correlation = await page.locator("#view-wipe").evaluate((view) => {
+    const [a, b] = [...view.querySelectorAll("canvas")].map((canvas) =>
+      canvas.getContext("2d").getImageData(100, 60, 400, 280).data.filter((_, k) => k % 4 === 1));
+    const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
+    const [m, n] = [mean(a), mean(b)];
+    let [ab, aa, bb] = [0, 0, 0];
+    a.forEach((value, k) => {
+      ab += (value - m) * (b[k] - n);
+      aa += (value - m) ** 2;
+      bb += (b[k] - n) ** 2;
+    });
+    return ab / Math.sqrt(aa * bb);
+  });
+  expect(correlation).toBeGreaterThan(0.95);
+});
+
+test("a file that is no picture is refused in one sentence", async ({ page }, info) => {
+  const bad = info.outputPath("letter.jpg");
+  writeFileSync(bad, "Dear browser");
+  const small = info.outputPath("small.png");
+  writeFileSync(small, Buffer.from("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg==", "base64"));
+  await page.goto("./");
+  await page.locator("#file").setInputFiles(bad);
+  await expect(page.getByRole("alert")).toContainText(
+    "letter.jpg is not a picture that this browser can read: use JPEG or PNG.");
+  await page.locator("#file").setInputFiles(small);
+  await expect(page.getByRole("alert")).toContainText("small.png is 1x1 pixels");
+  await page.locator("#file").setInputFiles([bad, small, bad]);
+  await expect(page.getByRole("alert")).toContainText("Give at most 2 pictures.");
+  await openFile(page, join(examples, "coffee.jpg"));
+  await expect(page.locator("#error")).toBeHidden();
+});
+
+test("pictures are dropped on the page", async ({ page }) => {
+  await page.goto("./");
+  await expect(page.locator("#examples button")).toHaveCount(3);
+  const bytes = [...readFileSync(join(examples, "coffee.jpg"))];
+  await page.evaluate((content) => {
+    const transfer = new DataTransfer();
+    transfer.items.add(new File([new Uint8Array(content)], "dropped.jpg", { type: "image/jpeg" }));
+    dispatchEvent(new DragEvent("drop", { dataTransfer: transfer, cancelable: true }));
+  }, bytes);
+  await expect(page.locator("#files b")).toHaveText("dropped.jpg");
+  await expect(page.locator("#count")).toContainText("keypoint");
+});
+
+test("it works without a network once it was open", async ({ page, context }) => {
+  await page.goto("./");
+  await page.evaluate(async () => {
+    await navigator.serviceWorker.ready;
+    while (!navigator.serviceWorker.controller) await new Promise((done) => setTimeout(done, 50));
+  });
+  await context.setOffline(true);
+  await page.reload();
+  await example(page, "Coffee").click();
+  await expect(page.locator("#count")).toContainText("keypoint");
+});
+
+test("two tabs at once", async ({ page, context }) => {
+  const other = await context.newPage();
+  await Promise.all([openExample(page, "Coffee"), openExample(other, "Motorcycle")]);
+  await expect(page.locator("#count")).toContainText("70,");
+  await expect(other.locator("#match-count")).toContainText("match");
+});
+
+test("by keys alone", async ({ page }) => {
+  await page.goto("./");
+  await expect(page.locator("#examples button")).toHaveCount(3);
+  const reach = async (id) => {
+    for (let k = 0; k < 40; k++) {
+      if (await page.evaluate((wanted) => document.activeElement.matches(wanted), id)) return;
+      await page.keyboard.press("Tab");
+    }
+    throw new Error(`${id} cannot be reached by Tab`);
+  };
+  await reach("#examples li:nth-child(2) button");
+  await page.keyboard.press("Enter");
+  await expect(page.locator("#count")).toContainText("keypoint");
+  await reach("#threshold");
+  const before = await page.locator("#count").textContent();
+  await page.keyboard.press("ArrowRight");
+  await expect(page.locator("#count")).not.toHaveText(before);
+  await page.keyboard.press("Shift+Tab");
+  for (let k = 0; k < 8 && !(await page.evaluate(() => document.activeElement.role === "tab" ||
+       document.activeElement.getAttribute("role") === "tab")); k++) await page.keyboard.press("Shift+Tab");
+  await page.keyboard.press("ArrowRight");
+  await expect(page.locator("#view-heatmap")).toBeVisible();
+  await expect(page.getByRole("tab", { name: "Heat map" })).toBeFocused();
+});
+
+for (const [width, colorScheme] of [[1280, "light"], [1280, "dark"], [390, "light"], [390, "dark"]]) {
+  test(`every view is accessible and fits, ${width} px, ${colorScheme}`, async ({ page }) => {
+    await page.setViewportSize({ width, height: 844 });
+    await page.emulateMedia({ colorScheme });
+    const check = async () => {
+      await expectAccessible(page);
+      expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBeLessThanOrEqual(width);
+    };
+    await page.goto("./");
+    await expect(page.locator("#examples button")).toHaveCount(3);
+    await check();
+    await example(page, "Coffee, turned").click();
+    await expect(page.locator("#match-hint")).toContainText("agree");
+    for (const name of ["Keypoints", "Heat map", "Matches", "Wipe"]) {
+      await page.getByRole("tab", { name }).click();
+      if (name === "Wipe") await expect(page.locator("#wipe-hint")).toContainText("registered");
+      await check();
+    }
+    await page.locator("#file").setInputFiles(join(examples, "coffee.jpg"));
+    await expect(page.getByRole("alert")).toContainText("There are two pictures already");
+    await check();
+  });
+}
