@@ -96,7 +96,7 @@ class Job:
                     os.killpg(self._process.pid, signal.SIGKILL)
                 else:
                     self._process.kill()
-        self._process.wait()
+        self._end()
 
     def remove(self) -> None:
         """End the process, and remove all files."""
@@ -109,11 +109,17 @@ class Job:
             for line in lines:
                 with contextlib.suppress(ValueError):
                     self._note(json.loads(line))
-        self._process.wait()
+        self._end()
         with self._lock:
             if self._state["state"] == "running":
                 reason = "the task ended without a result: there may be too little memory for it"
                 self._state = {"state": "failed", "error": reason}
+
+    def _end(self) -> None:
+        """Wait for the process, and close what it was held by."""
+        self._process.wait()
+        assert self._process.stdin is not None
+        self._process.stdin.close()
 
     def _note(self, told: dict[str, Any]) -> None:
         with self._lock:
@@ -158,7 +164,10 @@ class Jobs:
         with self._lock:
             at_work = sum(job.running for job in self._jobs.values())
         if at_work >= self.limits.max_tasks:
-            raise OptionError(f"{at_work} tasks are at work already: wait for one, or cancel it")
+            raise OptionError(
+                f"as many tasks as are allowed ({self.limits.max_tasks}) are at work: wait for one "
+                "of them, or cancel it"
+            )
 
     def start(
         self,

@@ -253,9 +253,9 @@ def run_folder_keypoints(
 ) -> TaskResult:
     """Write the best keypoints of each photograph, as one CSV file each, into one ZIP file."""
     from ..detector.detector import DeepDetect
+    from ..io.image import load_image
     from ..io.tables import save_keypoints
     from ..viz.draw import draw_keypoints, save_picture
-    from ..io.image import load_image
 
     detector, table, failures = DeepDetect(), folder / "table.csv", []
     count = int(options.get("max_keypoints", FOLDER_KEYPOINTS))

@@ -1,0 +1,108 @@
+"""A running server, and requests to it as any program could make them."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deepdetect.app.options import AppOptions
+from deepdetect.app.server import AppServer
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back."""
+
+    status: int
+    headers: dict[str, str]
+    content: bytes
+
+    @property
+    def values(self) -> Any:
+        return json.loads(self.content)
+
+
+class Client:
+    """Asks a server, with the headers that the page sends unless others are given."""
+
+    def __init__(self, server: AppServer) -> None:
+        self.server = server
+        self.host = f"127.0.0.1:{server.server_port}"
+
+    def ask(
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        headers: dict[str, str | None] | None = None,
+    ) -> Answer:
+        given: dict[str, str | None] = {
+            "Host": self.host,
+            "Authorization": f"Bearer {self.server.key}",
+            **(headers or {}),
+        }
+        connection = http.client.HTTPConnection("127.0.0.1", self.server.server_port, timeout=60)
+        connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+        if body is not None and "Content-Length" not in given:
+            given["Content-Length"] = str(len(body))
+        for name, value in given.items():
+            if value is not None:
+                connection.putheader(name, value)
+        connection.endheaders(body)
+        response = connection.getresponse()
+        answer = Answer(response.status, dict(response.getheaders()), response.read())
+        connection.close()
+        return answer
+
+    def start(self, kind: str, files: list[tuple[str, bytes]], **options: Any) -> Answer:
+        return self.ask("POST", f"/api/jobs?kind={kind}", packed(files, options))
+
+    def wait(self, job: str) -> dict[str, Any]:
+        """Return the state of a task when it has ended."""
+        until = time.monotonic() + 120
+        while time.monotonic() < until:
+            state = self.ask("GET", f"/api/jobs/{job}").values
+            if state["state"] != "running":
+                return state
+            time.sleep(0.1)
+        raise AssertionError("the task does not end")
+
+
+def packed(files: list[tuple[str, bytes]], options: Any) -> bytes:
+    """Make the body of a request for a task."""
+    listed = [{"name": name, "size": len(content)} for name, content in files]
+    description = json.dumps({"files": listed, "options": options}).encode()
+    return len(description).to_bytes(4) + description + b"".join(content for _, content in files)
+
+
+@pytest.fixture
+def serve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., tuple[Client, Path]]]:
+    """Start a server; return a client, and the folder of all its temporary files."""
+    import tempfile
+
+    started = []
+
+    def start(**options: Any) -> tuple[Client, Path]:
+        folder = tmp_path / f"temporary{len(started)}"
+        folder.mkdir()
+        monkeypatch.setattr(tempfile, "tempdir", str(folder))
+        server = AppServer(AppOptions(port=0, **options))
+        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        started.append((server, folder))
+        return Client(server), folder
+
+    yield start
+    for server, folder in started:
+        server.shutdown()
+        server.server_close()
+        assert list(folder.iterdir()) == []

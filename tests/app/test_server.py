@@ -1,0 +1,351 @@
+"""Who is answered, how large and slow a request may be, and that nothing is kept."""
+
+from __future__ import annotations
+
+import io
+import socket
+import time
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from deepdetect import DeepDetect
+from deepdetect._shared.errors import OptionError
+from deepdetect.app.options import AppOptions
+from deepdetect.app.server import STATIC, AppServer
+from deepdetect.app.tasks import TASKS
+
+from .conftest import Client, packed
+
+
+def encoded(rgb: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(rgb).save(file, "png")
+    return file.getvalue()
+
+
+def folders(temporary: Path) -> list[Path]:
+    """Return the folders of tasks."""
+    return [task for server in temporary.iterdir() for task in server.iterdir()]
+
+
+def test_it_is_bound_to_the_loopback_address(serve: Any) -> None:
+    client, _ = serve()
+    assert client.server.server_address[0] == "127.0.0.1"
+    assert client.server.address.startswith(f"http://{client.host}/#key=")
+
+
+@pytest.mark.parametrize("path", ["/", "/config.json", "/js/main.js", "/examples/coffee.jpg"])
+def test_the_page_is_served_with_a_strict_policy(path: str, serve: Any) -> None:
+    client, _ = serve()
+    answer = client.ask("GET", path, headers={"Authorization": None})
+    assert answer.status == 200
+    policy = answer.headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "http" not in policy
+    assert "unsafe-inline" not in policy
+    assert "Access-Control-Allow-Origin" not in answer.headers
+    assert answer.headers["X-Content-Type-Options"] == "nosniff"
+
+
+def test_the_policy_of_the_file_is_that_of_the_server(serve: Any) -> None:
+    """So that the page is as safe on any web server; frames are what a file cannot speak of."""
+    client, _ = serve()
+    policy = client.ask("GET", "/").headers["Content-Security-Policy"]
+    assert policy.removesuffix("; frame-ancestors 'none'") in (STATIC / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    "host", ["example.org", "127.0.0.1", "127.0.0.1:1", "127.0.0.1.example.org:{port}", "", None]
+)
+def test_another_host_is_refused(host: str | None, serve: Any) -> None:
+    """What DNS rebinding would send."""
+    client, _ = serve()
+    given = None if host is None else host.format(port=client.server.server_port)
+    for path in ("/", "/config.json", "/api/jobs/x"):
+        assert client.ask("GET", path, headers={"Host": given}).status == 421
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://example.org", "null", "https://{host}", "http://127.0.0.1"]
+)
+def test_another_origin_is_refused(origin: str, serve: Any) -> None:
+    client, _ = serve()
+    headers = {"Origin": origin.format(host=client.host)}
+    assert client.ask("POST", "/api/jobs?kind=match", b"", headers).status == 403
+    assert client.ask("GET", "/config.json", headers=headers).status == 403
+    right = {"Origin": f"http://{client.host}"}
+    assert client.ask("GET", "/config.json", headers=right).status == 200
+
+
+@pytest.mark.parametrize(
+    "key", [None, "Bearer ", "Bearer wrong", "Bearer ü".encode().decode("latin1")]
+)
+def test_the_key_is_needed(key: str | None, serve: Any) -> None:
+    client, temporary = serve()
+    headers = {"Authorization": key}
+    answer = client.ask("POST", "/api/jobs?kind=match", b"abc", headers)
+    assert answer.status == 401
+    assert "open the address that it has printed" in answer.values["error"]
+    assert client.ask("POST", "/api/heatmap?width=16&height=16", b"", headers).status == 401
+    assert folders(temporary) == []
+
+
+def test_the_key_is_new_at_each_start(serve: Any) -> None:
+    assert serve()[0].server.key != serve()[0].server.key
+
+
+def test_a_request_of_another_site_is_refused_even_with_the_key(serve: Any) -> None:
+    client, _ = serve()
+    for site in ("cross-site", "same-site", "none"):
+        headers = {"Sec-Fetch-Site": site}
+        assert client.ask("POST", "/api/jobs?kind=match", b"", headers).status == 403
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/../server.py", "/js/../../server.py", "/%2e%2e/server.py", "//etc/passwd", "/js", "/x"],
+)
+def test_only_the_files_of_the_page_are_served(path: str, serve: Any) -> None:
+    client, _ = serve()
+    assert client.ask("GET", path).status == 404
+
+
+def test_the_logits_are_those_of_the_package(serve: Any, photo: np.ndarray) -> None:
+    client, _ = serve()
+    rgb = np.ascontiguousarray(photo[:100, :91])
+    answer = client.ask("POST", "/api/heatmap?width=91&height=100", rgb.tobytes())
+    assert answer.status == 200
+    found = np.frombuffer(answer.content, "<f4").reshape(100, 91)
+    np.testing.assert_array_equal(found, DeepDetect().heatmap_and_logits(rgb)[1])
+
+
+@pytest.mark.parametrize(
+    ("query", "length", "status"),
+    [
+        ("width=16&height=16", 767, 400),
+        ("width=16&height=16", 769, 413),
+        ("width=15&height=16", 720, 400),
+        ("width=-16&height=-16", 768, 400),
+        ("width=9999&height=9999", 100, 400),
+        ("width=1e1&height=16", 768, 400),
+        ("", 768, 400),
+    ],
+)
+def test_a_wrong_heat_map_is_refused(query: str, length: int, status: int, serve: Any) -> None:
+    client, _ = serve()
+    answer = client.ask("POST", f"/api/heatmap?{query}", bytes(length))
+    assert answer.status == status
+    assert answer.values["error"]
+
+
+def test_a_body_without_length_is_refused(serve: Any) -> None:
+    client, _ = serve()
+    for headers in (
+        {"Content-Length": None, "Transfer-Encoding": "chunked"},
+        {"Content-Length": "-1"},
+        {"Content-Length": "1e3"},
+        {"Content-Length": "٣"},
+    ):
+        try:
+            answer = client.ask("POST", "/api/jobs?kind=match", b"", headers)
+        except UnicodeEncodeError:
+            continue  # http.client does not send it
+        assert answer.status == 411
+
+
+def test_sizes_are_limited(serve: Any, photo: np.ndarray) -> None:
+    client, temporary = serve(max_file_mb=0.01, max_task_mb=0.015, max_files=3)
+    pixel = ("a.png", b"x")
+    for files, said in (
+        ([("big.png", bytes(10_001))] * 2, "big.png is over 0.01 MB"),
+        ([pixel] * 4, "there are 4 photographs, over 3"),
+        ([("a.png", bytes(9_000))] * 60, "this is over"),
+    ):
+        answer = client.start("stitch", files)
+        assert answer.status in (400, 413)
+        assert said in answer.values["error"]
+    assert folders(temporary) == []
+
+
+def test_too_many_pixels_are_refused_before_they_are_decoded(serve: Any) -> None:
+    client, _ = serve(max_megapixels=0.05)
+    large = ("large.png", encoded(np.zeros((300, 300, 3), np.uint8)))
+    job = client.start("folder-keypoints", [large]).values["job"]
+    state = client.wait(job)
+    assert state["state"] == "failed"
+    assert "large.png has 300x300 pixels, which is over 0.05 megapixels" in state["error"]
+    assert "/" not in state["error"]  # no path of this computer
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"\0\0",
+        (2**31).to_bytes(4) + b"{}",
+        (2).to_bytes(4) + b"{}",
+        (4).to_bytes(4) + b"null",
+        (3).to_bytes(4) + b"[[[",
+        packed([("a.png", b"abc"), ("b.png", b"de")], {}) + b"x",
+        packed([("a.png", b"abc"), ("b.png", b"de")], {})[:-1],
+        packed([("a.png", b"abc"), ("b.png", b"de")], {}).replace(b'"size": 3', b'"size":-3'),
+        packed([("a.png", b"abc"), ("b.png", b"de")], [1]),
+    ],
+)
+def test_a_damaged_task_is_refused(body: bytes, serve: Any) -> None:
+    client, temporary = serve()
+    answer = client.ask("POST", "/api/jobs?kind=match", body)
+    assert answer.status == 400
+    assert len(answer.values["error"].splitlines()) == 1
+    assert folders(temporary) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "options", "said"),
+    [
+        ("mach", 2, {}, "did you mean 'match'"),
+        ("match", 3, {}, "takes 2 photographs, not 3"),
+        ("stitch", 1, {}, "takes at least 2 photographs, not 1"),
+        ("match", 2, {"focal_px": 3}, "does not take 'focal_px'"),
+        ("reconstruct", 2, {"focal_px": "3"}, "does not take 'focal_px' as '3'"),
+        ("reconstruct", 2, {"focal_px": -3}, "does not take 'focal_px' as -3"),
+        ("reconstruct", 2, {"focal_px": True}, "does not take 'focal_px' as True"),
+    ],
+)
+def test_a_task_that_does_not_fit_is_refused(
+    kind: str, count: int, options: dict[str, Any], said: str, serve: Any
+) -> None:
+    client, temporary = serve()
+    answer = client.start(kind, [("a.png", b"x")] * count, **options)
+    assert answer.status == 400
+    assert said in answer.values["error"]
+    assert folders(temporary) == []
+
+
+def test_a_task_is_done_and_forgotten(serve: Any, photo: np.ndarray) -> None:
+    client, temporary = serve()
+    files = [("../../etc/a b.png", encoded(photo)), ("x/\n.txt", b"no picture")]
+    job = client.start("folder-keypoints", files, max_keypoints=50)
+    assert job.status == 400  # the number is not an option of the page
+    job = client.start("folder-keypoints", files).values["job"]
+    state = client.wait(job)
+    assert state["state"] == "done", state
+    assert state["numbers"]["Photographs"] == "1 of 2"
+    address = f"/api/jobs/{job}/files/keypoints.zip"
+    assert client.ask("GET", address, headers={"Authorization": None}).status == 401
+    answer = client.ask("GET", address)
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+        assert sorted(archive.namelist()) == ["a b.csv", "failures.txt"]
+        table = archive.read("a b.csv").decode().splitlines()
+    expected = DeepDetect().detect(photo, max_keypoints=2048)
+    assert len(table) == len(expected) + 1
+    for name in ("task.json", "../task.json", "../0000.png", "failures.txt", ""):
+        assert client.ask("GET", f"/api/jobs/{job}/files/{name}").status == 404
+    assert len(folders(temporary)) == 1
+    assert client.ask("DELETE", f"/api/jobs/{job}").status == 200
+    assert folders(temporary) == []
+    assert client.ask("GET", address).status == 404
+
+
+def test_photographs_can_be_read_by_their_owner_only(serve: Any, photo: np.ndarray) -> None:
+    client, temporary = serve()
+    client.start("folder-keypoints", [("a.png", encoded(photo))])
+    for folder in [*temporary.iterdir(), *folders(temporary)]:
+        assert folder.stat().st_mode & 0o077 == 0
+
+
+def long_task(client: Client) -> str:
+    """Start a task that would take minutes."""
+    rgb = np.random.default_rng(0).integers(0, 256, (600, 600, 3)).astype(np.uint8)
+    files = [(f"{number}.png", encoded(rgb)) for number in range(60)]
+    return client.start("folder-keypoints", files).values["job"]
+
+
+def test_a_task_is_cancelled(serve: Any) -> None:
+    client, temporary = serve(max_tasks=1)
+    job = long_task(client)
+    process = client.server.jobs.find(job)._process
+    refused = client.start("folder-keypoints", [("a.png", b"x")])
+    assert "as many tasks as are allowed (1) are at work" in refused.values["error"]
+    assert client.ask("DELETE", f"/api/jobs/{job}").status == 200
+    assert process.poll() is not None
+    assert folders(temporary) == []
+    assert client.start("folder-keypoints", [("a.png", b"x")]).status == 200
+
+
+def test_a_task_that_takes_too_long_is_ended(serve: Any) -> None:
+    client, _ = serve(max_task_s=0.5)
+    state = client.wait(long_task(client))
+    assert state["state"] == "failed"
+    assert "it took over" in state["error"]
+
+
+def test_a_task_that_nobody_asks_for_is_forgotten(serve: Any) -> None:
+    client, temporary = serve(abandoned_s=0.5)
+    long_task(client)
+    until = time.monotonic() + 30
+    while folders(temporary) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert folders(temporary) == []
+
+
+def test_a_process_that_dies_is_said_in_one_sentence(serve: Any) -> None:
+    client, _ = serve()
+    job = long_task(client)
+    client.server.jobs.find(job)._process.kill()
+    state = client.wait(job)
+    assert state["state"] == "failed"
+    assert "ended without a result" in state["error"]
+
+
+def test_a_worker_ends_with_the_server(serve: Any) -> None:
+    client, _ = serve()
+    process = client.server.jobs.find(long_task(client))._process
+    process.stdin.close()  # as when the server is killed
+    assert process.wait(timeout=60) != 0
+
+
+def test_a_request_that_stands_still_is_ended(serve: Any) -> None:
+    client, _ = serve(max_request_s=0.3)
+    with socket.create_connection(("127.0.0.1", client.server.server_port)) as connection:
+        connection.settimeout(30)
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: ")
+        assert connection.recv(100) == b""
+
+
+def test_a_body_that_trickles_is_ended(serve: Any) -> None:
+    client, _ = serve(max_request_s=0.1)
+    head = (
+        f"POST /api/heatmap?width=1000&height=1000 HTTP/1.1\r\nHost: {client.host}\r\n"
+        f"Authorization: Bearer {client.server.key}\r\nContent-Length: 3000000\r\n\r\n"
+    )
+    with socket.create_connection(("127.0.0.1", client.server.server_port)) as connection:
+        connection.sendall(head.encode())
+
+        def trickle() -> None:
+            for _ in range(600):
+                connection.sendall(b"x")
+                time.sleep(0.05)
+
+        with pytest.raises(ConnectionError):
+            trickle()
+
+
+def test_a_port_that_is_taken_is_said_in_one_sentence(serve: Any) -> None:
+    client, _ = serve()
+    with pytest.raises(OptionError, match="cannot be used"):
+        AppServer(AppOptions(port=client.server.server_port))
+
+
+def test_what_is_not_installed_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    import importlib.util
+
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert TASKS["match"].missing == 'pip install "deepdetect[standard]"'
+    with pytest.raises(OptionError, match="needs another package"):
+        TASKS["match"].check(2, {})

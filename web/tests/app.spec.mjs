@@ -1,0 +1,163 @@
+// The page with Python: `deepdetect app`.
+import { cpSync, mkdirSync, readdirSync, writeFileSync } from "node:fs";
+import { join } from "node:path";
+import { NO_BROWSER, askPython, chromium, downloaded, examples, expect, expectAccessible, openExample,
+         test, watch } from "./page.mjs";
+
+test.skip(!chromium, NO_BROWSER);
+
+/** The folders of tasks that are there. */
+const tasksOf = ({ folder }) => readdirSync(folder).filter((name) => name.startsWith("deepdetect-app-"))
+  .flatMap((name) => readdirSync(join(folder, name)));
+
+const openTasks = async (page, title, app) => {
+  await openExample(page, title, app.address);
+  await page.getByRole("tab", { name: "Python" }).click();
+};
+
+const startTask = (page, kind) => page.locator(`[data-kind="${kind}"]`).click();
+
+test("it says what it can, and finds the keypoints of Python", async ({ page, app }) => {
+  await openExample(page, "Coffee", app.address);
+  await expect(page.locator("#power")).toHaveText("With Python on this computer");
+  expect(page.url()).not.toContain("key");
+  const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=csv]"));
+  const expected = askPython(`
+import json, sys
+from deepdetect import DeepDetect
+print(json.dumps(DeepDetect().detect(sys.argv[1]).xy.tolist()))
+`, join(examples, "coffee.jpg"));
+  const found = String(content).trim().split("\n").slice(1).map((line) => line.split(",").slice(0, 2).map(Number));
+  expect(found).toEqual(expected);
+});
+
+test("guided matching finds many times as many, and nothing is kept", async ({ page, app }) => {
+  await openTasks(page, "Motorcycle", app);
+  const alone = Number((await page.locator("#match-count").textContent()).replace(/\D/g, ""));
+  await startTask(page, "match");
+  await expect(page.locator("#job-cancel")).toBeFocused();
+  await expect(page.locator("#job-result img")).toBeVisible({ timeout: 120_000 });
+  await expect(page.locator("[data-kind=match]")).toBeFocused();
+  const matches = Number(/Matches([\d,]+)/.exec(await page.locator("#job-numbers").textContent())[1].replaceAll(",", ""));
+  expect(matches).toBeGreaterThan(20 * alone);
+  await expect.poll(() => tasksOf(app)).toEqual([]);
+  const { name, content } = await downloaded(page, page.getByRole("button", { name: "matches.csv" }));
+  expect(name).toBe("matches.csv");
+  expect(String(content).split("\n").length).toBe(matches + 2);
+  await expectAccessible(page);
+});
+
+test("a 3D model is shown, and can be turned", async ({ page, app }) => {
+  await openTasks(page, "Motorcycle", app);
+  await startTask(page, "reconstruct");
+  await expect(page.getByRole("alert")).toContainText("focal", { timeout: 120_000 });
+  await page.locator("[name=focal_px]").fill("995");
+  await startTask(page, "reconstruct");
+  const viewer = page.frameLocator("#job-result iframe");
+  await expect(viewer.locator("#message")).toBeHidden({ timeout: 120_000 });
+  await expect(viewer.locator("dl")).toContainText("Points");
+  const frame = page.locator("#job-result iframe");
+  const before = await frame.screenshot();
+  const box = await frame.boundingBox();
+  await page.mouse.move(box.x + 500, box.y + 100);
+  await page.mouse.down();
+  await page.mouse.move(box.x + 300, box.y + 100);
+  await page.mouse.up();
+  expect((await frame.screenshot()).equals(before)).toBe(false);
+  await expect.poll(() => tasksOf(app)).toEqual([]);
+  const { content } = await downloaded(page, page.getByRole("button", { name: "model.ply" }));
+  expect(String(content.subarray(0, 3))).toBe("ply");
+  await expectAccessible(page);
+});
+
+test("registration is compared in the wipe", async ({ page, app }) => {
+  await openTasks(page, "Coffee, turned", app);
+  await startTask(page, "register");
+  await page.getByRole("button", { name: "Compare in Wipe" }).click({ timeout: 120_000 });
+  await expect(page.locator("#wipe-hint")).toContainText("guided matching");
+});
+
+test("a panorama", async ({ page, app }) => {
+  await openTasks(page, "Coffee, turned", app);
+  await startTask(page, "stitch");
+  await expect(page.locator("#job-numbers")).toContainText("2 of 2", { timeout: 120_000 });
+  const { name, content } = await downloaded(page, page.getByRole("button", { name: "panorama.jpg" }));
+  expect(name).toBe("panorama.jpg");
+  expect(content.subarray(0, 2)).toEqual(Buffer.from([0xff, 0xd8]));
+});
+
+test("a task is cancelled", async ({ page, app }) => {
+  await openTasks(page, "Motorcycle", app);
+  await startTask(page, "match");
+  await expect.poll(() => tasksOf(app).length).toBe(1);
+  await page.locator("#job-cancel").click();
+  await expect(page.locator("#job-progress")).toBeHidden();
+  await expect.poll(() => tasksOf(app)).toEqual([]);
+  await expect(page.locator("[data-kind=match]")).toBeEnabled();
+  await expect(page.locator("#error")).toBeHidden();
+});
+
+test("closing the page ends its task", async ({ context, app }) => {
+  const page = await context.newPage();
+  await openTasks(page, "Motorcycle", app);
+  await startTask(page, "match");
+  await expect.poll(() => tasksOf(app).length).toBe(1);
+  await page.close({ runBeforeUnload: false });
+  await expect.poll(() => tasksOf(app)).toEqual([]);
+});
+
+test("a folder", async ({ page, app }, info) => {
+  const folder = info.outputPath("photos");
+  mkdirSync(folder);
+  for (const name of ["coffee.jpg", "motorcycle-left.jpg"]) cpSync(join(examples, name), join(folder, name));
+  writeFileSync(join(folder, "damaged.png"), "no picture");
+  writeFileSync(join(folder, "notes.txt"), "not asked for");
+  await page.goto(app.address);
+  await page.getByRole("button", { name: "Work on a folder" }).click();
+  await page.locator("[data-kind=folder-keypoints]").click();
+  await page.locator("#folder").setInputFiles(folder);
+  await expect(page.locator("#job-numbers")).toContainText("2 of 3", { timeout: 120_000 });
+  await expect(page.locator("#job-numbers")).toContainText("4,096");
+  const { content } = await downloaded(page, page.getByRole("button", { name: "keypoints.zip" }));
+  for (const name of ["coffee.csv", "motorcycle-left.csv", "failures.txt"]) expect(content.includes(name)).toBe(true);
+});
+
+test("what has no geometry is said in one sentence", async ({ page, app }) => {
+  await page.goto(app.address);
+  await page.locator("#file").setInputFiles([join(examples, "coffee.jpg"), join(examples, "motorcycle-left.jpg")]);
+  await page.getByRole("tab", { name: "Python" }).click();
+  await startTask(page, "register");
+  await expect(page.getByRole("alert")).toContainText("No homography can be trusted", { timeout: 120_000 });
+});
+
+test("two tabs at once, each with its own task", async ({ page, context, app }) => {
+  const other = await context.newPage();
+  const seen = watch(other);
+  await openTasks(page, "Coffee, turned", app);
+  await openTasks(other, "Coffee, turned", app);
+  await Promise.all([startTask(page, "register"), startTask(other, "match")]);
+  await expect(page.locator("#job-numbers")).toContainText("Overlap", { timeout: 150_000 });
+  await expect(other.locator("#job-numbers")).toContainText("homography", { timeout: 150_000 });
+  expect(seen).toEqual({ elsewhere: [], errors: [] });
+});
+
+test("without the key of this start nothing is answered", async ({ page, app }) => {
+  await page.goto(app.address.replace(/#.*/, ""));
+  await expect(page.getByRole("alert")).toContainText("Open the address that deepdetect app has printed");
+  const status = await page.evaluate(async () => (await fetch("/api/jobs?kind=match", { method: "POST", body: "x" })).status);
+  expect(status).toBe(401);
+});
+
+for (const width of [1280, 390]) {
+  test(`the tasks are accessible and fit, ${width} px`, async ({ page, app }) => {
+    await page.setViewportSize({ width, height: 844 });
+    await openTasks(page, "Coffee, turned", app);
+    await expectAccessible(page);
+    await startTask(page, "register");
+    await expect(page.locator("#job-progress")).toBeVisible();
+    await expectAccessible(page);
+    await expect(page.locator("#job-numbers")).toContainText("Overlap", { timeout: 120_000 });
+    await expectAccessible(page);
+    expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBeLessThanOrEqual(width);
+  });
+}
