@@ -213,6 +213,25 @@ test("it works without a network once it was open", async ({ page, context }) =>
   await expect(page.locator("#count")).toContainText("keypoint");
 });
 
+test("the graphics card finds nearly the same keypoints", async ({ playwright, baseURL }) => {
+  const options = { executablePath: chromium, args: ["--enable-unsafe-webgpu", "--enable-features=Vulkan",
+                                                     "--use-webgpu-adapter=swiftshader"] };
+  const browser = await playwright.chromium.launch(options);
+  const page = await browser.newPage({ baseURL });
+  const count = async () => Number((await page.locator("#count").textContent()).replace(/\D/g, ""));
+  await openExample(page, "Coffee");
+  const before = await count();
+  const has = await page.evaluate(async () => Boolean(await navigator.gpu?.requestAdapter()));
+  test.skip(!has, "this browser has no WebGPU");
+  await page.getByRole("button", { name: "Use the graphics card" }).click();
+  await expect(page.locator("#engine")).toContainText("WebGPU");
+  await page.locator("#restart").click();
+  await example(page, "Coffee").click();
+  await expect(page.locator("#count")).toContainText("keypoint");
+  expect(Math.abs(await count() - before)).toBeLessThan(10);
+  await browser.close();
+});
+
 test("two tabs at once", async ({ page, context }) => {
   const other = await context.newPage();
   await Promise.all([openExample(page, "Coffee"), openExample(other, "Motorcycle")]);

@@ -51,12 +51,13 @@ export function drawHeatMap(canvas, map) {
 /**
  * Draws keypoints over a transparent canvas: circles when they are few, else pixels.
  *
+ * @param {Float32Array | null} xy positions; without them the pixels are drawn
  * @param {number} unit pixels of the picture that make one pixel of the screen
  */
 export function drawKeypoints(canvas, picture, pixels, xy, unit) {
   const context = resized(canvas, picture.width, picture.height);
   context.clearRect(0, 0, canvas.width, canvas.height);
-  if (pixels.length > MAX_CIRCLES) {
+  if (xy === null || pixels.length > MAX_CIRCLES) {
     const image = context.createImageData(picture.width, picture.height);
     const words = new Uint32Array(image.data.buffer);
     const mark = new Uint32Array(new Uint8Array([...MARK, 150]).buffer)[0];

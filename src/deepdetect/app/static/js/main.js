@@ -46,20 +46,31 @@ async function start() {
   if (alone && "serviceWorker" in navigator && config.offline) {
     navigator.serviceWorker.register("sw.js").catch(() => {}); // without it, only when online
   }
-  opened = background.call("open", { engine: config.engine, token: page.token,
-                                     processor: await processor(config) });
-  opened.then((words) => {
-    element("engine").textContent = `The network runs on ${words}.`;
-  }, (error) => showError(error.message));
+  const open = (processor) => background.call(
+    "open", { engine: config.engine, token: page.token, processor });
+  opened = open("processor");
+  opened.then(sayWhere, (error) => showError(error.message));
   await showExamples();
+  if (config.webgpu && await hasGraphics()) offerGraphics(() => open("graphics"));
 }
 
-/** Where the network runs in a browser: what the address asks for, where it is possible. */
-async function processor(config) {
-  const wanted = new URLSearchParams(location.search).get("processor");
-  const graphics = config.webgpu && wanted === "webgpu" && navigator.gpu
-    && await navigator.gpu.requestAdapter().catch(() => null);
-  return graphics ? "webgpu" : "wasm";
+function sayWhere(words) {
+  element("engine").textContent = `The network runs on ${words}.`;
+}
+
+/** @returns {Promise<boolean>} whether there is a graphics card that networks can run on */
+async function hasGraphics() {
+  return Boolean(await navigator.gpu?.requestAdapter().catch(() => null));
+}
+
+/** Lets the network run on the graphics card, from the next picture on. */
+function offerGraphics(open) {
+  const button = element("graphics");
+  button.hidden = false;
+  button.onclick = () => guarded(async () => {
+    sayWhere(await during("Loading the network…", open()));
+    button.hidden = true;
+  });
 }
 
 /** Takes the key of this start from the address, where nobody should see or copy it. */

@@ -72,8 +72,9 @@ function pixelsOf(bitmap, name) {
 
 async function browserNetwork(processor) {
   const folder = new URL("../ort/", import.meta.url).href;
-  const graphics = processor === "webgpu";
+  const graphics = processor === "graphics";
   const ort = await import(`${folder}ort.${graphics ? "webgpu" : "wasm"}.min.mjs`);
+  ort.env.logLevel = "error";
   ort.env.wasm.wasmPaths = folder;
   ort.env.wasm.numThreads = self.crossOriginIsolated
     ? Math.min(MAX_THREADS, navigator.hardwareConcurrency || 1) : 1;

@@ -110,7 +110,7 @@ export function roundHalfEven(value) {
 
 /** @param {HeatMap} map @param {Options} options @returns {Uint32Array} pixels, in their order */
 export function select(map, options) {
-  const { probability, logits, maxima, sorted } = map;
+  const { probability, logits, maxima } = map;
   const threshold = options.density === null ? fround(options.threshold) : 0;
   const wanted = options.density === null ? null : roundHalfEven(options.density * logits.length);
   if (options.maxKeypoints !== null) {
@@ -118,29 +118,37 @@ export function select(map, options) {
     const count = Math.min(passing, options.maxKeypoints, wanted ?? Infinity);
     return maxima.slice(0, count).sort();
   }
-  if (wanted === null) return where(logits.length, (k) => probability[k] > threshold);
-  return highest(map, wanted);
+  return wanted === null ? above(probability, threshold) : highest(map, wanted);
+}
+
+// The loops over all pixels are plain: they run while a slider moves.
+
+/** The pixels with a probability above a threshold. */
+function above(probability, threshold) {
+  const found = new Uint32Array(probability.length);
+  let count = 0;
+  for (let k = 0; k < probability.length; k++) if (probability[k] > threshold) found[count++] = k;
+  return found.subarray(0, count);
 }
 
 /** The `wanted` pixels of highest rank, among those that are possible at all. */
 function highest({ logits, probability, sorted, width, height }, wanted) {
   if (wanted === 0) return new Uint32Array(0);
   const last = sorted[logits.length - wanted];
-  const above = logits.length - leading(sorted.length, (k) => sorted[k] <= last);
-  const tied = where(logits.length, (k) => logits[k] === last && probability[k] > 0);
-  const bayer = (pixel) => bayerOrder(pixel % width, Math.floor(pixel / width), width, height);
-  const spread = tied.length > wanted - above ? tied.sort((a, b) => bayer(a) - bayer(b) || a - b)
-                                              : tied;
-  const kept = new Set(spread.subarray(0, wanted - above));
-  return where(logits.length, (k) => probability[k] > 0
-    && (logits[k] > last || (logits[k] === last && kept.has(k))));
-}
-
-function where(length, holds) {
-  const found = new Uint32Array(length);
+  const better = logits.length - leading(sorted.length, (k) => sorted[k] <= last);
+  const found = new Uint32Array(logits.length);
+  const tied = [];
   let count = 0;
-  for (let k = 0; k < length; k++) if (holds(k)) found[count++] = k;
-  return found.slice(0, count);
+  for (let k = 0; k < logits.length; k++) {
+    if (logits[k] < last || probability[k] === 0) continue;
+    if (logits[k] === last) tied.push(k);
+    found[count++] = k;
+  }
+  if (better + tied.length <= wanted) return found.subarray(0, count);
+  const bayer = (pixel) => bayerOrder(pixel % width, Math.floor(pixel / width), width, height);
+  tied.sort((a, b) => bayer(a) - bayer(b) || a - b);
+  const dropped = new Set(tied.slice(wanted - better));
+  return found.subarray(0, count).filter((pixel) => !dropped.has(pixel));
 }
 
 /**
@@ -152,15 +160,23 @@ function where(length, holds) {
 export function positions(map, pixels, options) {
   const { logits, width, height } = map;
   const xy = new Float32Array(2 * pixels.length);
-  const refine = options.maxKeypoints !== null;
-  pixels.forEach((pixel, k) => {
-    const [column, row] = [pixel % width, Math.floor(pixel / width)];
-    const middle = logits[pixel];
-    const offset = (inner, step) => refine && inner
-      ? peakOffset(logits[pixel - step], middle, logits[pixel + step]) : 0;
-    xy[2 * k] = column + fround(offset(column > 0 && column < width - 1, 1));
-    xy[2 * k + 1] = row + fround(offset(row > 0 && row < height - 1, width));
-  });
+  for (let k = 0; k < pixels.length; k++) {
+    const pixel = pixels[k];
+    const row = Math.floor(pixel / width);
+    const column = pixel - row * width;
+    let [right, down] = [0, 0];
+    if (options.maxKeypoints !== null) {
+      const middle = logits[pixel];
+      if (column > 0 && column < width - 1) {
+        right = fround(peakOffset(logits[pixel - 1], middle, logits[pixel + 1]));
+      }
+      if (row > 0 && row < height - 1) {
+        down = fround(peakOffset(logits[pixel - width], middle, logits[pixel + width]));
+      }
+    }
+    xy[2 * k] = column + right;
+    xy[2 * k + 1] = row + down;
+  }
   return xy;
 }
 

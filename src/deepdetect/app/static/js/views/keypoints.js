@@ -47,8 +47,9 @@ export function draw() {
   const picture = activePicture();
   if (!picture) return;
   const pixels = select(picture.map, chosen);
-  const xy = positions(picture.map, pixels, chosen);
-  shown = { picture, options: chosen, pixels, xy };
+  // Of dense keypoints the pixels are all that is drawn.
+  const xy = chosen.maxKeypoints === null ? null : positions(picture.map, pixels, chosen);
+  shown = { picture, options: chosen, pixels };
   const canvas = view.querySelector(".picture");
   if (canvas.source !== picture) {
     canvas.source = picture;
@@ -66,7 +67,8 @@ export function draw() {
 
 /** Rows of x, y and probability, in the photograph's own pixels. */
 function rows() {
-  const { picture, pixels, xy } = shown;
+  const { picture, pixels, options: chosen } = shown;
+  const xy = positions(picture.map, pixels, chosen);
   return Array.from(pixels, (pixel, k) =>
     [...toOriginal(picture, xy[2 * k], xy[2 * k + 1]), picture.map.probability[pixel]]);
 }
