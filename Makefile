@@ -33,7 +33,7 @@ install_locked = $(call install,$(1)) --no-deps --require-hashes -r $(2)
 install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requirements/torch.txt
 install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
 
-.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest coverage lint spelling types contracts check \
+.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web coverage lint spelling types contracts check \
 	format lock upgrade check-lock audit sbom docs test-docs notebooks figures dist release-check clean
 
 demo: $(VENV)/.demo
@@ -72,6 +72,14 @@ test-integrations: $(VENV_INTEGRATIONS)/.test
 # The lowest versions that pyproject.toml allows, but for torch.
 test-lowest: $(VENV_LOWEST)/.test
 	$(VENV_LOWEST)/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_LOWEST)
+
+# The page for any web server, with ONNX Runtime and the network, in web/dist.
+web: web/node_modules/.package-lock.json
+	cd web && npm run --silent build
+
+# The page in Chromium: alone, and with `deepdetect app`.
+test-web: $(VENV)/.test web
+	cd web && DEEPDETECT_PYTHON=$(abspath $(VENV))/bin/python npx playwright test $(TESTS_WEB)
 
 coverage: $(VENV)/.test
 	$(VENV)/bin/python $(PYTEST) --cov --cov-report term:skip-covered --cov-report html
@@ -143,7 +151,11 @@ release-check: $(VENV_DOCS)/.test
 
 clean:
 	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(VENV_RAY) $(VENV_INTEGRATIONS) $(VENV_DOCS) $(DEMO_OUTPUT)
+	rm -rf web/dist web/node_modules web/test-results
 	rm -rf build dist sbom.json htmlcov .coverage .coverage.* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
+
+web/node_modules/.package-lock.json: web/package-lock.json
+	cd web && npm ci --ignore-scripts --no-audit --no-fund
 
 %/bin/uv: requirements/uv.txt
 	$(PYTHON) -m venv $*

@@ -19,7 +19,7 @@ const startTask = (page, kind) => page.locator(`[data-kind="${kind}"]`).click();
 
 test("it says what it can, and finds the keypoints of Python", async ({ page, app }) => {
   await openExample(page, "Coffee", app.address);
-  await expect(page.locator("#power")).toHaveText("With Python on this computer");
+  await expect(page.locator("#power")).toHaveText("With Python");
   expect(page.url()).not.toContain("key");
   const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=csv]"));
   const expected = askPython(`
@@ -52,7 +52,13 @@ test("a 3D model is shown, and can be turned", async ({ page, app }) => {
   await startTask(page, "reconstruct");
   await expect(page.getByRole("alert")).toContainText("focal", { timeout: 120_000 });
   await page.locator("[name=focal_px]").fill("995");
+  const framed = page.waitForResponse((response) => response.url().endsWith("/model.html")
+    && response.request().isNavigationRequest());
   await startTask(page, "reconstruct");
+  const policy = (await framed).headers()["content-security-policy"];
+  expect(policy).toContain("default-src 'none'");
+  expect(policy).toContain("sandbox allow-scripts");
+  expect(policy).not.toContain("connect-src");
   const viewer = page.frameLocator("#job-result iframe");
   await expect(viewer.locator("#message")).toBeHidden({ timeout: 120_000 });
   await expect(viewer.locator("dl")).toContainText("Points");

@@ -22,6 +22,25 @@ export function askPython(code, ...words) {
   return JSON.parse(execFileSync(python, ["-c", code, ...words], { maxBuffer: 2 ** 28 }));
 }
 
+/** Starts deepdetect app. */
+export async function startApp(env) {
+  const child = spawn(python, ["-m", "deepdetect", "app", "--port", "0"],
+                      { env, stdio: ["ignore", "pipe", "inherit"] });
+  const ended = new Promise((resolve) => child.on("exit", resolve));
+  const address = await new Promise((resolve, reject) => {
+    child.stdout.on("data", (data) => {
+      const found = /http:\S+/.exec(String(data));
+      if (found) resolve(found[0]);
+    });
+    child.on("exit", (code) => reject(new Error(`deepdetect app ended with ${code}`)));
+  });
+  const end = () => {
+    child.kill("SIGTERM");
+    return ended;
+  };
+  return { address, end };
+}
+
 export const test = base.extend({
   // No test may ask another host, or leave an error in the console.
   page: async ({ page }, use) => {
@@ -33,19 +52,9 @@ export const test = base.extend({
   // deepdetect app, with a folder for temporary files that is looked at when it has ended.
   app: [async ({}, use) => {
     const folder = mkdtempSync(join(tmpdir(), "app-test-"));
-    const child = spawn(python, ["-m", "deepdetect", "app", "--port", "0"],
-                        { env: { ...process.env, TMPDIR: folder }, stdio: ["ignore", "pipe", "inherit"] });
-    const address = await new Promise((resolve, reject) => {
-      child.stdout.on("data", (data) => {
-        const found = /http:\S+/.exec(String(data));
-        if (found) resolve(found[0]);
-      });
-      child.on("exit", (code) => reject(new Error(`deepdetect app ended with ${code}`)));
-    });
-    await use({ address, folder });
-    const ended = new Promise((resolve) => child.on("exit", resolve));
-    child.kill("SIGTERM");
-    await ended;
+    const app = await startApp({ ...process.env, TMPDIR: folder });
+    await use({ address: app.address, folder });
+    await app.end();
     rmSync(folder, { recursive: true });
   }, { scope: "worker" }],
 });

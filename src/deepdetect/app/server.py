@@ -7,6 +7,7 @@ own page with the key of this start, and that are neither too large nor too slow
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import json
 import secrets
@@ -42,6 +43,10 @@ MAX_DESCRIPTION_BYTES = 1 << 18
 
 MAX_NAME_LENGTH = 200
 PIECE_BYTES = 1 << 20
+DRAINED_BYTES = 16 << 20
+"""Of a refused request that are read before it is answered: browsers look for the answer only when
+they have sent everything. What was refused for its other contents is read whole."""
+
 SLOWEST = 10
 """A request may last so many times as long in all as it may stand still."""
 
@@ -192,15 +197,17 @@ class Handler(BaseHTTPRequestHandler):
         self._answer(self._delete)
 
     def _answer(self, method: Any) -> None:
-        """Answer, or say in one sentence why not; what is left of a refused request is not read."""
+        """Answer, or say in one sentence why not."""
+        self.received, self.accepted_length = 0, 0
         self.deadline = time.monotonic() + SLOWEST * self.server.options.max_request_s
         try:
-            self._check_source()
-            method(urlsplit(self.path))
-        except Refused as refusal:
-            self._refuse(refusal.status, str(refusal))
-        except DeepDetectError as error:
-            self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+            try:
+                self._check_source()
+                method(urlsplit(self.path))
+            except Refused as refusal:
+                self._refuse(refusal.status, str(refusal))
+            except DeepDetectError as error:
+                self._refuse(HTTPStatus.BAD_REQUEST, str(error))
         except (ConnectionError, TimeoutError):
             self.close_connection = True
 
@@ -337,7 +344,17 @@ class Handler(BaseHTTPRequestHandler):
                 HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
                 f"this is over {largest / 1e6:.3g} MB: give fewer or smaller photographs",
             )
-        return int(text)
+        self.accepted_length = int(text)
+        return self.accepted_length
+
+    def _drain(self) -> None:
+        """Read what is left of a refused request, as far as that is worth it."""
+        text = self.headers.get("Content-Length", "")
+        length = int(text) if text.isascii() and text.isdigit() and len(text) < 15 else 0
+        left = min(length, max(self.accepted_length, DRAINED_BYTES)) - self.received
+        with contextlib.suppress(Refused):
+            for _ in self._pieces(max(0, left)):
+                pass
 
     def _pieces(self, length: int) -> Any:
         """Yield so many bytes of the request's body."""
@@ -348,10 +365,12 @@ class Handler(BaseHTTPRequestHandler):
             if not piece:
                 raise ConnectionError("the browser has ended the request")
             length -= len(piece)
+            self.received += len(piece)
             yield piece
 
     def _refuse(self, status: HTTPStatus, sentence: str) -> None:
         self.close_connection = True
+        self._drain()
         self._send_json({"error": sentence}, status)
 
     def _send_json(self, values: Any, status: HTTPStatus = HTTPStatus.OK) -> None:

@@ -34,7 +34,7 @@ async function start() {
   for (const part of document.querySelectorAll(".without-python")) part.hidden = !alone;
   element("tab-python").hidden = alone;
   element("use-folder").hidden = alone;
-  element("power").textContent = alone ? "In this browser" : "With Python on this computer";
+  element("power").textContent = alone ? "In this browser" : "With Python";
   element("promise").textContent = alone
     ? "Your pictures stay on this device: the network runs in this browser."
     : "Your pictures stay on this computer, and are forgotten after each task.";
