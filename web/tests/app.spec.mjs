@@ -103,13 +103,15 @@ test("a task is cancelled", async ({ page, app }) => {
   await expect(page.locator("#error")).toBeHidden();
 });
 
-test("closing the page ends its task", async ({ context, app }) => {
+test("leaving the page ends its task", async ({ context, app }) => {
   const page = await context.newPage();
   await openTasks(page, "Motorcycle", app);
   await startTask(page, "match");
-  await expect.poll(() => tasksOf(app).length).toBe(1);
-  await page.close({ runBeforeUnload: false });
+  await expect(page.locator("#job-stage")).not.toContainText("sending");
+  expect(tasksOf(app).length).toBe(1);
+  await page.goto("about:blank");
   await expect.poll(() => tasksOf(app)).toEqual([]);
+  await page.close();
 });
 
 test("a folder", async ({ page, app }, info) => {

@@ -87,6 +87,24 @@ print(json.dumps(DeepDetect(backend="onnxruntime", resolution="native").detect(s
   expect(shared / Math.max(expected.length, found.keypoints.length)).toBeGreaterThan(0.9995);
 });
 
+test("a photograph that its camera has turned is upright", async ({ page }, info) => {
+  const path = info.outputPath("turned.jpg");
+  askPython(`
+import sys
+from PIL import Image
+image = Image.open(sys.argv[1])
+exif = image.getexif()
+exif[0x0112] = 6
+image.save(sys.argv[2], exif=exif, quality=95)
+print("null")
+`, join(examples, "coffee.jpg"), path);
+  await page.goto("./");
+  await openFile(page, path);
+  await expect(page.locator("#files small")).toHaveText("400×600");
+  const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=csv]"));
+  expect(pixels(table(content))).toEqual(pixels(askPython(KEYPOINTS, path, "{}").xy));
+});
+
 test("sliders answer at once, and do not run the network", async ({ page }) => {
   await openExample(page, "Coffee");
   const count = async () => Number((await page.locator("#count").textContent()).replace(/\D/g, ""));

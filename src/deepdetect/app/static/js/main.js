@@ -132,6 +132,7 @@ async function addPictures(files) {
     document.body.dataset.networkRuns = String(++runs);
     if (page.pictures.length >= MAX_PICTURES) return; // of two that were given at once
     page.pictures.push({ name: file.name, file, ...read, canvas, map, seconds });
+    if (file === files.at(-1)) break;
     page.active = page.pictures.length - 1;
     showPictures();
   }

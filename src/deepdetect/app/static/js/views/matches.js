@@ -16,6 +16,7 @@ const view = element("view-matches");
 const form = view.querySelector("form");
 const background = new Background(new URL("../matching_worker.js", import.meta.url));
 let found = null; // mutual matches of the pictures with their ratios
+let pending = null; // the matching that is at work, or was the last
 let kept = null; // those under the ratio, with their geometry
 let asked = 0;
 
@@ -35,11 +36,24 @@ export async function match() {
   const [first, second] = page.pictures;
   if (!second) return;
   const key = [first, second, count()];
-  if (found?.key.every((value, k) => value === key[k])) return;
+  const same = (other) => other?.key.every((value, k) => value === key[k]);
+  if (same(found)) return;
+  if (!same(pending)) pending = { key, done: matchNew(key) };
+  try {
+    await pending.done;
+  } catch (error) {
+    pending = null; // it may be tried again
+    throw error;
+  }
+}
+
+/** Matches pictures, and finds the geometry of their matches. */
+async function matchNew(key) {
+  const [first, second] = key;
   const own = ++asked;
   const pictures = [first, second].map((picture) => ({
     rgba: picture.rgba, width: picture.width, height: picture.height,
-    xy: bestKeypoints(picture, count()),
+    xy: bestKeypoints(picture, key[2]),
   }));
   const result = await during("Matching…", background.call("match", { pictures }));
   if (own !== asked) return;
@@ -136,7 +150,7 @@ const downloads = {
 
 /** Forgets the matches of pictures that are gone. */
 export function reset() {
-  [found, kept] = [null, null];
+  [found, pending, kept] = [null, null, null];
   asked++;
   element("match-count").textContent = "–";
   element("match-hint").textContent = "";
