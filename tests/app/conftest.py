@@ -65,9 +65,9 @@ class Client:
     def start(self, kind: str, files: list[tuple[str, bytes]], **options: Any) -> Answer:
         return self.ask("POST", f"/api/jobs?kind={kind}", packed(files, options))
 
-    def wait(self, job: str) -> dict[str, Any]:
+    def wait(self, job: str, seconds: float = 120) -> dict[str, Any]:
         """Return the state of a task when it has ended."""
-        until = time.monotonic() + 120
+        until = time.monotonic() + seconds
         while time.monotonic() < until:
             state = self.ask("GET", f"/api/jobs/{job}").values
             if state["state"] != "running":
