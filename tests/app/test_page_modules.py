@@ -77,7 +77,7 @@ OPTIONS = (
 
 
 def compare(run_node: Any, logits: np.ndarray, options: dict[str, Any]) -> int:
-    from deepdetect.features.selection import sigmoid
+    from deepdetect.features.maps import sigmoid
 
     expected = select_keypoints(sigmoid(logits), logits=logits, **options)
     names = {"max_keypoints": "maxKeypoints"}
