@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
+import sys
+
 import numpy as np
 
 from .._shared.kernels import has_compiler
 
 MIN_COMPILED_POINTS = 30_000
-"""From which importing the compiled code, where there is numba, takes less time than it saves."""
+"""From which importing the compiled code, where there is numba, takes less time than it saves.
+
+The points of each pass count. Where numba has been imported already, compiled code is always taken.
+"""
 
 DISTANCE_STEP_PX = 0.25
 """To which the distance of `spread_by_distance` is found."""
@@ -39,13 +45,18 @@ def suppress_neighbors(
     radii = np.broadcast_to(np.asarray(radius_px, np.float64), len(order))[order]
     cell = float(radii.min())
     columns, rows = (int(side) + 1 for side in places.max(0) / cell)
-    if len(order) >= MIN_COMPILED_POINTS and has_compiler():
+    if _saves_time(len(order)):
         from .suppression_kernel import keep_distant
 
         x, y = (np.ascontiguousarray(axis) for axis in places.T)
         kept: np.ndarray = keep_distant(x, y, radii, cell, columns, rows)
         return order[kept]
     return order[_keep_distant(places, radii, cell, columns)]
+
+
+def _saves_time(points: int) -> bool:
+    """Whether compiled code is there, and is worth its import for so many points."""
+    return has_compiler() and (points >= MIN_COMPILED_POINTS or "numba" in sys.modules)
 
 
 def _keep_distant(places: np.ndarray, radii: np.ndarray, cell: float, columns: int) -> list[int]:
@@ -118,6 +129,9 @@ def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.nda
     if count >= len(best):
         return best
     near, far = 0.0, float(np.linalg.norm(np.ptp(np.asarray(xy, np.float64), axis=0))) + 1
+    passes = math.ceil(math.log2(far / DISTANCE_STEP_PX))
+    if _saves_time(passes * len(best)):
+        from . import suppression_kernel  # noqa: F401 (each pass then finds it imported)
     while far - near > DISTANCE_STEP_PX:
         middle = (near + far) / 2
         kept = suppress_neighbors(xy, scores, middle)
