@@ -16,7 +16,10 @@ from deepdetect.io.depth import load_depth_png
 FOCAL, OFFSET, BASELINE = 994.978, 31.086, 193.001
 """In pixels and mm, of the page of skimage.data.stereo_motorcycle."""
 
-FILES = ["m.glb", "m.html", "m.json", "m.ply", "m_depth.jpg", "m_depth.npz", "m_depth.png"]
+FILES = [
+    *(".deepdetect", "m.glb", "m.html", "m.json", "m.ply"),
+    *("m_depth.jpg", "m_depth.npz", "m_depth.png"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +91,7 @@ def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
     assert sorted(path.name for path in Path("out").iterdir()) == FILES
     values = json.loads(result.stdout)
     assert values == json.loads(Path("out/m.json").read_text())
-    assert sorted(Path(file).name for file in values["files"]) == FILES
+    assert sorted(Path(file).name for file in values["files"]) == FILES[1:]
 
     assert values["rectified"] is True
     assert "on the same row" in values["rectified_why"]
@@ -191,6 +194,28 @@ def test_selection_options_and_weights_reach_the_detector(run, folder: Path) -> 
         values = json.loads(run("reconstruct", *pair, "--threshold", 0.7, *given).stdout)
         expected = DeepDetect(weights).detect(folder / "left.png", threshold=0.7)
         assert values["keypoints"] == len(expected)
+
+
+def test_results_of_other_photographs_are_not_replaced_silently(run, folder: Path) -> None:
+    Path("out").mkdir()
+    for name in ("m.ply", "m_depth.png"):
+        Path("out", name).write_text("mine")
+    pair = folder / "left.png", folder / "right.png"
+    arguments = ("--focal", FOCAL, "--rectified", "--max-keypoints", 2000, "-o", "out/m.ply")
+    refused = run("reconstruct", *pair, *arguments)
+    assert (refused.exit_code, len(refused.stderr.strip().splitlines())) == (2, 1)
+    assert "m.ply exists already, and is not known to be of" in " ".join(refused.stderr.split())
+    assert [path.read_text() for path in Path("out").iterdir()] == ["mine", "mine"]
+    for more in (["--overwrite"], []):  # its own are replaced
+        result = run("reconstruct", *pair, *arguments, *more)
+        assert result.exit_code == 0, result.output
+        assert Path("out/m.ply").read_bytes()[:3] == b"ply"
+        assert sorted(path.name for path in Path("out").iterdir()) == FILES
+    refused = run("reconstruct", pair[0], folder / "beside.png", *arguments)
+    assert refused.exit_code == 2
+    assert "right.png: choose another folder with -o, or replace it with --overwrite" in (
+        " ".join(refused.stderr.split())
+    )
 
 
 CASES = {
@@ -340,7 +365,7 @@ def test_models_of_before_survive_a_failure(
     monkeypatch.setattr(np, "savez_compressed", fail)
     result = run(
         *("reconstruct", folder / "left.png", folder / "right.png", "--focal", FOCAL),
-        *("-o", "m.ply"),
+        *("-o", "m.ply", "--overwrite"),
     )
     assert result.exit_code == 2
     assert "No space left" in result.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -50,16 +51,36 @@ def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
     assert other.exit_code == 2
     assert "--overwrite" in other.stderr
 
+    # Other photographs do not take the place of these, not even of what a killed run has left.
+    for gone in ("model.ply", "model.glb", "model.html", "model.json", "database.db"):
+        Path("model", gone).unlink()
+    copy = shutil.copytree(fountain, fountain.with_name("others"))
+    refused = run("reconstruct", copy, *arguments[2:], "--max-keypoints", 1500)
+    assert refused.exit_code == 2
+    assert one_sentence(refused.stderr)
+    assert "exists already, made from" in refused.stderr
+    assert not Path("model/model.ply").exists()
+    resumed = run(*arguments, "--max-keypoints", 1500)
+    assert resumed.exit_code == 0, resumed.output
+    assert Path("model/model.ply").exists()
+    replaced = run("reconstruct", copy, *arguments[2:], "--max-keypoints", 1500, "--overwrite")
+    assert replaced.exit_code == 0, replaced.output
+
 
 def test_a_list_of_photographs_is_a_folder(run, fountain: Path) -> None:
     images = sorted(fountain.glob("*.jpg"))
-    result = run(
-        *("reconstruct", *images, "-o", "model", "--workers", 1, "--max-keypoints", 1000),
-        *("--no-dense", "--sequential", 2, "--json"),
-    )
+    more = ("-o", "model", "--workers", 1, "--max-keypoints", 1000, "--no-dense", "--json")
+    result = run("reconstruct", *images, *more, "--sequential", 2)
     assert result.exit_code == 0, result.output
     values = json.loads(result.stdout)
     assert (values["registered"], values["pairs"], values["dense_points"]) == (3, 3, 0)
+    # More photographs are added to them; fewer would be another model.
+    added = run("reconstruct", *images, fountain / "black.png", *more, "--sequential", 2)
+    assert added.exit_code == 0, added.output
+    assert json.loads(added.stdout)["photographs"] == 4
+    fewer = run("reconstruct", *images, *more, "--sequential", 2)
+    assert fewer.exit_code == 2
+    assert "made from" in fewer.stderr
 
 
 @pytest.mark.parametrize(
@@ -69,7 +90,6 @@ def test_a_list_of_photographs_is_a_folder(run, fountain: Path) -> None:
         ((".", "a.png"), "one folder, or photographs"),
         (("a.png", "b.png", "--no-dense"), "--dense is for more than two"),
         (("a.png", "b.png", "--sequential", "3"), "--sequential is for more than two"),
-        (("a.png", "b.png", "--overwrite"), "--overwrite is for more than two"),
         (("a.png", "b.png", "--workers", "2"), "--workers is for more than two"),
         ((".", "--rectified"), "for two photographs"),
     ],

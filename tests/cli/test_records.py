@@ -76,3 +76,17 @@ def test_what_nobody_claimed_is_not_replaced(tmp_path: Path) -> None:
         path.write_bytes(b"the picture is somebody's own")
     with pytest.raises(OptionError, match=r"m\.jpg exists already, and is not known"):
         claim_outputs("match", inputs, outputs, overwrite=False)
+
+
+def test_a_growing_list_of_inputs_keeps_its_outputs(tmp_path: Path) -> None:
+    photographs = [tmp_path / f"{name}.jpg" for name in "abc"]
+    model = tmp_path / "model.ply"
+    claim_outputs("reconstruct", photographs[:2], [model], overwrite=False, growing=True)
+    model.write_text("")
+    with pytest.raises(OptionError, match=r"model\.ply exists already, made from .*a\.jpg"):
+        claim_outputs("reconstruct", photographs, [model], overwrite=False)
+    claim_outputs("reconstruct", photographs, [model], overwrite=False, growing=True)
+    with pytest.raises(OptionError, match=r"made from .*c\.jpg: choose another folder"):
+        claim_outputs("reconstruct", photographs[1:], [model], overwrite=False, growing=True)
+    claim_outputs("reconstruct", photographs[1:], [model], overwrite=True, growing=True)
+    claim_outputs("reconstruct", photographs[1:], [model], overwrite=False)

@@ -41,8 +41,11 @@ def reconstruct_folder(
 ) -> None:
     """Reconstruct many photographs, and print what was found."""
     from ..features.selection import SelectionOptions
+    from ..sfm.colmap import import_pycolmap
     from ..sfm.options import MultiViewOptions
-    from ..sfm.pipeline import reconstruct_many
+    from ..sfm.pipeline import check_output_folder, output_files, reconstruct_many
+    from ..sfm.stages import check_photographs
+    from ._records import claim_outputs
 
     target = OUTPUT if output is None else output
     detector = given_only({name: values.pop(name) for name in DETECTOR.names})
@@ -52,8 +55,14 @@ def reconstruct_folder(
     selection = {name: values.pop(name) for name in fields if name in values}
     options = MultiViewOptions()
     chosen = dataclasses.replace(options.selection, **given_only(selection))
+    photographs = images[0] if len(images) == 1 else images
+    # What is missing or wrong is said before anything is written.
+    import_pycolmap()
+    check_output_folder(target)
+    check_photographs(photographs)
+    claim_outputs("reconstruct", sorted(images), output_files(target), overwrite, growing=True)
     found = reconstruct_many(
-        images[0] if len(images) == 1 else images,
+        photographs,
         target,
         detector=detector,
         options=dataclasses.replace(options, selection=chosen),

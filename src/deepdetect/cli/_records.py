@@ -110,32 +110,70 @@ class OutputRecords:
             temporary.write_text(text, encoding="utf-8")
 
 
+def check_outputs(
+    command: str,
+    inputs: Sequence[Path],
+    outputs: Sequence[Path],
+    overwrite: bool,
+    growing: bool = False,
+) -> None:
+    """Refuse to replace outputs of other files; arguments and errors as of `claim_outputs`."""
+    names = _names(inputs)
+    for path in outputs:
+        if overwrite or not path.exists():
+            continue
+        record = _read(_claim(command, path))
+        if record is None or path.name not in record["files"]:
+            raise _exists(path, f"and is not known to be of {' and '.join(names)}")
+        if record["input"] != " and ".join(names):
+            before = record["settings"].get("inputs")
+            if not (growing and isinstance(before, list) and set(before) <= set(names)):
+                raise _exists(path, f"made from {record['input']}")
+
+
 def claim_outputs(
-    command: str, inputs: Sequence[Path], outputs: Sequence[Path], overwrite: bool
+    command: str,
+    inputs: Sequence[Path],
+    outputs: Sequence[Path],
+    overwrite: bool,
+    growing: bool = False,
 ) -> None:
     """Note from which files each output is made; refuse to replace those of other files.
 
     Outputs of the same files are replaced, whatever the options were: call it before the work.
 
+    Args:
+        command: its name.
+        inputs: files or folders.
+        outputs: files or folders.
+        overwrite: replace whatever there is.
+        growing: outputs of a part of the inputs are replaced, too.
+
     Raises:
         OptionError: an output exists that was made from other files, or by something else.
         DeepDetectError: the folder cannot be written.
     """
-    source = " and ".join(str(path.resolve()) for path in inputs)
-    places = {path: path.parent / FOLDER / command / f"{path.name}.json" for path in outputs}
-    for path, place in places.items():
-        if overwrite or not path.exists():
-            continue
-        record = _read(place)
-        if record is None or path.name not in record["files"]:
-            raise _exists(path, f"and is not known to be of {source}")
-        if record["input"] != source:
-            raise _exists(path, f"made from {record['input']}")
-    for path, place in places.items():
-        files = {path.name: None}
-        value = {"input": source, "state": [0, 0], "settings": {}, "files": files, "numbers": None}
-        with atomic_path(place) as temporary:
+    check_outputs(command, inputs, outputs, overwrite, growing)
+    names = _names(inputs)
+    for path in outputs:
+        value = {
+            "input": " and ".join(names),
+            "state": [0, 0],
+            "settings": {"inputs": names},
+            "files": {path.name: None},
+            "numbers": None,
+        }
+        with atomic_path(_claim(command, path)) as temporary:
             temporary.write_text(json.dumps(value), encoding="utf-8")
+
+
+def _names(inputs: Sequence[Path]) -> list[str]:
+    return [str(path.resolve()) for path in inputs]
+
+
+def _claim(command: str, output: Path) -> Path:
+    """Return where it is noted from what an output is made."""
+    return output.parent / FOLDER / command / f"{output.name}.json"
 
 
 def recorded_outputs(folder: Path) -> set[Path]:

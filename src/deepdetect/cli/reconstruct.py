@@ -107,23 +107,31 @@ def reconstruct(
     if len(images) < 2:
         raise click.UsageError("give two photographs, or more, or a folder of them")
     of_many = {name: values.pop(name) for name in MANY.names}
-    for name in given_only({**of_many, "workers": workers, "overwrite": overwrite or None}):
+    for name in given_only({**of_many, "workers": workers}):
         flag = MANY.flags.get(name, "--" + name.replace("_", "-"))
         raise click.UsageError(f"{flag} is for more than two photographs")
-    _reconstruct_two(images[0], images[1], output or MODEL, as_json, **values)
+    _reconstruct_two(images[0], images[1], output or MODEL, overwrite, as_json, **values)
 
 
 def _reconstruct_two(
-    left: Path, right: Path, output: Path, as_json: bool, calibration: Path | None, **values: Any
+    left: Path,
+    right: Path,
+    output: Path,
+    overwrite: bool,
+    as_json: bool,
+    calibration: Path | None,
+    **values: Any,
 ) -> None:
     """Reconstruct two photographs, and print what was found."""
     from .._shared.progress import progress
     from ..io.point_cloud import find_writer
     from ..reconstruction.pipeline import reconstruct as reconstruct_pair
+    from ._records import check_outputs, claim_outputs
 
     find_writer(output)
     files = _files(output, [path for path in (left, right, calibration) if path is not None])
     detector = make_detector(values, weights="dense")
+    check_outputs("reconstruct", [left, right], list(files.values()), overwrite)
     chosen = given_only(values)
     # On a terminal only: what is logged stays readable.
     with progress(STAGES + 1, "reconstructing", "stage", not sys.stderr.isatty()) as bar:
@@ -141,6 +149,7 @@ def _reconstruct_two(
             **chosen,
         )
         bar.update(STAGES - bar.n)
+        claim_outputs("reconstruct", [left, right], list(files.values()), overwrite)
         numbers = _write(found, files, {"left": left, "right": right})
         done("files")
     print_result(as_json, numbers, _rows(found, numbers), f"{left} and {right}")

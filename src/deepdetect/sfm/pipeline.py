@@ -122,14 +122,19 @@ def reconstruct_many(
         chosen = replace(chosen, dense=None)
     import_pycolmap()  # what is missing is said before hours of work
     target = Path(output)
-    if target.is_file() or target.suffix.lower() in (".ply", ".glb", ".html"):
-        raise OptionError(f"{target} is the name of a file: give the name of a folder with -o")
+    check_output_folder(target)
     if overwrite and (target / WORK).exists():
         shutil.rmtree(target / WORK)
     if calibration is not None and focal_px is not None:
         raise ReconstructionError("give `calibration` or `focal_px`, not both")
     stages = Stages(target, chosen, workers, quiet)
     return _reconstruct(stages, images, calibration, focal_px, detector)
+
+
+def check_output_folder(output: Path) -> None:
+    """Raise an OptionError where results cannot be in a folder of this name."""
+    if output.is_file() or output.suffix.lower() in (".ply", ".glb", ".html"):
+        raise OptionError(f"{output} is the name of a file: give the name of a folder with -o")
 
 
 def _seeded(options: MultiViewOptions, seed: int) -> MultiViewOptions:
@@ -209,15 +214,15 @@ def _reconstruct(
             verified,
             len(pairs),
             timer.seconds,
-            _files(stages.output),
+            output_files(stages.output)[:-1],
         )
         _write(found, stages.output)
     return found
 
 
-def _files(output: Path) -> tuple[Path, ...]:
-    """Name all files."""
-    names = ("model.ply", "model.glb", "model.html", "model.json", "sparse", "database.db")
+def output_files(output: Path) -> tuple[Path, ...]:
+    """Name all that is written into the folder of the results; the last is what stages made."""
+    names = ("model.ply", "model.glb", "model.html", "model.json", "sparse", "database.db", WORK)
     return tuple(output / name for name in names)
 
 

@@ -65,6 +65,27 @@ class PhotographFeatures:
     failures: dict[str, str]
 
 
+def check_photographs(images: str | Path | Sequence[str | Path]) -> dict[str, Path]:
+    """Return the photographs below a folder, or of a list, by name.
+
+    Raises:
+        ImageError: the folder is missing or holds no image, or a file is missing.
+        OptionError: two files of a list have one name.
+    """
+    if isinstance(images, (str, Path)):
+        folder = Path(images)
+        return {path.relative_to(folder).as_posix(): path for path in find_images(folder)}
+    paths = [Path(path) for path in images]
+    missing = [path for path in paths if not path.is_file()]
+    if missing:
+        raise MissingImageError(f"there is no file {missing[0]}: check the path")
+    taken: dict[str, Path] = {}
+    for path in paths:
+        if taken.setdefault(path.name, path).resolve() != path.resolve():
+            raise OptionError(f"{taken[path.name]} and {path} have one name: rename one of them")
+    return taken
+
+
 class Stages:
     """The stages of a reconstruction; what each makes is kept in a folder.
 
@@ -88,16 +109,7 @@ class Stages:
             if self.output.resolve() == folder.resolve():
                 raise OptionError(f"{folder} holds the photographs: give another folder with -o")
             return folder
-        paths = [Path(path) for path in images]
-        missing = [path for path in paths if not path.is_file()]
-        if missing:
-            raise MissingImageError(f"there is no file {missing[0]}: check the path")
-        taken: dict[str, Path] = {}
-        for path in paths:
-            if taken.setdefault(path.name, path).resolve() != path.resolve():
-                raise OptionError(
-                    f"{taken[path.name]} and {path} have one name: rename one of them"
-                )
+        taken = check_photographs(images)
         folder = self.work / "images"
         folder.mkdir(parents=True, exist_ok=True)
         for old in folder.iterdir():
