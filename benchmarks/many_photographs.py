@@ -26,7 +26,7 @@ import numpy as np
 from deepdetect import Camera, MultiViewReconstruction, PointCloud, reconstruct_many
 from deepdetect.datasets.posed_images import PosedScene, load_posed_scenes
 from deepdetect.geometry.point_cloud import robust_box
-from deepdetect.io.html_viewer import ViewerCamera, camera_lines
+from deepdetect.io.html_viewer import camera_lines
 from deepdetect.io.image import find_images, load_image
 from deepdetect.sfm.colmap import quiet_pycolmap
 from deepdetect.sfm.mapping import MappingOptions, adjust, read_sparse_model
@@ -189,11 +189,7 @@ def show_bad(scene: PosedScene, bad: Path, output: Path, workers: int | None) ->
 def draw(found: MultiViewReconstruction, folder: Path, pictures: Path) -> None:
     """Draw the cameras with the sparse and with the dense points, and these from two sides."""
     pictures.mkdir(parents=True, exist_ok=True)
-    cameras = [
-        ViewerCamera(name, view.camera, view.rotation, np.asarray(view.translation))
-        for name, view in found.views.items()
-    ]
-    ends = camera_lines(cameras)
+    ends = camera_lines(list(found.views.values()))
     steps = np.linspace(0, 1, LINE_POINTS)[:, None]
     lines = np.concatenate([start + steps * (end - start) for start, end in ends])
     red = np.tile(np.array([[200, 40, 30]], np.uint8), (len(lines), 1))

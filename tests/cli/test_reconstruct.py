@@ -371,7 +371,7 @@ def test_models_of_before_survive_a_failure(
     assert "No space left" in result.stderr
     assert Path("m_depth.npz").read_bytes() == b"of before"
     assert not Path("m.json").exists()
-    assert not [path for path in Path().iterdir() if path.name.startswith(".")]
+    assert not [path for path in Path().iterdir() if ".part" in path.name]
 
 
 def test_exif_gives_the_focal_length(run, folder: Path) -> None:
@@ -414,7 +414,10 @@ def test_the_progress_counts_every_stage(monkeypatch: pytest.MonkeyPatch, run, f
     monkeypatch.setattr(deepdetect._shared.progress, "progress", Bar)
     for pair, more in ((("left", "right"), []), (("turned0", "turned1"), ["--not-rectified"])):
         paths = [folder / f"{name}.png" for name in pair]
-        assert run("reconstruct", *paths, "--focal", FOCAL, *more, "-o", "m.ply").exit_code == 0
+        assert (
+            run("reconstruct", *paths, "--focal", FOCAL, *more, "-o", f"{pair[0]}.ply").exit_code
+            == 0
+        )
     assert [bar.n == bar.total for bar in bars] == [True, True]
     assert bars[0].stages[:3] == ["rectified or not", "keypoints", "matching"]
     assert bars[1].stages[:3] == ["keypoints and matching", "sub-pixel", "checks"]

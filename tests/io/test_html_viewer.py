@@ -13,8 +13,8 @@ import pytest
 
 from deepdetect.geometry.camera import Camera
 from deepdetect.geometry.point_cloud import PointCloud
+from deepdetect.geometry.posed_view import PosedView
 from deepdetect.io.html_viewer import (
-    ViewerCamera,
     camera_lines,
     page_points,
     write_html_page,
@@ -212,10 +212,10 @@ def test_the_template_is_part_of_the_package() -> None:
     assert files("deepdetect.io").joinpath("viewer.html").is_file()
 
 
-def view_cameras() -> list[ViewerCamera]:
+def view_cameras() -> list[PosedView]:
     camera = Camera((640, 480), 500.0)
     return [
-        ViewerCamera(f"{x:g}", camera, np.eye(3), np.array([-x, 0.0, 0.0])) for x in (0.0, 1.0, 2.0)
+        PosedView(f"{x:g}", camera, np.eye(3), np.array([-x, 0.0, 0.0])) for x in (0.0, 1.0, 2.0)
     ]
 
 

@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 
 from deepdetect.geometry.camera import Camera
+from deepdetect.geometry.posed_view import PosedView
 from deepdetect.sfm.dense import find_references, limited_view
 from deepdetect.sfm.fusion import DenseOptions
 from deepdetect.sfm.lens import Lens
 from deepdetect.sfm.mapping import SparseModel
 from deepdetect.sfm.track_refinement import Observations
-from deepdetect.sfm.views import PosedView
 
 SIZE = (320, 240)
 

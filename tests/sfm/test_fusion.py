@@ -7,13 +7,13 @@ import pytest
 
 from deepdetect import OptionError
 from deepdetect.geometry.camera import Camera
+from deepdetect.geometry.posed_view import PosedView
 from deepdetect.sfm.fusion import (
     DenseOptions,
     DensePoints,
     fuse_matches,
     merge_dense_points,
 )
-from deepdetect.sfm.views import PosedView
 
 SIZE = (320, 240)
 

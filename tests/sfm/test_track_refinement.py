@@ -8,13 +8,13 @@ import pytest
 
 from deepdetect import OptionError
 from deepdetect.geometry.camera import Camera
+from deepdetect.geometry.posed_view import PosedView
 from deepdetect.sfm.track_refinement import (
     Observations,
     TrackRefinementOptions,
     refine_observations,
     surface_normals,
 )
-from deepdetect.sfm.views import PosedView
 
 SIZE, DEPTH = (400, 300), 5.0
 

@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry.camera import Camera
 from ..geometry.point_cloud import PointCloud, angular_spacing, robust_box
+from ..geometry.posed_view import PosedView
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
 """Tangent of half the field of view, and its range."""
@@ -58,39 +58,11 @@ class PagePoints:
     left_out: int
 
 
-@dataclass(frozen=True, eq=False)
-class ViewerCamera:
-    """A camera that the page draws.
-
-    Attributes:
-        name: of its photograph.
-        camera: its intrinsics.
-        rotation, translation: (3, 3) and (3,), from the cloud's frame to the camera's.
-    """
-
-    name: str
-    camera: Camera
-    rotation: np.ndarray
-    translation: np.ndarray
-
-    @property
-    def centre(self) -> np.ndarray:
-        """(3,) float64, in the cloud's frame."""
-        return np.asarray(-self.rotation.T @ self.translation)
-
-    def corners(self, depth: float) -> np.ndarray:
-        """Return the (4, 3) corners of what it sees at a depth, around the image."""
-        width, height = self.camera.size
-        pixels = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-        rays = self.camera.rays(pixels) * depth
-        return np.asarray((rays - self.translation) @ self.rotation)
-
-
 def write_html_page(
     cloud: PointCloud,
     path: Path,
     metadata: Mapping[str, str],
-    cameras: Sequence[ViewerCamera] = (),
+    cameras: Sequence[PosedView] = (),
 ) -> None:
     """Write the page: 12 bytes per point, as 16-bit positions and 8-bit colours in base64.
 
@@ -146,12 +118,13 @@ def page_points(cloud: PointCloud) -> PagePoints:
     return PagePoints(levels, cloud.colors[near], low, step, int((~near).sum()))
 
 
-def camera_lines(cameras: Sequence[ViewerCamera]) -> np.ndarray:
+def camera_lines(cameras: Sequence[PosedView]) -> np.ndarray:
     """Return the ends (N, 2, 3) of the lines that draw cameras, and the path from each to the next.
 
     Example:
+        >>> from deepdetect.geometry.camera import Camera
         >>> poses = [(np.eye(3), np.array([x, 0.0, 0])) for x in (0.0, -1.0)]
-        >>> cameras = [ViewerCamera("", Camera((64, 48), 50.0), *pose) for pose in poses]
+        >>> cameras = [PosedView("", Camera((64, 48), 50.0), *pose) for pose in poses]
         >>> camera_lines(cameras).shape, camera_lines(cameras)[-1].tolist()
         ((17, 2, 3), [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     """
@@ -171,7 +144,7 @@ def camera_lines(cameras: Sequence[ViewerCamera]) -> np.ndarray:
 
 
 def _description(
-    cloud: PointCloud, stored: PagePoints, cameras: Sequence[ViewerCamera] = ()
+    cloud: PointCloud, stored: PagePoints, cameras: Sequence[PosedView] = ()
 ) -> dict[str, object]:
     box = robust_box(cloud)
     corners = np.stack([stored.offset, stored.offset + MAX_LEVEL * stored.step])

@@ -13,12 +13,12 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from ..geometry.camera import Camera
+from ..geometry.posed_view import PosedView, relative_fundamental
 from ..io.image import load_image, luma
 from ..matching.guided.rectified import match_by_rectification
 from .fusion import DenseOptions, DensePoints, angles_between, fuse_matches
 from .lens import Lens
 from .mapping import SparseModel
-from .views import PosedView, relative_fundamental
 
 
 @dataclass(frozen=True, eq=False)

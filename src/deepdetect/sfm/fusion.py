@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from .._shared.options import check_ranges, suggest_keywords
+from ..geometry.posed_view import PosedView
 from ..matching.guided.options import RectifiedMatchingOptions
-from .views import PosedView
 
 BLOCK = 50_000
 """Pixels that are triangulated at once, which bounds the memory."""

@@ -16,10 +16,10 @@ import numpy as np
 
 from .._shared.errors import NoDepthError
 from .._shared.options import check_ranges, suggest_keywords
+from ..geometry.posed_view import PosedView
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .lens import Lens
 from .track_refinement import Observations, TrackRefinementOptions, refine_observations
-from .views import PosedView
 
 Pair = tuple[str, str]
 

@@ -21,7 +21,7 @@ from .._shared.options import replace_options, suggest_keywords
 from .._shared.timing import StageTimer
 from ..geometry.camera import Calibration, Camera
 from ..geometry.point_cloud import PointCloud
-from ..io.html_viewer import ViewerCamera, write_html_page
+from ..io.html_viewer import write_html_page
 from ..io.image import load_image
 from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap
@@ -235,12 +235,8 @@ def _write(found: MultiViewReconstruction, output: Path) -> None:
     }
     save_point_cloud(found.cloud, output / "model.ply", notes)
     save_point_cloud(found.cloud, output / "model.glb", notes)
-    cameras = [
-        ViewerCamera(name, view.camera, view.rotation, np.asarray(view.translation))
-        for name, view in found.views.items()
-    ]
     with atomic_path(output / "model.html") as path:
-        write_html_page(found.cloud, path, notes, cameras)
+        write_html_page(found.cloud, path, notes, list(found.views.values()))
     values = {**found.summary(), "files": [str(path) for path in found.files]}
     with atomic_path(output / "model.json") as path:
         path.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")

@@ -11,8 +11,8 @@ import numpy as np
 
 from .._shared.options import suggest_keywords
 from ..geometry.point_cloud import PointCloud
+from ..geometry.posed_view import PosedView
 from .lens import Lens
-from .views import PosedView
 
 SCALE = "lengths are in spacings, the median distance from a camera to the nearest other one: the \
 true scale is not known"

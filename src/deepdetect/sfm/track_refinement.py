@@ -16,7 +16,7 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
-from .views import PosedView
+from ..geometry.posed_view import PosedView
 
 BLOCK = 2000
 """Patches that are aligned at once, which bounds the memory."""

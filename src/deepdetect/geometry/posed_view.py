@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.camera import Camera
-from ..geometry.triangulation import cross_matrix
+from .camera import Camera
+from .triangulation import cross_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,13 @@ class PosedView:
         """Return positions (N, 2) in pixels, and depths (N,), of points (N, 3) of the world."""
         seen = np.asarray(points, np.float64) @ self.rotation.T + self.translation
         return self.camera.project(seen), seen[:, 2]
+
+    def corners(self, depth: float) -> np.ndarray:
+        """Return the (4, 3) corners of what it sees at a depth, around the image."""
+        width, height = self.camera.size
+        pixels = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+        rays = self.camera.rays(pixels) * depth
+        return np.asarray((rays - self.translation) @ self.rotation)
 
 
 def relative_fundamental(first: PosedView, second: PosedView) -> np.ndarray:
