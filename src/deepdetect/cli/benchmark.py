@@ -11,7 +11,8 @@ from ._generated import generated_command
 from ._options import DETECTOR, PATH, json_option, make_detector, print_json
 
 NAMES = (
-    *("oxford", "hpatches", "middlebury", "pose", "foreground", "low-visibility", "speed"),
+    *("oxford", "hpatches", "middlebury", "pose", "sfm"),
+    *("foreground", "low-visibility", "speed"),
     "all",
 )
 
@@ -75,6 +76,13 @@ NAMES = (
     show_default=True,
     help="Of each scene at most this many pairs, evenly spaced; 1 for a first look.",
 )
+@click.option(
+    "--max-photographs",
+    type=int,
+    default=20,
+    show_default=True,
+    help="sfm: of each scene at most this many, of a sequence the first, else evenly spaced.",
+)
 @json_option
 def benchmark(
     name: str,
@@ -88,6 +96,7 @@ def benchmark(
     cache: Path | None,
     geometry_weights: tuple[str, ...],
     max_pairs: int,
+    max_photographs: int,
     as_json: bool,
     **values: Any,
 ) -> None:
@@ -103,6 +112,7 @@ def benchmark(
     deepdetect benchmark oxford --data data -o report --method xfeat.onnx
     deepdetect benchmark foreground --data data --baselines sift,fast-low -o report
     deepdetect benchmark pose --data data/fountain -o report
+    deepdetect benchmark sfm --data data/fountain -o report
     """
     from .._shared.errors import BatchError, OptionError
     from .._shared.registry import look_up
@@ -134,6 +144,7 @@ def benchmark(
         geometry_weights,
         PairSelectionOptions(max_pairs),
         degraded_images,
+        max_photographs,
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)
     paths = report.save(output)

@@ -47,6 +47,7 @@ from .protocols.paper_numbers import (
     with_paper_rows,
 )
 from .protocols.pose import pose_section
+from .protocols.sfm import sfm_section
 from .protocols.speed import PAIR, speed_part
 from .protocols.standard import standard_part
 from .protocols.stereo import STEREO_TEXT, stereo_parts
@@ -402,6 +403,14 @@ def plan_pose(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
     return [pose_section(context, options, scenes)]
 
 
+def plan_sfm(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
+    """Cameras and points of many photographs with known cameras."""
+    folder = context.folder("sfm")
+    if folder == context.data:
+        folder = context.folder("pose")
+    return [sfm_section(context, options, load_posed_scenes(folder))]
+
+
 def plan_foreground(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
     """Table I's second half."""
     photographs = load_foreground(context.folder("foreground"))
@@ -426,6 +435,7 @@ BENCHMARKS: dict[str, Benchmark] = {
         Benchmark("hpatches", plan_hpatches),
         Benchmark("middlebury", plan_middlebury, ("dense",)),
         Benchmark("pose", plan_pose),
+        Benchmark("sfm", plan_sfm),
         Benchmark("foreground", plan_foreground),
         Benchmark("low-visibility", plan_low_visibility),
         Benchmark("speed", plan_speed),

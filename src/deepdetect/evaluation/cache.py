@@ -28,6 +28,7 @@ STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "corner_errors": (1, ("matches",)),
     "pose": (1, ("matches", "guided")),
     "foreground": (1, ("keypoints",)),
+    "sfm": (1, ()),
 }
 """Version of each stage, and the stages it is made from.
 

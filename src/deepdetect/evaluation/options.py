@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
-from .._shared.options import suggest_keywords
+from .._shared.options import check_ranges, suggest_keywords
 from ..datasets.pair_selection import PairSelectionOptions
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
@@ -52,6 +52,8 @@ class BenchmarkOptions:
         geometry_weights: the weights for stereo pairs, one or more.
         pair_selection: which pairs of a scene are measured, and at which frame distances.
         degraded_images: which images of a pair the protocol "degraded" degrades.
+        max_photographs: of a scene that is reconstructed: of a sequence the first, else evenly
+            spaced ones.
 
     Raises:
         OptionError: a name is unknown, or nothing is left to do.
@@ -65,8 +67,10 @@ class BenchmarkOptions:
     geometry_weights: tuple[str | Path, ...] = ("dense",)
     pair_selection: PairSelectionOptions = field(default_factory=PairSelectionOptions)
     degraded_images: DegradedImages = "second"
+    max_photographs: int = 20
 
     def __post_init__(self) -> None:
+        check_ranges(self, between={"max_photographs": (3, float("inf"))})
         for protocol in self.protocols:
             if protocol not in PROTOCOLS:
                 raise unknown_name("protocol", protocol, PROTOCOLS)

@@ -5,13 +5,15 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
-from .._shared.errors import MissingExtraError
+from .._shared.errors import DeepDetectError, MissingExtraError
+
+Outcome = TypeVar("Outcome")
 
 SAMPLING_INTERVAL_S = 0.005
 
@@ -122,12 +124,47 @@ def peak_memory() -> int:
         >>> peak_memory() > 1_000_000
         True
     """
+    # Linux counts what the process that started this one held as its maximum, too; here it does
+    # not.
+    with suppress(OSError), open("/proc/self/status", encoding="ascii") as status:
+        for line in status:
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
     try:
         import resource
     except ImportError:  # on Windows
         return int(getattr(_process().memory_info(), "peak_wset", 0))
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
+    """Call a function in a process of its own, whose `peak_memory` is that of its work alone.
+
+    Args:
+        function: of a module.
+        arguments: what can be pickled.
+
+    Raises:
+        DeepDetectError: the process was ended from outside; or what the function raises.
+
+    Example:
+        >>> run_in_child(max, 1, 2)
+        2
+    """
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+    from concurrent.futures.process import BrokenProcessPool
+
+    # Spawned: a fork would begin with all memory of this process.
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(function, *arguments).result()
+        except BrokenProcessPool:
+            raise DeepDetectError(
+                "its process was ended by the system, probably for lack of memory: take fewer or "
+                "smaller images"
+            ) from None
 
 
 def _process() -> Any:

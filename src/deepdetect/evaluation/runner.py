@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from .._shared.errors import ImageError
+from .._shared.errors import ImageError, MissingExtraError
 from .._shared.progress import progress
 from .._shared.provenance import provenance
 from .._shared.registry import look_up
@@ -51,7 +51,7 @@ def run_benchmarks(
     for benchmark in chosen:
         try:
             plans += benchmark.plan(context, options)
-        except ImageError as error:
+        except (ImageError, MissingExtraError) as error:
             if len(chosen) == 1:
                 raise
             context.fail(f"the benchmark {benchmark.name}: {error}")

@@ -18,6 +18,10 @@ MAX_GAP_PX = 6.0
 """From a point to the nearest of the other set, in pixels of the nearest photograph: further away
 the other set has nothing there. Three times the usual stride."""
 
+DEPTH_WEIGHT = 0.1
+"""Of a difference in depth in that distance, against one across the line of sight: errors are along
+it, and must not decide which points are near."""
+
 AGREEMENT_PX = (0.1, 0.25, 0.5, 1.0, 2.0)
 """Distances of which the share of points is reported."""
 
@@ -140,9 +144,9 @@ def cloud_agreement(
 
     Two sets that were made from different photographs have independent errors of matching. The
     surface at a point is the plane of the `PLANE_NEIGHBOURS` nearest points of the other set, so
-    that the spacing of the points counts for nothing. The distance from it along its normal is also
-    given in pixels: how far the point and its foot on the plane are apart in the photograph that
-    shows them farthest apart.
+    that the spacing of the points counts for nothing, and the distance is that along the line of
+    sight from the nearest photograph, where the errors are. In pixels it is what the photograph
+    sees of it that shows the point and the place on the plane farthest apart.
 
     What both sets have in common is not seen: errors of the poses, or edges that are too wide in
     both. A point more than `MAX_GAP_PX` from the other set is not covered, and has no distance: the
@@ -162,45 +166,57 @@ def cloud_agreement(
         >>> round(found.median_depth_ratio, 6), found.covered
         (0.005, 1.0)
     """
-    from scipy.spatial import KDTree
-
-    if not len(points) or len(others) < PLANE_NEIGHBOURS or not views:
-        nothing = float("nan")
-        return CloudAgreement(len(points), 0.0, nothing, nothing, (0.0,) * len(AGREEMENT_PX))
     points, others = np.asarray(points, np.float64), np.asarray(others, np.float64)
-    distances, nearest = KDTree(others).query(points, PLANE_NEIGHBOURS)
-    projected = [_seen(view, points) for view in views]
-    footprint = np.min(
-        [
-            depth / view.camera.focal_px[0]
-            for view, (_, depth) in zip(views, projected, strict=True)
-        ],
-        axis=0,
-    )
-    depth = np.min([depth for _, depth in projected], axis=0)
-    covered = np.flatnonzero(distances[:, 0] <= MAX_GAP_PX * footprint)
-    if not len(covered):
-        nothing = float("nan")
-        return CloudAgreement(len(points), 0.0, nothing, nothing, (0.0,) * len(AGREEMENT_PX))
-    near = others[nearest[covered]]
-    middle = near.mean(axis=1)
-    centred = near - middle[:, None]
-    _, directions = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))
-    normal = directions[:, :, 0]
-    offset = np.einsum("ij,ij->i", points[covered] - middle, normal)
-    foot = points[covered] - offset[:, None] * normal
-    apart = np.zeros(len(covered))
-    for view, (xy, _) in zip(views, projected, strict=True):
-        there, _ = _seen(view, foot)
-        distance = np.linalg.norm(xy[covered] - there, axis=1)
-        apart = np.fmax(apart, distance)  # NaN where the photograph does not show it
+    depth, apart = np.full(len(points), np.nan), np.zeros(len(points))
+    there = np.full(len(points), np.nan)
+    seen = [_seen(view, points) for view in views]
+    sizes = [own / view.camera.focal_px[0] for view, (_, own) in zip(views, seen, strict=True)]
+    nearest = np.argmin(sizes, axis=0)  # the photograph that shows it largest
+    for number, view in enumerate(views):
+        rows = np.flatnonzero((nearest == number) & np.isfinite(sizes[number]))
+        depth[rows] = seen[number][1][rows]
+        there[rows] = _surface_depths(view, points[rows], others)
+        on_surface = view.centre + (points[rows] - view.centre) * (there / depth)[rows, None]
+        for other, (xy, _) in zip(views, seen, strict=True):
+            distance = np.linalg.norm(other.project(on_surface)[0] - xy[rows], axis=1)
+            apart[rows] = np.fmax(apart[rows], distance)  # NaN: the photograph does not show it
+    covered = np.isfinite(there)
+    if not covered.any():
+        return CloudAgreement(len(points), 0.0, np.nan, np.nan, (0.0,) * len(AGREEMENT_PX))
     return CloudAgreement(
         len(points),
-        len(covered) / len(points),
-        float(np.median(apart)),
-        float(np.median(np.abs(offset) / depth[covered])),
-        tuple(float((apart <= limit).mean()) for limit in AGREEMENT_PX),
+        float(covered.mean()),
+        float(np.median(apart[covered])),
+        float(np.median(np.abs(there / depth - 1)[covered])),
+        tuple(float((apart[covered] <= limit).mean()) for limit in AGREEMENT_PX),
     )
+
+
+def _surface_depths(view: PosedView, points: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the depths (N,) at which lines of sight to points meet the surface of others.
+
+    NaN where there are none near. The inverse depth of a plane is a linear function of the pixel:
+    its least squares have no bias by errors along the line of sight, as those of distances from
+    the plane would have.
+    """
+    from scipy.spatial import KDTree
+
+    (places, own), (around, depth) = _seen(view, points), _seen(view, others)
+    around, depth = around[np.isfinite(depth)], depth[np.isfinite(depth)]
+    if not len(points) or len(depth) < PLANE_NEIGHBOURS:
+        return np.full(len(points), np.nan)
+    weight = DEPTH_WEIGHT * view.camera.focal_px[0]
+    tree = KDTree(np.column_stack([around, weight * np.log(depth)]))
+    distances, rows = tree.query(np.column_stack([places, weight * np.log(own)]), PLANE_NEIGHBOURS)
+    offsets = around[rows] - places[:, None]
+    terms = np.concatenate([np.ones((*rows.shape, 1)), offsets], axis=2)
+    normal = np.einsum("nki,nkj->nij", terms, terms)
+    # Neighbours on a line give the slope along it only.
+    normal += np.diag([0, 1, 1]) * 1e-6 * np.einsum("nii->n", normal)[:, None, None]
+    right = np.einsum("nki,nk->ni", terms, 1 / depth[rows])
+    inverse = np.linalg.solve(normal, right[:, :, None])[:, 0, 0]
+    near = (distances[:, 0] <= MAX_GAP_PX) & (inverse > 0)
+    return np.where(near, 1 / np.where(near, inverse, 1), np.nan)
 
 
 def _seen(view: PosedView, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

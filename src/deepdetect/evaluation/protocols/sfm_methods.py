@@ -1,0 +1,423 @@
+"""The keypoints whose reconstructions from many photographs are compared, and how these are made.
+
+All go through the stages of `reconstruct_many` with the same options; only the keypoints, and for
+SIFT the matches, are others. Each method runs in a process of its own, which tells its memory.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..._shared.errors import NoDepthError
+from ...batch.extraction import feature_group
+from ...batch.parted_file import Group, import_h5py, open_hdf5, write_groups
+from ...features.keypoints import Keypoints
+from ...features.orientation import dominant_angles
+from ...features.sift import described_at_own_size
+from ...geometry.camera import Camera
+from ...geometry.posed_view import PosedView
+from ...io.image import load_image, luma
+from ...sfm.colmap import PIXEL_CENTRE, quiet_pycolmap
+from ...sfm.fusion import DensePoints
+from ...sfm.intrinsics import photograph_lenses
+from ...sfm.mapping import SparseModel, read_sparse_model
+from ...sfm.options import MultiViewOptions
+from ...sfm.pair_selection import PairSelectionOptions
+from ...sfm.stages import Stages
+from ..metrics.multi_view import AGREEMENT_PX, CloudAgreement, cloud_agreement
+from ..profiling import peak_memory
+
+FEATURES, DATABASE = "features.h5", "sift.db"
+
+OPTIONS = MultiViewOptions(pair_selection=PairSelectionOptions(pairs="all"))
+"""Of all methods: those of `reconstruct_many`, but every pair is matched."""
+
+Pair = tuple[str, str]
+Finder = Callable[[Stages, Path], None]
+Matcher = Callable[[Stages, Sequence[Pair]], dict[Pair, np.ndarray]]
+
+
+def match_features(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
+    """Match as `reconstruct_many` does."""
+    return stages.match(pairs)
+
+
+@dataclass(frozen=True)
+class SfmMethod:
+    """A row of the tables.
+
+    Attributes:
+        title: how tables name it.
+        find: writes the keypoints of the photographs in a folder; a function of a module.
+        match: returns the matches of pairs; a function of a module.
+        depends: what results depend on besides the code, the photographs and the options.
+        chance: the time it takes to find the points means nothing.
+    """
+
+    title: str
+    find: Finder
+    match: Matcher = match_features
+    depends: str = ""
+    chance: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class SfmTask:
+    """What a process is asked for.
+
+    Attributes:
+        method: whose keypoints.
+        photographs: their files.
+        cameras: the true cameras, by the names of the files.
+        dense: whether dense points are made of two halves of the photographs.
+    """
+
+    method: SfmMethod
+    photographs: tuple[Path, ...]
+    cameras: Mapping[str, Camera]
+    dense: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class SfmModel:
+    """A model of one kind of intrinsics.
+
+    Attributes:
+        views: the cameras by name; none where there is no model.
+        points: number of sparse points.
+        track_length: mean number of photographs that see one.
+        error_px: mean reprojection error.
+        seconds, cpu_seconds: of verification and mapping.
+    """
+
+    views: Mapping[str, PosedView]
+    points: int
+    track_length: float
+    error_px: float
+    seconds: float
+    cpu_seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class SfmResult:
+    """What a method gives.
+
+    Attributes:
+        keypoints: mean number in a photograph.
+        matches: of all pairs together.
+        seconds, cpu_seconds: of keypoints and matches.
+        given, estimated: the models with the true intrinsics and with estimated ones.
+        memory: bytes that the process held at most, before dense points are made.
+        dense_points: number in each half of the photographs; 0 where there are none.
+        dense_cpu_seconds: for both.
+        dense_memory: bytes that the process held at most in the end.
+        agreement: of the points of each half with those of the other.
+    """
+
+    keypoints: float
+    matches: int
+    seconds: float
+    cpu_seconds: float
+    given: SfmModel
+    estimated: SfmModel
+    memory: int
+    dense_points: tuple[int, int] = (0, 0)
+    dense_cpu_seconds: float = 0.0
+    dense_memory: int = 0
+    agreement: tuple[CloudAgreement, ...] = ()
+
+
+@dataclass
+class _Clock:
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Add what the block takes."""
+        wall, own = time.perf_counter(), time.process_time()
+        yield
+        self.seconds += time.perf_counter() - wall
+        self.cpu_seconds += time.process_time() - own
+
+
+def find_points(stages: Stages, folder: Path, detector: tuple[tuple[str, str], ...] = ()) -> None:
+    """Find the ranked points, as `reconstruct_many` does.
+
+    Args:
+        stages: of the reconstruction.
+        folder: of the photographs.
+        detector: arguments of `DeepDetect`.
+    """
+    stages.extract(folder, dict(detector))
+
+
+def find_random_points(
+    stages: Stages, folder: Path, detector: tuple[tuple[str, str], ...] = (), seed: int = 0
+) -> None:
+    """Put as many random points in place of the ranked ones.
+
+    They get the sizes of these in another order, the dominant angle of the gradients there, and the
+    same descriptor.
+    """
+    find_points(stages, folder, detector)
+    with import_h5py().File(stages.work / FEATURES, "r+") as file:
+        for number, name in enumerate(sorted(path.name for path in folder.iterdir())):
+            rng = np.random.default_rng((seed, number))
+            group = file[name]
+            width, height = (int(side) for side in group["image_size"][()])
+            count = len(group["keypoints"])
+            xy = rng.uniform(0, (width - 1, height - 1), (count, 2)).astype(np.float32)
+            gray = luma(load_image(folder / name))
+            sizes = rng.permutation(2 * group["scales"][()])
+            points = Keypoints(
+                xy,
+                rng.random(count, np.float32),
+                (width, height),
+                sizes=sizes,
+                angles=dominant_angles(gray, xy, sizes),
+            )
+            made = feature_group(name, described_at_own_size(gray, points)).arrays
+            for kind in ("keypoints", "descriptors", "scores", "scales", "oris"):
+                group[kind][...] = made[kind]
+
+
+def find_sift(stages: Stages, folder: Path) -> None:
+    """Find keypoints by pycolmap's own SIFT with its defaults, at most as many as ours."""
+    names = sorted(path.name for path in folder.iterdir())
+    with quiet_pycolmap() as pycolmap:
+        how = pycolmap.FeatureExtractionOptions()
+        how.num_threads = 1
+        how.sift.max_num_features = stages.options.selection.max_keypoints
+        pycolmap.extract_features(
+            stages.work / DATABASE, folder, image_names=names, extraction_options=how
+        )
+        groups = []
+        with pycolmap.Database.open(stages.work / DATABASE) as database:
+            for image in database.read_all_images():
+                camera = database.read_camera(image.camera_id)
+                xy = np.asarray(database.read_keypoints(image.image_id))[:, :2] - PIXEL_CENTRE
+                arrays = {
+                    "keypoints": xy.astype(np.float32),
+                    "image_size": np.array([camera.width, camera.height], np.int32),
+                }
+                groups.append(Group(image.name, arrays))
+    write_groups(stages.work / FEATURES, groups)
+
+
+def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
+    """Match by pycolmap's own matcher with its defaults; the verification is that of all."""
+    with quiet_pycolmap() as pycolmap:
+        how = pycolmap.FeatureMatchingOptions()
+        how.num_threads = 1
+        how.skip_geometric_verification = True
+        pycolmap.match_exhaustive(stages.work / DATABASE, matching_options=how)
+        with pycolmap.Database.open(stages.work / DATABASE) as database:
+            names = {image.image_id: image.name for image in database.read_all_images()}
+            found: dict[Pair, np.ndarray] = {}
+            for identifier, rows in zip(*database.read_all_matches(), strict=True):
+                one, other = (names[k] for k in pycolmap.pair_id_to_image_pair(identifier))
+                found[one, other] = np.asarray(rows, np.int64).reshape(-1, 2)
+    nothing = np.empty((0, 2), np.int64)
+    return {
+        pair: found[pair] if pair in found else found.get(pair[::-1], nothing)[:, ::-1]
+        for pair in pairs
+    }
+
+
+def run_method(task: SfmTask) -> SfmResult:
+    """Reconstruct photographs by a method; to be called in a process of its own."""
+    with tempfile.TemporaryDirectory(prefix="deepdetect-sfm-") as scratch:
+        stages = Stages(Path(scratch) / "model", OPTIONS, 1, True)
+        folder = stages.folder_of(task.photographs)
+        clock = _Clock()
+        with clock.running():
+            task.method.find(stages, folder)
+        if task.method.chance:
+            clock = _Clock()
+        sizes, counts = _sizes_and_counts(stages.work / FEATURES)
+        names = sorted(sizes)
+        with clock.running():
+            matches = task.method.match(stages, stages.choose_pairs(names))
+        models, sparse = [], None
+        for known in (task.cameras, {}):
+            model, found = _map(stages, folder, names, sizes, matches, known)
+            models.append(model)
+            sparse = found if known else sparse
+        result = SfmResult(
+            float(np.mean(counts)),
+            sum(len(rows) for rows in matches.values()),
+            clock.seconds,
+            clock.cpu_seconds,
+            models[0],
+            models[1],
+            peak_memory(),
+        )
+        if sparse is None or not task.dense:
+            return result
+        clock = _Clock()
+        with clock.running():
+            halves = _dense_halves(stages, folder, sparse)
+        views = list(sparse.views.values())
+        agreement = tuple(
+            cloud_agreement(one.points, other.points, views)
+            for one, other in (halves, halves[::-1])
+        )
+        return replace(
+            result,
+            dense_points=(len(halves[0]), len(halves[1])),
+            dense_cpu_seconds=clock.cpu_seconds,
+            dense_memory=peak_memory(),
+            agreement=agreement if all(map(len, halves)) else (),
+        )
+
+
+def _sizes_and_counts(path: Path) -> tuple[dict[str, tuple[int, int]], list[int]]:
+    with open_hdf5(path) as file:
+        sides = {name: file[name]["image_size"][()].tolist() for name in file}
+        sizes = {name: (int(width), int(height)) for name, (width, height) in sides.items()}
+        return sizes, [len(file[name]["keypoints"]) for name in file]
+
+
+def _map(
+    stages: Stages,
+    folder: Path,
+    names: Sequence[str],
+    sizes: Mapping[str, tuple[int, int]],
+    matches: Mapping[Pair, np.ndarray],
+    known: Mapping[str, Camera],
+) -> tuple[SfmModel, SparseModel | None]:
+    """Map with known cameras, or with those that are estimated; no model is a result, too."""
+    lenses = photograph_lenses(folder, names, sizes, known)
+    clock = _Clock()
+    try:
+        with clock.running():
+            model, _, _ = stages.map(folder, names, lenses, matches, bool(known))
+    except NoDepthError:
+        return SfmModel({}, 0, float("nan"), float("nan"), clock.seconds, clock.cpu_seconds), None
+    sparse = read_sparse_model(model)
+    views = {view.name: view for view in sparse.views.values()}
+    return SfmModel(
+        dict(sorted(views.items())),
+        len(sparse.points),
+        float(sparse.tracks.mean()),
+        float(sparse.errors.mean()),
+        clock.seconds,
+        clock.cpu_seconds,
+    ), sparse
+
+
+def _dense_halves(
+    stages: Stages, folder: Path, sparse: SparseModel
+) -> tuple[DensePoints, DensePoints]:
+    """Make dense points of every second photograph, and of the others; all poses are those of all.
+
+    Each half is made as that of a model of its own, so that no photograph has a part in both.
+    """
+    order = sorted(sparse.views, key=lambda number: sparse.views[number].name)
+    first, second = (
+        Stages(stages.output / name, stages.options, 1, True).dense(
+            folder, part_of_model(sparse, order[start::2])
+        )
+        for start, name in enumerate(("even", "odd"))
+    )
+    return first, second
+
+
+def part_of_model(sparse: SparseModel, numbers: Sequence[int]) -> SparseModel:
+    """Return some of the photographs of a model, with what they see of its points."""
+    rows = np.isin(sparse.seen.views, numbers)
+    seen = replace(
+        sparse.seen,
+        points=sparse.seen.points[rows],
+        views=sparse.seen.views[rows],
+        xy=sparse.seen.xy[rows],
+    )
+    return replace(
+        sparse,
+        views={number: sparse.views[number] for number in numbers},
+        lenses={number: sparse.lenses[number] for number in numbers},
+        seen=seen,
+    )
+
+
+def pack_result(result: SfmResult) -> dict[str, np.ndarray]:
+    """Return a result as arrays by name, for the cache."""
+    arrays: dict[str, np.ndarray] = {
+        "numbers": np.array(
+            [
+                *(result.keypoints, result.matches, result.seconds, result.cpu_seconds),
+                *(result.memory, *result.dense_points, result.dense_cpu_seconds),
+                result.dense_memory,
+            ],
+            np.float64,
+        ),
+        "agreement": np.array(
+            [
+                [one.points, one.covered, one.median_px, one.median_depth_ratio, *one.within]
+                for one in result.agreement
+            ],
+            np.float64,
+        ).reshape(-1, 4 + len(AGREEMENT_PX)),
+    }
+    for kind in ("given", "estimated"):
+        model: SfmModel = getattr(result, kind)
+        views = list(model.views.values())
+        arrays[f"{kind}_names"] = np.array([view.name for view in views], np.str_)
+        arrays[f"{kind}_poses"] = np.array(
+            [[*view.rotation.ravel(), *np.ravel(view.translation)] for view in views], np.float64
+        ).reshape(-1, 12)
+        arrays[f"{kind}_cameras"] = np.array(
+            [[*v.camera.size, *v.camera.focal_px, *v.camera.centre] for v in views], np.float64
+        ).reshape(-1, 6)
+        arrays[f"{kind}_numbers"] = np.array(
+            [model.points, model.track_length, model.error_px, model.seconds, model.cpu_seconds]
+        )
+    return arrays
+
+
+def unpack_result(arrays: Mapping[str, np.ndarray]) -> SfmResult:
+    """Return the result of `pack_result`."""
+    keypoints, matches, seconds, cpu, memory, first, second, dense_cpu, dense_memory = arrays[
+        "numbers"
+    ].tolist()
+    agreement = tuple(
+        CloudAgreement(int(row[0]), row[1], row[2], row[3], tuple(row[4:]))
+        for row in arrays["agreement"].tolist()
+    )
+    return SfmResult(
+        keypoints,
+        int(matches),
+        seconds,
+        cpu,
+        _unpack_model(arrays, "given"),
+        _unpack_model(arrays, "estimated"),
+        int(memory),
+        (int(first), int(second)),
+        dense_cpu,
+        int(dense_memory),
+        agreement,
+    )
+
+
+def _unpack_model(arrays: Mapping[str, np.ndarray], kind: str) -> SfmModel:
+    points, track_length, error_px, seconds, cpu_seconds = arrays[f"{kind}_numbers"].tolist()
+    views = {}
+    for name, pose, camera in zip(
+        *(arrays[f"{kind}_{part}"] for part in ("names", "poses", "cameras")), strict=True
+    ):
+        width, height, fx, fy, cx, cy = camera.tolist()
+        views[str(name)] = PosedView(
+            str(name),
+            Camera((int(width), int(height)), (fx, fy), (cx, cy)),
+            pose[:9].reshape(3, 3),
+            pose[9:],
+        )
+    return SfmModel(views, int(points), track_length, error_px, seconds, cpu_seconds)
