@@ -235,6 +235,41 @@ def test_cameras_are_lines_of_the_page(cones: PointCloud, tmp_path: Path) -> Non
     assert saved(cones, tmp_path / "plain.html").scripts["cloud"].count('"lines": []') == 1
 
 
+def test_a_page_with_cameras_opens_where_all_of_them_are_seen(
+    cones: PointCloud, tmp_path: Path
+) -> None:
+    spacing = 0.2 * float(np.median(cones.points[:, 2]))
+    camera = Camera((640, 480), 500.0)
+    cameras = [
+        PosedView(f"{x:g}", camera, np.eye(3), np.array([-x * spacing, 0.0, 0.0])) for x in range(4)
+    ]
+    path = tmp_path / "cones.html"
+    write_html_page(cones, path, {}, cameras)
+    page = Page(path.read_text("utf-8"))
+    points, _, cloud = stored_points(page)
+    for aspect in (0.6, 1.0, 1.8):
+        code = f"return [...clipMatrix(cloud, firstView(cloud), {aspect})];"
+        matrix = np.reshape(run_node(page, code), (4, 4))
+
+        def screen(world: np.ndarray, matrix: np.ndarray = matrix) -> np.ndarray:
+            levels = (world - cloud["offset"]) / cloud["step"]
+            clip = np.column_stack([levels, np.ones(len(levels))]) @ matrix
+            assert (clip[:, 3] > 0).all()
+            return clip[:, :3] / clip[:, 3:]
+
+        lines = screen(np.array(cloud["lines"]).reshape(-1, 3))
+        assert (np.abs(lines) < 1).all()
+        seen = screen(points)
+        assert (np.abs(seen) < 1).all(axis=1).mean() > 0.95
+        # It is as near as it can be.
+        if aspect == 1.0:
+            both = np.concatenate([lines, seen])[:, :2]
+            assert np.percentile(np.abs(both), 99.9, axis=0).max() > 0.8
+    again = run_node(page, "const v = firstView(cloud); v.azimuth = 9; return firstView(cloud);")
+    assert again["azimuth"] == pytest.approx(0.4)
+    assert json.loads(saved(cones, tmp_path / "plain.html").scripts["cloud"])["view"] is None
+
+
 def test_a_single_camera_is_drawn_without_a_path() -> None:
     assert camera_lines(view_cameras()[:1]).shape == (8, 2, 3)
     assert camera_lines([]).shape == (0, 2, 3)

@@ -40,6 +40,13 @@ CAMERA_SIZE = 0.35
 """Depth of the pyramid that stands for a camera, over the distance to the nearest other one."""
 
 
+OVERVIEW_RADIANS = (0.4, 0.5)
+"""Azimuth and elevation from which a page with cameras is first seen."""
+
+OVERVIEW_POINTS = 2000
+"""That are looked at to place it."""
+
+
 @dataclass(frozen=True, eq=False)
 class PagePoints:
     """Points as the page stores them: position = offset + levels * step.
@@ -152,6 +159,7 @@ def _description(
     lines = camera_lines(cameras).reshape(-1, 3)
     if len(lines):
         reach = max(reach, np.linalg.norm(lines - box.centre, axis=1).max())
+    slope = _largest_slope(cloud)
     return {
         "count": len(stored.levels),
         "unit": cloud.unit,
@@ -161,8 +169,31 @@ def _description(
         "radius": box.radius,
         "reach": float(reach),
         "spacing": angular_spacing(cloud),
-        "slope": _largest_slope(cloud),
+        "slope": slope,
+        "view": _overview(cloud, lines, slope) if len(lines) else None,
         "lines": lines.round(6).ravel().tolist(),
+    }
+
+
+def _overview(cloud: PointCloud, lines: np.ndarray, slope: float) -> dict[str, object]:
+    """Return the nearest view from behind and above that shows the cloud and all cameras."""
+    box = robust_box(cloud)
+    inside = ((cloud.points >= box.low) & (cloud.points <= box.high)).all(axis=1)
+    near = cloud.points[inside][:: max(1, int(inside.sum()) // OVERVIEW_POINTS)]
+    shown = np.concatenate([near.astype(np.float64), lines])
+    (c, s), (d, t) = ((np.cos(angle), np.sin(angle)) for angle in OVERVIEW_RADIANS)
+    axes = np.array([[c, 0, s], [t * s, d, -t * c], [-d * s, t, d * c]])  # as of the page
+    seen = shown @ axes.T
+    # A point is inside where both |x - x0| and |y - y0| are below slope * (z + distance).
+    right, left = ((sign * seen[:, :2] - slope * seen[:, 2:]).max(axis=0) for sign in (1, -1))
+    across = (right - left) / 2
+    depth = np.median(near @ axes[2])
+    distance = float((right + left).max() / 2 / slope + depth)
+    return {
+        "azimuth": OVERVIEW_RADIANS[0],
+        "elevation": OVERVIEW_RADIANS[1],
+        "distance": max(1.05 * distance, box.radius * 1e-3),
+        "target": (np.array([*across, depth]) @ axes).tolist(),
     }
 
 
