@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -72,6 +74,25 @@ def low_visibility_folder(tmp_path_factory: pytest.TempPathFactory, write_scene)
             fading=fading,
         )
     return root
+
+
+@pytest.fixture(scope="session")
+def write_posed_fountain(shared: Path) -> Callable[..., Path]:
+    """Write small photographs of the fountain with their cameras."""
+    from PIL import Image
+
+    def write(folder: Path, names: Sequence[str], width: int = 384) -> Path:
+        folder.mkdir(parents=True)
+        source = shared / "data" / "fountain"
+        for name in names:
+            with Image.open(source / f"{name}.jpg") as image:
+                size = (width, round(image.height * width / image.width))
+                small = image.resize(size, Image.Resampling.LANCZOS)
+                small.save(folder / f"{name}.jpg", quality=95)
+            shutil.copy(source / f"{name}.camera", folder)
+        return folder
+
+    return write
 
 
 class NoBar:

@@ -1,14 +1,16 @@
 from __future__ import annotations
 
+import math
 import mmap
+import os
 import sys
 import time
 
 import numpy as np
 import pytest
 
-from deepdetect import MissingExtraError
-from deepdetect.evaluation.profiling import StageProfiler, peak_memory, profiled
+from deepdetect import DeepDetectError, MissingExtraError
+from deepdetect.evaluation.profiling import StageProfiler, peak_memory, profiled, run_in_child
 
 
 def test_the_time_is_that_of_the_block() -> None:
@@ -91,3 +93,21 @@ def test_the_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, one_line)
     with pytest.raises(MissingExtraError, match="psutil") as caught:
         StageProfiler()
     assert "pip install" in one_line(caught.value)
+
+
+def _leave() -> None:
+    os._exit(1)
+
+
+def test_a_child_tells_its_own_memory_not_that_of_its_parent() -> None:
+    held = np.ones(60_000_000)  # 480 MB
+    assert peak_memory() > held.nbytes
+    assert 1e6 < run_in_child(peak_memory) < held.nbytes
+
+
+def test_a_child_that_is_ended_is_one_sentence() -> None:
+    with pytest.raises(DeepDetectError, match="ended by the system") as caught:
+        run_in_child(_leave)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="math domain"):
+        run_in_child(math.sqrt, -1)

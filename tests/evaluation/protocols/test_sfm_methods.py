@@ -1,0 +1,160 @@
+"""Keypoints and matches of each method, on small photographs of the fountain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
+from deepdetect.evaluation.metrics.multi_view import CloudAgreement
+from deepdetect.evaluation.metrics.pose import epipolar_inlier_ratio
+from deepdetect.evaluation.protocols.sfm_methods import (
+    FEATURES,
+    SfmModel,
+    SfmResult,
+    find_points,
+    find_random_points,
+    find_sift,
+    match_features,
+    match_sift,
+    pack_result,
+    part_of_model,
+    unpack_result,
+)
+from deepdetect.features.selection import SelectionOptions
+from deepdetect.geometry.camera import Camera
+from deepdetect.geometry.posed_view import PosedView
+from deepdetect.sfm.mapping import SparseModel
+from deepdetect.sfm.options import MultiViewOptions
+from deepdetect.sfm.stages import Stages
+from deepdetect.sfm.track_refinement import Observations
+
+NAMES = ("0004", "0005", "0006")
+MAX_KEYPOINTS = 800
+
+
+@pytest.fixture(scope="module")
+def scene(write_posed_fountain, tmp_path_factory):
+    pytest.importorskip("h5py", reason="needs h5py")
+    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    folder = write_posed_fountain(tmp_path_factory.mktemp("scene") / "fountain", NAMES)
+    (found,) = load_posed_scenes(folder)
+    return found
+
+
+def stages_in(folder: Path, scene) -> tuple[Stages, Path]:
+    options = MultiViewOptions(selection=SelectionOptions(max_keypoints=MAX_KEYPOINTS))
+    stages = Stages(folder, options, 1, True)
+    return stages, stages.folder_of([image.path for image in scene.images])
+
+
+def keypoints_of(stages: Stages) -> dict[str, dict[str, np.ndarray]]:
+    import h5py
+
+    with h5py.File(stages.work / FEATURES) as file:
+        return {name: {kind: file[name][kind][()] for kind in file[name]} for name in file}
+
+
+def agreement(scene, stages: Stages, matches) -> list[float]:
+    """Return the fraction of the matches of each pair that agree with the true cameras."""
+    found = keypoints_of(stages)
+    images = {image.path.name: image for image in scene.images}
+    ratios = []
+    for (first, second), rows in matches.items():
+        pair = PosedPair("fountain", images[first], images[second])
+        xy = [found[n]["keypoints"][rows[:, k]] for k, n in enumerate((first, second))]
+        ratios.append(epipolar_inlier_ratio(*xy, pair.fundamental, 2.0))
+    return ratios
+
+
+def test_random_points_differ_from_ours_in_nothing_but_their_places(scene, tmp_path: Path) -> None:
+    from deepdetect import load_image
+    from deepdetect.features.keypoints import Keypoints
+    from deepdetect.features.sift import described_at_own_size
+    from deepdetect.io.image import luma
+
+    ours, folder = stages_in(tmp_path / "ours", scene)
+    find_points(ours, folder)
+    random, folder = stages_in(tmp_path / "random", scene)
+    find_random_points(random, folder)
+    both = keypoints_of(ours), keypoints_of(random)
+    assert set(both[0]) == set(both[1]) == {f"{name}.jpg" for name in NAMES}
+    for name, own in both[0].items():
+        its = both[1][name]
+        assert {k: v.shape for k, v in its.items()} == {k: v.shape for k, v in own.items()}
+        np.testing.assert_array_equal(np.sort(its["scales"]), np.sort(own["scales"]))
+        size = its["image_size"]
+        # Uniform: each quarter of the image has about as many.
+        counts = np.histogram2d(*its["keypoints"].T, 2, [[0, size[0] - 1], [0, size[1] - 1]])[0]
+        np.testing.assert_allclose(counts, len(own["keypoints"]) / 4, rtol=0.25)
+        points = Keypoints(
+            its["keypoints"],
+            its["scores"],
+            tuple(map(int, size)),
+            sizes=2 * its["scales"],
+            angles=its["oris"],
+        )
+        described = described_at_own_size(luma(load_image(folder / name)), points).descriptors
+        expected = described.astype(np.float32)
+        expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+        np.testing.assert_allclose(its["descriptors"].T, expected, atol=1e-6)
+    first, second = (both[1][f"{name}.jpg"]["keypoints"] for name in NAMES[:2])
+    assert np.abs(first - second).max() > 10  # other places in each photograph
+    pairs = [("0004.jpg", "0005.jpg"), ("0005.jpg", "0006.jpg")]
+    ratios = [agreement(scene, s, match_features(s, pairs)) for s in (ours, random)]
+    assert min(ratios[0]) > max(ratios[1])
+
+
+def test_sift_is_matched_by_its_own_matcher(scene, tmp_path: Path) -> None:
+    stages, folder = stages_in(tmp_path / "sift", scene)
+    find_sift(stages, folder)
+    found = keypoints_of(stages)
+    for values in found.values():
+        assert values["image_size"].tolist() == [384, 256]
+        assert 200 < len(values["keypoints"]) <= 1.5 * MAX_KEYPOINTS  # some at two angles
+        assert (values["keypoints"] > -0.5).all()
+    pairs = [("0005.jpg", "0004.jpg"), ("0005.jpg", "0006.jpg"), ("0004.jpg", "0006.jpg")]
+    matches = match_sift(stages, pairs)
+    assert list(matches) == pairs  # also the other way round
+    assert min(len(rows) for rows in matches.values()) > 50
+    assert min(agreement(scene, stages, matches)) > 0.85
+
+
+def test_a_part_of_a_model_sees_what_its_photographs_see() -> None:
+    camera = Camera((64, 48), 50.0)
+    views = {k: PosedView(f"{k}", camera, np.eye(3), np.array([-k, 0.0, 0])) for k in range(3)}
+    seen = Observations(
+        np.array([0, 0, 1, 1, 1]), np.array([0, 1, 0, 1, 2]), np.arange(10.0).reshape(5, 2)
+    )
+    lenses = dict.fromkeys(views)
+    sparse = SparseModel(views, lenses, np.ones((2, 3)), np.zeros(2), seen)  # type: ignore[arg-type]
+    part = part_of_model(sparse, [0, 2])
+    assert list(part.views) == list(part.lenses) == [0, 2]
+    np.testing.assert_array_equal(part.seen.points, [0, 1, 1])
+    np.testing.assert_array_equal(part.seen.views, [0, 0, 2])
+    np.testing.assert_array_equal(part.seen.xy[:, 0], [0, 4, 8])
+    assert part.points is sparse.points
+
+
+def test_a_result_survives_the_cache() -> None:
+    camera = Camera((64, 48), (50.0, 51.0), (30.0, 20.0))
+    view = PosedView("a b.jpg", camera, np.eye(3)[[1, 2, 0]], np.array([1.0, 2.0, 3.0]))
+    model = SfmModel({view.name: view}, 7, 2.5, 0.25, 4.0, 8.0)
+    nothing = SfmModel({}, 0, float("nan"), float("nan"), 1.0, 1.0)
+    agreement = CloudAgreement(5, 0.5, 0.1, 0.001, (0.1, 0.2, 0.3, 0.4, 0.5))
+    result = SfmResult(100.5, 9, 1.0, 2.0, model, nothing, 10, (3, 4), 5.0, 12, (agreement,))
+    read = unpack_result(pack_result(result))
+    assert (read.keypoints, read.matches, read.memory, read.dense_memory) == (100.5, 9, 10, 12)
+    assert (read.seconds, read.cpu_seconds, read.dense_cpu_seconds) == (1, 2, 5)
+    assert read.dense_points == (3, 4)
+    assert read.agreement == (agreement,)
+    assert read.estimated.views == {}
+    assert np.isnan(read.estimated.error_px)
+    again = read.given.views["a b.jpg"]
+    assert again.camera == camera
+    np.testing.assert_array_equal(again.rotation, view.rotation)
+    np.testing.assert_array_equal(again.translation, view.translation)
+    assert (read.given.points, read.given.track_length, read.given.error_px) == (7, 2.5, 0.25)
+    assert (read.given.seconds, read.given.cpu_seconds) == (4, 8)
