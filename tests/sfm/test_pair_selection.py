@@ -68,3 +68,28 @@ def test_pairs_are_listed_once_and_the_vocabulary_repeats() -> None:
     names = list("abcdef")
     pairs = similar_pairs(names, vectors, 10)  # more than there are
     assert pairs == list(itertools.combinations(names, 2))
+
+
+@pytest.mark.parametrize("count", [51, 200])
+def test_of_a_large_set_those_that_see_the_same_are_matched(count: int) -> None:
+    """Photographs along a wall, each of which sees 120 things, most of them new after four."""
+    rng = np.random.default_rng(2)
+    things = rng.normal(size=(30 * count + 120, 128)).astype(np.float32)
+    seen = []
+    for k in range(count):
+        own = things[30 * k : 30 * k + 120] + 0.3 * rng.normal(size=(120, 128))
+        strange = rng.normal(size=(80, 128))  # leaves, and what moves
+        each = np.concatenate([own, strange]).astype(np.float32)
+        seen.append(each / np.linalg.norm(each, axis=1, keepdims=True))
+    options = PairSelectionOptions(similar=6)
+    assert options.way(count) == "similar"
+    names = [f"{k:03}" for k in range(count)]
+    order = rng.permutation(count)
+    vectors = vlad_vectors([seen[k] for k in order], options)
+    pairs = similar_pairs([names[k] for k in order], vectors, options.similar)
+    assert len(pairs) <= 6 * count < count * (count - 1) / 2
+    found = {tuple(sorted(map(int, pair))) for pair in pairs}
+    assert len(found) == len(pairs)
+    for step, share in ((1, 1.0), (2, 0.95)):  # three and two quarters in common
+        asked = {(k, k + step) for k in range(count - step)}
+        assert len(asked & found) >= share * len(asked)

@@ -239,17 +239,23 @@ def test_photographs_with_blanks_in_their_names_in_a_sequence(
     assert len(found.views) == 4
 
 
-def test_the_most_alike_are_matched(write_fountain, tmp_path: Path, pycolmap) -> None:
+@pytest.mark.parametrize(
+    "selection",
+    [PairSelectionOptions("similar", similar=2), PairSelectionOptions(max_exhaustive=3, similar=2)],
+    ids=["asked for", "more than are matched exhaustively"],
+)
+def test_the_most_alike_are_matched(
+    write_fountain, tmp_path: Path, pycolmap, selection: PairSelectionOptions
+) -> None:
     folder = write_fountain(tmp_path / "photos")
     found = reconstruct_many(
         folder,
         tmp_path / "model",
-        pairs="similar",
         dense=False,
-        options=MultiViewOptions(pair_selection=PairSelectionOptions(similar=2)),
+        options=MultiViewOptions(pair_selection=selection),
         **QUICK,
     )
-    assert 4 <= found.pairs <= 6
+    assert 4 <= found.pairs < 6
     assert len(found.views) == 4
 
 
