@@ -1,13 +1,15 @@
 """Compare reconstructions of many photographs with pycolmap's own SIFT, by the true cameras.
 
     python benchmarks/many_photographs.py SCENE [--output FOLDER] [--pictures FOLDER] [--bad FOLDER]
-        [--resume] [--workers N]
+        [--resume] [--workers N] [--limits]
 
 SCENE is a folder of photographs with known cameras (docs/benchmarks.md lists the layouts). Both
 pipelines run with the true intrinsics and with estimated ones. Printed are the photographs that are
 registered, mean errors of camera centres and rotations after the alignment of the centres, points,
 reprojection errors and CPU seconds. `--pictures` draws the cameras, the sparse and the dense model.
-With `--bad` the photographs of that folder are added, and a black and a damaged one.
+With `--bad` the photographs of that folder are added, and a black and a damaged one. `--limits`,
+after a run without it, shows what the errors of the poses consist of: the last adjustment is made
+again from two random halves of the sparse points, and with other losses.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ import numpy as np
 
 from deepdetect import Camera, MultiViewReconstruction, PointCloud, reconstruct_many
 from deepdetect.datasets.posed_images import PosedScene, load_posed_scenes
+from deepdetect.evaluation.metrics.multi_view import camera_errors
 from deepdetect.geometry.point_cloud import robust_box
+from deepdetect.geometry.posed_view import PosedView
 from deepdetect.io.html_viewer import camera_lines
 from deepdetect.io.image import find_images, load_image
 from deepdetect.sfm.colmap import quiet_pycolmap
@@ -49,12 +53,16 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, help="folder for pictures of the model")
     parser.add_argument("--bad", type=Path, help="folder of photographs of something else")
     parser.add_argument("--workers", type=int, help="processes")
+    parser.add_argument("--limits", action="store_true", help="what the errors consist of")
     parser.add_argument("--resume", action="store_true", help="keep what earlier runs have made")
     args = parser.parse_args()
     (scene,) = load_posed_scenes(args.scene)
     names = sorted(image.path.name for image in scene.images)
     if args.bad is not None:
         show_bad(scene, args.bad, args.output / "bad", args.workers)
+        return
+    if args.limits:
+        show_limits(scene, args.output / "true-plain" / "sparse")
         return
     camera = true_camera(scene)
     print(
@@ -146,24 +154,52 @@ def row(
     )
 
 
+def true_views(scene: PosedScene) -> dict[str, PosedView]:
+    """Return the true cameras by the names of the photographs."""
+    camera = true_camera(scene)
+    return {
+        image.path.name: PosedView(image.path.name, camera, image.rotation, image.translation)
+        for image in scene.images
+    }
+
+
 def pose_errors(scene: PosedScene, views: dict) -> tuple[float, float]:
     """Return mean errors of centres, in the scene's unit, and of rotations in degrees."""
-    images = {image.path.name: image for image in scene.images}
-    own = np.array([view.centre for view in views.values()])
-    true = np.array([-images[name].rotation.T @ images[name].translation for name in views])
-    means = own.mean(axis=0), true.mean(axis=0)
-    left, values, right = np.linalg.svd((true - means[1]).T @ (own - means[0]))
-    signs = np.array([1, 1, np.sign(np.linalg.det(left @ right))])
-    turn = left * signs @ right
-    scale = (values * signs).sum() / ((own - means[0]) ** 2).sum()
-    centres = np.linalg.norm(scale * (own - means[0]) @ turn.T + means[1] - true, axis=1)
-    angles = [
-        np.degrees(
-            np.linalg.norm(cv2.Rodrigues(view.rotation @ turn.T @ images[name].rotation.T)[0])
+    truth = true_views(scene)
+    found = camera_errors(list(views.values()), [truth[name] for name in views])
+    return float(found.centres.mean()), float(found.rotations_deg.mean())
+
+
+def show_limits(scene: PosedScene, folder: Path) -> None:
+    """Adjust a model with the true intrinsics again, of half of its points and by other losses."""
+
+    def adjusted(dropped: slice, seed: int, scale_px: float) -> dict[str, PosedView]:
+        with quiet_pycolmap() as pycolmap:
+            model = pycolmap.Reconstruction(folder)
+        numbers = np.random.default_rng(seed).permutation(sorted(model.points3D))
+        for number in numbers[dropped]:
+            model.delete_point3D(int(number))
+        adjust(model, True, scale_px)
+        return {view.name: view for view in read_sparse_model(model).views.values()}
+
+    def show(title: str, views: dict) -> None:
+        centres, rotations = pose_errors(scene, views)
+        print(f"{title}: centres {1000 * centres:.2f} mm, rotations {rotations:.3f} degrees")
+
+    for scale_px in (0.1, 0.25, 0.5, 1.0, 2.0, 100.0):
+        show(f"all points, loss at {scale_px:g} px", adjusted(slice(0), 0, scale_px))
+    truth = true_views(scene)
+    for seed in range(3):
+        halves = [adjusted(slice(start, None, 2), seed, 1.0) for start in (0, 1)]
+        for title, views in zip("AB", halves, strict=True):
+            show(f"half {title} of the points, seed {seed}", views)
+        first, second = halves
+        unit = camera_errors(list(second.values()), [truth[name] for name in second]).scale
+        apart = camera_errors([first[name] for name in second], list(second.values()))
+        print(
+            f"from half to half: centres {1000 * unit * apart.centres.mean():.2f} mm, "
+            f"rotations {apart.rotations_deg.mean():.3f} degrees"
         )
-        for name, view in views.items()
-    ]
-    return float(centres.mean()), float(np.mean(angles))
 
 
 def show_bad(scene: PosedScene, bad: Path, output: Path, workers: int | None) -> None:

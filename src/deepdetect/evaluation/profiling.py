@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 import threading
 import time
@@ -12,6 +14,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from .._shared.errors import DeepDetectError, MissingExtraError
+from .._shared.parallel import use_one_thread
 
 Outcome = TypeVar("Outcome")
 
@@ -141,6 +144,8 @@ def peak_memory() -> int:
 def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
     """Call a function in a process of its own, whose `peak_memory` is that of its work alone.
 
+    OpenCV and our kernels have one thread there.
+
     Args:
         function: of a module.
         arguments: what can be pickled.
@@ -157,7 +162,8 @@ def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
     from concurrent.futures.process import BrokenProcessPool
 
     # Spawned: a fork would begin with all memory of this process.
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context, initializer=_start_child) as pool:
         try:
             return pool.submit(function, *arguments).result()
         except BrokenProcessPool:
@@ -165,6 +171,22 @@ def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
                 "its process was ended by the system, probably for lack of memory: take fewer or "
                 "smaller images"
             ) from None
+
+
+def _start_child() -> None:
+    """Prepare the process: one thread, and it ends with its parent, or by Ctrl-C, at once."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    use_one_thread()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    import multiprocessing
+
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _process() -> Any:
