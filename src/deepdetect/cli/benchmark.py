@@ -119,7 +119,7 @@ def benchmark(
     from ..datasets.pair_selection import PairSelectionOptions
     from ..evaluation.baselines.plugin import find_feature
     from ..evaluation.benchmarks import BENCHMARKS
-    from ..evaluation.options import BASELINES, DEFAULT_PROTOCOLS, BenchmarkOptions
+    from ..evaluation.options import BASELINES, DEFAULT_PROTOCOLS, BenchmarkOptions, SfmOptions
     from ..evaluation.runner import run_benchmarks
     from ..matching.options import get_preset
 
@@ -144,7 +144,7 @@ def benchmark(
         geometry_weights,
         PairSelectionOptions(max_pairs),
         degraded_images,
-        max_photographs,
+        SfmOptions(max_photographs),
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)
     paths = report.save(output)

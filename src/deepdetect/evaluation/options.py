@@ -38,6 +38,24 @@ BASELINES: dict[str, LocalFeature] = {**CLASSICAL, **HESSIAN}
 
 
 @suggest_keywords
+@dataclass(frozen=True)
+class SfmOptions:
+    """Which photographs of a scene are reconstructed.
+
+    Attributes:
+        max_photographs: at most this many: of a sequence the first, else evenly spaced ones.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    max_photographs: int = 20
+
+    def __post_init__(self) -> None:
+        check_ranges(self, between={"max_photographs": (3, float("inf"))})
+
+
+@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class BenchmarkOptions:
     """What is compared, and how.
@@ -52,8 +70,7 @@ class BenchmarkOptions:
         geometry_weights: the weights for stereo pairs, one or more.
         pair_selection: which pairs of a scene are measured, and at which frame distances.
         degraded_images: which images of a pair the protocol "degraded" degrades.
-        max_photographs: of a scene that is reconstructed: of a sequence the first, else evenly
-            spaced ones.
+        sfm: which photographs are reconstructed.
 
     Raises:
         OptionError: a name is unknown, or nothing is left to do.
@@ -67,10 +84,9 @@ class BenchmarkOptions:
     geometry_weights: tuple[str | Path, ...] = ("dense",)
     pair_selection: PairSelectionOptions = field(default_factory=PairSelectionOptions)
     degraded_images: DegradedImages = "second"
-    max_photographs: int = 20
+    sfm: SfmOptions = field(default_factory=SfmOptions)
 
     def __post_init__(self) -> None:
-        check_ranges(self, between={"max_photographs": (3, float("inf"))})
         for protocol in self.protocols:
             if protocol not in PROTOCOLS:
                 raise unknown_name("protocol", protocol, PROTOCOLS)

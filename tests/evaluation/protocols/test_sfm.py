@@ -14,7 +14,7 @@ from deepdetect.datasets.posed_images import PosedImage, PosedPair, PosedScene
 from deepdetect.evaluation.benchmarks import plan_sfm
 from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.metrics.multi_view import CloudAgreement
-from deepdetect.evaluation.options import BenchmarkOptions
+from deepdetect.evaluation.options import BenchmarkOptions, SfmOptions
 from deepdetect.evaluation.protocols import sfm
 from deepdetect.evaluation.protocols.sfm import (
     POINTS,
@@ -162,7 +162,7 @@ def test_options_choose_the_methods() -> None:
     without = sfm_methods(BenchmarkOptions(detector, classical=()))
     assert [method.title for method in without] == [POINTS, RANDOM]
     with pytest.raises(OptionError, match="max_photographs"):
-        BenchmarkOptions(detector, max_photographs=2)
+        SfmOptions(max_photographs=2)
 
 
 def test_without_pycolmap_it_says_what_to_install(

@@ -147,7 +147,7 @@ def sfm_section(
         if len(scene.images) < MIN_PHOTOGRAPHS:
             context.fail(f"{scene.name}: it has {len(scene.images)} photographs, 3 are needed")
         else:
-            chosen.append(choose_photographs(scene, options.max_photographs))
+            chosen.append(choose_photographs(scene, options.sfm.max_photographs))
     for feature in options.others:
         context.skipped.append(f"sfm: {feature.title}: this benchmark runs no further methods")
     methods = sfm_methods(options)
