@@ -16,11 +16,11 @@ from PIL import Image
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
-from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError
+from deepdetect import DeepDetect, DeepDetectError, ImageError, MissingExtraError, OptionError
 from deepdetect.evaluation import runner
 from deepdetect.evaluation.baselines.method import BaselineError, LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
-from deepdetect.evaluation.benchmarks import BENCHMARKS
+from deepdetect.evaluation.benchmarks import BENCHMARKS, Benchmark
 from deepdetect.evaluation.cache import StageCache
 from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.metrics import repeatability
@@ -430,3 +430,20 @@ def test_a_cache_that_cannot_be_written_ends_the_run(
     (tmp_path / "cache").write_text("a file")
     with pytest.raises(DeepDetectError, match="cannot write"):
         run_benchmarks(["foreground"], data, options, cache=tmp_path / "cache")
+
+
+def test_a_missing_package_stops_only_the_benchmark_that_needs_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, edge_detector: DeepDetect
+) -> None:
+    def lacks(context: BenchmarkContext, options: BenchmarkOptions) -> list:
+        raise MissingExtraError("this needs pycolmap: pip install 'deepdetect[sfm]'")
+
+    known = {"one": Benchmark("one", lacks), "other": Benchmark("other", lambda *_: [])}
+    monkeypatch.setattr(runner, "BENCHMARKS", known)
+    options = BenchmarkOptions(edge_detector)
+    report = run_benchmarks(["one", "other"], tmp_path, options)
+    assert report.failures == (
+        "the benchmark one: this needs pycolmap: pip install 'deepdetect[sfm]'",
+    )
+    with pytest.raises(MissingExtraError):
+        run_benchmarks(["one"], tmp_path, options)
