@@ -125,6 +125,26 @@ def test_an_error_of_a_centre_has_its_size(scene: SfmScene, found: dict) -> None
     assert each.rows[4][3:] == ("000004.png", None, None)
 
 
+def test_models_are_compared_with_the_first_in_the_unit_of_the_truth(
+    scene: SfmScene, found: dict
+) -> None:
+    first = found["arc", POINTS].given
+    half = {  # in a unit of its own, and one camera is 0.03 of the truth's aside
+        name: PosedView(
+            name, view.camera, view.rotation, -view.rotation @ (0.5 * view.centre + [move, 0, 0])
+        )
+        for (name, view), move in zip(first.views.items(), (0.03, 0, 0, 0), strict=True)
+    }
+    other = SfmModel(half, 1, 2.0, 0.1, 1.0, 1.0)
+    exact = SfmModel(dict(first.views), 1, 2.0, 0.1, 1.0, 1.0)
+    found["arc", SIFT] = SfmResult(1, 1, 1.0, 1.0, other, exact, 1)
+    table = camera_table([scene], [POINTS, SIFT, RANDOM], found)
+    column = "from the first row's, unit of the truth"
+    values = [by_column(table, row)[column] for row in range(6)]
+    assert values[0] is values[1] is values[3] is values[4] is None
+    assert 0.005 < values[2] < 0.03
+
+
 def test_halves_count_by_their_points(scene: SfmScene, found: dict) -> None:
     table = dense_table([scene], [POINTS, RANDOM], found)
     ours = by_column(table, 0)

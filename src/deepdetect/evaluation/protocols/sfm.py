@@ -68,7 +68,7 @@ TEXT = (
     "stages with the same options, once with the true intrinsics and once with estimated ones; "
     "the true poses only judge. What differs are the keypoints: the ranked points of DeepDetect; "
     "as many random points with their sizes, described and matched as they are; and pycolmap's "
-    "own SIFT with its own matcher, which has at most as many keypoints.",
+    "own SIFT with its own matcher, at as many places at most, some of them at two angles.",
     "Dense points are matched along rows of rectified photographs, whatever the keypoints were: "
     "they depend on these by the poses only. Where there is no scan to compare them with, those of "
     "every second photograph are compared with those of the others, with the poses of all.",
@@ -203,6 +203,16 @@ def _errors(model: SfmModel, scene: SfmScene) -> CameraErrors | None:
     return camera_errors(list(model.views.values()), [truth[name] for name in model.views])
 
 
+def _apart(model: SfmModel, other: SfmModel | None, truth: Mapping[str, PosedView]) -> float | None:
+    """Return the mean distance of the centres of two models in the unit of the truth."""
+    names = sorted(set(model.views) & set(() if other is None else other.views))
+    if other is None or len(names) < MIN_PHOTOGRAPHS:
+        return None
+    views, others = ([each.views[name] for name in names] for each in (model, other))
+    unit = camera_errors(others, [truth[name] for name in names]).scale
+    return unit * float(camera_errors(views, others).centres.mean())
+
+
 def path_extent(scene: SfmScene) -> float:
     """Return the largest distance of two true cameras."""
     centres = np.array([view.centre for view in scene.truth.values()])
@@ -216,7 +226,8 @@ def camera_table(scenes: Sequence[SfmScene], titles: Sequence[str], found: Resul
         *(Column("photographs", "d"), Column("registered", "d")),
         *(Column(f"AUC at {threshold:g}°", ".3f") for threshold in POSE_THRESHOLDS_DEG),
         *(Column("centres, unit of the truth", ".5f"), Column("centres, ‰ of the extent", ".2f")),
-        *(Column("rotations, °", ".3f"), Column("sparse points", ",d")),
+        *(Column("from the first row's, unit of the truth", ".5f"), Column("rotations, °", ".3f")),
+        Column("sparse points", ",d"),
         *(Column("track length", ".2f"), Column("reprojection error, px", ".3f")),
     )
     rows: list[tuple[Cell, ...]] = []
@@ -226,6 +237,8 @@ def camera_table(scenes: Sequence[SfmScene], titles: Sequence[str], found: Resul
             if (scene.name, title) not in found:
                 continue
             for kind, model in _models(found[scene.name, title]):
+                first = found.get((scene.name, titles[0])) if title != titles[0] else None
+                other = None if first is None else dict(_models(first))[kind]
                 pairs = relative_pose_errors(model.views, truth)
                 errors = _errors(model, scene)
                 centre = None if errors is None else float(errors.centres.mean())
@@ -235,6 +248,7 @@ def camera_table(scenes: Sequence[SfmScene], titles: Sequence[str], found: Resul
                         *(pose_auc(pairs, threshold) for threshold in POSE_THRESHOLDS_DEG),
                         centre,
                         None if centre is None else 1000 * centre / extent,
+                        _apart(model, other, truth),
                         None if errors is None else float(errors.rotations_deg.mean()),
                         *(model.points, model.track_length, model.error_px),
                     )
@@ -244,7 +258,9 @@ def camera_table(scenes: Sequence[SfmScene], titles: Sequence[str], found: Resul
         "larger of the angle of the rotation and the angle between the directions of translation; "
         "pairs with a photograph that is not registered count as infinite. Centres and rotations: "
         "mean errors of the registered cameras after the alignment of their centres (rotation, "
-        "shift and scale); extent: the largest distance of two true cameras. Of cameras on a "
+        "shift and scale); extent: the largest distance of two true cameras. From the first row's: "
+        "mean distance of the centres from those of the first method; where that is much less than "
+        "the errors of both, these are the truth's, or common to both. Of cameras on a "
         "straight line the alignment leaves a rotation open: take the AUC. Track length: mean "
         "number of photographs that see a point. Reprojection error: mean; the points are the "
         "method's own, so it is no error of the cameras."
@@ -281,7 +297,8 @@ def cost_table(scenes: Sequence[SfmScene], titles: Sequence[str], found: Results
     note = (
         "Of one process, which has no other work: keypoints, descriptors and matches on one "
         "thread, verification and mapping on as many as COLMAP takes. Memory: the most that the "
-        "process held, with Python and all libraries. Finding random points takes no time. "
+        "process held, with Python and all libraries. Random points take the places of ranked ones, "
+        "which are found first: that is in their memory, not in their seconds. "
         "Seconds may be those of an earlier run, from the cache; on a busy machine compare CPU "
         "seconds."
     )

@@ -190,7 +190,7 @@ def find_random_points(
 
 
 def find_sift(stages: Stages, folder: Path) -> None:
-    """Find keypoints by pycolmap's own SIFT with its defaults, at most as many as ours."""
+    """Find keypoints by pycolmap's own SIFT with its defaults, at no more places than ours."""
     names = sorted(path.name for path in folder.iterdir())
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureExtractionOptions()
