@@ -297,8 +297,8 @@ def cost_table(scenes: Sequence[SfmScene], titles: Sequence[str], found: Results
     note = (
         "Of one process, which has no other work: keypoints, descriptors and matches on one "
         "thread, verification and mapping on as many as COLMAP takes. Memory: the most that the "
-        "process held, with Python and all libraries. Random points take the places of ranked ones, "
-        "which are found first: that is in their memory, not in their seconds. "
+        "process held, with Python and all libraries. Random points take the places of ranked "
+        "ones, which are found first: that is in their memory, not in their seconds. "
         "Seconds may be those of an earlier run, from the cache; on a busy machine compare CPU "
         "seconds."
     )
