@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from deepdetect import Camera, OptionError
+from deepdetect.sfm.database import DatabaseImage, write_database
 from deepdetect.sfm.lens import Lens
 from deepdetect.sfm.mapping import (
     MappingOptions,
     adjust,
     camera_spacing,
+    map_photographs,
     normalise_model,
     read_sparse_model,
+    verify_pairs,
     write_sparse_model,
 )
 
@@ -102,6 +105,53 @@ def test_a_written_model_replaces_the_one_before(model, pycolmap, tmp_path: Path
     assert (folder / "images.bin").read_bytes() != first
     assert pycolmap.Reconstruction(folder).num_points3D() == 80
     assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
+
+
+def test_cameras_that_move_straight_ahead_are_mapped(
+    pycolmap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP's defaults find no pair to begin with: the second attempt does."""
+    attempts = []
+    original = pycolmap.incremental_mapping
+
+    def counted(*arguments, **keywords):
+        attempts.append(original(*arguments, **keywords))
+        return attempts[-1]
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", counted)
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-5, -3, 7), (5, 3, 13), (400, 3))
+    lens = Lens.of_camera(Camera((640, 480), 500.0))
+    images, rows = [], []
+    for number in range(5):
+        seen = points - [0, 0, 0.4 * number]
+        xy = seen[:, :2] / seen[:, 2:] * 500 + (319.5, 239.5)
+        inside = ((xy > 0) & (xy < (639, 479))).all(axis=1)
+        rows.append(np.flatnonzero(inside))
+        noisy = xy[inside] + rng.normal(0, 0.2, (inside.sum(), 2))
+        images.append(DatabaseImage(f"{number}.jpg", lens, noisy))
+    matches = {
+        (images[a].name, images[b].name): np.column_stack(
+            np.intersect1d(rows[a], rows[b], return_indices=True)[1:]
+        )
+        for a in range(5)
+        for b in range(a + 1, 5)
+    }
+    options = MappingOptions()
+    write_database(tmp_path / "database.db", images, matches)
+    verify_pairs(tmp_path / "database.db", options)
+    (tmp_path / "space").mkdir()
+    model, others = map_photographs(
+        tmp_path / "database.db", tmp_path, tmp_path / "space", True, options
+    )
+    assert [len(models) for models in attempts] == [0, 1]
+    views = read_sparse_model(model).views.values()
+    assert (len(views), others) == (5, [])
+    path = np.array([view.centre for view in sorted(views, key=lambda view: view.name)])
+    steps = np.diff(path, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    np.testing.assert_allclose(lengths, lengths.mean(), rtol=0.1)
+    assert ((steps @ steps[0]) / (lengths * lengths[0]) > 0.99).all()
 
 
 @pytest.mark.parametrize("wrong", [{"min_views": 1}, {"min_verified": 0}, {"robust_scale_px": 0}])

@@ -35,6 +35,9 @@ class MappingOptions:
         min_views: of a model; smaller ones are given up.
         max_models: groups of photographs that do not hang together, of which models are made.
         max_first_pairs: pairs with which each of them may begin.
+        forward_angle_deg: COLMAP begins with a pair whose points are seen at large angles, and
+            which did not move straight ahead. Where there is none, as in a clip from a car, it may
+            have, and this angle is enough.
         refine_tracks: align the patches around all observations of a point before the last
             adjustment.
         track_refinement: how they are aligned.
@@ -53,6 +56,7 @@ class MappingOptions:
     min_views: int = 3
     max_models: int = 5
     max_first_pairs: int = 20
+    forward_angle_deg: float = 4.0
     refine_tracks: bool = False
     track_refinement: TrackRefinementOptions = field(default_factory=TrackRefinementOptions)
     robust_scale_px: float = 1.0
@@ -66,6 +70,7 @@ class MappingOptions:
             positive=(
                 *("min_verified", "max_verification_error_px"),
                 *("robust_scale_px", "refined_scale_px", "max_models", "max_first_pairs"),
+                "forward_angle_deg",
             ),
             not_negative=("seed",),
             between={"min_views": (2, np.inf), "min_views_of_principal_point": (3, np.inf)},
@@ -172,14 +177,20 @@ def map_photographs(
         if known_cameras:
             how.ba_refine_focal_length = False
             how.ba_refine_extra_params = False
-        models = pycolmap.incremental_mapping(
-            database,
-            folder,
-            workspace,
-            how,
-            initial_image_pair_callback=lambda: registered(2),
-            next_image_callback=lambda: registered(1),
-        )
+        for forward in (False, True):
+            if forward:
+                how.mapper.init_max_forward_motion = 1.0
+                how.mapper.init_min_tri_angle = options.forward_angle_deg
+            models = pycolmap.incremental_mapping(
+                database,
+                folder,
+                workspace,
+                how,
+                initial_image_pair_callback=lambda: registered(2),
+                next_image_callback=lambda: registered(1),
+            )
+            if models:
+                break
     found = sorted(models.values(), key=lambda model: -model.num_reg_images())
     if not found or found[0].num_reg_images() < options.min_views:
         raise NoDepthError(
