@@ -11,9 +11,9 @@ const TYPES = { ".html": "text/html", ".css": "text/css", ".js": "text/javascrip
 
 const port = Number(process.argv[2] ?? 8080);
 createServer(async (request, response) => {
-  const path = normalize(decodeURIComponent(new URL(request.url, "http://localhost").pathname));
-  const file = join(dist, path.endsWith("/") ? `${path}index.html` : path);
   try {
+    const path = normalize(decodeURIComponent(new URL(request.url, "http://localhost").pathname));
+    const file = join(dist, path.endsWith("/") ? `${path}index.html` : path);
     const content = await readFile(file);
     response.writeHead(200, { "Content-Type": TYPES[extname(file)] ?? "application/octet-stream" });
     response.end(content);

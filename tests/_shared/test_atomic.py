@@ -5,12 +5,13 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from deepdetect._shared import atomic
-from deepdetect._shared.atomic import atomic_path
+from deepdetect._shared.atomic import atomic_path, private_folder
 from deepdetect._shared.errors import DeepDetectError
 
 
@@ -211,3 +212,45 @@ def test_files_of_another_machine_are_removed_after_a_day(
         pass
     assert foreign.exists() == stays
     assert users.exists()
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+def test_a_private_folder_is_for_its_user_only(temporary: Path) -> None:
+    folder = private_folder("example-")
+    assert folder.parent == temporary
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert private_folder("example-") != folder
+    assert folder.is_dir()  # its process is at work
+
+
+def test_folders_of_processes_that_ended_are_removed(temporary: Path) -> None:
+    code = "from deepdetect._shared.atomic import private_folder as f; print(f('example-'))"
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    words = [sys.executable, "-c", code]
+    left = Path(subprocess.check_output(words, text=True, env=environment).strip())
+    (left / "photograph.jpg").write_bytes(b"x")
+    other = temporary / "example-x" / "y"
+    other.mkdir(parents=True)
+    named_alike = temporary / left.name.replace("example", "sample")
+    named_alike.mkdir()
+    link = temporary / f"{left.name[:-8]}00000000"
+    link.symlink_to(other, target_is_directory=True)
+    assert private_folder("example-").is_dir()
+    assert not left.exists()
+    assert other.is_dir()
+    assert named_alike.is_dir()
+    assert link.is_symlink()
+
+
+def test_no_place_for_a_private_folder_is_an_error_of_ours(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary / "absent"))
+    with pytest.raises(DeepDetectError, match="cannot make a temporary folder") as caught:
+        private_folder("example-")
+    assert "\n" not in str(caught.value)

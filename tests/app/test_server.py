@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import io
+import json
 import socket
+import subprocess
+import sys
 import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +119,38 @@ def test_only_the_files_of_the_page_are_served(path: str, serve: Any) -> None:
     assert client.ask("GET", path).status == 404
 
 
+def test_what_is_no_address_is_refused(serve: Any, capfd: pytest.CaptureFixture[str]) -> None:
+    client, _ = serve()
+    for path in ("http://[x", "http://[::1"):
+        assert client.ask("GET", path).status == 400
+    assert capfd.readouterr().err == ""
+
+
+def test_port_80_is_left_out_by_browsers(serve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    client, _ = serve()
+    assert client.ask("GET", "/", headers={"Host": "127.0.0.1"}).status == 421
+    monkeypatch.setattr(client.server, "server_port", 80)
+    connection = socket.create_connection(client.server.server_address)
+    connection.sendall(b"GET /config.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+    assert connection.recv(12) == b"HTTP/1.1 200"
+    connection.close()
+
+
+def test_a_body_that_nobody_reads_is_no_request(serve: Any) -> None:
+    client, _ = serve()
+    inner = f"GET /icon.svg HTTP/1.1\r\nHost: {client.host}\r\n\r\n"
+    outer = (
+        f"GET /config.json HTTP/1.1\r\nHost: {client.host}\r\nContent-Length: {len(inner)}\r\n\r\n"
+    )
+    with socket.create_connection(client.server.server_address) as connection:
+        connection.settimeout(30)
+        connection.sendall((outer + inner).encode())
+        answer = b""
+        while piece := connection.recv(1 << 16):
+            answer += piece
+    assert answer.count(b"HTTP/1.1 ") == 1
+
+
 def test_the_logits_are_those_of_the_package(serve: Any, photo: np.ndarray) -> None:
     client, _ = serve()
     rgb = np.ascontiguousarray(photo[:100, :91])
@@ -215,6 +251,8 @@ def test_a_damaged_task_is_refused(body: bytes, serve: Any) -> None:
         ("reconstruct", 2, {"focal_px": "3"}, "does not take 'focal_px' as '3'"),
         ("reconstruct", 2, {"focal_px": -3}, "does not take 'focal_px' as -3"),
         ("reconstruct", 2, {"focal_px": True}, "does not take 'focal_px' as True"),
+        ("reconstruct", 2, {"focal_px": 10**400}, "does not take 'focal_px' as 1000"),
+        ("folder-keypoints", 0, {}, "takes at least 1 photograph, not 0"),
     ],
 )
 def test_a_task_that_does_not_fit_is_refused(
@@ -259,11 +297,16 @@ def test_photographs_can_be_read_by_their_owner_only(serve: Any, photo: np.ndarr
         assert folder.stat().st_mode & 0o077 == 0
 
 
+def noise(count: int) -> list[tuple[str, bytes]]:
+    """Return photographs that take seconds each."""
+    rgb = np.random.default_rng(0).integers(0, 256, (600, 600, 3)).astype(np.uint8)
+    content = encoded(rgb)
+    return [(f"{number}.png", content) for number in range(count)]
+
+
 def long_task(client: Client) -> str:
     """Start a task that would take minutes."""
-    rgb = np.random.default_rng(0).integers(0, 256, (600, 600, 3)).astype(np.uint8)
-    files = [(f"{number}.png", encoded(rgb)) for number in range(60)]
-    return client.start("folder-keypoints", files).values["job"]
+    return client.start("folder-keypoints", noise(60)).values["job"]
 
 
 def test_a_task_is_cancelled(serve: Any) -> None:
@@ -334,6 +377,44 @@ def test_a_body_that_trickles_is_ended(serve: Any) -> None:
 
         with pytest.raises(ConnectionError):
             trickle()
+
+
+def test_photographs_that_cannot_be_written_are_said(
+    serve: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    client, temporary = serve()
+    (home,) = temporary.iterdir()
+    home.rmdir()  # as programs do that clean up
+    answer = client.start("folder-keypoints", [("a.png", b"x")])
+    assert answer.status == 400
+    assert answer.values["error"].startswith("the task cannot be started (No such file")
+    assert capfd.readouterr().err == ""
+
+
+def test_the_last_place_is_taken_once(serve: Any) -> None:
+    client, _ = serve(max_tasks=1)
+    with ThreadPoolExecutor(6) as pool:
+        asked = [pool.submit(client.start, "folder-keypoints", noise(30)) for _ in range(6)]
+        found = sorted(one.result().status for one in asked)
+    assert found == [200, *[400] * 5]
+
+
+def test_a_full_disk_is_said_by_the_task(tmp_path: Path) -> None:
+    task = {"kind": "match", "photographs": [], "options": {}, "max_megapixels": 1}
+    (tmp_path / "task.json").write_text(json.dumps(task))
+    code = (
+        "import errno, pathlib, sys, types\n"
+        "from deepdetect.app import worker\n"
+        "def full(*given):\n    raise OSError(errno.ENOSPC, 'No space left on device')\n"
+        "worker.TASKS['match'] = types.SimpleNamespace(run=full)\n"
+        "worker.main(pathlib.Path(sys.argv[1]))\n"
+    )
+    words = [sys.executable, "-c", code, str(tmp_path)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        told = json.loads(process.stdout.readline())
+    said = "the files cannot be written (No space left on device): free some space"
+    assert told == {"error": said}
 
 
 def test_a_port_that_is_taken_is_said_in_one_sentence(serve: Any) -> None:

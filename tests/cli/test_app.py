@@ -8,6 +8,7 @@ import sys
 import urllib.request
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner
 
 from deepdetect.cli import main
@@ -34,6 +35,46 @@ def test_it_prints_its_address_and_ends_without_a_trace(tmp_path: Path) -> None:
     assert started.returncode == 0
     assert said.splitlines() == ["Ctrl+C ends it.", "deepdetect: ended; nothing was kept"]
     assert list(tmp_path.iterdir()) == []
+
+
+def started(temporary: Path) -> subprocess.Popen[str]:
+    """Start the program, and wait until it has said its address."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "deepdetect", "app", "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(temporary)},
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline()
+    return process
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("signal_name", ["SIGTERM", "SIGHUP"])
+def test_no_signal_that_asks_leaves_files(signal_name: str, tmp_path: Path) -> None:
+    process = started(tmp_path)
+    assert list(tmp_path.iterdir())
+    process.send_signal(getattr(signal, signal_name))
+    process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_what_a_killed_server_left_is_removed_at_the_next_start(tmp_path: Path) -> None:
+    process = started(tmp_path)
+    (left,) = tmp_path.iterdir()
+    (left / "photograph.jpg").write_bytes(b"x")
+    process.kill()
+    process.communicate(timeout=60)
+    assert left.is_dir()
+    process = started(tmp_path)
+    (now,) = tmp_path.iterdir()
+    assert now != left
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
 
 
 def test_a_port_out_of_range() -> None:

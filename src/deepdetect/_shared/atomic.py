@@ -1,4 +1,4 @@
-"""Files that appear whole under their final name, or not at all."""
+"""Files that appear whole under their final name, or not at all; folders for temporary files."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import os
 import platform
 import re
 import secrets
+import shutil
+import tempfile
 import time
 import uuid
 from collections.abc import Iterator
@@ -23,8 +25,11 @@ ABANDONED_S = 24 * 3600.0
 STEM_LENGTH = 40
 """Characters of the final name in a temporary one, which must not become too long."""
 
-# Stem, machine, process, a random number, "part" and the suffix of the final file.
-_TEMPORARY = re.compile(r"\..*\.(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}\.part(\..*)?")
+# Machine, process and a random number.
+_OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")
+
+# Stem, owner, "part" and the suffix of the final file.
+_TEMPORARY = re.compile(rf"\..*\.{_OWNER.pattern}\.part(\..*)?")
 
 _HOST_FILES = (Path("/proc/sys/kernel/random/boot_id"), Path("/etc/machine-id"))
 
@@ -61,7 +66,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         final.parent.mkdir(parents=True, exist_ok=True)
         clear_abandoned(final.parent)
-        owner = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+        owner = _owner()
         name = final.with_name(f".{final.stem[:STEM_LENGTH]}.{owner}.part{final.suffix}")
         # Nobody else reads what is not whole.
         os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
@@ -97,6 +102,66 @@ def clear_abandoned(folder: Path) -> None:
             if match is not None and _is_abandoned(entry, match["machine"], int(match["process"])):
                 with contextlib.suppress(OSError):
                     os.unlink(entry)
+
+
+def private_folder(prefix: str) -> Path:
+    """Make a folder for temporary files, which only this user can read.
+
+    Folders of the same prefix whose processes have ended are removed first.
+
+    Args:
+        prefix: how the folder's name begins.
+
+    Returns:
+        A new folder in the system's folder for temporary files. Who asks for it removes it.
+
+    Raises:
+        DeepDetectError: there is no folder for temporary files that can be written.
+
+    Example:
+        >>> folder = private_folder("example-")
+        >>> folder.name.startswith("example-")
+        True
+        >>> folder.rmdir()
+    """
+    try:
+        parent = Path(tempfile.gettempdir())
+        _clear_abandoned_folders(parent, prefix)
+        folder = parent / f"{prefix}{_owner()}"
+        folder.mkdir(mode=0o700)
+    except OSError as error:
+        raise DeepDetectError(
+            f"cannot make a temporary folder ({error.strerror or error}): "
+            "free some space, or set TMPDIR to a folder that can be written"
+        ) from error
+    return folder
+
+
+def _clear_abandoned_folders(parent: Path, prefix: str) -> None:
+    """Remove this user's folders of `private_folder` whose processes have ended."""
+    with contextlib.suppress(OSError), os.scandir(parent) as entries:
+        for entry in entries:
+            match = _OWNER.fullmatch(entry.name.removeprefix(prefix))
+            if match is None or not entry.name.startswith(prefix):
+                continue
+            if _is_own_folder(entry) and _is_abandoned(
+                entry, match["machine"], int(match["process"])
+            ):
+                shutil.rmtree(entry, ignore_errors=True)
+
+
+def _is_own_folder(entry: os.DirEntry[str]) -> bool:
+    """Return whether it is a folder of this user: others write to the same parent."""
+    try:
+        own = not hasattr(os, "getuid") or entry.stat(follow_symlinks=False).st_uid == os.getuid()
+        return own and entry.is_dir(follow_symlinks=False)
+    except OSError:
+        return False
+
+
+def _owner() -> str:
+    """Return the part of a temporary name that says which process it is of; new each time."""
+    return f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 def _is_abandoned(entry: os.DirEntry[str], machine: str, process: int) -> bool:

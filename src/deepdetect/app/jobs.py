@@ -13,12 +13,17 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from .._shared.atomic import private_folder
 from .._shared.errors import DeepDetectError, OptionError
 from .options import AppOptions
+
+FOLDER_PREFIX = "deepdetect-app-"
+"""Of the folder of a server, in the folder for temporary files."""
 
 CHECK_EVERY_S = 1.0
 """How often it is looked for tasks that last too long or are forgotten."""
@@ -151,18 +156,42 @@ class Jobs:
         self.limits = limits
         self._jobs: dict[str, Job] = {}
         self._lock = threading.Lock()
-        self._folder = Path(tempfile.mkdtemp(prefix="deepdetect-app-"))
+        self._folder = private_folder(FOLDER_PREFIX)
         self._closed = threading.Event()
         threading.Thread(target=self._watch, daemon=True).start()
 
-    def new_folder(self) -> Path:
-        """Make a folder for the photographs of a task, which nobody else can read."""
-        return Path(tempfile.mkdtemp(dir=self._folder))
+    @contextmanager
+    def new_folder(self) -> Iterator[Path]:
+        """Make a folder for the photographs of a task, which nobody else can read.
+
+        It is removed where the task cannot be started.
+
+        Raises:
+            DeepDetectError: files cannot be written, or the process cannot be started.
+        """
+        folder = None
+        try:
+            folder = Path(tempfile.mkdtemp(dir=self._folder))
+            yield folder
+        except BaseException as error:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+            if isinstance(error, DeepDetectError | ConnectionError | TimeoutError):
+                raise  # the browser has ended the request, or is too slow
+            if isinstance(error, OSError):
+                raise DeepDetectError(
+                    f"the task cannot be started ({error.strerror or error}): free some space and "
+                    "memory, or start deepdetect app again"
+                ) from error
+            raise
 
     def check_room(self) -> None:
         """Raise an OptionError where too many tasks are at work."""
         with self._lock:
-            at_work = sum(job.running for job in self._jobs.values())
+            self._check_room()
+
+    def _check_room(self) -> None:
+        at_work = sum(job.running for job in self._jobs.values())
         if at_work >= self.limits.max_tasks:
             raise OptionError(
                 f"as many tasks as are allowed ({self.limits.max_tasks}) are at work: wait for one "
@@ -181,9 +210,9 @@ class Jobs:
         Raises:
             DeepDetectError: the server ends, or too many tasks are at work.
         """
-        self.check_room()
-        job = Job(folder, kind, photographs, options, self.limits)
-        with self._lock:
+        with self._lock:  # two requests at once must not both take the last place
+            self._check_room()
+            job = Job(folder, kind, photographs, options, self.limits)
             self._jobs[job.name] = job
         if self._closed.is_set():
             self.close()

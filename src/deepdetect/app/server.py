@@ -21,7 +21,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
@@ -33,6 +33,7 @@ STATIC = Path(__file__).parent / "static"
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")
+HTTP_PORT = 80
 
 MAX_HEATMAP_PIXELS = 2_100_000
 """The page reduces photographs to two megapixels, with sides that are multiples of 8."""
@@ -96,6 +97,7 @@ class AppServer(ThreadingHTTPServer):
 
     Raises:
         OptionError: the port is taken.
+        DeepDetectError: there is no folder for temporary files.
 
     Example:
         >>> with AppServer(AppOptions(port=0)) as server:
@@ -116,7 +118,11 @@ class AppServer(ThreadingHTTPServer):
                 f"port {options.port} cannot be used ({error.strerror}): give another `port`, or 0 "
                 "for any that is free"
             ) from None
-        self.jobs = Jobs(options)
+        try:
+            self.jobs = Jobs(options)
+        except DeepDetectError:
+            self.server_close()
+            raise
         self.pages = {
             f"/{path.relative_to(STATIC).as_posix()}": path
             for path in STATIC.rglob("*")
@@ -203,18 +209,33 @@ class Handler(BaseHTTPRequestHandler):
         try:
             try:
                 self._check_source()
-                method(urlsplit(self.path))
+                method(self._url())
             except Refused as refusal:
                 self._refuse(refusal.status, str(refusal))
             except DeepDetectError as error:
                 self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+            if self._body_is_left():  # it would be taken for the next request
+                self.close_connection = True
         except (ConnectionError, TimeoutError):
             self.close_connection = True
+
+    def _url(self) -> SplitResult:
+        try:
+            return urlsplit(self.path)
+        except ValueError:
+            raise Refused(HTTPStatus.BAD_REQUEST, "this is not an address") from None
+
+    def _body_is_left(self) -> bool:
+        length = self.headers.get("Content-Length", "0")
+        return "Transfer-Encoding" in self.headers or length != str(self.received)
 
     def _check_source(self) -> None:
         """Refuse requests for other computers (DNS rebinding), and of other pages."""
         hosts = self.headers.get_all("Host", [])
-        allowed = [f"{name}:{self.server.server_port}" for name in NAMES]
+        port = self.server.server_port
+        allowed = [f"{name}:{port}" for name in NAMES]
+        if port == HTTP_PORT:  # browsers leave it out
+            allowed += NAMES
         if len(hosts) != 1 or hosts[0] not in allowed:
             raise Refused(HTTPStatus.MISDIRECTED_REQUEST, "this address is not served here")
         origin = self.headers.get("Origin")
@@ -320,8 +341,7 @@ class Handler(BaseHTTPRequestHandler):
         if sum(sizes) != left - 4 - size:
             raise Refused(HTTPStatus.BAD_REQUEST, "the photographs are not as long as is said")
         numbers = TASKS[kind].check(len(names), given)
-        folder = jobs.new_folder()
-        try:
+        with jobs.new_folder() as folder:
             files = []
             for number, bytes_ in enumerate(sizes):
                 files.append(f"{number:04d}{_suffix(names[number])}")
@@ -329,9 +349,6 @@ class Handler(BaseHTTPRequestHandler):
                     for piece in self._pieces(bytes_):
                         file.write(piece)
             job = jobs.start(folder, kind, list(zip(files, names, strict=True)), numbers)
-        except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
         self._send_json({"job": job.name})
 
     def _length(self, largest: int) -> int:

@@ -96,12 +96,13 @@ class Task:
         least, most = self.files
         if count < least or (most is not None and count > most):
             number = f"{least}" if most == least else f"at least {least}"
-            raise OptionError(f"{self.title} takes {number} photographs, not {count}")
+            plural = "" if least == 1 else "s"
+            raise OptionError(f"{self.title} takes {number} photograph{plural}, not {count}")
         if self.missing:
             raise OptionError(f"{self.title} needs another package: {self.missing}")
         for name, value in options.items():
             real = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if name not in self.options or not real or not 0 < float(value) < 1e6:  # type: ignore[arg-type]
+            if name not in self.options or not real or not 0 < value < 1e6:  # type: ignore[operator]
                 raise OptionError(f"{self.title} does not take {name!r:.40} as {value!r:.40}")
         return {name: float(value) for name, value in options.items()}  # type: ignore[arg-type]
 

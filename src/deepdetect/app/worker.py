@@ -54,6 +54,8 @@ def main(folder: Path) -> None:
         tell(error=_with_names(str(error), photographs))
     except MemoryError:
         tell(error="there is not enough memory for this: use smaller photographs")
+    except OSError as error:
+        tell(error=f"the files cannot be written ({error.strerror or error}): free some space")
 
 
 def _with_names(message: str, photographs: list[Photograph]) -> str:

@@ -31,14 +31,17 @@ def app(open_browser: bool, **values: Any) -> None:
     from ..app.server import AppServer
 
     with AppServer(AppOptions(**given_only(values))) as server:
-        click.echo(f"DeepDetect is at {server.address}")
-        click.echo("Ctrl+C ends it.", err=True)
-        if open_browser:
-            webbrowser.open(server.address)
         if threading.current_thread() is threading.main_thread():
             # As Ctrl+C, so that tasks are ended and their files removed.
             signal.signal(signal.SIGTERM, signal.default_int_handler)
+            hangup = getattr(signal, "SIGHUP", None)  # of a terminal that is closed
+            if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # by nohup
+                signal.signal(hangup, signal.default_int_handler)
         try:
+            click.echo(f"DeepDetect is at {server.address}")
+            click.echo("Ctrl+C ends it.", err=True)
+            if open_browser:
+                webbrowser.open(server.address)
             server.serve_forever()
         except KeyboardInterrupt:
             click.echo("deepdetect: ended; nothing was kept", err=True)
