@@ -1,7 +1,7 @@
 // The page with Python: `deepdetect app`.
 import { cpSync, mkdirSync, readdirSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
-import { NO_BROWSER, askPython, chromium, downloaded, examples, expect, expectAccessible, openExample,
+import { NO_BROWSER, askPython, chromium, downloaded, example, examples, expect, expectAccessible, openExample,
          test, watch } from "./page.mjs";
 
 test.skip(!chromium, NO_BROWSER);
@@ -101,6 +101,59 @@ test("a task is cancelled", async ({ page, app }) => {
   await expect.poll(() => tasksOf(app)).toEqual([]);
   await expect(page.locator("[data-kind=match]")).toBeEnabled();
   await expect(page.locator("#error")).toBeHidden();
+});
+
+test("a task can follow a cancelled one at once", async ({ page, app }) => {
+  await openTasks(page, "Coffee, turned", app);
+  for (let k = 0; k < 2; k++) {
+    await startTask(page, "match");
+    await expect.poll(() => tasksOf(app).length).toBe(1);
+    await page.locator("#job-cancel").click();
+  }
+  await startTask(page, "register");
+  await expect(page.locator("#job-numbers")).toContainText("Overlap", { timeout: 120_000 });
+  await expect(page.locator("#error")).toBeHidden();
+  await expect.poll(() => tasksOf(app)).toEqual([]);
+});
+
+test("a task that is cancelled while its result is fetched says nothing", async ({ page, app }) => {
+  let answer = () => {};
+  const held = new Promise((resolve) => { answer = resolve; });
+  await page.route("**/files/registered.png", async (route) => {
+    await held;
+    await route.continue();
+  });
+  await openTasks(page, "Coffee, turned", app);
+  const asked = page.waitForRequest("**/files/registered.png", { timeout: 120_000 });
+  await startTask(page, "register");
+  await asked;
+  await page.locator("#job-cancel").click();
+  answer();
+  await expect.poll(() => tasksOf(app)).toEqual([]);
+  await page.waitForTimeout(500);
+  await expect(page.locator("#error")).toBeHidden();
+  await expect(page.locator("#job-result")).toBeHidden();
+});
+
+test("a task ends with the pictures that it was for", async ({ page, app }) => {
+  await openTasks(page, "Coffee, turned", app);
+  await startTask(page, "register");
+  await expect.poll(() => tasksOf(app).length).toBe(1);
+  await page.locator(".remove").first().click();
+  await expect.poll(() => tasksOf(app)).toEqual([]);
+  await expect(page.locator("#job-progress")).toBeHidden();
+  await expect(page.locator("#job-empty")).toBeVisible();
+});
+
+test("the address of a new start is taken where the page is open", async ({ page, app }) => {
+  await page.goto(app.address.replace(/key=.*/, "key=old"));
+  await expect(page.locator("#examples button").first()).toBeVisible();
+  await example(page, "Coffee").click();
+  await expect(page.getByRole("alert")).toContainText("key of this page is not that of deepdetect app");
+  await page.goto(app.address); // the browser only changes what follows the #
+  await expect(page.locator("#error")).toBeHidden();
+  await example(page, "Coffee").click();
+  await expect(page.locator("#count")).toContainText("keypoint");
 });
 
 test("leaving the page ends its task", async ({ context, app }) => {

@@ -206,6 +206,16 @@ test("a file that is no picture is refused in one sentence", async ({ page }, in
   await expect(page.locator("#error")).toBeHidden();
 });
 
+test("nothing is added after starting over", async ({ page }) => {
+  await page.goto("./");
+  await page.locator("#file").setInputFiles(["coffee.jpg", "coffee-turned.jpg"].map((name) => join(examples, name)));
+  await expect(page.locator("#files li")).toHaveCount(1);
+  await page.locator("#restart").click();
+  await expect(page.locator("#busy")).toBeHidden();
+  await expect(page.locator("#start")).toBeVisible();
+  await expect(page.locator("#files li")).toHaveCount(0);
+});
+
 test("pictures are dropped on the page", async ({ page }) => {
   await page.goto("./");
   await expect(page.locator("#examples button")).toHaveCount(3);

@@ -24,6 +24,9 @@ let current = "keypoints";
 /** How often the network was run: sliders must not change it. */
 let runs = 0;
 
+/** How often it was started over: what was being read before is not added any more. */
+let restarts = 0;
+
 async function start() {
   const config = await (await fetch("config.json")).json();
   page.token = takeToken();
@@ -83,6 +86,12 @@ function takeToken() {
   return sessionStorage.getItem("key") ?? "";
 }
 
+/** Takes the key of a new start, whose address differs from that of the open page in it alone. */
+function takeNewToken() {
+  const old = page.token;
+  if (takeToken() !== old) location.reload();
+}
+
 async function showExamples() {
   const examples = await (await fetch("examples/examples.json")).json();
   element("examples").replaceChildren(...examples.map(({ title, note, files }) => {
@@ -123,13 +132,16 @@ async function addPictures(files) {
     throw new Error(room ? `Give at most ${counted(room, "picture")}${advice}`
                          : "There are two pictures already: remove one, or start over.");
   }
+  const started = restarts;
   await during("Loading the network…", opened);
   for (const file of files) {
+    if (restarts !== started) return;
     const read = await during("Reading the picture…",
                               background.call("read", { file, name: file.name }));
     const canvas = canvasOf(read.rgba, read.width, read.height);
     const { map, seconds } = await during("Finding keypoints…", background.call("run", read));
     document.body.dataset.networkRuns = String(++runs);
+    if (restarts !== started) return;
     if (page.pictures.length >= MAX_PICTURES) return; // of two that were given at once
     page.pictures.push({ name: file.name, file, ...read, canvas, map, seconds });
     if (file === files.at(-1)) break;
@@ -242,6 +254,7 @@ function setUp() {
   };
   element("restart").onclick = () => {
     page.pictures = [];
+    restarts++;
     showError("");
     showView("keypoints");
     focusStart();
@@ -249,6 +262,7 @@ function setUp() {
   element("error").querySelector("button").onclick = () => showError("");
   setUpTabs();
   setUpDropping();
+  addEventListener("hashchange", takeNewToken);
 }
 
 function setUpTabs() {

@@ -8,8 +8,9 @@ const NUMBERS = [10, 20, 50, 100, 200, 300, 500, 750, 1000, 1500, 2000, 3000, 40
                  10_000, 15_000, 20_000, 30_000, 50_000];
 const HINTS = {
   dense: "Every pixel that passes, as detect() gives them.",
-  ranked: "The best pixels of 3x3 windows, refined to fractions of a pixel, as "
-    + "detect(max_keypoints=N, mode=\"dense\") gives them.",
+  ranked: "The best pixels of the heat map, refined to fractions of a pixel, as "
+    + "detect(max_keypoints=N, mode=\"dense\") gives them. Where few keypoints are wanted, the points "
+    + "of all scales, detect(max_keypoints=N) in Python, are found again more often.",
 };
 
 const view = element("view-keypoints");

@@ -6,8 +6,7 @@ import { compare } from "./wipe.js";
 
 const IMAGE = /\.(bmp|jpe?g|pgm|png|ppm|tiff?|webp)$/i;
 
-let task = null; // at work
-let kind = ""; // of the last task
+let work = null; // the task that is at work: what was asked, and whether it was cancelled
 let given = ""; // the number that a task takes
 let urls = []; // of files of the result that is shown
 
@@ -68,32 +67,32 @@ export function show() {
     const button = document.querySelector(`[data-kind="${each.kind}"]`);
     const [least, most] = each.files;
     const fits = each.folder || (page.pictures.length >= least && page.pictures.length <= most);
-    button.disabled = Boolean(task) || Boolean(each.missing) || !fits;
+    button.disabled = Boolean(work) || Boolean(each.missing) || !fits;
   }
 }
 
 async function run(each, files, showWipe) {
-  if (task) return;
+  if (work) return;
   showError("");
   clear();
-  kind = each.kind;
+  const own = { each, task: null, cancelled: false };
+  work = own;
   const options = Number(given) > 0 && "focal_px" in each.options ? { focal_px: Number(given) } : {};
-  progress(each.title, "sending the pictures", 0, 0);
+  const tell = (...told) => own.cancelled || progress(each.title, ...told);
+  tell("sending the pictures", 0, 0);
+  show();
   try {
-    task = "sending";
-    show();
-    const started = await Task.start(each.kind, files, options);
-    if (task !== "sending") return await started.forget(); // it was cancelled meanwhile
-    task = started;
-    const result = await task.result((...told) => progress(each.title, ...told));
-    if (result) await showResult(each, result, files, showWipe);
+    own.task = await Task.start(each.kind, files, options);
+    const result = own.cancelled ? null : await own.task.result(tell);
+    if (result) await showResult(own, result, showWipe);
   } catch (error) {
-    showError(error.message);
+    if (!own.cancelled) showError(error.message);
   } finally {
-    const ended = task;
-    task = null;
-    if (!element("job-progress").hidden) end(each.kind);
-    if (ended?.forget) await ended.forget();
+    if (work === own) { // after a cancelled task another one may be at work
+      work = null;
+      end(each.kind);
+    }
+    await own.task?.forget();
   }
 }
 
@@ -125,17 +124,22 @@ function progress(title, stage, done, total) {
 }
 
 async function cancel() {
-  const ended = task;
-  task = null;
-  end(kind);
-  if (ended?.forget) await ended.forget();
+  const own = work;
+  if (!own) return;
+  own.cancelled = true;
+  work = null;
+  clear();
+  end(own.each.kind);
   announce("Cancelled");
+  await own.task?.forget();
 }
 
-async function showResult(each, { numbers, shown, files }, sent, showWipe) {
+async function showResult(own, { numbers, shown, files }, showWipe) {
+  const { each, task } = own;
   // All files are fetched before the server forgets them.
   const blobs = new Map();
   for (const name of new Set([shown, ...files])) blobs.set(name, await task.file(name));
+  if (own.cancelled) return;
   const place = element("job-result");
   const what = shown.endsWith(".html") ? await modelFrame(`${task.address}/files/${shown}`)
                                        : picture(blobs.get(shown), each.title);
@@ -143,6 +147,8 @@ async function showResult(each, { numbers, shown, files }, sent, showWipe) {
   place.hidden = false;
   element("job-empty").hidden = true;
   if (what.loaded) await what.loaded;
+  const bitmap = blobs.has("registered.png") ? await createImageBitmap(blobs.get("registered.png")) : null;
+  if (own.cancelled) return;
   element("job-numbers").replaceChildren(...Object.entries(numbers).flatMap(([name, text]) => {
     const [term, value] = [document.createElement("dt"), document.createElement("dd")];
     [term.textContent, value.textContent] = [name, text];
@@ -158,7 +164,7 @@ async function showResult(each, { numbers, shown, files }, sent, showWipe) {
     return button;
   }));
   element("job-summary").hidden = false;
-  if (blobs.has("registered.png")) await offerWipe(blobs.get("registered.png"), showWipe);
+  if (bitmap) offerWipe(bitmap, showWipe);
   announce(`${each.title} is done: ${Object.entries(numbers).map((pair) => pair.join(" ")).join(", ")}`);
 }
 
@@ -183,8 +189,7 @@ function picture(blob, title) {
   return image;
 }
 
-async function offerWipe(blob, showWipe) {
-  const bitmap = await createImageBitmap(blob);
+function offerWipe(bitmap, showWipe) {
   const button = document.createElement("button");
   button.type = "button";
   button.textContent = "Compare in Wipe";
@@ -206,8 +211,10 @@ function clear() {
   element("job-numbers").replaceChildren();
 }
 
-/** Forgets the result of pictures that are gone. */
+/** Ends the task of pictures that are gone, and forgets its result; folders stay. */
 export function reset() {
+  if (work?.each.folder) return show();
+  cancel();
   clear();
   show();
 }
