@@ -18,8 +18,9 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect
-from deepdetect._shared.errors import OptionError
-from deepdetect.app import jobs
+from deepdetect._shared.atomic import atomic_path
+from deepdetect._shared.errors import DeepDetectError, OptionError
+from deepdetect.app import jobs, worker
 from deepdetect.app.jobs import Job
 from deepdetect.app.options import AppOptions
 from deepdetect.app.server import STATIC, AppServer
@@ -218,6 +219,15 @@ def test_too_many_pixels_are_refused_before_they_are_decoded(serve: Any) -> None
     assert state["state"] == "failed"
     assert "large.png has 300x300 pixels, which is over 0.05 megapixels" in state["error"]
     assert "/" not in state["error"]  # no path of this computer
+    assert state["error"].endswith("allow more by --max-megapixels")
+
+
+def test_a_result_that_cannot_be_written_is_named_without_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "results" / "matches.csv").mkdir(parents=True)
+    with pytest.raises(DeepDetectError) as caught, atomic_path(tmp_path / "results/matches.csv"):
+        pass
+    said = worker._for_the_page(str(caught.value), [], tmp_path)
+    assert said.startswith("cannot write matches.csv (Is a directory)")
 
 
 @pytest.mark.parametrize(

@@ -206,13 +206,26 @@ test("a file that is no picture is refused in one sentence", async ({ page }, in
   await expect(page.locator("#error")).toBeHidden();
 });
 
+test("what belongs to two pictures is not said of one", async ({ page }, info) => {
+  const plain = info.outputPath("plain.png");
+  askPython("import sys, cv2, numpy; cv2.imwrite(sys.argv[1], numpy.full((90, 120), 77, 'u1')); print(0)", plain);
+  await page.goto("./");
+  await page.locator("#file").setInputFiles([plain, join(examples, "coffee.jpg")]);
+  await expect(page.locator("#match-count")).toHaveText("0 matches");
+  await expect(page.locator("#match-hint")).toHaveText("Nothing in one picture is like anything in the other.");
+  await page.getByRole("tab", { name: "Wipe" }).click();
+  await expect(page.locator("#wipe-hint")).toContainText("No homography");
+  await page.locator(".remove").first().click();
+  await expect(page.locator("#wipe-hint")).toHaveText("");
+});
+
 test("nothing is added after starting over", async ({ page }) => {
   await page.goto("./");
   await page.locator("#file").setInputFiles(["coffee.jpg", "coffee-turned.jpg"].map((name) => join(examples, name)));
   await expect(page.locator("#files li")).toHaveCount(1);
   await page.locator("#restart").click();
-  await expect(page.locator("#busy")).toBeHidden();
-  await expect(page.locator("#start")).toBeVisible();
+  await expect(page.locator("body")).toHaveAttribute("data-network-runs", "2"); // of the second picture
+  await expect(page.locator("#start")).toBeVisible({ timeout: 1 });
   await expect(page.locator("#files li")).toHaveCount(0);
 });
 

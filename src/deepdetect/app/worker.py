@@ -51,18 +51,20 @@ def main(folder: Path) -> None:
             }
         )
     except DeepDetectError as error:
-        tell(error=_with_names(str(error), photographs))
+        tell(error=_for_the_page(str(error), photographs, folder))
     except MemoryError:
         tell(error="there is not enough memory for this: use smaller photographs")
     except OSError as error:
         tell(error=f"the files cannot be written ({error.strerror or error}): free some space")
 
 
-def _with_names(message: str, photographs: list[Photograph]) -> str:
-    """Name photographs as the user does."""
+def _for_the_page(message: str, photographs: list[Photograph], folder: Path) -> str:
+    """Name photographs and files as the user does, and options as `deepdetect app` does."""
     for number, one in enumerate(photographs):
         message = message.replace(str(one.path), one.name).replace(f"images[{number}]", one.name)
-    return message
+    for path in (folder / "results", folder):
+        message = message.replace(f"{path}{os.sep}", "")
+    return message.replace("`max_megapixels`", "--max-megapixels")
 
 
 def _end_with_the_server() -> None:

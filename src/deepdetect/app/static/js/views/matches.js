@@ -105,8 +105,9 @@ export function draw() {
   const agreeing = kept.inliers.reduce((sum, value) => sum + value, 0);
   const text = counted(kept.ratios.length, "match");
   element("match-count").textContent = text;
-  const hint = kept.model === "none"
-    ? "No geometry explains them better than chance: most may be wrong."
+  const doubt = kept.ratios.length ? "No geometry explains them better than chance: most may be wrong."
+                                   : "Nothing in one picture is like anything in the other.";
+  const hint = kept.model === "none" ? doubt
     : `${agreeing.toLocaleString("en")} agree with ${MODELS[kept.model]}.`;
   const sample = drawn < rowsShown().length ? ` ${drawn} of them are drawn.` : "";
   element("match-hint").textContent = hint + sample;

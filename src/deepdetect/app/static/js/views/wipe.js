@@ -73,6 +73,7 @@ function composed() {
 
 export function reset() {
   shown = null;
+  element("wipe-hint").textContent = "";
 }
 
 export function setUp() {
