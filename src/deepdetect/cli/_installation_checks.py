@@ -29,21 +29,21 @@ PURPOSES = {
     "data": "`datasets get`",
     "demo": "`demo`",
     "faiss": "the matcher faiss",
-    "hdf5": "`extract` and `match-many`",
+    "hdf5": "`extract`, `match-many` and `export hloc`",
     "labels": "`label` and `train`, with all nine detectors",
     "match": "guided matching, `register`, `stitch` and `reconstruct`",
     "onnx": "`export onnx`",
     "opencv": "everything that reads or writes pictures",
     "openvino": "a faster network on CPUs",
     "ray": "`extract` and `match-many` on a cluster",
-    "sfm": "`reconstruct` of three photographs and more",
+    "sfm": "`reconstruct` of three photographs and more, `export colmap`, and visual odometry",
     "standard": "detection and matching",
     "train": "`train`, `average`, and weights in .safetensors",
 }
 """What each extra of the package is for."""
 
 MIN_FREE_BYTES = 200_000_000
-"""On the disk of a cache: what numba compiles takes about 20 MB, results much more."""
+"""On a disk that is written to: what numba compiles takes about 20 MB, results much more."""
 
 MIN_MEMORY_BYTES = 1_000_000_000
 """Available: the network takes 150 bytes a pixel, at two megapixels 0.3 GB."""
