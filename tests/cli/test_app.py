@@ -54,6 +54,8 @@ def started(temporary: Path) -> subprocess.Popen[str]:
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 @pytest.mark.parametrize("signal_name", ["SIGTERM", "SIGHUP"])
 def test_no_signal_that_asks_leaves_files(signal_name: str, tmp_path: Path) -> None:
+    if signal.getsignal(getattr(signal, signal_name)) == signal.SIG_IGN:
+        pytest.skip("whoever started the tests ignores it, as nohup does")
     process = started(tmp_path)
     assert list(tmp_path.iterdir())
     process.send_signal(getattr(signal, signal_name))
@@ -73,7 +75,7 @@ def test_what_a_killed_server_left_is_removed_at_the_next_start(tmp_path: Path) 
     process = started(tmp_path)
     (now,) = tmp_path.iterdir()
     assert now != left
-    process.send_signal(signal.SIGINT)
+    process.terminate()
     process.communicate(timeout=60)
 
 
