@@ -1,5 +1,6 @@
 // Keeps the page's own files, so that it works without a network. The build fills in both lists.
-const version = "VERSION";
+const prefix = `deepdetect ${self.registration.scope} `; // caches are those of the whole host
+const version = prefix + "VERSION";
 const files = ["FILES"];
 
 self.addEventListener("install", (event) => {
@@ -9,7 +10,8 @@ self.addEventListener("install", (event) => {
 
 self.addEventListener("activate", (event) => {
   event.waitUntil(caches.keys()
-    .then((names) => Promise.all(names.filter((name) => name !== version).map((name) => caches.delete(name))))
+    .then((names) => Promise.all(names.filter((name) => name.startsWith(prefix) && name !== version)
+      .map((name) => caches.delete(name))))
     .then(() => self.clients.claim()));
 });
 

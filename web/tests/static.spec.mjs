@@ -245,6 +245,16 @@ test("pictures are dropped on the page", async ({ page }) => {
   await expect(page.locator("#count")).toContainText("keypoint");
 });
 
+test("what other pages of the same host keep is left alone", async ({ page }) => {
+  await page.goto("./icon.svg");
+  await page.evaluate(() => caches.open("of another page"));
+  await page.goto("./");
+  await page.evaluate(async () => {
+    while (!navigator.serviceWorker.controller) await new Promise((done) => setTimeout(done, 50));
+  });
+  expect(await page.evaluate(() => caches.has("of another page"))).toBe(true);
+});
+
 test("it works without a network once it was open", async ({ page, context }) => {
   await page.goto("./");
   await page.evaluate(async () => {

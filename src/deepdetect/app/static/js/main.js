@@ -58,7 +58,7 @@ async function start() {
 }
 
 function sayWhere(words) {
-  element("engine").textContent = `The network runs on ${words}.`;
+  element("engine").textContent = `The network runs ${words}.`;
 }
 
 /** @returns {Promise<boolean>} whether there is a graphics card that networks can run on */

@@ -89,7 +89,7 @@ async function browserNetwork(processor) {
     const { logits } = await session.run({ image }, ["logits"]);
     return Float32Array.from(logits.data);
   };
-  const words = graphics ? "the graphics card (WebGPU)" : "the processor (WebAssembly)";
+  const words = graphics ? "on the graphics card (WebGPU)" : "on the processor (WebAssembly)";
   return { run, words };
 }
 
@@ -113,7 +113,7 @@ function pythonNetwork(token) {
     if (!response.ok) throw new UserError((await response.json()).error);
     return new Float32Array(await response.arrayBuffer());
   };
-  return { run, words: "Python on this computer" };
+  return { run, words: "in Python on this computer" };
 }
 
 self.onmessage = async ({ data: { id, task, values } }) => {
