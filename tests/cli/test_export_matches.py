@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -140,3 +141,45 @@ def test_a_mistake_is_one_sentence(
         "\n".join(line for line in result.stderr.splitlines() if line.startswith("deepdetect"))
     )
     assert not (saved / "a.db").exists()
+
+
+def test_a_bad_photograph_does_not_stop_the_export(run, photos: Path, tmp_path: Path) -> None:
+    """The others are written; it is named at the end, with exit code 1."""
+    shutil.copytree(photos, tmp_path / "photos")
+    (tmp_path / "photos" / "broken.jpg").write_bytes(b"no image")
+    words = ("photos", "--max-keypoints", 200, "--workers", 1)
+    result = run("export", "opencv", *words, "-o", "made", "--json")
+    assert result.exit_code == 1, result.output
+    assert "1 of the photographs and pairs failed" in result.stderr
+    assert "broken.jpg is not an image" in result.stderr
+    made = json.loads(result.stdout)
+    assert (made["images"], made["pairs"], len(made["failures"])) == (3, 3, 1)
+    assert (tmp_path / "made" / "cat.jpg.yml").is_file()
+    result = run("export", "hloc", *words, "-o", "small", "--max-megapixels", 0.001)
+    assert result.exit_code == 1
+    assert "--max-megapixels" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("colmap photos -o a.db --focal -5", "focal length must be above 0"),
+        ("colmap photos -o a.db --calibration none.json", "no file none.json"),
+        ("bundler photos -o a", "rename 'my cat.jpg'"),
+        ("hloc photos -o a", "rename 'my cat.jpg'"),
+    ],
+)
+def test_what_is_wrong_is_said_before_the_work(
+    run, photos: Path, tmp_path: Path, monkeypatch, words: str, message: str
+) -> None:
+    import deepdetect.interchange
+
+    if words.startswith("colmap"):
+        pytest.importorskip("pycolmap", reason="needs pycolmap")
+    shutil.copytree(photos, tmp_path / "photos")
+    (tmp_path / "photos" / "cat.jpg").rename(tmp_path / "photos" / "my cat.jpg")
+    monkeypatch.setattr(deepdetect.interchange, "match_photographs", lambda *_, **__: 1 / 0)
+    result = run("export", *words.split())
+    assert result.exit_code == 2, result.output
+    assert message in result.stderr
+    assert not (tmp_path / "a").exists()

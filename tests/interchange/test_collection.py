@@ -9,6 +9,9 @@ from deepdetect import DeepDetect, ImageError, Keypoints, OptionError
 from deepdetect.features.sift import described_at_own_size
 from deepdetect.interchange import Collection, PairMatches, describe_collection
 from deepdetect.interchange.collection import sift_bytes
+from deepdetect.interchange.colmap import write_colmap_text
+from deepdetect.interchange.hloc import write_hloc
+from deepdetect.interchange.opencv import write_opencv
 from deepdetect.io.image import luma
 
 
@@ -60,3 +63,25 @@ def test_descriptors_as_bytes() -> None:
     assert sift_bytes(Keypoints(**sizes, descriptors=-unit)) is None
     assert sift_bytes(Keypoints(**sizes, descriptors=unit[:, :64])) is None
     assert sift_bytes(Keypoints(**sizes)) is None
+
+
+@pytest.mark.parametrize("write", [write_hloc, write_colmap_text])
+def test_lists_of_names_with_blanks_cannot_be_read_back(write, small_collection, tmp_path) -> None:
+    """`a b.jpg c.jpg` on a line is no pair."""
+    keypoints = {
+        "a b.jpg": small_collection.keypoints["a.jpg"],
+        "c.jpg": small_collection.keypoints["c.jpg"],
+    }
+    matches = {("a b.jpg", "c.jpg"): small_collection.matches["c.jpg", "a.jpg"]}
+    with pytest.raises(OptionError, match=r"separate by blanks: rename 'a b\.jpg'"):
+        write(Collection(keypoints, matches), tmp_path / "made")
+    assert not (tmp_path / "made").exists()
+    write(Collection(keypoints), tmp_path / "made")
+
+
+@pytest.mark.parametrize("write", [write_opencv, write_colmap_text])
+def test_the_file_of_the_matches_replaces_no_other(write, small_collection, tmp_path) -> None:
+    keypoints = {"matches": small_collection.keypoints["a.jpg"]}
+    with pytest.raises(OptionError, match="the file of the matches"):
+        write(Collection(keypoints), tmp_path / "made")
+    assert not (tmp_path / "made").exists()

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
 
 from deepdetect import DeepDetectError, OptionError, match_images, save_keypoints, save_matches
+from deepdetect._shared.errors import BatchError
 from deepdetect.batch import extract_features, match_pairs
 from deepdetect.interchange import match_photographs, read_collection
 
@@ -107,6 +108,61 @@ def test_names_with_folders_and_what_does_not_fit(tmp_path: Path, one_line) -> N
         with pytest.raises(DeepDetectError) as caught:
             read_collection(**arguments)
         one_line(caught.value)
+
+
+def _write_hloc_files(folder: Path, count: int) -> None:
+    """Write features of two images at the top, and matches of `count` keypoints of the first."""
+    import h5py
+
+    with h5py.File(folder / "f.h5", "w") as file:
+        for name in ("1.jpg", "2.jpg"):
+            file[f"{name}/keypoints"] = np.arange(10, dtype=np.float32).reshape(5, 2)
+            file[f"{name}/image_size"] = np.array([120, 100])
+    with h5py.File(folder / "m.h5", "w") as file:
+        file["1.jpg/2.jpg/matches0"] = np.arange(count, dtype=np.int32) % 5
+
+
+def test_features_given_as_matches_are_named(tmp_path: Path, one_line) -> None:
+    _write_hloc_files(tmp_path, 5)
+    with pytest.raises(DeepDetectError, match=r"f\.h5 holds no matches") as caught:
+        read_collection([tmp_path / "f.h5"], matches=tmp_path / "f.h5")
+    one_line(caught.value)
+
+
+@pytest.mark.parametrize("count", [3, 7])
+def test_matches_of_other_features_are_refused(tmp_path: Path, one_line, count: int) -> None:
+    _write_hloc_files(tmp_path, count)
+    with pytest.raises(DeepDetectError, match=f"{count} keypoints of 1.jpg, which has 5") as caught:
+        read_collection([tmp_path / "f.h5"], matches=tmp_path / "m.h5")
+    one_line(caught.value)
+
+
+def test_the_folder_of_other_photographs_is_refused(tmp_path: Path, one_line) -> None:
+    _write_hloc_files(tmp_path, 5)
+    (tmp_path / "photos").mkdir()
+    for folder in ("photos", "none"):
+        with pytest.raises(OptionError, match="none of the photographs") as caught:
+            read_collection([tmp_path / "f.h5"], images=tmp_path / folder)
+        one_line(caught.value)
+    (tmp_path / "photos" / "2.jpg").write_bytes(b"")
+    assert read_collection([tmp_path / "f.h5"], images=tmp_path / "photos").path("1.jpg") is None
+
+
+def test_a_bad_photograph_does_not_stop_the_others(pair: Path) -> None:
+    (pair / "middle.png").write_bytes(b"no image")
+    found = match_photographs(pair, sequential=1, max_keypoints=300, workers=1)
+    assert list(found.keypoints) == ["left_1.png", "right.png"]
+    assert list(found.matches) == [("left_1.png", "right.png")]  # the next one that can be read
+    (failure,) = found.failures
+    assert "middle.png is not an image" in failure
+    pairs = [("left_1.png", "right.png"), ("middle.png", "right.png"), ("right.png", "typo.png")]
+    named = match_photographs(pair, pairs=pairs, max_keypoints=300, workers=1)
+    assert list(named.matches) == pairs[:1]
+    assert [failure.split()[-1] for failure in named.failures] == ["JPEG", "typo.png"]
+    for name in ("left_1.png", "right.png"):
+        (pair / name).write_bytes(b"no image")
+    with pytest.raises(BatchError, match="3 of 3 images failed"):
+        match_photographs(pair, workers=1)
 
 
 def test_pairs_of_a_folder(pair: Path) -> None:

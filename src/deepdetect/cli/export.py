@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from .._shared.errors import DeepDetectError
+from .._shared.errors import BatchError, DeepDetectError
 from ._generated import with_flags
 from .export_matches import EXPORTS_OF_MATCHES
 from .export_onnx import export_onnx
@@ -24,6 +24,8 @@ class Exports(click.Group):
         except DeepDetectError as error:
             command = self.get_command(context, context.invoked_subcommand or "")
             error.args = (with_flags(str(error), command),)
+            if isinstance(error, BatchError):
+                error.failures = tuple(with_flags(each, command) for each in error.failures)
             raise
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from .._shared.errors import OptionError
+from .._shared.errors import BatchError, MissingFileError, OptionError
 from ._options import (
     PATH,
     check_inputs_survive,
@@ -240,6 +240,7 @@ def _export(
     one_file = form == "colmap"
     if one_file:  # what is missing is said before the work
         import_pycolmap("a database of COLMAP")
+    _check_before_work(form, sources, camera)
     marker = output if one_file else output / MARKERS[form].format(**settings)
     if not (one_file or overwrite or marker.exists()) and _has_files(output):
         raise OptionError(
@@ -265,6 +266,7 @@ def _export(
             "pairs": len(collection.matches),
             "matches": matches,
             "files": files,
+            "failures": collection.failures,
         },
         [
             ("images", f"{len(collection.keypoints):,} with {keypoints:,} keypoints"),
@@ -272,6 +274,29 @@ def _export(
             ("written", str(output) if len(files) == 1 else f"{len(files)} files in {output}"),
         ],
     )
+    if count := len(collection.failures):
+        raise BatchError(
+            f"{count} of the photographs and pairs failed, the others are in {output}",
+            collection.failures,
+        )
+
+
+def _check_before_work(form: str, sources: tuple[Path, ...], camera: Mapping[str, Any]) -> None:
+    """Say what is wrong with cameras and names before photographs are matched."""
+    from ..geometry.camera import Camera
+    from ..interchange.collection import check_names
+    from ..io.image import find_images
+
+    calibration, focal_px = camera.get("calibration"), camera.get("focal_px")
+    if calibration is not None and focal_px is not None:
+        raise OptionError("give --calibration or --focal, not both")
+    if focal_px is not None:
+        Camera((1, 1), focal_px)
+    if calibration is not None and not calibration.is_file():
+        raise MissingFileError(f"there is no file {calibration}: check the path")
+    if len(sources) == 1 and sources[0].is_dir():
+        names = (path.relative_to(sources[0]).as_posix() for path in find_images(sources[0]))
+        check_names(form, names)
 
 
 def _has_files(folder: Path) -> bool:
@@ -312,16 +337,13 @@ def _lenses(collection: Collection, camera: Mapping[str, Any]) -> dict[str, Lens
     from ..sfm.intrinsics import known_cameras, photograph_lenses
 
     sizes = {name: points.image_size for name, points in collection.keypoints.items()}
-    calibration, focal_px = camera["calibration"], camera["focal_px"]
-    if calibration is not None and focal_px is not None:
-        raise OptionError("give --calibration or --focal, not both")
-    found = known_cameras(calibration, sizes)
+    found = known_cameras(camera["calibration"], sizes)
     if found.refused:
         name, reason = next(iter(found.refused.items()))
         raise OptionError(f"{name}: {reason}")
     folder = collection.folder or Path("no-such-folder")
     return photograph_lenses(
-        folder, list(sizes), sizes, found.known, focal_px, camera["single_camera"]
+        folder, list(sizes), sizes, found.known, camera["focal_px"], camera["single_camera"]
     )
 
 

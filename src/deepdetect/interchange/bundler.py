@@ -16,7 +16,7 @@ from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..sfm.lens import Lens
-from .collection import Collection, sift_bytes
+from .collection import Collection, check_names, sift_bytes
 from .colmap import DEFAULT_SIZE_PX, orientations_of
 
 NUMBERS_PER_LINE = 20
@@ -43,6 +43,7 @@ def write_bundler(
         DeepDetectError: a file cannot be written.
     """
     folder = Path(output)
+    check_names("bundler", collection.keypoints)
     keys: dict[str, str] = {}
     for name, points in collection.keypoints.items():
         if sift_bytes(points) is None:
@@ -50,8 +51,6 @@ def write_bundler(
                 f"the keypoints of {name} have no SIFT descriptors, which .key files need: name "
                 "the folder of the photographs as `images`"
             )
-        if len(name.split()) != 1:
-            raise OptionError(f"Bundler's lists separate by blanks: rename {name!r}")
         key = str(PurePosixPath(name).with_suffix(".key"))
         if key in keys:
             raise OptionError(f"{keys[key]} and {name} would have the same {key}: rename one")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,6 +21,16 @@ ROOT_SIFT_NORM = 512
 """Length of RootSIFT descriptors as bytes."""
 
 SIFT_NUMBERS = 128
+
+MATCHES_NAME = "matches"
+"""Of a file of all matches beside one file for each photograph, without its ending."""
+
+BLANK_SEPARATED = {
+    "bundler": "Bundler's lists",
+    "colmap-text": "COLMAP's lists of matches",
+    "hloc": "hloc's lists of pairs",
+}
+"""Formats with lists of names that have a blank between them."""
 
 
 @suggest_keywords
@@ -67,6 +77,7 @@ class Collection:
         keypoints: by the name of the photograph: its path below their folder, with "/".
         matches: by the names of two photographs.
         folder: of the photographs, where it is known.
+        failures: a sentence on each photograph or pair that could not be worked on.
 
     Raises:
         OptionError: a match is of a photograph or a keypoint that is not there.
@@ -75,6 +86,7 @@ class Collection:
     keypoints: Mapping[str, Keypoints]
     matches: Mapping[Pair, PairMatches] = field(default_factory=dict)
     folder: Path | None = None
+    failures: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for pair, found in self.matches.items():
@@ -130,6 +142,35 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
                 described[name] = replace(points, descriptors=found)
             bar.update()
     return replace(collection, keypoints=described)
+
+
+def check_names(form: str, names: Iterable[str]) -> None:
+    """Refuse names with blanks where the lists of a format could not be read back.
+
+    Raises:
+        OptionError: a name has a blank.
+
+    Example:
+        >>> check_names("hloc", ["db/1.jpg"])
+    """
+    if form not in BLANK_SEPARATED:
+        return
+    for name in names:
+        if len(name.split()) != 1:
+            raise OptionError(f"{BLANK_SEPARATED[form]} separate by blanks: rename {name!r}")
+
+
+def check_matches_name(names: Iterable[str]) -> None:
+    """Refuse a photograph whose file would be that of the matches.
+
+    Raises:
+        OptionError: one is named "matches", without an ending.
+    """
+    if MATCHES_NAME in names:
+        raise OptionError(
+            f"the keypoints of {MATCHES_NAME!r} would have the file of the matches: rename their "
+            "file, or name the folder of the photographs as `images`"
+        )
 
 
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:

@@ -19,7 +19,7 @@ from ..sfm.colmap import PIXEL_CENTRE, import_pycolmap
 from ..sfm.database import DatabaseImage, write_database
 from ..sfm.lens import Lens
 from ..sfm.mapping import MappingOptions, verify_pairs
-from .collection import Collection, sift_bytes
+from .collection import MATCHES_NAME, Collection, check_matches_name, check_names, sift_bytes
 
 DEFAULT_SIZE_PX = 3.0
 """Diameter of keypoints without a size: that of dense keypoints."""
@@ -100,9 +100,12 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
         The files.
 
     Raises:
-        OptionError: keypoints have no SIFT descriptors, which this format always has.
+        OptionError: keypoints have no SIFT descriptors, which this format always has; a name in
+            the list of matches has a blank; or a photograph is named "matches", without an ending.
         DeepDetectError: a file cannot be written.
     """
+    check_names("colmap-text", (name for pair in collection.matches for name in pair))
+    check_matches_name(collection.keypoints)
     folder = Path(output)
     written = []
     for name, points in collection.keypoints.items():
@@ -123,7 +126,7 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
                 fmt=["%.4f"] * 4 + ["%d"] * descriptors.shape[1],
             )
         written.append(path)
-    path = folder / "matches.txt"
+    path = folder / f"{MATCHES_NAME}.txt"
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for (name0, name1), found in collection.matches.items():
             lines = "".join(f"{row0} {row1}\n" for row0, row1 in found.rows.tolist())

@@ -18,7 +18,7 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.registry import look_up
 from ..features.keypoints import Keypoints
-from .collection import Collection, PairMatches
+from .collection import MATCHES_NAME, Collection, PairMatches, check_matches_name
 
 SUFFIXES = {"yml": ".yml", "yml.gz": ".yml.gz", "xml": ".xml", "json": ".json"}
 """Of the files that OpenCV knows."""
@@ -45,7 +45,7 @@ def write_opencv(
         The files, each of which appears whole, or not at all.
 
     Raises:
-        OptionError: the format is unknown.
+        OptionError: the format is unknown, or a photograph is named "matches", without an ending.
         DeepDetectError: a file cannot be written.
 
     Example:
@@ -58,6 +58,7 @@ def write_opencv(
         [3.0, 4.5, 7.0, 90.0, 0.5]
     """
     suffix = look_up("file format", file_format, SUFFIXES)
+    check_matches_name(collection.keypoints)
     folder = Path(output)
     written = []
     for name, points in collection.keypoints.items():
@@ -69,7 +70,7 @@ def write_opencv(
             if points.descriptors is not None and len(points):
                 storage.write("descriptors", points.descriptors)
         written.append(path)
-    path = folder / f"matches{suffix}"
+    path = folder / f"{MATCHES_NAME}{suffix}"
     with _storage(path, suffix) as storage:
         storage.startWriteStruct("pairs", cv2.FileNode_SEQ)
         for (name0, name1), found in collection.matches.items():

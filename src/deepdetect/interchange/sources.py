@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import MAX_KEYPOINTS, extract_features
-from ..batch.pair_matching import PairMatchingOptions, match_pairs
+from ..batch.pair_matching import PairMatchingOptions, match_pairs, read_pairs
 from ..batch.parted_file import import_h5py, open_hdf5
 from ..features.keypoints import Keypoints
 from ..features.matches import Matches
@@ -66,6 +66,11 @@ def read_collection(
         return _read_archives(archives, folder)
     keypoints = read_features_file(paths[0])
     found = {} if matches is None else read_matches_file(Path(matches), keypoints)
+    if folder is not None and not any((folder / name).is_file() for name in keypoints):
+        raise OptionError(
+            f"none of the photographs of {paths[0]} is in {folder}, such as "
+            f"{next(iter(keypoints))}: name the folder that they were extracted from as `images`"
+        )
     return Collection(keypoints, found, folder)
 
 
@@ -118,26 +123,26 @@ def _features(group: Any) -> Keypoints:
     )
 
 
-def read_matches_file(path: Path, names: Iterable[str]) -> dict[Pair, PairMatches]:
+def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pair, PairMatches]:
     """Read all matches of an HDF5 file of hloc's layout.
 
     Args:
         path: the file.
-        names: of the images, which the file writes with "-" for "/".
+        keypoints: that were matched, by the name of the image; the file writes "-" for "/" in it.
 
     Raises:
-        DeepDetectError: the file is missing or damaged, holds no matches, or it is not known of
-            which images.
+        DeepDetectError: the file is missing or damaged, holds no matches, it is not known of which
+            images, or they are of other keypoints.
     """
     known: dict[str, list[str]] = {}
-    for name in names:
+    for name in keypoints:
         known.setdefault(name.replace("/", "-"), []).append(name)
+    h5py = import_h5py()
     found: dict[Pair, PairMatches] = {}
     with open_hdf5(path) as file:
-        for first in file:
-            for second in file[first]:
-                group = file[first][second]
-                if "matches0" not in group:
+        for first, seconds in file.items():
+            for second, group in seconds.items() if isinstance(seconds, h5py.Group) else ():
+                if not isinstance(group, h5py.Group) or "matches0" not in group:
                     continue
                 pair = []
                 for written in (first, second):
@@ -149,6 +154,12 @@ def read_matches_file(path: Path, names: Iterable[str]) -> dict[Pair, PairMatche
                         )
                     pair.append(known[written][0])
                 rows1 = np.asarray(group["matches0"][()], np.int64)
+                count = len(keypoints[pair[0]])
+                if rows1.shape != (count,):
+                    raise InvalidFileError(
+                        f"{path} has matches of {rows1.size} keypoints of {pair[0]}, which has "
+                        f"{count}: give the features that were matched"
+                    )
                 rows0 = np.flatnonzero(rows1 >= 0)
                 scores = group.get("matching_scores0")
                 kept = np.ones(len(rows0)) if scores is None else scores[()][rows0]
@@ -258,10 +269,14 @@ def match_photographs(
         workers: number of processes; default one per processor.
         quiet: show no progress bars.
 
+    Returns:
+        The collection. A photograph that cannot be read, or a pair that cannot be matched, does not
+        stop the others: they are in its `failures`.
+
     Raises:
         ImageError: the folder is missing, or holds no image.
         OptionError: an option is out of its range, or there are too many photographs for all pairs.
-        BatchError: an image cannot be read, or a pair not be matched.
+        BatchError: no image can be read.
         MissingExtraError: h5py is not installed.
     """
     root = Path(folder)
@@ -270,26 +285,37 @@ def match_photographs(
         raise OptionError("give `pairs` or `sequential`, not both")
     if sequential is not None and sequential < 1:
         raise OptionError(f"`sequential` must be at least 1, not {sequential}")
-    if pairs is None:
-        if sequential is None and len(names) > MAX_ALL_PAIRS:
-            raise OptionError(
-                f"all pairs of {len(names)} photographs would take long: name them by `pairs`, or "
-                "give `sequential`"
-            )
-        reach = len(names) if sequential is None else sequential
-        pairs = [
-            (first, second)
-            for k, first in enumerate(names)
-            for second in names[k + 1 : k + 1 + reach]
-        ]
+    if isinstance(pairs, str | Path):
+        pairs = read_pairs(pairs)  # what is wrong with them is said before the work
+    if pairs is None and sequential is None and len(names) > MAX_ALL_PAIRS:
+        raise OptionError(
+            f"all pairs of {len(names)} photographs would take long: name them by `pairs`, or "
+            "give `sequential`"
+        )
     selection = SelectionOptions(max_keypoints=max_keypoints)
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
         features, found = Path(temporary, "features.h5"), Path(temporary, "matches.h5")
-        extract_features(
+        extracted = extract_features(
             root, features, selection=selection, detector=detector, workers=workers, quiet=quiet
-        ).check()
+        )
+        if not extracted.images:
+            extracted.check()
         keypoints = read_features_file(features)
-        if not pairs:
-            return Collection(keypoints, {}, root)
-        match_pairs(features, pairs, found, options=matching, workers=workers, quiet=quiet).check()
-        return Collection(keypoints, read_matches_file(found, keypoints), root)
+        unread = set(names) - keypoints.keys()
+        if pairs is None:
+            good = [name for name in names if name in keypoints]
+            reach = len(good) if sequential is None else sequential
+            wanted = [
+                (first, second)
+                for k, first in enumerate(good)
+                for second in good[k + 1 : k + 1 + reach]
+            ]
+        else:  # a photograph that cannot be read is one failure, not one for each of its pairs
+            wanted = [pair for pair in pairs if unread.isdisjoint(pair)]
+        if not wanted:
+            return Collection(keypoints, {}, root, extracted.failures)
+        matched = match_pairs(
+            features, wanted, found, options=matching, workers=workers, quiet=quiet
+        )
+        matches = read_matches_file(found, keypoints) if matched.matches else {}
+        return Collection(keypoints, matches, root, (*extracted.failures, *matched.failures))
