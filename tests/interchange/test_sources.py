@@ -137,6 +137,22 @@ def test_matches_of_other_features_are_refused(tmp_path: Path, one_line, count: 
     one_line(caught.value)
 
 
+def test_a_pair_both_ways_round_is_one_pair(tmp_path: Path) -> None:
+    """COLMAP's database has room for one of them only."""
+    import h5py
+
+    _write_hloc_files(tmp_path, 5)
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file["1.jpg/2.jpg/matches0"] = np.array([1, -1, -1, -1, 2])
+        file["1.jpg/2.jpg/matching_scores0"] = np.array([0.5, 0, 0, 0, 0.5])
+        file["2.jpg/1.jpg/matches0"] = np.array([-1, 0, 3, -1, -1])
+        file["2.jpg/1.jpg/matching_scores0"] = np.array([0, 0.5, 0.9, 0, 0])
+    found = read_collection([tmp_path / "f.h5"], matches=tmp_path / "m.h5")
+    ((pair, matches),) = found.matches.items()
+    assert pair == ("1.jpg", "2.jpg")
+    assert matches.rows.tolist() == [[0, 1], [3, 2]]  # the better one of keypoint 2's two
+
+
 def test_the_folder_of_other_photographs_is_refused(tmp_path: Path, one_line) -> None:
     _write_hloc_files(tmp_path, 5)
     (tmp_path / "photos").mkdir()

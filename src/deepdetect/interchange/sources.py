@@ -164,10 +164,21 @@ def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pa
                 scores = group.get("matching_scores0")
                 kept = np.ones(len(rows0)) if scores is None else scores[()][rows0]
                 rows = np.column_stack([rows0, rows1[rows0]])
-                found[pair[0], pair[1]] = PairMatches.one_to_one(rows, kept)
+                _add_matches(found, (pair[0], pair[1]), PairMatches.one_to_one(rows, kept))
     if not found:
         raise InvalidFileError(f"{path} holds no matches: give a file of deepdetect match-many")
     return found
+
+
+def _add_matches(found: dict[Pair, PairMatches], pair: Pair, matches: PairMatches) -> None:
+    """Add the matches of a pair; to those of the pair the other way round, where these are there."""
+    other = found.get(pair[::-1])
+    if other is None:
+        found[pair] = matches
+        return
+    rows = np.concatenate([other.rows, matches.rows[:, ::-1]])
+    scores = np.concatenate([other.scores, matches.scores])
+    found[pair[::-1]] = PairMatches.one_to_one(rows, scores)
 
 
 def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
@@ -190,7 +201,7 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
                     f"{path} has other keypoints of {name} than another file: make all files with "
                     "the same options"
                 )
-        matches[pair] = _pair_matches(loaded)
+        _add_matches(matches, pair, _pair_matches(loaded))
     return Collection(keypoints, matches, folder)
 
 
