@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from deepdetect.tracking import FrameSource, load_tracks
+from deepdetect.tracking.video import write_video
 from tests.cli.conftest import one_sentence
 
 
@@ -39,6 +40,31 @@ def test_a_folder(run, frames: Path, tmp_path: Path) -> None:
     assert "frames per second" in result.stdout
     assert [frame.number for frame in load_tracks(tmp_path / "again.csv")] == [0, 2]
     assert not (tmp_path / "again.mp4").exists()
+
+
+def test_bad_frames_are_listed_at_the_end(run, frames: Path, tmp_path: Path) -> None:
+    (frames / "1.png").write_bytes(b"no image")
+    result = run("track", frames, "-o", "out.mp4", "--max-keypoints", 80, "--json")
+    assert result.exit_code == 1, result.output
+    assert "1 of 4 frames failed, the others are done" in result.stderr
+    assert "1.png is not an image" in result.stderr
+    assert len(json.loads(result.stdout)["failures"]) == 1
+    with FrameSource(tmp_path / "out.mp4") as video:
+        assert len(list(video)) == 3
+
+
+def test_a_video_that_is_cut_off_is_said_to_be(run, frames: Path, tmp_path: Path) -> None:
+    with write_video(tmp_path / "whole.avi", 10) as writer:
+        for path in sorted(frames.iterdir()) * 3:
+            writer.write(np.asarray(Image.open(path)))
+    content = (tmp_path / "whole.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(content[: len(content) * 2 // 3])
+    texts = [
+        run("track", name, "-o", f"{name}.csv", "--max-keypoints", 80).stdout
+        for name in ("whole.avi", "cut.avi")
+    ]
+    assert "the file states" not in texts[0]
+    assert "the file states 12, and may be cut off" in texts[1]
 
 
 def test_nothing_is_replaced_silently(run, frames: Path, tmp_path: Path) -> None:

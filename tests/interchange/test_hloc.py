@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
 
 from deepdetect import Keypoints, OptionError
-from deepdetect.interchange import Collection, PairMatches
+from deepdetect.interchange import Collection, PairMatches, read_collection
 from deepdetect.interchange.hloc import write_hloc
 
 
@@ -114,3 +114,10 @@ def test_it_is_mapped(fountain, fountain_collection, map_database, tmp_path: Pat
     model = map_database(database, fountain, tmp_path / "sparse")
     assert model.num_reg_images() == 4
     assert model.num_points3D() > 300
+
+
+def test_keypoints_without_an_angle_stay_without_one(tmp_path: Path) -> None:
+    """OpenCV's -1 is no angle, and not 359 degrees."""
+    points = Keypoints([[3, 4], [5, 6]], [1, 1], (20, 10), sizes=[3, 3], angles=[-1, 90])
+    path, *_ = write_hloc(Collection({"a.jpg": points}), tmp_path)
+    assert read_collection([path]).keypoints["a.jpg"].angles.tolist() == [-1, 90]

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from deepdetect import DeepDetectError, ImageError, OptionError
-from deepdetect._shared.errors import MissingFileError
+from deepdetect._shared.errors import BatchError, MissingFileError
 from deepdetect.tracking import FrameSource
 from deepdetect.tracking.video import write_video
 
@@ -36,6 +37,20 @@ def test_a_video_gives_what_was_written(moving_photo, tmp_path: Path) -> None:
         assert [frame.number for frame in source] == [0, 4]
     with FrameSource(tmp_path / "v.mp4", max_frames=2) as source:
         assert source.count == len(list(source)) == 2
+
+
+def test_an_image_that_is_no_frame_is_left_out(frame_folder, moving_photo) -> None:
+    (frame_folder / "002.png").write_bytes(b"no image")
+    Image.fromarray(moving_photo(3)[:-9]).save(frame_folder / "003.png")
+    with FrameSource(frame_folder, max_frames=3) as source:
+        assert [frame.number for frame in source] == [0, 1, 4]
+        bad, small = source.failures
+    assert "002.png is not an image" in bad
+    assert "003.png has 320x231 pixels, the first frame has 320x240" in small
+    for path in frame_folder.iterdir():
+        path.write_bytes(b"no image")
+    with FrameSource(frame_folder) as source, pytest.raises(BatchError, match="none of 6 frames"):
+        next(iter(source))
 
 
 class Camera:

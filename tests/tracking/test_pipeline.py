@@ -10,6 +10,7 @@ import pytest
 from deepdetect import DeepDetect, OptionError
 from deepdetect.tracking import FrameSource, Tracker, TrackingOptions, load_tracks, track
 from deepdetect.tracking.pipeline import track_frames
+from deepdetect.tracking.tracks import common_rows
 
 FEW = TrackingOptions(max_keypoints=100)
 
@@ -26,6 +27,18 @@ def test_video_and_table_of_a_folder(frame_folder, tmp_path: Path) -> None:
     assert len(shown) == 6
     assert shown[0].rgb.shape == (240, 320, 3)
     assert sorted(os.listdir(tmp_path / "out")) == ["t.csv", "t.mp4"]
+
+
+def test_points_are_followed_past_a_bad_frame(frame_folder, tmp_path: Path) -> None:
+    (frame_folder / "002.png").write_bytes(b"no image")
+    report = track(frame_folder, tmp_path / "t.csv", options=FEW)
+    frames = load_tracks(tmp_path / "t.csv")
+    assert [frame.number for frame in frames] == [0, 1, 3, 4, 5]
+    assert (report.frames, report.expected, len(report.failures)) == (5, 6, 1)
+    rows0, rows1 = common_rows(frames[1], frames[2])
+    assert len(rows0) > 0.6 * len(frames[1])
+    moved = np.median(frames[2].xy[rows1] - frames[1].xy[rows0], axis=0)
+    np.testing.assert_allclose(moved, [-6, -4], atol=0.1)  # of two frames
 
 
 def test_a_table_alone(frame_folder, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,7 +18,11 @@ from ._options import (
     max_megapixels_option,
     overwrite_option,
     print_result,
+    report_failures,
 )
+
+if TYPE_CHECKING:
+    from ..tracking.pipeline import TrackingReport
 
 TRACKING = FieldOptions("tracking.tracker:TrackingOptions")
 FRAMES = FieldOptions(
@@ -46,7 +50,8 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
 
     Writes a video with the points, their last positions and the frames per second of the work, and
     beside it a table of all tracks (.csv): frame, track, x, y, score. Ctrl-C on a camera ends the
-    recording, and both files are written.
+    recording, and both files are written. An image of a folder that cannot be read, or has another
+    size than the first one, does not stop the others: they are listed at the end, with exit code 1.
 
     \b
     deepdetect track drive.mp4 -o tracks.mp4
@@ -84,7 +89,7 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
         as_json,
         vars(report),
         [
-            ("frames", f"{report.frames:,}"),
+            ("frames", _frames_text(report)),
             ("tracks", f"{report.tracks:,}"),
             ("tracks per frame", f"{report.tracks_per_frame:.0f}"),
             ("frames per track", f"{report.frames_per_track:.1f}"),
@@ -93,3 +98,12 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
         ],
         str(source),
     )
+    report_failures(report.failures, report.frames + len(report.failures), "frames")
+
+
+def _frames_text(report: TrackingReport) -> str:
+    """Return the number of frames, and how many the source states where these are more."""
+    found = report.frames + len(report.failures)
+    if report.expected is None or found >= report.expected:
+        return f"{report.frames:,}"
+    return f"{report.frames:,}; the file states {report.expected:,}, and may be cut off"

@@ -14,7 +14,7 @@ from .._shared.options import suggest_keywords
 from ..batch.extraction import MAX_KEYPOINTS, extract_features
 from ..batch.pair_matching import PairMatchingOptions, match_pairs, read_pairs
 from ..batch.parted_file import import_h5py, open_hdf5
-from ..features.keypoints import Keypoints
+from ..features.keypoints import UNSET_ANGLE, Keypoints
 from ..features.matches import Matches
 from ..features.selection import SelectionOptions
 from ..io.image import find_images
@@ -113,12 +113,15 @@ def _features(group: Any) -> Keypoints:
         size = np.ceil(xy.max(axis=0, initial=0)) + 1
     descriptors, scales = arrays.get("descriptors"), arrays.get("scales")
     angles = arrays.get("oris")
+    if angles is not None:
+        angles = np.asarray(angles, np.float32)
+        angles = np.where(angles == UNSET_ANGLE, angles, angles % 360)
     return Keypoints(
         xy,
         np.ones(len(xy), np.float32) if scores is None else scores,
         (int(size[0]), int(size[1])),
         sizes=None if scales is None else 2 * np.asarray(scales, np.float32),
-        angles=None if angles is None else np.asarray(angles, np.float32) % 360,
+        angles=angles,
         descriptors=None if descriptors is None else np.ascontiguousarray(descriptors.T),
     )
 
@@ -171,7 +174,7 @@ def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pa
 
 
 def _add_matches(found: dict[Pair, PairMatches], pair: Pair, matches: PairMatches) -> None:
-    """Add the matches of a pair; to those of the pair the other way round, where these are there."""
+    """Add the matches of a pair, to those of the pair the other way round where there are any."""
     other = found.get(pair[::-1])
     if other is None:
         found[pair] = matches

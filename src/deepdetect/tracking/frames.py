@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import (
+    BatchError,
     DeepDetectError,
     ImageError,
     InvalidFileError,
@@ -55,7 +56,10 @@ class FrameSource(AbstractContextManager["FrameSource"]):
     Attributes:
         live: whether it is a camera, which has no end.
         fps: frames per second of what is taken.
-        count: number of frames that will be taken; None where it is not known.
+        count: number of frames that will be taken, as far as the file states it; None where it is
+            not known.
+        failures: a sentence on each image of a folder that was left out until now: it cannot be
+            read, or has another size than the first one.
 
     Raises:
         MissingFileError: there is no such file, folder or camera.
@@ -77,6 +81,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         self._name = f"camera {self.camera}" if self.live else str(source)
         self._capture: Any = None
         self._images: list[Path] = []
+        self.failures: list[str] = []
         total: int | None = None
         fps = FOLDER_FPS
         path = Path(str(source))
@@ -125,8 +130,26 @@ class FrameSource(AbstractContextManager["FrameSource"]):
                 return
 
     def _from_images(self) -> Iterator[Frame]:
+        first: tuple[int, int] | None = None
         for number in range(0, len(self._images), self.every):
-            yield Frame(number, load_image(self._images[number]))
+            path = self._images[number]
+            try:
+                rgb = load_image(path)
+            except ImageError as error:
+                self.failures.append(str(error))
+                continue
+            size = rgb.shape[1], rgb.shape[0]
+            first = first or size
+            if size != first:
+                self.failures.append(
+                    f"{path} has {size[0]}x{size[1]} pixels, the first frame has "
+                    f"{first[0]}x{first[1]}: give frames of one size"
+                )
+                continue
+            yield Frame(number, rgb)
+        if first is None:
+            count = len(self.failures)
+            raise BatchError(f"none of {count} frames can be read", self.failures)
 
     def _from_capture(self) -> Iterator[Frame]:
         number = 0

@@ -44,6 +44,9 @@ class TrackingReport:
         fps: frames per second of the work, drawing and writing included.
         seconds: of all the work.
         files: that were written.
+        expected: number of frames that the source states; None where it is not known. A file that
+            is cut off gives fewer.
+        failures: a sentence on each frame of a folder that was left out.
     """
 
     frames: int
@@ -53,6 +56,8 @@ class TrackingReport:
     fps: float
     seconds: float
     files: tuple[Path, ...]
+    expected: int | None = None
+    failures: tuple[str, ...] = ()
 
 
 def point_candidates(detector: DeepDetect, options: TrackingOptions = TrackingOptions()) -> Detect:
@@ -84,8 +89,8 @@ def track_frames(
         Each frame, (H, W, 3) uint8 RGB, and its tracks, in pixels of this frame.
 
     Raises:
-        OptionError: `max_side` is too small, or frames differ in size.
-        ImageError: a frame cannot be read.
+        OptionError: `max_side` is too small.
+        BatchError: no frame of a folder can be read.
     """
     _check_side(max_side)
     for frame in source:
@@ -116,7 +121,9 @@ def track(
 ) -> TrackingReport:
     """Follow the points of a video, and write a video with the tracks, and their table.
 
-    Ctrl-C on a camera ends the recording; both files are written.
+    Ctrl-C on a camera ends the recording; both files are written. An image of a folder that cannot
+    be read, or has another size than the first one, does not stop the others: it is named in the
+    report.
 
     Args:
         source: a video file, a folder of images, or the number of a camera.
@@ -144,8 +151,7 @@ def track(
     _check_side(max_side)
     if tail < 1:
         raise OptionError(f"`tail` must be at least 1, not {tail}")
-    lengths = np.zeros(0, np.int64)
-    frames = 0
+    frames = tracks = positions = 0
     begun = time.perf_counter()
     with ExitStack() as stack:
         opened = stack.enter_context(FrameSource(source, every=every, max_frames=max_frames))
@@ -166,9 +172,8 @@ def track(
                 caption = f"{rate:.1f} frames/s   {len(frame)} tracks"
                 drawn.write(drawer.draw(rgb, frame, caption))
             frames += 1
-            most = int(frame.tracks.max(initial=-1)) + 1
-            lengths = np.append(lengths, np.zeros(max(0, most - len(lengths)), np.int64))
-            lengths[frame.tracks] += 1
+            tracks = max(tracks, int(frame.tracks.max(initial=-1)) + 1)
+            positions += len(frame)
             bar.update()
             bar.set_postfix_str(f"{len(frame)} tracks", refresh=False)
             if stopped():
@@ -176,12 +181,14 @@ def track(
     seconds = time.perf_counter() - begun
     return TrackingReport(
         frames,
-        len(lengths),
-        float(lengths.sum() / max(1, frames)),
-        float(lengths.mean()) if len(lengths) else 0.0,
+        tracks,
+        positions / max(1, frames),
+        positions / max(1, tracks),
         frames / seconds,
         seconds,
         tuple(path for path in (video, table) if path is not None),
+        opened.count,
+        tuple(opened.failures),
     )
 
 
