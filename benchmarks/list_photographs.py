@@ -16,7 +16,6 @@ import csv
 import gzip
 import hashlib
 import io
-import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -30,6 +29,7 @@ from deepdetect._shared.progress import progress
 from deepdetect.datasets.photographs import (
     CROP_SIDE_PX,
     PICTURE_SUFFIXES,
+    RESTRICTED,
     SOURCES,
     Crop,
     Source,
@@ -164,7 +164,7 @@ def file_licences(source: Source, clone: Path) -> dict[str, str]:
 def plain_licence(words: str) -> str:
     """Return the short name of a licence; as it is where it is not known to be free."""
     plain = words.lower()
-    if re.search(r"\b(n[cd]|noncommercial|noderiv\w*)\b", plain):
+    if RESTRICTED.search(plain):
         return words
     for mark, name in (
         ("cc0", "CC0"),

@@ -37,6 +37,8 @@ RATIO = 0.85
 """Of Lowe's test, where described keypoints are matched."""
 
 COLORS = {"DeepDetect": "C0", "SIFT": "C1", "ORB": "C2"}
+NAMES = (*COLORS, *(f"{name}, matched" for name in COLORS))
+"""Of the methods."""
 
 Update = Callable[[np.ndarray], TrackedFrame]
 
@@ -168,7 +170,7 @@ def main() -> None:
     parser.add_argument("--max-keypoints", type=int, default=TrackingOptions.max_keypoints)
     parser.add_argument("--first", type=int, default=0, help="first frame")
     parser.add_argument("--frames", type=int, help="how many  [default: all]")
-    parser.add_argument("--methods", nargs="+", help="some of them")
+    parser.add_argument("--methods", nargs="+", choices=NAMES, help="some of them")
     arguments = parser.parse_args()
     last = None if arguments.frames is None else arguments.first + arguments.frames
     paths = find_images(arguments.folder)[arguments.first : last]

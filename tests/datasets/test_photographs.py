@@ -132,3 +132,18 @@ def test_what_is_not_listed_is_refused(unpacked: tuple[Path, list[Crop]]) -> Non
     file.unlink()
     with pytest.raises(DeepDetectError, match=r"osie has no data/stimuli/1\.png"):
         write_crops(folder, crops)
+
+
+@pytest.mark.parametrize(
+    ("licence", "free"),
+    [
+        ("CC BY 4.0", True),
+        ("CC BY-SA 3.0", True),
+        ("CC BY-NC 4.0", False),
+        ("CC BY-NC-SA", False),
+        ("CC BY-ND 2.0", False),
+        ("CC BY, non-commercial use", False),
+    ],
+)
+def test_what_only_begins_as_a_free_licence_is_not_free(licence: str, free: bool) -> None:
+    assert Crop("gb82", "a.png", "0" * 64, licence, 480, 0, 0).is_free is free

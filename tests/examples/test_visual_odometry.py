@@ -32,3 +32,13 @@ def test_the_errors_are_below_those_that_the_page_promises(shared: Path, tmp_pat
         assert found["end_deg_per_m"] < 0.02
         assert len((tmp_path / f"{name.lower()}.txt").read_text().splitlines()) == 51
     assert (tmp_path / "trajectory.jpg").stat().st_size > 10_000
+
+
+def test_an_unknown_method_is_refused(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), str(tmp_path), "--methods", "Deepdetect"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert "invalid choice: 'Deepdetect'" in done.stderr

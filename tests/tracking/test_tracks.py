@@ -63,3 +63,16 @@ def test_a_table_is_whole_or_not_there(tmp_path: Path) -> None:
 def test_shapes_are_checked() -> None:
     with pytest.raises(OptionError):
         TrackedFrame(0, np.arange(2), np.zeros((3, 2)), np.zeros(2), np.zeros(2))
+
+
+def test_rows_are_whole(tmp_path: Path, one_line) -> None:
+    """Five rows of three numbers are not three rows of five."""
+    (tmp_path / "t.csv").write_text("frame,track,x,y,score\n" + "1,2,3\n" * 5)
+    with pytest.raises(DeepDetectError, match="3 numbers, not 5") as caught:
+        load_tracks(tmp_path / "t.csv")
+    one_line(caught.value)
+
+
+def test_a_table_without_tracks_comes_back(tmp_path: Path) -> None:
+    save_tracks([], tmp_path / "t.csv")
+    assert load_tracks(tmp_path / "t.csv") == []

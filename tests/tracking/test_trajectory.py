@@ -40,3 +40,22 @@ def test_another_file_is_one_sentence(text: str, tmp_path: Path, one_line) -> No
     assert "holds no poses" in one_line(caught.value)
     with pytest.raises(DeepDetectError, match="no file"):
         load_poses(tmp_path / "q.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1 0 0 0 0 0 0 1\n" * 3, "8 numbers, not 12"),  # TUM's format, of 2 x 12 numbers
+        ("nan " * 12, "not finite"),
+    ],
+)
+def test_what_is_no_kitti_file_is_refused(tmp_path: Path, one_line, text: str, words: str) -> None:
+    (tmp_path / "poses.txt").write_text(text)
+    with pytest.raises(DeepDetectError, match=words) as caught:
+        load_poses(tmp_path / "poses.txt")
+    one_line(caught.value)
+
+
+def test_a_path_without_poses_comes_back(tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("")
+    assert len(load_poses(tmp_path / "poses.txt")) == 0

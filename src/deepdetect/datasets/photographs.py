@@ -11,6 +11,7 @@ import csv
 import gzip
 import hashlib
 import io
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -34,6 +35,9 @@ VALIDATION_SHARE = 1 / 20
 
 FREE_LICENCES = ("CC0", "CC BY", "CC BY-SA", "Unsplash")
 """Beginnings of the licences that allow any use, of weights that were trained on them too."""
+
+RESTRICTED = re.compile(r"\b(n[cd]|non-?commercial|no-?deriv\w*)\b", re.IGNORECASE)
+"""What a licence says that begins as a free one and is not."""
 
 FREE_SOURCES = ("codecs", "gb82", "deepin", "budgie", "ukui", "endless", "boofcv")
 """Sources that have such pictures."""
@@ -259,8 +263,8 @@ class Crop:
 
     @property
     def is_free(self) -> bool:
-        """Whether the licence allows any use."""
-        return self.licence.startswith(FREE_LICENCES)
+        """Whether the licence allows any use: CC BY does, CC BY-NC and CC BY-ND do not."""
+        return self.licence.startswith(FREE_LICENCES) and not RESTRICTED.search(self.licence)
 
     @property
     def part(self) -> str:

@@ -123,6 +123,23 @@ def save_tracks(frames: Iterable[TrackedFrame], path: str | Path) -> None:
             writer.write(frame)
 
 
+def read_table(file: TextIO, columns: int, delimiter: str | None = None) -> np.ndarray:
+    """Read the rest of a text file as rows of so many numbers; there may be none.
+
+    Raises:
+        ValueError: a row has something else.
+    """
+    begin = file.tell()
+    empty = not file.readline().strip()  # of which NumPy warns
+    file.seek(begin)
+    if empty:
+        return np.empty((0, columns))
+    table = np.loadtxt(file, delimiter=delimiter, ndmin=2)
+    if table.shape[1] != columns:
+        raise ValueError(f"its lines have {table.shape[1]} numbers, not {columns}")
+    return table
+
+
 @suggest_keywords
 def load_tracks(path: str | Path) -> list[TrackedFrame]:
     """Read the CSV file that `save_tracks` or `deepdetect track` wrote.
@@ -145,7 +162,7 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
         with Path(path).open(encoding="ascii") as file:
             if file.readline().strip() != HEADER:
                 raise ValueError(f"its first line is not {HEADER}")
-            table = np.loadtxt(file, delimiter=",", ndmin=2).reshape(-1, 5)
+            table = read_table(file, len(HEADER.split(",")), delimiter=",")
             if not np.isfinite(table).all():
                 raise ValueError("a number is not finite")
     except FileNotFoundError:
@@ -153,6 +170,8 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
     except (OSError, ValueError) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InvalidFileError(f"{path} holds no tracks ({reason}): write the file again") from None
+    if not len(table):
+        return []
     table = table[np.lexsort((table[:, 1], table[:, 0]))]
     numbers, begins = np.unique(table[:, 0].astype(np.int64), return_index=True)
     born: dict[int, int] = {}

@@ -10,6 +10,7 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import InvalidFileError, MissingFileError, OptionError
 from .._shared.options import suggest_keywords
+from .tracks import read_table
 
 
 @suggest_keywords
@@ -91,7 +92,10 @@ def load_poses(path: str | Path) -> Trajectory:
         [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
     """
     try:
-        matrices = np.loadtxt(path, ndmin=2).reshape(-1, 3, 4)
+        with Path(path).open(encoding="utf-8") as file:
+            matrices = read_table(file, 12).reshape(-1, 3, 4)
+        if not np.isfinite(matrices).all():
+            raise ValueError("a number is not finite")
     except FileNotFoundError:
         raise MissingFileError(f"there is no file {path}: check the path") from None
     except (OSError, ValueError) as error:

@@ -51,6 +51,12 @@ def test_drift_of_scale_is_an_error() -> None:
     assert errors.segment_percent > 2
 
 
+def test_the_wrong_way_is_an_error() -> None:
+    errors = trajectory_errors(STRAIGHT, -PATH, STRAIGHT, PATH)
+    assert errors.scale == 0
+    assert errors.end_percent == pytest.approx(100)
+
+
 def test_short_paths_have_no_segments() -> None:
     errors = trajectory_errors(STRAIGHT[:5], PATH[:5], STRAIGHT[:5], PATH[:5])
     assert np.isnan(errors.segment_percent)

@@ -19,7 +19,7 @@ class TrajectoryErrors:
     """Errors of a path, as `trajectory_errors` aligns it.
 
     Attributes:
-        scale: by which the estimated path was multiplied.
+        scale: by which the estimated path was multiplied, 0 for one that goes the wrong way.
         length: of the true path.
         end_percent: distance of the last positions, in per cent of this length.
         mean_percent: mean distance of all positions, in per cent of this length.
@@ -80,7 +80,8 @@ def trajectory_errors(
     squares = float((moved**2).sum())
     if squares == 0 or along[-1] == 0:
         raise OptionError("a path that does not move has no scale: give one that does")
-    scale = float((moved * true).sum()) / squares
+    # Below 0 it would turn a path that goes the wrong way into a right one.
+    scale = max(0.0, float((moved * true).sum()) / squares)
     aligned = scale * moved
     distances = np.linalg.norm(aligned - true, axis=1)
     length = float(along[-1])
