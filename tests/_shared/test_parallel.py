@@ -126,6 +126,36 @@ def test_workers_end_when_the_parent_is_killed(tmp_path: Path) -> None:
     _wait_until(lambda: not any(_runs(int(path.read_text())) for path in pids))
 
 
+@pytest.mark.skipif(os.name != "posix", reason="needs signals")
+def test_an_interrupt_of_the_parent_alone_ends_all_processes(tmp_path: Path) -> None:
+    """As `timeout -s INT` and process managers send it: the workers are in endless tasks."""
+    (tmp_path / "endless.py").write_text(
+        "import os, time\n"
+        "from pathlib import Path\n"
+        "from deepdetect._shared import parallel\n"
+        "def work(task):\n"
+        "    Path(f'pid{task}').write_text(str(os.getpid()))\n"
+        "    time.sleep(600)\n"
+        "if __name__ == '__main__':\n"
+        "    parallel.UNWANTED_TASK_S = 0.5\n"
+        "    list(parallel.map_in_processes(work, range(9), 2))\n"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "endless.py"],
+        cwd=tmp_path,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    pids = [tmp_path / "pid0", tmp_path / "pid1"]
+    _wait_until(lambda: all(path.exists() and path.read_text() for path in pids))
+    process.send_signal(signal.SIGINT)
+    try:
+        assert process.wait(timeout=60) != 0
+    finally:
+        process.kill()
+    _wait_until(lambda: not any(_runs(int(path.read_text())) for path in pids))
+
+
 @pytest.mark.skipif(os.name != "posix", reason="needs process groups")
 @pytest.mark.parametrize("moment", ["while a worker starts", "while it works"])
 def test_ctrl_c_ends_all_processes_without_a_word_of_theirs(moment: str, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import os
 import platform
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -22,13 +23,16 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from .errors import DeepDetectError, OptionError
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
+    from concurrent.futures import Future, ProcessPoolExecutor
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
 PARTS_PER_THREAD = 4
 """More than one, so that a thread with easy parts takes more of them."""
+
+UNWANTED_TASK_S = 20.0
+"""How long a task may go on after the work was interrupted or has failed."""
 
 DEFAULT_MEMORY = 4_000_000_000
 """Bytes assumed where the system does not say."""
@@ -113,6 +117,7 @@ def map_in_processes(
                 for _, task in zip(places, remaining, strict=False)
             }
 
+    pending: set[Future[Outcome]] = set()
     try:
         pending = submit(range(4 * count))
         while pending:
@@ -127,7 +132,24 @@ def map_in_processes(
         ) from None
     finally:
         ended.set()  # some are queued where they cannot be cancelled
+        if pending:
+            _end_soon(pool)
         pool.shutdown(cancel_futures=True)
+
+
+def _end_soon(pool: ProcessPoolExecutor) -> None:
+    """Wait a while for tasks that nobody wants any more, then kill the processes.
+
+    A signal to this process alone does not reach them. What they write is under temporary names
+    until it is whole.
+    """
+    workers = list((getattr(pool, "_processes", None) or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    deadline = time.monotonic() + UNWANTED_TASK_S
+    while any(worker.is_alive() for worker in workers) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    for worker in workers:
+        worker.kill()
 
 
 @contextmanager
