@@ -10,7 +10,8 @@ import pytest
 
 from deepdetect import DeepDetectError, OptionError, SelectionOptions
 from deepdetect.batch import PairMatchingOptions, extract_features, match_pairs
-from deepdetect.batch.pair_matching import match_features, pair_name, read_pairs
+from deepdetect.batch.pair_list import pair_name, read_pairs
+from deepdetect.batch.pair_matching import match_features
 
 PAIR = ("a/00.png", "b/01.png")
 

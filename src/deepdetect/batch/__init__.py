@@ -2,13 +2,8 @@
 
 from .engines import ENGINES, get_engine
 from .extraction import ExtractionReport, extract_features
-from .pair_matching import (
-    PairMatchingOptions,
-    PairMatchingReport,
-    match_pairs,
-    pair_name,
-    read_pairs,
-)
+from .pair_list import pair_name, read_pairs
+from .pair_matching import PairMatchingOptions, PairMatchingReport, match_pairs
 
 __all__ = [
     "ENGINES",

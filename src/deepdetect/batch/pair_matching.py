@@ -12,13 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from .._shared.errors import (
-    BatchError,
-    DeepDetectError,
-    InvalidFileError,
-    MissingFileError,
-    OptionError,
-)
+from .._shared.errors import BatchError, InvalidFileError, OptionError
 from .._shared.kernels import require_compiler
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import TaskMap
@@ -28,6 +22,7 @@ from ..features.matchers import MATCHERS, get_matcher, match_descriptors
 from ..geometry import GeometryOptions, estimate_geometry
 from .engines import get_engine
 from .extraction import DESCRIPTOR, parts_of
+from .pair_list import Pair, check_pairs, pair_name, read_pairs
 from .parted_file import (
     SETTINGS,
     Group,
@@ -47,8 +42,6 @@ ROOT_SIFT_NORM = 512
 
 MATCHERS_OF_FLOATS = {name: MATCHERS[name] for name in MATCHERS if name != "hamming"}
 """Features in files are no bits."""
-
-Pair = tuple[str, str]
 
 
 @suggest_keywords
@@ -117,75 +110,6 @@ class PairMatchingReport:
             )
 
 
-def pair_name(name0: str, name1: str) -> str:
-    """Return the path of a pair's group in a file of matches, as hloc makes it.
-
-    Example:
-        >>> pair_name("db/1.jpg", "query/2.jpg")
-        'db-1.jpg/query-2.jpg'
-    """
-    return "/".join(name.replace("/", "-") for name in (name0, name1))
-
-
-def read_pairs(path: str | Path) -> list[Pair]:
-    """Read a list of pairs: two names of images on each line, with a blank or a tab between.
-
-    A pair that is there twice, or also the other way round, is taken once, as it is there first.
-
-    Raises:
-        DeepDetectError: the file is missing or empty, or a line is something else.
-    """
-    pairs: list[Pair] = []
-    try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise MissingFileError(f"there is no file {path}: check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
-        raise DeepDetectError(f"{path} cannot be read ({reason}): check the file") from None
-    for number, line in enumerate(text.splitlines(), 1):
-        if not line.strip():
-            continue
-        names = line.strip().split("\t") if "\t" in line.strip() else line.split()
-        if len(names) != 2 or names[0] == names[1]:
-            raise DeepDetectError(
-                f"line {number} of {path} is no pair: give the names of two images, with a blank "
-                "between, or a tab where they have blanks themselves"
-            )
-        pairs.append((names[0], names[1]))
-    if not pairs:
-        raise DeepDetectError(f"{path} has no pairs: give the names of two images on each line")
-    return _once_each(pairs)
-
-
-def _checked_pairs(pairs: Any) -> list[Pair]:
-    """Return pairs that were given from Python, once each."""
-    try:
-        found: list[Any] = [pair if isinstance(pair, str) else tuple(pair) for pair in pairs]
-    except TypeError:
-        found = [str(pairs)]
-    for pair in found:
-        if (
-            isinstance(pair, str)
-            or len(pair) != 2
-            or not all(isinstance(name, str) and name for name in pair)
-            or pair[0] == pair[1]
-        ):
-            raise OptionError(
-                f"{pair!r} in `pairs` is no pair: give (name, name) of two images, or a text file"
-            )
-    return _once_each(found)
-
-
-def _once_each(pairs: Sequence[Pair]) -> list[Pair]:
-    """Leave out pairs that are there before, or the other way round."""
-    kept: dict[Pair, None] = {}
-    for pair in pairs:
-        if pair[::-1] not in kept:
-            kept[pair] = None
-    return list(kept)
-
-
 @suggest_keywords
 def match_pairs(
     features: str | Path,
@@ -234,7 +158,7 @@ def match_pairs(
         ...     match_pairs("features.h5", "pairs.txt", "matches.h5").check()
     """
     map_tasks: TaskMap = get_engine(engine)
-    listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else _checked_pairs(pairs)
+    listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else check_pairs(pairs)
     source, target = Path(features).absolute(), Path(path).absolute()
     if source == target:
         raise OptionError(f"{path} holds the features: give the matches another file with -o")

@@ -14,7 +14,7 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import feature_group
-from ..batch.pair_matching import pair_name
+from ..batch.pair_list import pair_name
 from ..batch.parted_file import Group, write_groups
 from .collection import Collection, check_names
 

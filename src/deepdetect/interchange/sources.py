@@ -12,7 +12,8 @@ import numpy as np
 from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import MAX_KEYPOINTS, extract_features
-from ..batch.pair_matching import PairMatchingOptions, match_pairs, read_pairs
+from ..batch.pair_list import read_pairs
+from ..batch.pair_matching import PairMatchingOptions, match_pairs
 from ..batch.parted_file import import_h5py, open_hdf5
 from ..features.keypoints import UNSET_ANGLE, Keypoints
 from ..features.matches import Matches

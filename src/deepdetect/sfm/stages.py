@@ -23,7 +23,8 @@ from .._shared.errors import ImageError, MissingImageError, OptionError, Reconst
 from .._shared.parallel import available_memory, map_in_processes, processor_count
 from .._shared.progress import progress
 from ..batch.extraction import extract_features
-from ..batch.pair_matching import match_pairs, pair_name
+from ..batch.pair_list import pair_name
+from ..batch.pair_matching import match_pairs
 from ..batch.parted_file import open_hdf5
 from ..io.image import find_images, load_image, luma
 from .colmap import import_pycolmap
