@@ -134,13 +134,16 @@ def test_nothing_is_replaced_silently(run, saved: Path) -> None:
 def test_a_mistake_is_one_sentence(
     run, saved: Path, photos: Path, words: str, message: str
 ) -> None:
+    before = {path.name for path in saved.iterdir()}
+    shutil.rmtree(saved / "out" / ".deepdetect")  # of what was saved
     result = run("export", *(word.format(photos=photos) for word in words.split()))
     assert result.exit_code == 2, result.output
     assert message in result.output
     assert one_sentence(
         "\n".join(line for line in result.stderr.splitlines() if line.startswith("deepdetect"))
     )
-    assert not (saved / "a.db").exists()
+    assert {path.name for path in saved.iterdir()} == before
+    assert not list(saved.rglob(".deepdetect"))
 
 
 def test_a_bad_photograph_does_not_stop_the_export(run, photos: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from deepdetect import OptionError
-from deepdetect.cli._records import OutputRecords, claim_outputs
+from deepdetect.cli._records import OutputRecords, claim_outputs, claimed_outputs
 
 
 @pytest.fixture
@@ -90,3 +90,35 @@ def test_a_growing_list_of_inputs_keeps_its_outputs(tmp_path: Path) -> None:
         claim_outputs("reconstruct", photographs[1:], [model], overwrite=False, growing=True)
     claim_outputs("reconstruct", photographs[1:], [model], overwrite=True, growing=True)
     claim_outputs("reconstruct", photographs[1:], [model], overwrite=False)
+
+
+def test_work_that_fails_leaves_no_trace(tmp_path: Path) -> None:
+    output = tmp_path / "new" / "folder" / "m.npz"
+    for error in (RuntimeError, KeyboardInterrupt):
+        with pytest.raises(error), claimed_outputs("match", [tmp_path / "a.png"], [output], False):
+            assert list((tmp_path / "new").rglob("*.json")), "it is claimed before the work"
+            raise error
+        assert not list(tmp_path.iterdir())
+
+
+def test_records_of_others_stay_when_work_fails(tmp_path: Path) -> None:
+    inputs = [tmp_path / "a.png"]
+    claim_outputs("match", inputs, [tmp_path / "other.npz"], overwrite=False)
+    with pytest.raises(RuntimeError), claimed_outputs("match", inputs, [tmp_path / "m.npz"], False):
+        raise RuntimeError
+    assert [path.name for path in tmp_path.rglob("*.json")] == ["other.npz.json"]
+
+
+def test_what_is_not_replaced_is_still_known_to_be_of_its_files(tmp_path: Path) -> None:
+    first, second = [tmp_path / "a.png"], [tmp_path / "b.png"]
+    outputs = [tmp_path / "m.npz", tmp_path / "m.jpg"]
+    with claimed_outputs("match", first, outputs, overwrite=False):
+        for path in outputs:
+            path.write_bytes(b"of a")
+    with pytest.raises(RuntimeError), claimed_outputs("match", second, outputs, overwrite=True):
+        outputs[0].write_bytes(b"whole, and of b")
+        raise RuntimeError
+    claim_outputs("match", second, outputs[:1], overwrite=False)
+    with pytest.raises(OptionError, match=r"m\.jpg exists already, made from .*a\.png"):
+        claim_outputs("match", second, outputs[1:], overwrite=False)
+    claim_outputs("match", first, outputs[1:], overwrite=False)

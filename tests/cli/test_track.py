@@ -130,5 +130,17 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(
     assert result.exit_code == 2
     assert message in result.output
     assert one_sentence(result.stderr)
-    assert not list(tmp_path.glob("*.csv"))
-    assert not (tmp_path / "tracks.mp4").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"frames", "text.mp4"}
+
+
+def test_a_run_that_is_stopped_leaves_nothing(
+    run, frames: Path, tmp_path: Path, monkeypatch
+) -> None:
+    from deepdetect.tracking import pipeline
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline.TrackDrawer, "draw", stop)
+    assert run("track", frames, "-o", "new/out.mp4").exit_code == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["frames"]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from .._shared.atomic import atomic_path, clear_abandoned
-from .._shared.errors import OptionError
+from .._shared.errors import DeepDetectError, OptionError
 
 FOLDER = ".deepdetect"
 ADVICE = "choose another folder with -o, or replace it with --overwrite"
@@ -165,6 +167,67 @@ def claim_outputs(
         }
         with atomic_path(_claim(command, path)) as temporary:
             temporary.write_text(json.dumps(value), encoding="utf-8")
+
+
+@contextmanager
+def claimed_outputs(
+    command: str, inputs: Sequence[Path], outputs: Sequence[Path], overwrite: bool
+) -> Iterator[None]:
+    """Claim outputs for the time of the work; one that fails or is stopped leaves no trace.
+
+    Outputs that it has not replaced belong to the files that they belonged to before, and folders
+    that were made for the records are removed again. Work that can be resumed keeps its records:
+    it calls `claim_outputs`.
+
+    Args:
+        command: its name.
+        inputs: files or folders.
+        outputs: files or folders.
+        overwrite: replace whatever there is.
+
+    Raises:
+        OptionError: an output exists that was made from other files, or by something else.
+        DeepDetectError: the folder cannot be written.
+    """
+    check_outputs(command, inputs, outputs, overwrite)
+    before = {path: (_state(path), _content(_claim(command, path))) for path in outputs}
+    missing = {folder for path in outputs for folder in path.parents if not folder.exists()}
+    try:
+        claim_outputs(command, inputs, outputs, overwrite)
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError, DeepDetectError):
+            for path, (state, record) in before.items():
+                if _state(path) == state:
+                    _put_back(_claim(command, path), record)
+        _remove_empty({folder / FOLDER / command for folder in {path.parent for path in outputs}})
+        _remove_empty({path.parent / FOLDER for path in outputs})
+        _remove_empty(missing)
+        raise
+
+
+def _content(path: Path) -> bytes | None:
+    """Return what is in a file, None where there is none that can be read."""
+    try:
+        return path.read_bytes()
+    except OSError:
+        return None
+
+
+def _put_back(path: Path, content: bytes | None) -> None:
+    """Make a file what it was."""
+    if content is None:
+        path.unlink(missing_ok=True)
+    elif content != _content(path):
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(content)
+
+
+def _remove_empty(folders: set[Path]) -> None:
+    """Remove folders that hold nothing, the innermost first."""
+    for folder in sorted(folders, key=lambda path: len(path.parts), reverse=True):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def _names(inputs: Sequence[Path]) -> list[str]:

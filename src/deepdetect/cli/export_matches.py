@@ -18,7 +18,7 @@ from ._options import (
     print_result,
     processes_option,
 )
-from ._records import claim_outputs
+from ._records import claimed_outputs
 
 if TYPE_CHECKING:
     from ..interchange import Collection
@@ -248,13 +248,13 @@ def _export(
             "with --overwrite"
         )
     check_inputs_survive([marker], inputs, "choose another name with -o")
-    claim_outputs(f"export-{form}", inputs, [marker], overwrite)
-    collection = _collection(sources, values)
-    if describe:
-        collection = describe_collection(collection, quiet=False)
-    if camera:
-        settings["lenses"] = _lenses(collection, camera)
-    files = get_format(form)(collection, output, **settings)
+    with claimed_outputs(f"export-{form}", inputs, [marker], overwrite):
+        collection = _collection(sources, values)
+        if describe:
+            collection = describe_collection(collection, quiet=False)
+        if camera:
+            settings["lenses"] = _lenses(collection, camera)
+        files = get_format(form)(collection, output, **settings)
     keypoints = sum(len(points) for points in collection.keypoints.values())
     matches = sum(len(found) for found in collection.matches.values())
     print_result(

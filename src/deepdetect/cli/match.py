@@ -93,7 +93,7 @@ def match(
     from ..io.tables import save_matches
     from ..matching.options import UNGUIDED_ONLY, get_preset
     from ..matching.pipeline import match_images
-    from ._records import claim_outputs
+    from ._records import claimed_outputs
 
     stem = f"{image0.stem}_{image1.stem}_matches"
     file = output / f"{stem}.{file_format}"
@@ -101,7 +101,6 @@ def match(
     files = [path for path in (file, picture) if path is not None]
     check_inputs_survive(files, [image0, image1], "choose another folder with -o")
     rgb0, rgb1 = load_image(image0), load_image(image1)
-    claim_outputs("match", [image0, image1], files, overwrite)
     resolution_given = values["resolution"] is not None
     detector = make_detector(values)
     given = given_only(values)
@@ -115,11 +114,12 @@ def match(
     if get_preset(preset).heatmap is not None and resolution_given:
         given["resolution"] = detector.heatmap_options.resolution
     guided = given.get("guided", get_preset(preset).guided)
-    with stage_progress("matching", GUIDED_STAGES if guided else UNGUIDED_STAGES) as done:
-        matches = match_images(rgb0, rgb1, detector, preset=preset, progress=done, **given)
-    save_matches(matches, file)
-    if picture is not None:
-        _draw(rgb0, rgb1, matches, picture)
+    with claimed_outputs("match", [image0, image1], files, overwrite):
+        with stage_progress("matching", GUIDED_STAGES if guided else UNGUIDED_STAGES) as done:
+            matches = match_images(rgb0, rgb1, detector, preset=preset, progress=done, **given)
+        save_matches(matches, file)
+        if picture is not None:
+            _draw(rgb0, rgb1, matches, picture)
     numbers = {
         "image0": image0,
         "image1": image1,

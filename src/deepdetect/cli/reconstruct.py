@@ -126,7 +126,7 @@ def _reconstruct_two(
     from .._shared.progress import progress
     from ..io.point_cloud import find_writer
     from ..reconstruction.pipeline import reconstruct as reconstruct_pair
-    from ._records import check_outputs, claim_outputs
+    from ._records import check_outputs, claimed_outputs
 
     find_writer(output)
     files = _files(output, [path for path in (left, right, calibration) if path is not None])
@@ -149,8 +149,8 @@ def _reconstruct_two(
             **chosen,
         )
         bar.update(STAGES - bar.n)
-        claim_outputs("reconstruct", [left, right], list(files.values()), overwrite)
-        numbers = _write(found, files, {"left": left, "right": right})
+        with claimed_outputs("reconstruct", [left, right], list(files.values()), overwrite):
+            numbers = _write(found, files, {"left": left, "right": right})
         done("files")
     print_result(as_json, numbers, _rows(found, numbers), f"{left} and {right}")
 

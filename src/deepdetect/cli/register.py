@@ -49,21 +49,21 @@ def register(
     from .._shared.progress import stage_progress
     from ..matching.registration import register as register_images
     from ..viz.draw import save_picture
-    from ._records import claim_outputs
+    from ._records import claimed_outputs
 
     stem = f"{image1.stem}_on_{image0.stem}"
     files = [output / f"{stem}{name}.png" for name in ("", "_checkerboard", "_difference")]
     files.append(output / f"{stem}_homography.txt")
     check_inputs_survive(files, [image0, image1], "choose another folder with -o")
     detector = make_detector(values)
-    claim_outputs("register", [image0, image1], files, overwrite)
-    with stage_progress("registering", STAGES) as done:
-        found = register_images(image0, image1, detector, progress=done, **given_only(values))
-    pictures = found.warped, found.checkerboard(), found.difference()
-    for path, picture in zip(files[:-1], pictures, strict=True):
-        save_picture(picture, path)
-    with atomic_path(files[-1]) as temporary:
-        np.savetxt(temporary, found.homography, fmt="%.12e")
+    with claimed_outputs("register", [image0, image1], files, overwrite):
+        with stage_progress("registering", STAGES) as done:
+            found = register_images(image0, image1, detector, progress=done, **given_only(values))
+        pictures = found.warped, found.checkerboard(), found.difference()
+        for path, picture in zip(files[:-1], pictures, strict=True):
+            save_picture(picture, path)
+        with atomic_path(files[-1]) as temporary:
+            np.savetxt(temporary, found.homography, fmt="%.12e")
     numbers = {
         "image0": image0,
         "image1": image1,

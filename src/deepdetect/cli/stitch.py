@@ -71,7 +71,7 @@ def stitch(
     from ..matching.stitching import STAGES
     from ..matching.stitching import stitch as stitch_images
     from ..viz.draw import picture_suffix, save_picture
-    from ._records import claim_outputs
+    from ._records import claimed_outputs
 
     # Before the work, which would else be lost.
     picture_suffix(output)
@@ -84,28 +84,28 @@ def stitch(
     if len(images) < min(given, 2) or (reference is not None and reference not in images):
         what = "too few photographs, or not the reference, can be read"
         raise ImageError(f"there is no panorama, as {what}: {'; '.join(failures)}")
-    claim_outputs("stitch", images, [output], overwrite)
-    try:
-        with stage_progress("stitching", STAGES) as done:
-            panorama = stitch_images(
-                images,
-                detector=detector,
-                reference=None if reference is None else images.index(reference),
-                progress=done,
-                **given_only(values),
-            )
-    except DeepDetectError as error:
-        if type(error) not in (
-            DeepDetectError,
-            OptionError,
-            RegistrationError,
-        ):  # an image, named as it was given
-            raise
-        text = str(error)
-        for number, path in enumerate(images):
-            text = text.replace(f"images[{number}]", str(path))
-        raise type(error)(text) from error
-    save_picture(panorama.image, output)
+    with claimed_outputs("stitch", images, [output], overwrite):
+        try:
+            with stage_progress("stitching", STAGES) as done:
+                panorama = stitch_images(
+                    images,
+                    detector=detector,
+                    reference=None if reference is None else images.index(reference),
+                    progress=done,
+                    **given_only(values),
+                )
+        except DeepDetectError as error:
+            if type(error) not in (
+                DeepDetectError,
+                OptionError,
+                RegistrationError,
+            ):  # an image, named as it was given
+                raise
+            text = str(error)
+            for number, path in enumerate(images):
+                text = text.replace(f"images[{number}]", str(path))
+            raise type(error)(text) from error
+        save_picture(panorama.image, output)
     numbers = {**_numbers(panorama, images, output), "failures": failures}
     print_result(as_json, numbers, _rows(panorama, images, output), "panorama")
     if not as_json:

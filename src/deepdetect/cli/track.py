@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,7 +63,7 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
     from ..tracking.pipeline import output_files
     from ..tracking.pipeline import track as track_points
     from ..tracking.tracker import TrackingOptions
-    from ._records import claim_outputs
+    from ._records import claimed_outputs
 
     files = [path for path in output_files(output) if path is not None]
     given = given_only(values)
@@ -71,6 +72,7 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
     options = TrackingOptions(**given)
     with FrameSource(source) as opened:
         live = opened.live
+    claim: AbstractContextManager[None] = nullcontext()
     if live:
         for path in files if not overwrite else ():
             if path.exists():
@@ -82,9 +84,12 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
         inputs = [Path(source)]
         if inputs[0].is_file():
             check_inputs_survive(files, inputs, "choose another name with -o")
-        claim_outputs("track", inputs, files, overwrite)
-    detector = make_detector({**dict.fromkeys(DETECTOR.names), **detection})
-    report = track_points(source, output, detector=detector, options=options, quiet=False, **frames)
+        claim = claimed_outputs("track", inputs, files, overwrite)
+    with claim:
+        detector = make_detector({**dict.fromkeys(DETECTOR.names), **detection})
+        report = track_points(
+            source, output, detector=detector, options=options, quiet=False, **frames
+        )
     print_result(
         as_json,
         vars(report),
