@@ -94,10 +94,15 @@ def test_a_growing_list_of_inputs_keeps_its_outputs(tmp_path: Path) -> None:
 
 def test_work_that_fails_leaves_no_trace(tmp_path: Path) -> None:
     output = tmp_path / "new" / "folder" / "m.npz"
-    for error in (RuntimeError, KeyboardInterrupt):
-        with pytest.raises(error), claimed_outputs("match", [tmp_path / "a.png"], [output], False):
-            assert list((tmp_path / "new").rglob("*.json")), "it is claimed before the work"
+
+    def work(error: type[BaseException]) -> None:
+        with claimed_outputs("match", [tmp_path / "a.png"], [output], overwrite=False):
+            assert list(tmp_path.rglob("*.json")), "it is claimed before the work"
             raise error
+
+    for error in (RuntimeError, KeyboardInterrupt):
+        with pytest.raises(error):
+            work(error)
         assert not list(tmp_path.iterdir())
 
 
@@ -115,9 +120,14 @@ def test_what_is_not_replaced_is_still_known_to_be_of_its_files(tmp_path: Path) 
     with claimed_outputs("match", first, outputs, overwrite=False):
         for path in outputs:
             path.write_bytes(b"of a")
-    with pytest.raises(RuntimeError), claimed_outputs("match", second, outputs, overwrite=True):
-        outputs[0].write_bytes(b"whole, and of b")
-        raise RuntimeError
+
+    def work() -> None:
+        with claimed_outputs("match", second, outputs, overwrite=True):
+            outputs[0].write_bytes(b"whole, and of b")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        work()
     claim_outputs("match", second, outputs[:1], overwrite=False)
     with pytest.raises(OptionError, match=r"m\.jpg exists already, made from .*a\.png"):
         claim_outputs("match", second, outputs[1:], overwrite=False)

@@ -87,11 +87,10 @@ def test_an_interrupt_ends_a_camera_properly(moving_photo, tmp_path: Path, monke
             pass
 
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(cv2, "VideoCapture", Camera)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Camera(0) if name == 0 else real(name))
     report = track(0, tmp_path / "t.mp4", options=FEW)
     assert report.frames == 3
     assert signal.getsignal(signal.SIGINT) is before
-    monkeypatch.setattr(cv2, "VideoCapture", real)
     assert len(load_tracks(tmp_path / "t.csv")) == 3
     with FrameSource(tmp_path / "t.mp4") as written:
         assert len(list(written)) == 3

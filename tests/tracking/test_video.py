@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,13 @@ import pytest
 
 from deepdetect import DeepDetectError, OptionError
 from deepdetect.tracking import TrackedFrame
-from deepdetect.tracking.video import TrackDrawer, track_color, write_video
+from deepdetect.tracking.video import (
+    CODECS,
+    TrackDrawer,
+    count_frames,
+    track_color,
+    write_video,
+)
 
 
 def test_there_is_no_file_unless_it_is_whole(moving_photo, tmp_path: Path) -> None:
@@ -43,6 +50,38 @@ def test_no_encoder_is_one_sentence(moving_photo, tmp_path: Path, monkeypatch, o
         writer.write(moving_photo(0))
     assert "no encoder (mp4v)" in one_line(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", sorted(CODECS))
+def test_a_full_disk_is_one_sentence(suffix: str, tmp_path: Path, one_line) -> None:
+    """The limit of a file's size stands for the disk: OpenCV says nothing in either case."""
+    resource = pytest.importorskip("resource", reason="needs limits of processes")
+    noise = np.random.default_rng(0)
+
+    def write() -> None:
+        with write_video(tmp_path / f"v{suffix}", 10) as writer:
+            for _ in range(20):
+                writer.write(noise.integers(0, 256, (120, 160, 3), dtype=np.uint8))
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    usual = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(DeepDetectError) as caught:
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, usual)
+    assert "of 20 frames" in one_line(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_all_frames_arrive(moving_photo, tmp_path: Path) -> None:
+    for suffix in CODECS:
+        with write_video(tmp_path / f"v{suffix}", 10) as writer:
+            for k in range(3):
+                writer.write(moving_photo(k))
+        assert count_frames(tmp_path / f"v{suffix}") == 3
 
 
 def test_frames_of_another_size_are_refused(moving_photo, tmp_path: Path) -> None:

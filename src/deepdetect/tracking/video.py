@@ -27,12 +27,19 @@ HUE_STEP = 0.61803
 
 
 class VideoWriter:
-    """Writes frames; the first one decides the size."""
+    """Writes frames; the first one decides the size.
+
+    OpenCV does not say when a frame could not be written: `write_video` checks the whole file.
+
+    Attributes:
+        frames: that were given to be written until now.
+    """
 
     def __init__(self, path: Path, codec: str, fps: float, name: Path) -> None:
         self._path, self._codec, self._fps, self._name = path, codec, fps, name
         self._writer: Any = None
         self._size = (0, 0)
+        self.frames = 0
 
     def write(self, rgb: np.ndarray) -> None:
         """Write a (H, W, 3) uint8 RGB frame.
@@ -52,16 +59,21 @@ class VideoWriter:
         if size != self._size:
             raise DeepDetectError(f"a frame has {size} pixels, the first one had {self._size}")
         self._writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+        self.frames += 1
 
     def close(self) -> None:
         """Finish the file."""
         if self._writer is not None:
             self._writer.release()
 
-    @property
-    def empty(self) -> bool:
-        """Whether no frame was written."""
-        return self._writer is None
+
+def count_frames(path: Path) -> int:
+    """Return how many frames of a video file can be read one after the other."""
+    capture, count = cv2.VideoCapture(str(path)), 0
+    while capture.grab():
+        count += 1
+    capture.release()
+    return count
 
 
 def check_video_name(path: str | Path) -> str:
@@ -90,7 +102,7 @@ def write_video(path: str | Path, fps: float) -> Iterator[VideoWriter]:
 
     Raises:
         OptionError: the ending is another.
-        DeepDetectError: the file cannot be written, or no frame was.
+        DeepDetectError: the file cannot be written, as where the disk is full, or no frame was.
     """
     codec = check_video_name(path)
     with atomic_path(path) as temporary:
@@ -99,8 +111,13 @@ def write_video(path: str | Path, fps: float) -> Iterator[VideoWriter]:
             yield writer
         finally:
             writer.close()
-        if writer.empty or not temporary.stat().st_size:
+        if not writer.frames:
             raise DeepDetectError(f"there is no frame to be written to {path}: check the source")
+        if (found := count_frames(temporary)) < writer.frames:
+            raise DeepDetectError(
+                f"cannot write {path} ({found} of {writer.frames} frames are in the file): free "
+                "some space, or choose another place"
+            )
 
 
 class TrackDrawer:
