@@ -53,6 +53,40 @@ def test_frames_between_keyframes_have_poses(drive) -> None:
     assert errors_of(few, made.truth).end_percent < 2
 
 
+def test_what_is_kept_does_not_grow_with_the_path(drive, monkeypatch) -> None:
+    """Of old keyframes their poses; and that changes no pose."""
+    made = drive(count=40, noise_px=0.3, moving=100)
+    near = {"window": 4, "anchors": 3}
+    odometry = run(made, **near)
+    lengths = [len(keyframe.tracks) for keyframe in odometry._keyframes]
+    assert len(lengths) > 30
+    assert min(lengths[-7:]) > 100
+    assert set(lengths[:-7]) == {0}
+    seen = [keyframe.tracks for keyframe in odometry._keyframes] + [made.frames[-1].tracks]
+    assert odometry._map.tracks.tolist() == np.unique(np.concatenate(seen)).tolist()
+    monkeypatch.setattr(VisualOdometry, "_forget", lambda *_: None)
+    whole = run(made, **near)
+    assert min(len(keyframe.tracks) for keyframe in whole._keyframes) > 100
+    assert len(whole._map.tracks) > 2 * len(odometry._map.tracks)
+    np.testing.assert_array_equal(odometry.points, whole.points)
+    np.testing.assert_array_equal(odometry.trajectory().centres, whole.trajectory().centres)
+
+
+def test_a_camera_that_stands_for_long_is_waited_for(drive) -> None:
+    made = drive(count=40, standing=25, noise_px=0.1)
+    odometry = VisualOdometry(made.camera, OdometryOptions(max_waiting=8))
+    waiting = 0
+    for frame in made.frames:
+        odometry.update(frame)
+        waiting = max(waiting, len(odometry._waiting))
+    assert waiting == 8
+    found = odometry.trajectory()
+    assert found.frames[0] == 0
+    assert found.frames[1] >= 18, "of those between there are no poses"
+    np.testing.assert_array_equal(found.frames[1:], np.arange(found.frames[1], 40))
+    assert errors_of(odometry, made.truth).end_percent < 1.5
+
+
 def test_a_camera_that_stands_gets_poses_when_it_moves(drive) -> None:
     made = drive(count=20, standing=5, noise_px=0.1)
     odometry = VisualOdometry(made.camera)
@@ -96,7 +130,14 @@ def test_the_same_tracks_give_the_same_path(drive) -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [{"window": 1}, {"min_inliers": 3}, {"max_error_px": 0}, {"min_tracked": 2}]
+    "values",
+    [
+        {"window": 1},
+        {"min_inliers": 3},
+        {"max_error_px": 0},
+        {"min_tracked": 2},
+        {"max_waiting": 1},
+    ],
 )
 def test_wrong_options(values) -> None:
     with pytest.raises(OptionError, match=next(iter(values))):

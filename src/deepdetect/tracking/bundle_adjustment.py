@@ -37,6 +37,11 @@ class Keyframe:
         """(3,) position of the camera."""
         return -self.rotation.T @ self.translation
 
+    def forget_observations(self) -> None:
+        """Keep the pose alone."""
+        self.tracks, self.used = self.tracks[:0].copy(), self.used[:0].copy()
+        self.xy = self.xy[:0].copy()
+
     def reprojection_errors(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return how far the points of its tracks are seen from where they are projected.
 
@@ -53,10 +58,62 @@ class Keyframe:
             return np.where((seen[:, 2] > 0) & np.isfinite(errors), errors, np.inf)
 
 
+class MapPoints:
+    """The points of tracks, by the numbers of these; of the tracks alone that were added and kept.
+
+    Attributes:
+        tracks: (T,) int64 numbers, rising.
+        xyz: (T, 3) float64 points, NaN where a track has none.
+        strikes: (T,) int64, how often the position of a track has not agreed with its point.
+
+    Example:
+        >>> points = MapPoints()
+        >>> points.add(np.array([7, 3, 9]))
+        >>> points.xyz[points.rows(np.array([7]))] = 1, 2, 3
+        >>> points.keep(np.array([7, 9]))
+        >>> points.tracks.tolist(), points.at(np.array([3, 7])).tolist()
+        ([7, 9], [[nan, nan, nan], [1.0, 2.0, 3.0]])
+    """
+
+    def __init__(self) -> None:
+        self.tracks = np.zeros(0, np.int64)
+        self.xyz = np.zeros((0, 3))
+        self.strikes = np.zeros(0, np.int64)
+
+    def rows(self, tracks: np.ndarray) -> np.ndarray:
+        """Return the rows of tracks that have been added."""
+        return np.searchsorted(self.tracks, tracks)
+
+    def at(self, tracks: np.ndarray) -> np.ndarray:
+        """Return (N, 3) points of tracks, NaN where there is none."""
+        points = np.full((len(tracks), 3), np.nan)
+        known = np.isin(tracks, self.tracks, assume_unique=True)
+        points[known] = self.xyz[self.rows(tracks[known])]
+        return points
+
+    def known(self) -> np.ndarray:
+        """Return which rows have a point, (T,) bool."""
+        return np.isfinite(self.xyz).all(axis=1)
+
+    def add(self, tracks: np.ndarray) -> None:
+        """Add tracks without a point; those that are there stay as they are."""
+        new = np.setdiff1d(tracks, self.tracks)
+        places = self.rows(new)
+        self.tracks = np.insert(self.tracks, places, new)
+        self.xyz = np.insert(self.xyz, places, np.nan, axis=0)
+        self.strikes = np.insert(self.strikes, places, 0)
+
+    def keep(self, tracks: np.ndarray) -> None:
+        """Forget all tracks but these."""
+        kept = np.isin(self.tracks, tracks)
+        self.tracks, self.xyz = self.tracks[kept], self.xyz[kept]
+        self.strikes = self.strikes[kept]
+
+
 def adjust_keyframes(
     camera: Camera,
     keyframes: Sequence[Keyframe],
-    points: np.ndarray,
+    points: MapPoints,
     fixed: int,
     robust_scale_px: float,
     max_iterations: int,
@@ -66,7 +123,7 @@ def adjust_keyframes(
     Args:
         camera: of all frames.
         keyframes: with at least two views of each point that is to be adjusted; poses are changed.
-        points: (T, 3) by the number of the track, not finite where there is none; changed.
+        points: of the tracks that they see; changed.
         fixed: that many of the first keyframes stay where they are.
         robust_scale_px: larger errors count less.
         max_iterations: of the solver.
@@ -97,9 +154,11 @@ def adjust_keyframes(
             model.add_image_with_trivial_frame(image, pose)
         tracks, begins = np.unique(seen[:, 0], return_index=True)
         numbers = []
-        for track, rows in zip(tracks.tolist(), np.split(seen[:, 1:], begins[1:]), strict=True):
+        places = points.rows(tracks)
+        observed = np.split(seen[:, 1:], begins[1:])
+        for xyz, rows in zip(points.xyz[places], observed, strict=True):
             elements = [pycolmap.TrackElement(view + 1, row) for view, row in rows.tolist()]
-            numbers.append(model.add_point3D(points[track], pycolmap.Track(elements)))
+            numbers.append(model.add_point3D(xyz, pycolmap.Track(elements)))
         config = pycolmap.BundleAdjustmentConfig()
         for k in range(len(keyframes)):
             config.add_image(k + 1)
@@ -112,8 +171,8 @@ def adjust_keyframes(
             pose = model.images[k + 1].cam_from_world()
             keyframe.rotation = pose.rotation.matrix()
             keyframe.translation = np.array(pose.translation)
-        for track, number in zip(tracks.tolist(), numbers, strict=True):
-            points[track] = model.points3D[number].xyz
+        for place, number in zip(places.tolist(), numbers, strict=True):
+            points.xyz[place] = model.points3D[number].xyz
 
 
 def _options(pycolmap: Any, robust_scale_px: float, max_iterations: int) -> Any:
@@ -126,11 +185,11 @@ def _options(pycolmap: Any, robust_scale_px: float, max_iterations: int) -> Any:
     return options
 
 
-def _observations(keyframes: Sequence[Keyframe], points: np.ndarray) -> np.ndarray:
+def _observations(keyframes: Sequence[Keyframe], points: MapPoints) -> np.ndarray:
     """List (track, keyframe, row) of the points that two keyframes see, by track."""
     tables = []
     for k, keyframe in enumerate(keyframes):
-        rows = np.flatnonzero(keyframe.used & np.isfinite(points[keyframe.tracks]).all(axis=1))
+        rows = np.flatnonzero(keyframe.used & np.isfinite(points.at(keyframe.tracks)).all(axis=1))
         tables.append(np.column_stack([keyframe.tracks[rows], np.full(len(rows), k), rows]))
     seen = np.concatenate(tables)
     _, inverse, counts = np.unique(seen[:, 0], return_inverse=True, return_counts=True)

@@ -18,7 +18,7 @@ from ..geometry.camera import Calibration, Camera
 from ..geometry.relative_pose import estimate_relative_pose
 from ..geometry.triangulation import triangulate
 from ..sfm.colmap import import_pycolmap
-from .bundle_adjustment import Keyframe, adjust_keyframes
+from .bundle_adjustment import Keyframe, MapPoints, adjust_keyframes
 from .tracks import TrackedFrame, common_rows
 from .trajectory import Trajectory
 
@@ -45,6 +45,8 @@ class OdometryOptions:
         max_iterations: of the adjustment.
         max_strikes: a track whose position has not agreed so many times is left out: it may be on
             something that moves.
+        max_waiting: frames that are kept until the camera has moved enough for the first points; of
+            more, those after the first one are dropped, and get no pose.
         seed: of the random samples for the first two frames; OpenCV's PnP has one of its own.
 
     Raises:
@@ -62,6 +64,7 @@ class OdometryOptions:
     robust_scale_px: float = 0.5
     max_iterations: int = 10
     max_strikes: int = 2
+    max_waiting: int = 1000
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -77,6 +80,7 @@ class OdometryOptions:
                 "min_inliers": (6, np.inf),
                 "window": (2, np.inf),
                 "anchors": (2, np.inf),
+                "max_waiting": (2, np.inf),
             },
         )
 
@@ -95,7 +99,8 @@ class VisualOdometry:
     """Estimates the path of a camera, frame by frame.
 
     Its world is the camera of the first frame with a pose; its unit is the distance between the two
-    frames that made the first points.
+    frames that made the first points. What is kept of frames and keyframes that the adjustment no
+    longer reaches are their poses: less than a kilobyte each.
 
     Args:
         camera: of all frames, without distortion.
@@ -116,10 +121,10 @@ class VisualOdometry:
         self.options = options
         self.lost: int | None = None
         self._waiting: list[TrackedFrame] = []
+        self._waited = 0
         self._keyframes: list[Keyframe] = []
         self._placed: list[_Placed] = []
-        self._points = np.full((0, 3), np.nan)
-        self._strikes = np.zeros(0, np.int64)
+        self._map = MapPoints()
         self._pose = np.eye(3), np.zeros(3)
         self._motion = np.eye(3), np.zeros(3)
 
@@ -135,23 +140,22 @@ class VisualOdometry:
         """
         if self.lost is not None:
             return False
-        most = int(frame.tracks.max(initial=-1)) + 1
-        if most > len(self._points):
-            missing = most - len(self._points)
-            self._points = np.concatenate([self._points, np.full((missing, 3), np.nan)])
-            self._strikes = np.append(self._strikes, np.zeros(missing, np.int64))
         if not self._keyframes:
             self._waiting.append(frame)
+            del self._waiting[1 : -self.options.max_waiting + 1]
+            self._waited += 1
             return self._begin()
+        self._map.add(frame.tracks)
         if self._place(frame):
+            self._forget(frame)
             return True
         self.lost = frame.number
         return False
 
     @property
     def points(self) -> np.ndarray:
-        """(P, 3) float64 points of the map."""
-        return self._points[np.isfinite(self._points).all(axis=1)]
+        """(P, 3) float64 points of the map: those that the last keyframes see."""
+        return self._map.xyz[self._map.known()]
 
     def trajectory(self) -> Trajectory:
         """Return all poses, as they are after the last adjustment."""
@@ -175,7 +179,7 @@ class VisualOdometry:
         rows0, rows1 = common_rows(first, last)
         if len(rows0) < options.min_inliers:
             if len(self._waiting) > 1:  # too much has changed: begin here
-                self._waiting = [last]
+                self._waiting, self._waited = [last], 1
             return False
         xy0, xy1 = (
             np.asarray(frame.xy[rows], np.float64)
@@ -195,7 +199,8 @@ class VisualOdometry:
         )
         if np.count_nonzero(good) < options.min_inliers:
             return False
-        self._points[first.tracks[rows0[good]]] = found.points[good]
+        self._map.add(np.union1d(first.tracks, last.tracks))
+        self._map.xyz[self._map.rows(first.tracks[rows0[good]])] = found.points[good]
         self._add_keyframe(first, np.eye(3), np.zeros(3))
         self._add_keyframe(last, pose.rotation, pose.translation)
         self._adjust()
@@ -207,7 +212,7 @@ class VisualOdometry:
                 self._placed.append(_Placed(frame.number, 0, rotation, translation))
         self._placed.append(_Placed(last.number, 1, np.eye(3), np.zeros(3)))
         self._pose = self._keyframes[1].rotation, self._keyframes[1].translation
-        share = 1 / (len(self._waiting) - 1)
+        share = 1 / (self._waited - 1)
         turn = cv2.Rodrigues(cv2.Rodrigues(self._pose[0])[0] * share)[0]
         self._motion = turn, self._pose[1] * share
         self._waiting = []
@@ -222,9 +227,9 @@ class VisualOdometry:
         if solved is None:
             return False
         rotation, translation, outliers = solved
-        self._strikes[frame.tracks[outliers]] += 1
-        gone = frame.tracks[self._strikes[frame.tracks] >= options.max_strikes]
-        self._points[gone] = np.nan
+        rows = self._map.rows(frame.tracks)
+        self._map.strikes[rows[outliers]] += 1
+        self._map.xyz[rows[self._map.strikes[rows] >= options.max_strikes]] = np.nan
         turn = rotation @ self._pose[0].T
         self._motion = turn, translation - turn @ self._pose[1]
         self._pose = rotation, translation
@@ -233,7 +238,7 @@ class VisualOdometry:
             last.tracks, frame.tracks, assume_unique=True, return_indices=True
         )[1:]
         motion = np.linalg.norm(last.xy[rows0] - frame.xy[rows1], axis=1)
-        known = np.isfinite(self._points[last.tracks]).all(axis=1)
+        known = np.isfinite(self._map.at(last.tracks)).all(axis=1)
         kept = np.count_nonzero(known[rows0]) / max(1, int(np.count_nonzero(known)))
         if kept >= options.min_tracked and np.median(motion) < options.min_motion_px:
             turn = rotation @ last.rotation.T
@@ -252,10 +257,11 @@ class VisualOdometry:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Return a frame's pose and the rows of its tracks that do not agree, or None."""
         options = self.options
-        rows = np.flatnonzero(np.isfinite(self._points[frame.tracks]).all(axis=1))
+        points = self._map.at(frame.tracks)
+        rows = np.flatnonzero(np.isfinite(points).all(axis=1))
         if len(rows) < options.min_inliers:
             return None
-        points = self._points[frame.tracks[rows]]
+        points = points[rows]
         xy = np.asarray(frame.xy[rows], np.float64)
         done, turn, move, inliers = cv2.solvePnPRansac(
             points,
@@ -301,7 +307,7 @@ class VisualOdometry:
 
     def _check(self, keyframe: Keyframe) -> None:
         """Trust the observations that agree with their points, and those without points."""
-        points = self._points[keyframe.tracks]
+        points = self._map.at(keyframe.tracks)
         errors = keyframe.reprojection_errors(self.camera, points)
         unknown = ~np.isfinite(points).all(axis=1)
         keyframe.used = unknown | (errors < self.options.max_error_px)
@@ -310,8 +316,9 @@ class VisualOdometry:
         """Add points for the tracks of the last keyframe, from the keyframe where they began."""
         options = self.options
         last = self._keyframes[-1]
-        unknown = ~np.isfinite(self._points[last.tracks]).all(axis=1)
-        left = last.tracks[unknown & (self._strikes[last.tracks] < options.max_strikes)]
+        rows = self._map.rows(last.tracks)
+        unknown = ~self._map.known()[rows]
+        left = last.tracks[unknown & (self._map.strikes[rows] < options.max_strikes)]
         both = Calibration(self.camera, self.camera)
         for keyframe in self._keyframes[-options.window : -1]:
             tracks, rows0 = np.intersect1d(
@@ -329,7 +336,7 @@ class VisualOdometry:
                 & (found.reprojection_errors < options.max_error_px / 2)
             )
             points = (found.points[good] - keyframe.translation) @ keyframe.rotation
-            self._points[tracks[good]] = points
+            self._map.xyz[self._map.rows(tracks[good])] = points
             left = np.setdiff1d(left, tracks)
         for keyframe in self._keyframes[-options.window :]:
             self._check(keyframe)
@@ -345,7 +352,7 @@ class VisualOdometry:
         adjust_keyframes(
             self.camera,
             window,
-            self._points,
+            self._map,
             fixed,
             options.robust_scale_px,
             options.max_iterations,
@@ -354,17 +361,25 @@ class VisualOdometry:
             self._rescale(window, scale / _distance(*first))
         for keyframe in window:
             self._check(keyframe)
-        seen = np.zeros(len(self._points), np.int64)
+        seen = np.zeros(len(self._map.tracks), np.int64)
         for keyframe in window:
-            seen[keyframe.tracks[keyframe.used]] += 1
-        recent = np.unique(np.concatenate([keyframe.tracks for keyframe in window]))
-        self._points[recent[seen[recent] < 2]] = np.nan
+            seen[self._map.rows(keyframe.tracks[keyframe.used])] += 1
+        recent = self._map.rows(np.unique(np.concatenate([each.tracks for each in window])))
+        self._map.xyz[recent[seen[recent] < 2]] = np.nan
+
+    def _forget(self, frame: TrackedFrame) -> None:
+        """Let go of what neither the last keyframes see nor the last frame."""
+        reach = self.options.window + self.options.anchors
+        for keyframe in self._keyframes[-reach - 1 : -reach]:
+            keyframe.forget_observations()
+        seen = [frame.tracks, *(keyframe.tracks for keyframe in self._keyframes[-reach:])]
+        self._map.keep(np.unique(np.concatenate(seen)))
 
     def _rescale(self, keyframes: list[Keyframe], factor: float) -> None:
         """Give all keyframes and points another scale; the first keyframe is the origin."""
         for keyframe in keyframes:
             keyframe.translation = keyframe.translation * factor
-        self._points *= factor
+        self._map.xyz *= factor
 
 
 def _distance(first: Keyframe, second: Keyframe) -> float:
