@@ -87,8 +87,10 @@ class MapPoints:
     def at(self, tracks: np.ndarray) -> np.ndarray:
         """Return (N, 3) points of tracks, NaN where there is none."""
         points = np.full((len(tracks), 3), np.nan)
-        known = np.isin(tracks, self.tracks, assume_unique=True)
-        points[known] = self.xyz[self.rows(tracks[known])]
+        if len(self.tracks):
+            rows = self.rows(tracks).clip(max=len(self.tracks) - 1)
+            known = self.tracks[rows] == tracks
+            points[known] = self.xyz[rows[known]]
         return points
 
     def known(self) -> np.ndarray:
