@@ -10,6 +10,7 @@ keyframes. The truth is used for one number, the scale, and to measure the error
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import time
 from collections.abc import Callable
@@ -17,7 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from deepdetect import Camera, DeepDetect, Keypoints, load_image
+from deepdetect import (
+    Camera,
+    DeepDetect,
+    DeepDetectError,
+    Keypoints,
+    MissingExtraError,
+    load_image,
+)
 from deepdetect.evaluation.metrics.trajectory import TrajectoryErrors, trajectory_errors
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift import described_at_own_size, to_root_sift
@@ -71,7 +79,7 @@ def by_matching(detect: Callable[[np.ndarray], Keypoints], matcher: str, ratio: 
         first = before["next"] if before else 0
         tracks[born] = first + np.arange(np.count_nonzero(born))
         before.update(
-            descriptors=found.descriptors, tracks=tracks, next=max(first, tracks.max() + 1)
+            descriptors=found.descriptors, tracks=tracks, next=tracks.max(initial=first - 1) + 1
         )
         order = np.argsort(tracks)
         return TrackedFrame(
@@ -96,6 +104,8 @@ def methods(count: int) -> dict[str, Callable[[], Update]]:
             if not describe:
                 return Keypoints.from_opencv(feature.detect(gray, None), size)
             points, descriptors = feature.detectAndCompute(gray, None)
+            if descriptors is None:  # there are no points
+                descriptors = np.zeros((0, feature.descriptorSize()), np.uint8)
             if feature.defaultNorm() == cv2.NORM_L2:
                 descriptors = to_root_sift(descriptors.astype(np.uint8))
             found = Keypoints.from_opencv(points, size)
@@ -129,11 +139,48 @@ def run(update: Update, paths: list[Path], camera: Camera) -> tuple[VisualOdomet
 
 
 def read_camera(folder: Path) -> Camera:
-    """Read the first camera of KITTI's calib.txt."""
-    lines = (folder / "calib.txt").read_text(encoding="ascii").split("\n")
-    matrix = np.array(lines[0].split(":")[-1].split(), float).reshape(3, 4)
+    """Read the first camera of KITTI's calib.txt.
+
+    Raises:
+        DeepDetectError: the file is missing or is another, or a frame cannot be read.
+    """
+    file = folder / "calib.txt"
+    try:
+        line = file.read_text(encoding="ascii").partition("\n")[0]
+        matrix = np.array(line.split(":")[-1].split(), float).reshape(3, 4)
+    except FileNotFoundError:
+        raise DeepDetectError(
+            f"there is no file {file}: give a folder with frames, calib.txt and poses.txt as KITTI "
+            "has them"
+        ) from None
+    except (OSError, ValueError):
+        raise DeepDetectError(
+            f"the first line of {file} must be twelve numbers, the projection matrix of the camera"
+        ) from None
     height, width = load_image(find_images(folder)[0]).shape[:2]
     return Camera((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
+
+
+def read_sequence(
+    folder: Path, first: int, count: int | None
+) -> tuple[list[Path], Camera, Trajectory]:
+    """Return frames, their camera, and the true path, which begins with frame 0.
+
+    Raises:
+        DeepDetectError: a file is missing, or there are fewer than two frames.
+    """
+    last = None if count is None else first + count
+    paths = find_images(folder)[first:last]
+    camera, truth = read_camera(folder), load_poses(folder / "poses.txt")
+    if first < 0 or len(paths) < 2:
+        raise DeepDetectError(f"there are not two frames from number {first} on: give others")
+    if len(truth) < first + len(paths):
+        raise DeepDetectError(
+            f"{folder / 'poses.txt'} has {len(truth)} lines, too few for frame "
+            f"{first + len(paths) - 1}: give a line for each frame, or fewer --frames"
+        )
+    truth = truth.at(np.arange(first, first + len(paths)))
+    return paths, camera, Trajectory(np.arange(len(paths)), truth.rotations, truth.centres)
 
 
 def measure(found: Trajectory, truth: Trajectory) -> TrajectoryErrors:
@@ -144,12 +191,10 @@ def measure(found: Trajectory, truth: Trajectory) -> TrajectoryErrors:
 
 def plot(paths: dict[str, np.ndarray], truth: np.ndarray, file: Path) -> None:
     """Draw trajectories from above and from the side against the truth."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True, layout="constrained")
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots(2, 1, sharex=True)
     for axis, row, label in zip(axes, (0, 1), ("right, m", "down, m"), strict=True):
         axis.plot(truth[:, 2], truth[:, row], "k--", label="truth")
         for name, centres in paths.items():
@@ -159,11 +204,10 @@ def plot(paths: dict[str, np.ndarray], truth: np.ndarray, file: Path) -> None:
     axes[0].legend()
     axes[1].set_xlabel("forward, m (other scale than across)")
     figure.savefig(file, dpi=110)
-    plt.close(figure)
 
 
 def main() -> None:
-    """Run all methods, print a table, and write poses and the plot."""
+    """Read the words of the command line; what is wrong ends it with a sentence."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("odometry"))
@@ -172,11 +216,19 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="how many  [default: all]")
     parser.add_argument("--methods", nargs="+", choices=NAMES, help="some of them")
     arguments = parser.parse_args()
-    last = None if arguments.frames is None else arguments.first + arguments.frames
-    paths = find_images(arguments.folder)[arguments.first : last]
-    camera, truth = read_camera(arguments.folder), load_poses(arguments.folder / "poses.txt")
-    truth = truth.at(np.arange(len(truth))[arguments.first : last])
-    truth = Trajectory(np.arange(len(truth)), truth.rotations, truth.centres)
+    try:
+        compare(arguments)
+    except DeepDetectError as error:
+        parser.exit(2, f"{parser.prog}: {error}\n")
+    except OSError as error:
+        parser.exit(2, f"{parser.prog}: cannot write {arguments.output} ({error.strerror})\n")
+
+
+def compare(arguments: argparse.Namespace) -> None:
+    """Run all methods, print a table, and write poses and the plot."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise MissingExtraError("the plot needs matplotlib: pip install matplotlib")
+    paths, camera, truth = read_sequence(arguments.folder, arguments.first, arguments.frames)
     arguments.output.mkdir(parents=True, exist_ok=True)
     numbers, shown = {}, {}
     print(f"{len(paths)} frames, {truth.length:.1f} m")
