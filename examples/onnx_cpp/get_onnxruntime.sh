@@ -6,8 +6,21 @@
 #
 #     get_onnxruntime.sh FOLDER PYTHON
 set -euo pipefail
+
+end() {
+    echo "get_onnxruntime.sh: $1" >&2
+    exit 2
+}
+test $# -eq 2 || end "give a folder, and the Python that has onnxruntime"
+for program in apt-get dpkg-deb "$2"; do
+    command -v "$program" > /dev/null || end "there is no $program: unpack a release instead"
+done
 folder=$(realpath -m "$1")
 python=$2
+package=$("$python" -c 'import importlib.util as u
+print(*(spec.submodule_search_locations if (spec := u.find_spec("onnxruntime")) else ()))')
+test -n "$package" || end "$python has no package onnxruntime: $python -m pip install onnxruntime"
+library=$(find "$package/capi" -name 'libonnxruntime.so.*' | head -1)
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
@@ -22,7 +35,5 @@ dpkg-deb -x "$work"/libonnxruntime-dev_*.deb "$work/parts"
 rm -rf "$folder/include"
 mv "$work/parts/usr/include/onnxruntime" "$folder/include"
 
-capi=$("$python" -c 'import importlib.util as u; print(u.find_spec("onnxruntime").submodule_search_locations[0])')/capi
-library=$(find "$capi" -name 'libonnxruntime.so.*' | head -1)
 ln -sf "$library" "$folder/lib/libonnxruntime.so"
 ln -sf "$library" "$folder/lib/libonnxruntime.so.1"

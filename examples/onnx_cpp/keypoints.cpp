@@ -2,10 +2,9 @@
 // prints "x y probability" of each pixel over the threshold (0.5 unless given).
 #include <onnxruntime_cxx_api.h>
 
-#include <cstdint>
+#include <algorithm>
 #include <cstdio>
 #include <cstdlib>
-#include <exception>
 #include <fstream>
 #include <stdexcept>
 #include <string>
@@ -22,8 +21,9 @@ Image read_ppm(const char* path) {
     std::string kind;
     Image image;
     int largest = 0;
-    if (!(file >> kind >> image.width >> image.height >> largest) || kind != "P6" || largest != 255)
-        throw std::runtime_error(std::string(path) + " is no binary PPM file of 8 bits");
+    if (!(file >> kind >> image.width >> image.height >> largest) || kind != "P6" || largest != 255 ||
+        std::min(image.width, image.height) < 1 || std::max(image.width, image.height) > 99999)
+        throw std::runtime_error(std::string(path) + " is missing, or no binary PPM of 8 bits");
     file.get();
     image.rgb.resize(3 * image.width * image.height);
     if (!file.read(reinterpret_cast<char*>(image.rgb.data()), image.rgb.size()))
@@ -32,8 +32,10 @@ Image read_ppm(const char* path) {
 }
 
 int main(int count, char** words) try {
-    if (count < 3) throw std::runtime_error("usage: keypoints MODEL.onnx PHOTO.ppm [PROBABILITY]");
-    const float threshold = count > 3 ? std::atof(words[3]) : 0.5f;
+    char* end = nullptr;
+    const float threshold = count > 3 ? std::strtof(words[3], &end) : 0.5f;
+    if (count < 3 || (end && (end == words[3] || *end)))
+        throw std::runtime_error("usage: keypoints MODEL.onnx PHOTO.ppm [PROBABILITY]");
     const Image image = read_ppm(words[2]);
     const int64_t pixels = image.width * image.height;
     std::vector<float> planes(3 * pixels);  // RGB from 0 to 1, one channel after the other

@@ -5,10 +5,15 @@ import * as ort from "onnxruntime-web";
 import { PNG } from "pngjs";
 
 const [model, photo, threshold = "0.5"] = process.argv.slice(2);
-if (!photo) {
-  console.error("usage: node keypoints.mjs MODEL.onnx PHOTO.png [PROBABILITY]");
+const end = (sentence) => {
+  console.error(sentence);
   process.exit(2);
+};
+if (!photo || !(Number(threshold) >= 0)) {
+  end("usage: node keypoints.mjs MODEL.onnx PHOTO.png [PROBABILITY]");
 }
+// A file that is missing or is another.
+process.on("uncaughtException", (error) => end(`keypoints: ${error.message.split("\n")[0]}`));
 ort.env.wasm.numThreads = 1;
 
 // In a page: fetch the model, and take width, height and data (RGBA) from a canvas's getImageData.

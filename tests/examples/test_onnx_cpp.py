@@ -14,6 +14,7 @@ from PIL import Image
 
 from deepdetect import DeepDetect
 from deepdetect.detector.pretrained import pretrained_weights
+from tests.cli.conftest import one_sentence
 
 FOLDER = Path(__file__).parents[2] / "examples/onnx_cpp"
 
@@ -52,12 +53,72 @@ def test_the_keypoints_are_those_of_the_package(
 
 
 @pytest.mark.slow
-def test_a_wrong_file_is_one_sentence(program: Path, tmp_path: Path) -> None:
-    (tmp_path / "photo.ppm").write_bytes(b"P6 4 4 255\nshort")
-    words = [str(program), str(pretrained_weights()), str(tmp_path / "photo.ppm")]
-    ended = subprocess.run(words, capture_output=True, text=True)
+@pytest.mark.parametrize(
+    ("content", "words", "message"),
+    [
+        (b"P6 4 4 255\nshort", [], "photo.ppm is cut off"),
+        (b"P6 -4 4 255\n", [], "photo.ppm is missing, or no binary PPM of 8 bits"),
+        (None, [], "photo.ppm is missing, or no binary PPM of 8 bits"),
+        (b"P6 4 4 255\n" + bytes(48), ["half"], "usage: keypoints MODEL.onnx PHOTO.ppm"),
+        (b"P6 4 4 255\n" + bytes(48), ["0.5", "none.onnx"], "none.onnx"),
+    ],
+)
+def test_a_mistake_is_one_sentence(
+    program: Path, content: bytes | None, words: list[str], message: str, tmp_path: Path
+) -> None:
+    if content is not None:
+        (tmp_path / "photo.ppm").write_bytes(content)
+    model = words.pop() if len(words) > 1 else str(pretrained_weights())
+    command = [str(program), model, str(tmp_path / "photo.ppm"), *words]
+    ended = subprocess.run(command, capture_output=True, text=True)
     assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr.endswith("photo.ppm is cut off\n")
+    assert message in ended.stderr
+    assert one_sentence(ended.stderr)
+
+
+def test_a_missing_library_is_named_before_the_compiler_starts(tmp_path: Path) -> None:
+    if shutil.which("make") is None:
+        pytest.skip("needs make")
+    words = ["make", "-C", str(FOLDER), "ONNXRUNTIME=none", f"BUILD={tmp_path / 'build'}"]
+    ended = subprocess.run(words, capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert "there is no ONNX Runtime in none: name the folder" in ended.stderr
+    assert not (tmp_path / "build").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "give a folder, and the Python"),
+        (["folder"], "give a folder, and the Python"),
+        (["folder", "no-such-python"], "there is no"),
+        (["folder", "{without}"], "has no package onnxruntime"),
+    ],
+)
+def test_what_the_script_lacks_is_one_sentence(
+    words: list[str], message: str, tmp_path: Path
+) -> None:
+    if shutil.which("bash") is None:
+        pytest.skip("needs bash")
+    without = tmp_path / "python"
+    without.write_text("#!/bin/sh\n")  # prints nothing: it does not find the package
+    without.chmod(0o755)
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    for name in ("apt-get", "dpkg-deb"):
+        (tools / name).write_text("#!/bin/sh\nexit 9\n")
+        (tools / name).chmod(0o755)
+    ended = subprocess.run(
+        ["bash", str(FOLDER / "get_onnxruntime.sh"), *(w.format(without=without) for w in words)],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PATH": f"{tools}:{os.environ['PATH']}"},
+    )
+    assert ended.returncode == 2
+    assert message in ended.stderr
+    assert one_sentence(ended.stderr)
+    assert not (tmp_path / "folder").exists()
 
 
 def test_the_example_is_short() -> None:

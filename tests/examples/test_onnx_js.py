@@ -12,6 +12,7 @@ from PIL import Image
 
 from deepdetect import DeepDetect
 from deepdetect.detector.pretrained import pretrained_weights
+from tests.cli.conftest import one_sentence
 
 FOLDER = Path(__file__).parents[2] / "examples/onnx_js"
 NO_NETWORK = ("ENOTFOUND", "EAI_AGAIN", "ECONNREFUSED", "ETIMEDOUT", "ENETUNREACH")
@@ -78,6 +79,35 @@ writeFileSync(made, new Uint8Array((await session.run({ image })).logits.data.bu
     detector = DeepDetect(backend="onnxruntime")
     for logits, rgb in zip(found, two, strict=True):
         np.testing.assert_allclose(logits, detector.heatmap_and_logits(rgb)[1], atol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("model", "photo", "words", "message"),
+    [
+        ("", "none.png", [], "none.png"),
+        ("", "text.png", [], "keypoints: "),
+        ("none.onnx", "photo.png", [], "none.onnx"),
+        ("text.png", "photo.png", [], "keypoints: "),
+        ("", "photo.png", ["half"], "usage: node keypoints.mjs"),
+    ],
+)
+def test_a_mistake_is_one_sentence(
+    model: str,
+    photo: str,
+    words: list[str],
+    message: str,
+    installed: Path,
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "text.png").write_text("I am neither a picture nor a network")
+    Image.new("RGB", (16, 16)).save(tmp_path / "photo.png")
+    given = [tmp_path / model if model else pretrained_weights(), tmp_path / photo, *words]
+    command = ["node", "keypoints.mjs", *map(str, given)]
+    ended = subprocess.run(command, cwd=installed, capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert message in ended.stderr
+    assert one_sentence(ended.stderr)
 
 
 def test_the_example_is_short_and_pinned() -> None:

@@ -32,7 +32,7 @@ from deepdetect.training.checkpoint import read_checkpoint  # noqa: E402
 from deepdetect.training.learner import Learner  # noqa: E402
 from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions  # noqa: E402
 from deepdetect.training.run import train  # noqa: E402
-from deepdetect.training.trainer import TrainingResult  # noqa: E402
+from deepdetect.training.trainer import TrainingResult, _initial_network  # noqa: E402
 
 PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1, checkpoint_interval_s=0)
 OPTIONS = TrainingOptions(
@@ -308,6 +308,18 @@ def test_random_weights_are_not_kept(name: str, photographs: Path, tmp_path: Pat
     with pytest.raises(OptionError, match=f"`{name}` .* `init_weights`"):
         train(photographs, tmp_path / "run", options, device=PLAIN)
     assert not (tmp_path / "run").exists()
+
+
+def test_the_caller_keeps_its_random_numbers() -> None:
+    """Random weights are those of the seed, as `torch.manual_seed` would make them."""
+    torch.manual_seed(3)
+    expected = torch.rand(4)
+    torch.manual_seed(3)
+    network = _initial_network(TrainingOptions(seed=5), None)[1]
+    assert torch.equal(torch.rand(4), expected)
+    torch.manual_seed(5)
+    for one, other in zip(network.parameters(), ESPNet().parameters(), strict=True):
+        assert torch.equal(one, other)
 
 
 def test_missing_weights_to_start_from_are_refused_before_any_work(

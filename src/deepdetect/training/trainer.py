@@ -354,5 +354,6 @@ def _initial_network(
                 f"`{name}` would keep the {what} of random weights: "
                 "give trained ones as `init_weights`, or leave it out"
             )
-    torch.manual_seed(options.seed)
-    return dataclasses.replace(options, frozen_batch_norm=False), ESPNet()
+    with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
+        torch.default_generator.manual_seed(options.seed)
+        return dataclasses.replace(options, frozen_batch_norm=False), ESPNet()

@@ -164,7 +164,6 @@ def estimate_pose(
     camera = np.diag([focal, focal, 1.0])
     first = _of_camera(points0, intrinsics0, camera)
     second = _of_camera(points1, intrinsics1, camera)
-    cv2.setRNGSeed(0)
     try:
         essential, inliers = cv2.findEssentialMat(
             first,

@@ -134,8 +134,10 @@ class PointsTrainer:
             )
         self.files = find_images(photos)
         self.pairs = validation_pairs(validation, pairs_per_kind)
-        torch.manual_seed(options.seed)
-        self.ranker = RankerModule(*self._statistics(), options.hidden)
+        statistics = self._statistics()
+        with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
+            torch.default_generator.manual_seed(options.seed)
+            self.ranker = RankerModule(*statistics, options.hidden)
         self.average = copy.deepcopy(self.ranker).requires_grad_(False)
         self.both = torch.nn.ModuleDict({"ranker": self.ranker, "average": self.average})
         self.optimizer = torch.optim.AdamW(
