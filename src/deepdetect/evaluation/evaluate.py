@@ -19,11 +19,11 @@ from ..detector.heatmap import HeatmapOptions
 from ..features.selection import SelectionOptions
 from ..io.image import find_images, load_image
 from .baselines.method import heatmap_feature
-from .benchmarks import select_pairs
 from .context import BenchmarkContext
 from .metrics.calibration import Calibration
 from .metrics.masks import MaskScore
 from .options import PAPER_RESOLUTION_PX, THRESHOLDS
+from .planar_benchmarks import select_pairs
 from .protocols.masks import (
     ScaleScore,
     check_scales,

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from deepdetect.evaluation.planar_benchmarks import plan_oxford
 
 from deepdetect import DeepDetect, OptionError
 from deepdetect.datasets.degradation import DEGRADATIONS, degrade
@@ -14,7 +15,6 @@ from deepdetect.datasets.low_visibility import load_low_visibility
 from deepdetect.datasets.types import PlanarPair
 from deepdetect.evaluation.baselines.method import with_common_descriptor
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
-from deepdetect.evaluation.benchmarks import plan_oxford
 from deepdetect.evaluation.cache import StageCache
 from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.metrics import repeatability

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from deepdetect.evaluation.planar_benchmarks import select_pairs
 
 from deepdetect import DeepDetect
 from deepdetect.datasets.middlebury import load_calibrated_pair
@@ -19,7 +20,6 @@ from deepdetect.evaluation.baselines.opencv import (
     self_described,
     with_kd_trees,
 )
-from deepdetect.evaluation.benchmarks import select_pairs
 from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.profiling import StageProfiler

@@ -29,7 +29,7 @@ from deepdetect.evaluation.protocols.sfm import (
     photograph_table,
     sfm_methods,
 )
-from deepdetect.evaluation.protocols.sfm_methods import SfmModel, SfmResult
+from deepdetect.evaluation.protocols.sfm_results import SfmModel, SfmResult
 from deepdetect.evaluation.report import Table
 from deepdetect.evaluation.runner import run_benchmarks
 from deepdetect.geometry.posed_view import PosedView

@@ -14,7 +14,7 @@ from deepdetect.geometry import epipolar_errors, transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.initial_geometry import find_initial_geometry
 from deepdetect.matching.guided.options import RectifiedMatchingOptions
-from deepdetect.matching.guided.rectified import _correlation_bounds, match_by_rectification
+from deepdetect.matching.guided.rectified import match_by_rectification
 
 TURNED = cv2.getRotationMatrix2D((225, 190), 30, 1.0)
 
@@ -83,18 +83,6 @@ def test_low_correlation_is_kept_where_little_is_found_by_chance(cones) -> None:
     assert set(strict.rows0) < set(lenient.rows0)
     assert len(lenient) > 1.05 * len(strict)
     assert within(lenient, xy0, cones, np.eye(2, 3)) > 0.97
-
-
-def test_bounds_of_correlation_follow_what_is_found_by_chance() -> None:
-    options = RectifiedMatchingOptions()
-    matches = np.linspace(-1, 1, 1000)
-    none, some = np.empty(0), np.full(5, 0.1)
-    assert _correlation_bounds(matches, none, 100, 2000, options) == (options.min_correlation, -1)
-    # Five in 100 pixels are 100 in 2000: all bounds up to theirs let too many pass.
-    assert _correlation_bounds(matches, some, 100, 2000, options) == (options.min_correlation,) * 2
-    assert _correlation_bounds(matches, some, 0, 2000, options) == (options.min_correlation,) * 2
-    many = np.full(5, 0.8)
-    assert _correlation_bounds(matches, many, 100, 2000, options) == (0.8, 0.8)
 
 
 def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(cones) -> None:

@@ -35,17 +35,14 @@ from ..tasks import Part, SectionPlan, Shown, Task
 from .sfm_methods import (
     OPTIONS,
     SfmMethod,
-    SfmModel,
-    SfmResult,
     SfmTask,
     find_points,
     find_random_points,
     find_sift,
     match_sift,
-    pack_result,
     run_method,
-    unpack_result,
 )
+from .sfm_results import SfmModel, SfmResult, pack_result, unpack_result
 
 MIN_PHOTOGRAPHS = 3
 

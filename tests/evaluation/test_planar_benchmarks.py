@@ -11,16 +11,16 @@ from deepdetect import DeepDetect
 from deepdetect.datasets.hpatches import in_d2net_subset
 from deepdetect.datasets.pair_selection import PairSelectionOptions
 from deepdetect.datasets.types import PlanarScene
-from deepdetect.evaluation import benchmarks
-from deepdetect.evaluation.benchmarks import (
+from deepdetect.evaluation import planar_benchmarks
+from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.options import BenchmarkOptions
+from deepdetect.evaluation.planar_benchmarks import (
     _table_3,
     hpatches_subsets,
     plan_hpatches,
     plan_oxford,
     select_pairs,
 )
-from deepdetect.evaluation.context import BenchmarkContext
-from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.report import Column, Table
 
 LARGE = (
@@ -54,7 +54,7 @@ def test_the_d2_net_subset_has_108_scenes(every: list[PlanarScene]) -> None:
 def test_both_sets_are_labelled_sections(
     every: list[PlanarScene], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(benchmarks, "load_hpatches", lambda folder: every)
+    monkeypatch.setattr(planar_benchmarks, "load_hpatches", lambda folder: every)
     options = BenchmarkOptions(DeepDetect(), ("standard",), ())
     plans = plan_hpatches(BenchmarkContext(tmp_path), options)
     assert [plan.title for plan in plans] == [
@@ -90,7 +90,9 @@ def test_table_3_averages_by_kind_of_scene_and_says_how_many() -> None:
 def test_a_small_oxford_is_measured_and_what_it_lacks_is_said(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(benchmarks, "load_oxford", lambda *_: [scene("graf"), scene("leuven")])
+    monkeypatch.setattr(
+        planar_benchmarks, "load_oxford", lambda *_: [scene("graf"), scene("leuven")]
+    )
     for name in ("graf", "leuven"):
         (tmp_path / name).mkdir()
         for number in range(2, 7):
