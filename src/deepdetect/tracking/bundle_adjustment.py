@@ -95,7 +95,7 @@ class MapPoints:
 
     def known(self) -> np.ndarray:
         """Return which rows have a point, (T,) bool."""
-        return np.isfinite(self.xyz).all(axis=1)
+        return np.asarray(np.isfinite(self.xyz).all(axis=1))
 
     def add(self, tracks: np.ndarray) -> None:
         """Add tracks without a point; those that are there stay as they are."""
