@@ -3,6 +3,7 @@ import { createHash } from "node:crypto";
 import { cpSync, mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
 import { dirname, join, relative } from "node:path";
 import { fileURLToPath } from "node:url";
+import { gzipSync } from "node:zlib";
 
 const here = dirname(fileURLToPath(import.meta.url));
 const dist = join(here, "dist");
@@ -17,9 +18,17 @@ const WEBGPU_FILES = ["ort.webgpu.min.mjs", "ort-wasm-simd-threaded.asyncify.mjs
 rmSync(dist, { recursive: true, force: true });
 cpSync(join(packaged, "app/static"), dist, { recursive: true });
 mkdirSync(join(dist, "ort"));
-for (const name of [...RUNTIME_FILES, ...WEBGPU_FILES]) cpSync(join(runtime, name), join(dist, "ort", name));
+// Not every web server compresses WebAssembly, so the page unpacks it. Servers know no files of this
+// ending: they leave them as they are.
+const packedName = (name) => name.replace(/\.wasm$/, ".wasm.packed");
+for (const name of [...RUNTIME_FILES, ...WEBGPU_FILES]) {
+  const content = readFileSync(join(runtime, name));
+  writeFileSync(join(dist, "ort", packedName(name)),
+                name.endsWith(".wasm") ? gzipSync(content, { level: 9 }) : content);
+}
 mkdirSync(join(dist, "model"));
 cpSync(join(packaged, "detector/weights/default.onnx"), join(dist, "model/default.onnx"));
+cpSync(join(packaged, "detector/points/ranker.npz"), join(dist, "model/ranker.npz"));
 writeFileSync(join(dist, "config.json"),
               JSON.stringify({ engine: "browser", offline: true, webgpu: true }) + "\n");
 
@@ -27,7 +36,8 @@ const files = readdirSync(dist, { recursive: true, withFileTypes: true })
   .filter((entry) => entry.isFile())
   .map((entry) => relative(dist, join(entry.parentPath, entry.name)).replaceAll("\\", "/"))
   .sort();
-const kept = files.filter((name) => !WEBGPU_FILES.includes(name.replace("ort/", "")));
+const webgpu = WEBGPU_FILES.map((name) => `ort/${packedName(name)}`);
+const kept = files.filter((name) => !webgpu.includes(name));
 const digest = createHash("sha256");
 for (const name of kept) digest.update(name).update(readFileSync(join(dist, name)));
 const worker = readFileSync(join(here, "sw.js"), "utf-8")

@@ -25,6 +25,7 @@ from urllib.parse import SplitResult, parse_qs, urlsplit
 
 from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
+from ..detector.pretrained import RANKER
 from .jobs import Jobs
 from .options import AppOptions
 from .tasks import TASKS
@@ -128,6 +129,7 @@ class AppServer(ThreadingHTTPServer):
             for path in STATIC.rglob("*")
             if path.is_file()
         }
+        self.pages["/model/ranker.npz"] = RANKER  # where a build for other servers has it, too
 
     @property
     def address(self) -> str:

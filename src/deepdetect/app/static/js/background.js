@@ -1,4 +1,7 @@
-// A worker whose tasks are called as functions that return promises.
+// A worker whose tasks are called as functions that return promises, and the worker's end of it.
+
+/** What the page may say to the user, unlike errors of the program. */
+export class UserError extends Error {}
 
 export class Background {
   constructor(url) {
@@ -28,4 +31,21 @@ export class Background {
       this.worker.postMessage({ id, task, values }, transfer);
     });
   }
+}
+
+/**
+ * Answers calls, in a worker.
+ *
+ * @param {Object<string, (values: any) => any>} tasks
+ * @param {(reason: string) => string} explain the sentence for an error of the program
+ */
+export function answer(tasks, explain) {
+  self.onmessage = async ({ data: { id, task, values } }) => {
+    try {
+      self.postMessage({ id, result: await tasks[task](values) });
+    } catch (error) {
+      const said = error instanceof UserError ? error.message : explain(error.message);
+      self.postMessage({ id, error: said });
+    }
+  };
 }

@@ -1,45 +1,71 @@
-// Upright RootSIFT descriptors: 16x16 pixels in 4x4 cells of 8 directions (Lowe, 2004;
-// Arandjelovic and Zisserman, 2012).
+// RootSIFT descriptors: 4x4 cells of 8 directions (Lowe, 2004; Arandjelovic and Zisserman, 2012).
+import { SIZE_PER_SIGMA, firstLayer, layersOf } from "./scale_space.js";
 
 export const LENGTH = 128;
 const CELLS = 4;
 const DIRECTIONS = 8;
-const CELL_PX = 4;
-const REACH_PX = 10; // half the window, and half a cell for the interpolation between cells
-const BLUR_PX = (1.6 ** 2 - 0.5 ** 2) ** 0.5; // SIFT's first blur, of a picture that has 0.5 already
+const UPRIGHT_CELL_PX = 4;
+const CELL_PER_SIGMA = 3;
+const REACH = (CELLS + 1) / 2; // half the window, and half a cell for the interpolation, in cells
 const MAX_VALUE = 0.2;
 
-/** @param {Uint8Array} gray @param {Float32Array} xy @returns {Float32Array} rows of 128, length 1 */
+/** Describes upright keypoints of one size. @returns {Float32Array} rows of 128, length 1 */
 export function describe(gray, width, height, xy) {
-  const image = blur(gray, width, height, BLUR_PX);
+  const layer = { image: firstLayer(gray, width, height), width, height };
   const result = new Float32Array(xy.length / 2 * LENGTH);
   for (let k = 0; k < xy.length / 2; k++) {
-    const row = result.subarray(k * LENGTH, (k + 1) * LENGTH);
-    addGradients(row, image, width, height, xy[2 * k], xy[2 * k + 1]);
-    normalise(row);
+    const place = { x: xy[2 * k], y: xy[2 * k + 1], cell: UPRIGHT_CELL_PX, angle: 0 };
+    describeOne(result.subarray(k * LENGTH, (k + 1) * LENGTH), layer, place);
   }
   return result;
 }
 
-function addGradients(row, image, width, height, x, y) {
+/**
+ * Describes keypoints at their own sizes and angles.
+ *
+ * @param {{xy: Float32Array, sizes: Float32Array, angles: Float32Array}} keypoints angles in degrees
+ * @returns {Float32Array} rows of 128, length 1
+ */
+export function describeAtOwnSize(gray, width, height, { xy, sizes, angles }) {
+  const result = new Float32Array(sizes.length * LENGTH);
+  for (const { rows, scale, ...layer } of layersOf(gray, width, height, sizes)) {
+    for (const k of rows) {
+      const place = { x: xy[2 * k] / scale, y: xy[2 * k + 1] / scale, angle: angles[k] * Math.PI / 180,
+                      cell: CELL_PER_SIGMA * sizes[k] / SIZE_PER_SIGMA / scale };
+      describeOne(result.subarray(k * LENGTH, (k + 1) * LENGTH), layer, place);
+    }
+  }
+  return result;
+}
+
+function describeOne(row, layer, place) {
+  addGradients(row, layer, place);
+  normalise(row);
+}
+
+function addGradients(row, { image, width, height }, { x, y, cell, angle }) {
+  const [cos, sin] = [Math.cos(angle) / cell, Math.sin(angle) / cell];
+  const turn = angle / (2 * Math.PI) * DIRECTIONS;
+  const reach = Math.ceil(REACH * cell * (Math.abs(cos) + Math.abs(sin)) * cell);
   const [column, line] = [Math.round(x), Math.round(y)];
-  for (let v = Math.max(1, line - REACH_PX); v <= Math.min(height - 2, line + REACH_PX); v++) {
-    for (let u = Math.max(1, column - REACH_PX); u <= Math.min(width - 2, column + REACH_PX); u++) {
+  for (let v = Math.max(1, line - reach); v <= Math.min(height - 2, line + reach); v++) {
+    for (let u = Math.max(1, column - reach); u <= Math.min(width - 2, column + reach); u++) {
       const at = v * width + u;
-      const [dx, dy] = [image[at + 1] - image[at - 1], image[at + width] - image[at - width]];
       // Cells are numbered from 0 to 3; a pixel counts for the four nearest to it.
-      const [cx, cy] = [(u - x) / CELL_PX + 1.5, (v - y) / CELL_PX + 1.5];
+      const cx = (u - x) * cos + (v - y) * sin + 1.5;
+      const cy = (v - y) * cos - (u - x) * sin + 1.5;
       if (cx <= -1 || cy <= -1 || cx >= CELLS || cy >= CELLS) continue;
+      const [dx, dy] = [image[at + 1] - image[at - 1], image[at + width] - image[at - width]];
       const distance = ((cx - 1.5) ** 2 + (cy - 1.5) ** 2) / (CELLS * CELLS / 2);
       const strength = Math.hypot(dx, dy) * Math.exp(-distance);
-      const direction = Math.atan2(dy, dx) / (2 * Math.PI) * DIRECTIONS + DIRECTIONS;
+      const direction = Math.atan2(dy, dx) / (2 * Math.PI) * DIRECTIONS - turn + 2 * DIRECTIONS;
       const [left, top, low] = [Math.floor(cx), Math.floor(cy), Math.floor(direction)];
       for (let j = 0; j < 2; j++) {
         for (let i = 0; i < 2; i++) {
-          const [cell, floor] = [left + i, top + j];
-          if (cell < 0 || floor < 0 || cell >= CELLS || floor >= CELLS) continue;
-          const share = strength * (1 - Math.abs(cx - cell)) * (1 - Math.abs(cy - floor));
-          const first = (floor * CELLS + cell) * DIRECTIONS;
+          const [across, down] = [left + i, top + j];
+          if (across < 0 || down < 0 || across >= CELLS || down >= CELLS) continue;
+          const share = strength * (1 - Math.abs(cx - across)) * (1 - Math.abs(cy - down));
+          const first = (down * CELLS + across) * DIRECTIONS;
           row[first + low % DIRECTIONS] += share * (low + 1 - direction);
           row[first + (low + 1) % DIRECTIONS] += share * (direction - low);
         }
@@ -55,30 +81,4 @@ function normalise(row) {
   let total = 0;
   for (let k = 0; k < LENGTH; k++) total += row[k] = Math.min(row[k], most);
   if (total > 0) for (let k = 0; k < LENGTH; k++) row[k] = Math.sqrt(row[k] / total);
-}
-
-/** Gaussian blur; at the border the picture is mirrored. */
-export function blur(gray, width, height, sigma) {
-  const radius = Math.ceil(3 * sigma);
-  const kernel = Float32Array.from({ length: 2 * radius + 1 },
-                                   (_, k) => Math.exp(-((k - radius) ** 2) / (2 * sigma ** 2)));
-  const total = kernel.reduce((sum, value) => sum + value);
-  const mirrored = (k, side) => {
-    if (side === 1) return 0;
-    while (k < 0 || k >= side) k = k < 0 ? -k : 2 * side - 2 - k;
-    return k;
-  };
-  const pass = (source, step, side, lines, lineStep) => {
-    const result = new Float32Array(source.length);
-    for (let k = 0; k < side; k++) {
-      const taps = Array.from(kernel, (_, j) => mirrored(k + j - radius, side) * step);
-      for (let line = 0; line < lines; line++) {
-        let sum = 0;
-        for (let j = 0; j < taps.length; j++) sum += kernel[j] * source[taps[j] + line * lineStep];
-        result[k * step + line * lineStep] = sum / total;
-      }
-    }
-    return result;
-  };
-  return pass(pass(gray, 1, width, height, width), width, height, width, 1);
 }

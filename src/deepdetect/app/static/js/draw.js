@@ -49,27 +49,40 @@ export function drawHeatMap(canvas, map) {
 }
 
 /**
+ * Marks pixels over a transparent canvas.
+ *
+ * @param {ArrayLike<number>} pixels numbered row by row
+ */
+export function drawPixels(canvas, picture, pixels) {
+  const context = resized(canvas, picture.width, picture.height);
+  const image = context.createImageData(picture.width, picture.height);
+  const words = new Uint32Array(image.data.buffer);
+  const mark = new Uint32Array(new Uint8Array([...MARK, 150]).buffer)[0];
+  for (let k = 0; k < pixels.length; k++) words[pixels[k]] = mark;
+  context.putImageData(image, 0, 0);
+}
+
+/**
  * Draws keypoints over a transparent canvas: circles when they are few, else pixels.
  *
- * @param {Float32Array | null} xy positions; without them the pixels are drawn
+ * @param {Float32Array} xy
+ * @param {(k: number) => number} radiusOf in pixels of the picture
  * @param {number} unit pixels of the picture that make one pixel of the screen
  */
-export function drawKeypoints(canvas, picture, pixels, xy, unit) {
-  const context = resized(canvas, picture.width, picture.height);
-  context.clearRect(0, 0, canvas.width, canvas.height);
-  if (xy === null || pixels.length > MAX_CIRCLES) {
-    const image = context.createImageData(picture.width, picture.height);
-    const words = new Uint32Array(image.data.buffer);
-    const mark = new Uint32Array(new Uint8Array([...MARK, 150]).buffer)[0];
-    for (let k = 0; k < pixels.length; k++) words[pixels[k]] = mark;
-    context.putImageData(image, 0, 0);
+export function drawCircles(canvas, picture, xy, radiusOf, unit) {
+  const count = xy.length / 2;
+  if (count > MAX_CIRCLES) {
+    const nearest = (k) => Math.round(xy[2 * k + 1]) * picture.width + Math.round(xy[2 * k]);
+    drawPixels(canvas, picture, Uint32Array.from({ length: count }, (_, k) => nearest(k)));
     return;
   }
+  const context = resized(canvas, picture.width, picture.height);
+  context.clearRect(0, 0, canvas.width, canvas.height);
   context.beginPath();
-  for (let k = 0; k < pixels.length; k++) {
+  for (let k = 0; k < count; k++) {
     const [x, y] = [xy[2 * k] + 0.5, xy[2 * k + 1] + 0.5]; // a canvas counts from the corner
-    context.moveTo(x + 3 * unit, y);
-    context.arc(x, y, 3 * unit, 0, 2 * Math.PI);
+    context.moveTo(x + radiusOf(k), y);
+    context.arc(x, y, radiusOf(k), 0, 2 * Math.PI);
   }
   context.lineWidth = 1.2 * unit;
   context.strokeStyle = `rgb(${MARK})`;

@@ -1,5 +1,5 @@
 // The page: where pictures come from, which view is shown, and what runs the network.
-import { Background } from "./background.js";
+import { isOpened, openNetwork, readPicture } from "./detection.js";
 import { canvasOf, newCanvas } from "./draw.js";
 import { activePicture, counted, during, element, page, showError } from "./page.js";
 import * as heatmap from "./views/heatmap.js";
@@ -10,19 +10,14 @@ import * as wipe from "./views/wipe.js";
 
 const MAX_PICTURES = 2;
 const VIEWS = {
-  keypoints: { show: keypoints.draw },
-  heatmap: { show: heatmap.draw },
+  keypoints: { show: keypoints.show },
+  heatmap: { show: heatmap.show },
   matches: { show: async () => { matches.draw(); await matches.match(); matches.draw(); } },
   wipe: { show: wipe.prepare },
   python: { show: python.show },
 };
 
-const background = new Background(new URL("picture_worker.js", import.meta.url));
-let opened = null; // a promise of what runs the network
 let current = "keypoints";
-
-/** How often the network was run: sliders must not change it. */
-let runs = 0;
 
 /** How often it was started over: what was being read before is not added any more. */
 let restarts = 0;
@@ -49,10 +44,8 @@ async function start() {
   if (alone && "serviceWorker" in navigator && config.offline) {
     navigator.serviceWorker.register("sw.js").catch(() => {}); // without it, only when online
   }
-  const open = (processor) => background.call(
-    "open", { engine: config.engine, token: page.token, processor });
-  opened = open("processor");
-  opened.then(sayWhere, (error) => showError(error.message));
+  const open = (processor) => openNetwork({ engine: config.engine, token: page.token, processor });
+  open("processor").then(sayWhere, (error) => showError(error.message));
   await showExamples();
   if (config.webgpu && await hasGraphics()) offerGraphics(() => open("graphics"));
 }
@@ -123,9 +116,9 @@ async function guarded(task) {
   }
 }
 
-/** Reads files and runs the network on them. */
+/** Reads files; what is found in them is asked for by the view. */
 async function addPictures(files) {
-  if (!opened) return;
+  if (!isOpened()) return;
   const room = MAX_PICTURES - page.pictures.length;
   if (files.length > room) {
     const advice = page.server ? " or use a folder under Python." : ".";
@@ -133,24 +126,21 @@ async function addPictures(files) {
                          : "There are two pictures already: remove one, or start over.");
   }
   const started = restarts;
-  await during("Loading the network…", opened);
   for (const file of files) {
-    if (restarts !== started) return;
-    const read = await during("Reading the picture…",
-                              background.call("read", { file, name: file.name }));
-    const canvas = canvasOf(read.rgba, read.width, read.height);
-    const { map, seconds } = await during("Finding keypoints…", background.call("run", read));
-    document.body.dataset.networkRuns = String(++runs);
+    const read = await readPicture(file);
     if (restarts !== started) return;
     if (page.pictures.length >= MAX_PICTURES) return; // of two that were given at once
-    page.pictures.push({ name: file.name, file, ...read, canvas, map, seconds });
+    page.pictures.push({ name: file.name, file, ...read,
+                         canvas: canvasOf(read.rgba, read.width, read.height) });
     if (file === files.at(-1)) break;
     page.active = page.pictures.length - 1;
-    showPictures();
+    listPictures();
+    keypoints.preview();
   }
   page.active = 0;
-  showPictures();
-  if (page.pictures.length === 2 && current === "keypoints") await showView("matches");
+  if (page.pictures.length === 2 && current === "keypoints") current = "matches";
+  listPictures();
+  await showView(current);
 }
 
 function removePicture(picture) {
@@ -166,8 +156,14 @@ function focusStart() {
   next.focus();
 }
 
-/** Shows the page for the pictures that are there. */
+/** Shows the view that is chosen, of the pictures that are there. */
 function showPictures() {
+  listPictures();
+  if (page.pictures.length) guarded(VIEWS[current].show);
+}
+
+/** Lists the pictures that are there, and forgets what belongs to others. */
+function listPictures() {
   const { pictures } = page;
   matches.reset();
   wipe.reset();
@@ -184,7 +180,6 @@ function showPictures() {
   }
   element("files").replaceChildren(...pictures.map(pictureItem));
   element("add").textContent = pictures.length ? "Add a second picture" : "Add pictures";
-  if (pictures.length) guarded(VIEWS[current].show);
 }
 
 function pictureItem(picture) {

@@ -1,15 +1,22 @@
 // Describes and matches keypoints of two pictures beside the page.
-import { describe } from "./descriptors.js";
+import { answer } from "./background.js";
+import { describe, describeAtOwnSize } from "./descriptors.js";
 import { mutualMatches } from "./matching.js";
 import { estimateGeometry, project } from "./geometry.js";
-import { luma } from "./pixels.js";
+import { dominantAngles } from "./orientation.js";
 
-const tasks = {
+/** Descriptors of keypoints: at their own sizes and angles where they have sizes, else upright. */
+function described({ gray, width, height, xy, sizes }) {
+  if (!sizes) return describe(gray, width, height, xy);
+  const angles = dominantAngles(gray, width, height, { xy, sizes });
+  return describeAtOwnSize(gray, width, height, { xy, sizes, angles });
+}
+
+answer({
   /** @returns mutual nearest neighbours with their ratios, as positions */
   match({ pictures }) {
-    const described = pictures.map(({ rgba, width, height, xy }) =>
-      describe(luma(rgba), width, height, xy));
-    const { rows0, rows1, ratios } = mutualMatches(described[0], described[1]);
+    const [first, second] = pictures.map(described);
+    const { rows0, rows1, ratios } = mutualMatches(first, second);
     const take = (xy, rows) => Float32Array.from({ length: 2 * rows.length },
                                                  (_, k) => xy[2 * rows[k >> 1] + (k & 1)]);
     return { points0: take(pictures[0].xy, rows0), points1: take(pictures[1].xy, rows1), ratios };
@@ -40,12 +47,4 @@ const tasks = {
     }
     return result;
   },
-};
-
-self.onmessage = ({ data: { id, task, values } }) => {
-  try {
-    self.postMessage({ id, result: tasks[task](values) });
-  } catch (error) {
-    self.postMessage({ id, error: `The pictures could not be matched (${error.message}).` });
-  }
-};
+}, (reason) => `The pictures could not be matched (${reason}).`);

@@ -8,7 +8,9 @@ export const element = (id) => document.getElementById(id);
  * @property {number} width @property {number} height as the network sees it
  * @property {{width: number, height: number}} original
  * @property {Uint8ClampedArray} rgba @property {HTMLCanvasElement} canvas
- * @property {import("./selection.js").HeatMap} map
+ * @property {import("./selection.js").HeatMap} [map] once the network was run (`findHeatMap`)
+ * @property {import("./points/ranking.js").Ranking & {gray: Uint8Array}} [ranking] once its points
+ *   were ranked (`findPoints`)
  */
 
 export const page = {
@@ -53,11 +55,15 @@ export async function during(text, promise) {
 export const counted = (number, word) =>
   `${number.toLocaleString("en")} ${word}${number === 1 ? "" : word.endsWith("ch") ? "es" : "s"}`;
 
+/** The same position in a picture of another size. */
+export const rescaled = (x, y, from, to) =>
+  [(x + 0.5) * to.width / from.width - 0.5, (y + 0.5) * to.height / from.height - 0.5];
+
 /** Positions in the photograph's own pixels, where the network saw it reduced. */
-export function toOriginal(picture, x, y) {
-  const { width, height, original } = picture;
-  return [(x + 0.5) * original.width / width - 0.5, (y + 0.5) * original.height / height - 0.5];
-}
+export const toOriginal = (picture, x, y) => rescaled(x, y, picture, picture.original);
+
+/** How much larger a picture is than another, on the average of both sides. */
+export const enlargement = (from, to) => (to.width / from.width + to.height / from.height) / 2;
 
 /** Runs a function at most once a frame, with the last state. */
 export function onceAFrame(draw) {

@@ -1,13 +1,10 @@
 // Reads pictures and runs the network, beside the page: by ONNX Runtime here, or by Python.
-import { MIN_SIDE, isConstant, networkSize, reduceByArea, toPlanes } from "./pixels.js";
+import { UserError, answer } from "./background.js";
+import { decode } from "./decoding.js";
+import { isConstant, networkSize, reduceByArea, toPlanes } from "./pixels.js";
 import { prepare } from "./selection.js";
 
-const MAX_FILE_MB = 100;
-const MAX_MEGAPIXELS = 100;
 const MAX_THREADS = 4;
-
-/** What the page may say to the user, unlike errors of the program. */
-class UserError extends Error {}
 
 let runNetwork = null;
 
@@ -20,54 +17,29 @@ const tasks = {
   },
 
   /** Decodes a file, upright, and reduces it to the size at which the network sees it. */
-  async read({ file, name }) {
-    if (file.size > MAX_FILE_MB * 1e6) {
-      throw new UserError(`${name} is over ${MAX_FILE_MB} MB: use a smaller picture.`);
-    }
-    let bitmap;
-    try {
-      bitmap = await createImageBitmap(file, { imageOrientation: "from-image",
-                                               colorSpaceConversion: "none" });
-    } catch {
-      throw new UserError(`${name} is not a picture that this browser can read: use JPEG or PNG.`);
-    }
-    try {
-      return pixelsOf(bitmap, name);
-    } finally {
-      bitmap.close();
-    }
+  read({ file, name }) {
+    return decode(file, name, ({ width, height }, readRows) => {
+      const [newWidth, newHeight] = networkSize(width, height);
+      const reduced = width !== newWidth || height !== newHeight;
+      const rgba = reduced ? reduceByArea(readRows, width, height, newWidth, newHeight)
+                           : readRows(0, height);
+      return { rgba, width: newWidth, height: newHeight, original: { width, height } };
+    });
   },
 
   /** Computes the heat map of pixels that `read` returned. */
   async run({ rgba, width, height }) {
-    const started = performance.now();
     const logits = isConstant(rgba) ? new Float32Array(width * height).fill(-Infinity)
                                     : await runNetwork(rgba, width, height);
-    const seconds = (performance.now() - started) / 1000;
-    return { map: prepare(logits, width, height), seconds };
+    return prepare(logits, width, height);
   },
 };
 
-function pixelsOf(bitmap, name) {
-  const { width, height } = bitmap;
-  if (Math.min(width, height) < MIN_SIDE) {
-    throw new UserError(`${name} is ${width}x${height} pixels: both sides must be at least `
-                        + `${MIN_SIDE}, use a larger picture.`);
-  }
-  if (width * height > MAX_MEGAPIXELS * 1e6) {
-    throw new UserError(`${name} has over ${MAX_MEGAPIXELS} megapixels: use a smaller picture.`);
-  }
-  const [newWidth, newHeight] = networkSize(width, height);
-  const readRows = (top, rows) => {
-    const canvas = new OffscreenCanvas(width, rows); // small: phones limit the size of a canvas
-    const context = canvas.getContext("2d", { willReadFrequently: true });
-    context.drawImage(bitmap, 0, -top);
-    return context.getImageData(0, 0, width, rows).data;
-  };
-  const reduced = width !== newWidth || height !== newHeight;
-  const rgba = reduced ? reduceByArea(readRows, width, height, newWidth, newHeight)
-                       : readRows(0, height);
-  return { rgba, width: newWidth, height: newHeight, original: { width, height } };
+/** The content of a file that the build has compressed. */
+async function unpacked(address) {
+  const response = await fetch(address);
+  if (!response.ok) throw new Error("a file of ONNX Runtime is missing");
+  return new Response(response.body.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
 }
 
 async function browserNetwork(processor) {
@@ -76,6 +48,8 @@ async function browserNetwork(processor) {
   const ort = await import(`${folder}ort.${graphics ? "webgpu" : "wasm"}.min.mjs`);
   ort.env.logLevel = "error";
   ort.env.wasm.wasmPaths = folder;
+  ort.env.wasm.wasmBinary = await unpacked(
+    `${folder}ort-wasm-simd-threaded.${graphics ? "asyncify." : ""}wasm.packed`);
   ort.env.wasm.numThreads = self.crossOriginIsolated
     ? Math.min(MAX_THREADS, navigator.hardwareConcurrency || 1) : 1;
   const response = await fetch(new URL("../model/default.onnx", import.meta.url));
@@ -116,12 +90,4 @@ function pythonNetwork(token) {
   return { run, words: "in Python on this computer" };
 }
 
-self.onmessage = async ({ data: { id, task, values } }) => {
-  try {
-    self.postMessage({ id, result: await tasks[task](values) });
-  } catch (error) {
-    const said = error instanceof UserError ? error.message
-      : `The picture could not be worked on (${error.message}): try a smaller one.`;
-    self.postMessage({ id, error: said });
-  }
-};
+answer(tasks, (reason) => `The picture could not be worked on (${reason}): try a smaller one.`);

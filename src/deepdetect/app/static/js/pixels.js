@@ -5,12 +5,23 @@ export const MAX_PIXELS = 2_000_000; // larger photographs are reduced to that, 
 export const MIN_SIDE = 16;
 const STRIDE = 8;
 
+/** How pixels lie in memory, and how many values of each are reduced. */
+const COLOUR = { step: 4, values: 3 };
+export const GRAY = { step: 1, values: 1 };
+
 /** The size at which the network sees a photograph: its own, or about two megapixels. */
 export function networkSize(width, height) {
   if (width * height <= MAX_PIXELS) return [width, height];
   const scale = (MAX_PIXELS / (height * width)) ** 0.5;
   return [width, height].map(
     (side) => Math.max(STRIDE, roundHalfEven(side * scale / STRIDE) * STRIDE));
+}
+
+/** The size at which points are looked for, which needs no multiples of 8. */
+export function pointsSize(width, height) {
+  if (width * height <= MAX_PIXELS) return [width, height];
+  const scale = (MAX_PIXELS / (height * width)) ** 0.5;
+  return [width, height].map((side) => Math.max(1, roundHalfEven(side * scale)));
 }
 
 /** RGB planes from 0 to 1, one after the other, of RGBA bytes. */
@@ -61,14 +72,15 @@ function areaWeights(from, to) {
 /**
  * Reduces a photograph by area averaging, as `cv2.resize` with INTER_AREA does.
  *
- * @param {(top: number, rows: number) => Uint8ClampedArray} readRows gives RGBA bytes of rows
+ * @param {(top: number, rows: number) => Uint8ClampedArray} readRows gives bytes of rows
  */
-export function reduceByArea(readRows, width, height, newWidth, newHeight) {
+export function reduceByArea(readRows, width, height, newWidth, newHeight,
+                             { step, values } = COLOUR) {
   const across = areaWeights(width, newWidth);
   const down = areaWeights(height, newHeight);
-  const result = new Uint8ClampedArray(4 * newWidth * newHeight).fill(255);
-  const sum = new Float32Array(3 * newWidth);
-  const line = new Float32Array(3 * newWidth);
+  const result = new Uint8ClampedArray(step * newWidth * newHeight).fill(255);
+  const sum = new Float32Array(values * newWidth);
+  const line = new Float32Array(values * newWidth);
   const bandRows = Math.max(1, Math.floor(2 ** 20 / width));
   let [band, bandTop, reduced] = [null, 0, -1];
   const reduceRow = (row) => {
@@ -77,12 +89,12 @@ export function reduceByArea(readRows, width, height, newWidth, newHeight) {
       bandTop = row - row % bandRows;
       band = readRows(bandTop, Math.min(bandRows, height - bandTop));
     }
-    const start = 4 * (row - bandTop) * width;
+    const start = step * (row - bandTop) * width;
     line.fill(0);
     across.forEach((weights, x) => {
       for (const [source, weight] of weights) {
-        const at = start + 4 * source;
-        for (let c = 0; c < 3; c++) line[3 * x + c] += Math.fround(band[at + c] * weight);
+        const at = start + step * source;
+        for (let c = 0; c < values; c++) line[values * x + c] += Math.fround(band[at + c] * weight);
       }
     });
     reduced = row;
@@ -94,8 +106,8 @@ export function reduceByArea(readRows, width, height, newWidth, newHeight) {
       for (let k = 0; k < sum.length; k++) sum[k] += Math.fround(line[k] * weight);
     }
     for (let x = 0; x < newWidth; x++) {
-      for (let c = 0; c < 3; c++) {
-        result[4 * (y * newWidth + x) + c] = roundHalfEven(sum[3 * x + c]);
+      for (let c = 0; c < values; c++) {
+        result[step * (y * newWidth + x) + c] = roundHalfEven(sum[values * x + c]);
       }
     }
   });

@@ -1,28 +1,43 @@
 // The heat map of a picture, over the picture.
 import { drawHeatMap } from "../draw.js";
+import { findHeatMap } from "../detection.js";
 import { savePng, stem } from "../downloads.js";
-import { activePicture, element, onceAFrame, page } from "../page.js";
+import { activePicture, element, onceAFrame, page, showError } from "../page.js";
 
 const view = element("view-heatmap");
 const form = view.querySelector("form");
 
-export function draw() {
+/** Shows the picture, and its heat map when there is one. */
+export async function show() {
+  draw();
+  const picture = activePicture();
+  if (!picture || picture.map) return;
+  await findHeatMap(picture);
+  draw();
+}
+
+function draw() {
   const opacity = Number(element("opacity").value);
   form.querySelector('output[for="opacity"]').textContent = `${opacity} %`;
   const picture = activePicture();
   if (!picture) return;
   const overlay = view.querySelector(".overlay");
   overlay.style.opacity = String(opacity / 100);
-  if (overlay.source === picture) return;
-  overlay.source = picture;
   const canvas = view.querySelector(".picture");
-  [canvas.width, canvas.height] = [picture.width, picture.height];
-  canvas.getContext("2d").drawImage(picture.canvas, 0, 0);
+  if (canvas.source !== picture) {
+    canvas.source = picture;
+    [canvas.width, canvas.height] = [picture.width, picture.height];
+    canvas.getContext("2d").drawImage(picture.canvas, 0, 0);
+    overlay.getContext("2d").clearRect(0, 0, overlay.width, overlay.height);
+    overlay.source = null;
+  }
+  if (overlay.source === picture || !picture.map) return;
+  overlay.source = picture;
   drawHeatMap(overlay, picture.map);
 }
 
 export function setUp() {
-  const later = onceAFrame(draw);
+  const later = onceAFrame(() => show().catch((error) => showError(error.message)));
   form.addEventListener("input", (event) => {
     if (event.target.name === "which-heatmap") page.active = Number(event.target.value);
     view.querySelector(".layers").classList.toggle("actual", element("actual-heatmap").checked);
@@ -30,6 +45,6 @@ export function setUp() {
   });
   form.querySelector("[data-download]").onclick = () => {
     const picture = activePicture();
-    if (picture) savePng(`${stem(picture.name)}_heatmap.png`, view.querySelector(".overlay"));
+    if (picture?.map) savePng(`${stem(picture.name)}_heatmap.png`, view.querySelector(".overlay"));
   };
 }

@@ -1,38 +1,67 @@
 // The keypoints of a picture: which ones, how many, and files of them.
-import { positions, select } from "../selection.js";
-import { composeKeypoints, drawKeypoints } from "../draw.js";
+import { anglesOf, findHeatMap, findPoints } from "../detection.js";
+import { composeKeypoints, drawCircles, drawPixels } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
-import { activePicture, announce, counted, element, onceAFrame, page, toOriginal } from "../page.js";
+import { activePicture, announce, counted, element, enlargement, onceAFrame, page, rescaled, showError,
+         toOriginal } from "../page.js";
+import { choosePoints } from "../points/detection.js";
+import { positions, select } from "../selection.js";
 
 const NUMBERS = [10, 20, 50, 100, 200, 300, 500, 750, 1000, 1500, 2000, 3000, 4000, 5000, 7500,
                  10_000, 15_000, 20_000, 30_000, 50_000];
-const HINTS = {
-  dense: "Every pixel that passes, as detect() gives them.",
-  ranked: "The best pixels of the heat map, refined to fractions of a pixel, as "
-    + "detect(max_keypoints=N, mode=\"dense\") gives them. Where few keypoints are wanted, the points "
-    + "of all scales, detect(max_keypoints=N) in Python, are found again more often.",
+const RANKED_RADIUS_PX = 3; // on the screen
+
+/** What a kind of keypoints needs of a picture, and what is said of it. */
+const KINDS = {
+  dense: {
+    find: findHeatMap, isFound: (picture) => picture.map, choose: chooseDense,
+    hint: "Every pixel that passes, as detect() gives them.",
+  },
+  points: {
+    find: findPoints, isFound: (picture) => picture.ranking, choose: chooseOfAllScales,
+    hint: "The best places of all scales to find again in another photograph, with their sizes, as "
+      + "detect(max_keypoints=N) gives them. The network is not run for them.",
+  },
+  ranked: {
+    find: findHeatMap, isFound: (picture) => picture.map, choose: chooseRanked,
+    hint: "The best pixels of the heat map, refined to fractions of a pixel, as "
+      + "detect(max_keypoints=N, mode=\"dense\") gives them. Points are found again more often.",
+  },
+};
+const SPREADS = {
+  none: "The best, wherever they are.",
+  grid: "In turn the best of each cell: 16 cells along the longer side.",
+  anms: "As far from each other as their number allows (adaptive non-maximal suppression).",
 };
 
 const view = element("view-keypoints");
 const form = view.querySelector("form");
 let shown = null; // the last selection: what is drawn and downloaded
 
-/** @returns {import("../selection.js").Options} what the controls say */
+/** What the controls say. */
 function options() {
   const chosen = new FormData(form);
   const density = chosen.get("by") === "density";
+  const kind = chosen.get("kind");
   return {
+    kind,
     threshold: Number(element("threshold").value),
     density: density ? Number(element("density").value) / 100 : null,
-    maxKeypoints: chosen.get("kind") === "ranked" ? NUMBERS[element("number").value] : null,
+    maxKeypoints: kind === "dense" ? null : NUMBERS[element("number").value],
+    spread: chosen.get("spread"),
   };
 }
 
-function showControls({ density, maxKeypoints, threshold }) {
-  element("threshold-row").hidden = density !== null;
-  element("density-row").hidden = density === null;
-  element("number-row").hidden = maxKeypoints === null;
-  element("kind-hint").textContent = HINTS[maxKeypoints === null ? "dense" : "ranked"];
+function showControls({ kind, density, threshold, spread }) {
+  const points = kind === "points";
+  element("by-row").hidden = points;
+  element("threshold-row").hidden = points || density !== null;
+  element("density-row").hidden = points || density === null;
+  element("number-row").hidden = kind === "dense";
+  element("spread-row").hidden = !points;
+  element("spread-hint").hidden = !points;
+  element("kind-hint").textContent = KINDS[kind].hint;
+  element("spread-hint").textContent = SPREADS[spread];
   const say = (id, text) => {
     form.querySelector(`output[for="${id}"]`).textContent = text;
     element(id).setAttribute("aria-valuetext", text);
@@ -42,15 +71,92 @@ function showControls({ density, maxKeypoints, threshold }) {
   say("number", NUMBERS[element("number").value].toLocaleString("en"));
 }
 
-export function draw() {
-  const chosen = options();
-  showControls(chosen);
-  const picture = activePicture();
-  if (!picture) return;
+/**
+ * What is chosen of a picture.
+ *
+ * @typedef {object} Selection
+ * @property {number} count
+ * @property {string} what it is, for those who hear the page
+ * @property {(overlay: HTMLCanvasElement, unit: number) => void} draw
+ * @property {string[]} columns of its files
+ * @property {() => number[][] | Promise<number[][]>} rows in the photograph's own pixels
+ * @property {object} options of `DeepDetect.detect` that give the same
+ */
+
+/** @returns {Selection} */
+function chooseDense(picture, chosen) {
   const pixels = select(picture.map, chosen);
-  // Of dense keypoints the pixels are all that is drawn.
-  const xy = chosen.maxKeypoints === null ? null : positions(picture.map, pixels, chosen);
-  shown = { picture, options: chosen, pixels };
+  const density = pixels.length / (picture.width * picture.height);
+  return {
+    count: pixels.length,
+    what: `${(100 * density).toFixed(1)} per 100 pixels`,
+    draw: (overlay) => drawPixels(overlay, picture, pixels),
+    ...filesOfPixels(picture, pixels, chosen),
+  };
+}
+
+/** @returns {Selection} */
+function chooseRanked(picture, chosen) {
+  const pixels = select(picture.map, chosen);
+  const xy = positions(picture.map, pixels, chosen);
+  return {
+    count: pixels.length,
+    what: "the best pixels of the heat map",
+    draw: (overlay, unit) => drawCircles(overlay, picture, xy, () => RANKED_RADIUS_PX * unit, unit),
+    ...filesOfPixels(picture, pixels, chosen),
+  };
+}
+
+function filesOfPixels(picture, pixels, chosen) {
+  return {
+    columns: ["x", "y", "score"],
+    rows: () => {
+      const xy = positions(picture.map, pixels, chosen);
+      return Array.from(pixels, (pixel, k) =>
+        [...toOriginal(picture, xy[2 * k], xy[2 * k + 1]), picture.map.probability[pixel]]);
+    },
+    options: { threshold: chosen.density === null ? chosen.threshold : null,
+               density: chosen.density, max_keypoints: chosen.maxKeypoints, mode: "dense" },
+  };
+}
+
+/** @returns {Selection} */
+function chooseOfAllScales(picture, { maxKeypoints, spread }) {
+  const { ranking } = picture;
+  const points = choosePoints(ranking, maxKeypoints, spread);
+  const { xy, scores, sizes } = points;
+  const drawn = Float32Array.from({ length: xy.length }, (_, k) =>
+    rescaled(xy[k - k % 2], xy[k - k % 2 + 1], ranking, picture)[k % 2]);
+  const [small, large] = [Math.min(...sizes), Math.max(...sizes)].map((size) => size.toFixed(1));
+  return {
+    count: scores.length,
+    what: scores.length ? `points of ${small} to ${large} pixels` : "no points",
+    draw: (overlay, unit) => drawCircles(
+      overlay, picture, drawn, (k) => sizes[k] / 2 * enlargement(ranking, picture), unit),
+    columns: ["x", "y", "score", "size", "angle"],
+    rows: async () => {
+      const angles = await anglesOf(picture, points);
+      return Array.from(scores, (score, k) => [
+        ...rescaled(xy[2 * k], xy[2 * k + 1], ranking, picture.original), score,
+        sizes[k] * enlargement(ranking, picture.original), angles[k]]);
+    },
+    options: { max_keypoints: maxKeypoints, spread, mode: "points" },
+  };
+}
+
+/** Shows the picture, and its keypoints once they are there. */
+export async function show() {
+  draw();
+  const picture = activePicture();
+  if (!picture || shown) return;
+  await KINDS[options().kind].find(picture);
+  draw();
+}
+
+/** Shows the picture alone. */
+export function preview() {
+  shown = null;
+  const picture = activePicture();
   const canvas = view.querySelector(".picture");
   if (canvas.source !== picture) {
     canvas.source = picture;
@@ -58,32 +164,39 @@ export function draw() {
     canvas.getContext("2d").drawImage(picture.canvas, 0, 0);
   }
   const overlay = view.querySelector(".overlay");
-  const unit = picture.width / Math.max(1, canvas.clientWidth || picture.width);
-  drawKeypoints(overlay, picture, pixels, xy, Math.max(1, unit));
-  const density = pixels.length / (picture.width * picture.height);
-  const text = `${counted(pixels.length, "keypoint")}`;
-  element("count").textContent = text;
-  overlay.setAttribute("aria-label", `${picture.name}: ${text}, ${(100 * density).toFixed(1)} per 100 pixels`);
+  overlay.getContext("2d").clearRect(0, 0, overlay.width, overlay.height);
+  element("count").textContent = "–";
 }
 
-/** Rows of x, y and probability, in the photograph's own pixels. */
-function rows() {
-  const { picture, pixels, options: chosen } = shown;
-  const xy = positions(picture.map, pixels, chosen);
-  return Array.from(pixels, (pixel, k) =>
-    [...toOriginal(picture, xy[2 * k], xy[2 * k + 1]), picture.map.probability[pixel]]);
+function draw() {
+  const chosen = options();
+  showControls(chosen);
+  shown = null;
+  const picture = activePicture();
+  if (!picture) return;
+  const kind = KINDS[chosen.kind];
+  if (view.querySelector(".picture").source !== picture || !kind.isFound(picture)) preview();
+  if (!kind.isFound(picture)) return;
+  const canvas = view.querySelector(".picture");
+  const overlay = view.querySelector(".overlay");
+  const unit = picture.width / Math.max(1, canvas.clientWidth || picture.width);
+  shown = { picture, ...kind.choose(picture, chosen) };
+  shown.draw(overlay, Math.max(1, unit));
+  const text = counted(shown.count, chosen.kind === "points" ? "point" : "keypoint");
+  element("count").textContent = text;
+  overlay.setAttribute("aria-label", `${picture.name}: ${text}, ${shown.what}`);
 }
 
 const downloads = {
-  csv: (name) => save(`${name}_keypoints.csv`, toCsv("x,y,score", rows()), "text/csv"),
-  json: (name) => {
-    const { picture, options: chosen } = shown;
+  csv: async (name) => {
+    const { columns, rows } = shown;
+    save(`${name}_keypoints.csv`, toCsv(columns.join(","), await rows()), "text/csv");
+  },
+  json: async (name) => {
+    const { picture, columns, rows, options: chosen } = shown;
     const values = {
       image: picture.name, width: picture.original.width, height: picture.original.height,
-      seen_as: [picture.width, picture.height],
-      options: { threshold: chosen.density === null ? chosen.threshold : null,
-                 density: chosen.density, max_keypoints: chosen.maxKeypoints, mode: "dense" },
-      columns: ["x", "y", "score"], keypoints: rows(),
+      seen_as: [picture.width, picture.height], options: chosen, columns, keypoints: await rows(),
     };
     save(`${name}_keypoints.json`, toJson(values), "application/json");
   },
@@ -92,7 +205,8 @@ const downloads = {
 };
 
 export function setUp() {
-  const later = onceAFrame(draw);
+  const guarded = (task) => task().catch((error) => showError(error.message));
+  const later = onceAFrame(() => guarded(show));
   form.addEventListener("input", (event) => {
     if (event.target.name === "which-keypoints") page.active = Number(event.target.value);
     for (const layers of view.querySelectorAll(".layers")) {
@@ -102,12 +216,7 @@ export function setUp() {
   });
   form.addEventListener("change", () => announce(element("count").textContent));
   for (const button of form.querySelectorAll("[data-download]")) {
-    button.onclick = () => shown && downloads[button.dataset.download](stem(shown.picture.name));
+    button.onclick = () => shown && guarded(async () =>
+      downloads[button.dataset.download](stem(shown.picture.name)));
   }
-}
-
-/** The best keypoints of a picture for matching. */
-export function bestKeypoints(picture, count) {
-  const chosen = { threshold: 0.5, density: null, maxKeypoints: count };
-  return positions(picture.map, select(picture.map, chosen), chosen);
 }

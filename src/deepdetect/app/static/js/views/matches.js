@@ -1,15 +1,24 @@
 // Matches of two pictures by descriptors, their lines, and the geometry that they agree with.
 import { Background } from "../background.js";
+import { findHeatMap, findPoints } from "../detection.js";
 import { drawMatches, newCanvas } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
-import { announce, counted, during, element, onceAFrame, page, showError, toOriginal } from "../page.js";
-import { bestKeypoints } from "./keypoints.js";
+import { announce, counted, during, element, onceAFrame, page, rescaled, showError, toOriginal } from "../page.js";
+import { luma } from "../pixels.js";
+import { choosePoints } from "../points/detection.js";
+import { positions, select } from "../selection.js";
 
 const NARROW_PX = 640; // below it the pictures stand above each other
 const SAVED_WIDTH_PX = 1600;
 const MODELS = {
   homography: "one homography: a plane, or a turn of the camera",
   fundamental: "one epipolar geometry: a scene with depth",
+};
+
+const KINDS = {
+  points: { describe: pointsOf, hint: "Points of all scales, described at their own sizes and angles." },
+  ranked: { describe: rankedOf, hint: "The best pixels of the heat map, described upright and at one size: "
+    + "not for turned pictures or other scales." },
 };
 
 const view = element("view-matches");
@@ -22,12 +31,30 @@ let asked = 0;
 
 export const matchingTask = (task, values) => background.call(task, values);
 
+const kind = () => new FormData(form).get("match-kind");
 const count = () => Number(element("match-number").value);
 const ratio = () => Number(element("ratio").value);
 
 function showControls() {
   form.querySelector('output[for="match-number"]').textContent = count().toLocaleString("en");
   form.querySelector('output[for="ratio"]').textContent = ratio().toFixed(2);
+  element("match-kind-hint").textContent = KINDS[kind()].hint;
+}
+
+/** The points of a picture, with the pixels that they were found in. */
+async function pointsOf(picture, number) {
+  await findPoints(picture);
+  const { gray, width, height } = picture.ranking;
+  const { xy, sizes } = choosePoints(picture.ranking, number);
+  return { gray, width, height, xy, sizes };
+}
+
+/** The best pixels of a picture's heat map. */
+async function rankedOf(picture, number) {
+  await findHeatMap(picture);
+  const { map, rgba, width, height } = picture;
+  const chosen = { threshold: 0.5, density: null, maxKeypoints: number };
+  return { gray: luma(rgba), width, height, xy: positions(map, select(map, chosen), chosen) };
 }
 
 /** Matches the pictures where that has not been done, and finds their geometry. */
@@ -35,7 +62,7 @@ export async function match() {
   showControls();
   const [first, second] = page.pictures;
   if (!second) return;
-  const key = [first, second, count()];
+  const key = [first, second, count(), kind()];
   const same = (other) => other?.key.every((value, k) => value === key[k]);
   if (same(found)) return;
   if (!same(pending)) pending = { key, done: matchNew(key) };
@@ -49,14 +76,17 @@ export async function match() {
 
 /** Matches pictures, and finds the geometry of their matches. */
 async function matchNew(key) {
-  const [first, second] = key;
+  const [first, second, number, chosen] = key;
   const own = ++asked;
-  const pictures = [first, second].map((picture) => ({
-    rgba: picture.rgba, width: picture.width, height: picture.height,
-    xy: bestKeypoints(picture, key[2]),
-  }));
+  const pictures = [await KINDS[chosen].describe(first, number),
+                    await KINDS[chosen].describe(second, number)];
+  if (own !== asked) return;
   const result = await during("Matching…", background.call("match", { pictures }));
   if (own !== asked) return;
+  const seen = (points, from, to) => Float32Array.from(points, (_, k) =>
+    rescaled(points[k - k % 2], points[k - k % 2 + 1], from, to)[k % 2]);
+  result.points0 = seen(result.points0, pictures[0], first);
+  result.points1 = seen(result.points1, pictures[1], second);
   found = { key, ...result };
   await filter();
 }
@@ -137,7 +167,7 @@ const downloads = {
     const values = {
       images: [kept.first.name, kept.second.name], model: kept.model,
       matrix: kept.matrix, matrix_of: [kept.first, kept.second].map((p) => [p.width, p.height]),
-      options: { keypoints: count(), ratio: ratio(), mutual: true },
+      options: { mode: found.key[3], keypoints: found.key[2], ratio: ratio(), mutual: true },
       columns: ["x0", "y0", "x1", "y1", "score", "inlier"], matches: rowsSaved(),
     };
     save(`${name}.json`, toJson(values), "application/json");
@@ -167,6 +197,7 @@ export function setUp() {
   element("match-number").oninput = showControls;
   element("match-number").onchange = guarded(match);
   element("agreeing").onchange = draw;
+  for (const input of form.querySelectorAll("[name=match-kind]")) input.onchange = guarded(match);
   addEventListener("resize", onceAFrame(() => !view.hidden && draw()));
   for (const button of form.querySelectorAll("[data-download]")) {
     button.onclick = () => kept && downloads[button.dataset.download](

@@ -1,0 +1,68 @@
+// What is found in a picture, each once, when it is first asked for: its heat map, for which the
+// network is run, and its points, for which it is not.
+import { Background } from "./background.js";
+import { during } from "./page.js";
+
+const pictureWorker = new Background(new URL("picture_worker.js", import.meta.url));
+const pointsWorker = new Background(new URL("points_worker.js", import.meta.url));
+let opened = null; // a promise of what runs the network
+const runs = { network: 0, points: 0 }; // how often: sliders must not change it
+
+function counted(kind) {
+  document.body.dataset[`${kind}Runs`] = String(++runs[kind]);
+}
+
+export const isOpened = () => opened !== null;
+
+/** Opens what runs the network, or another. @returns {Promise<string>} what that is, in words */
+export function openNetwork(options) {
+  const network = pictureWorker.call("open", options);
+  opened ??= network;
+  return network;
+}
+
+/** Reads a file, at the size at which the network sees it. */
+export const readPicture = (file) =>
+  during("Reading the picture…", pictureWorker.call("read", { file, name: file.name }));
+
+/** Remembers the result of a task in a picture, unless it fails: then it may be tried again. */
+function once(picture, name, task) {
+  picture.pending ??= {};
+  picture.pending[name] ??= task().then((result) => {
+    picture[name] = result;
+  }).finally(() => {
+    delete picture.pending[name];
+  });
+  return picture.pending[name];
+}
+
+/** Runs the network on a picture, where that has not been done. @param {import("./page.js").Picture} picture */
+export async function findHeatMap(picture) {
+  if (picture.map) return;
+  await once(picture, "map", async () => {
+    await during("Loading the network…", opened);
+    const { rgba, width, height } = picture;
+    const found = pictureWorker.call("run", { rgba, width, height });
+    const map = await during("Finding keypoints…", found);
+    counted("network");
+    return map;
+  });
+}
+
+/** Ranks the points of a picture, where that has not been done. */
+export async function findPoints(picture) {
+  if (picture.ranking) return;
+  await once(picture, "ranking", async () => {
+    const { file, name, rgba, width, height, original } = picture;
+    const found = pointsWorker.call("rank", { file, name, rgba, width, height, original });
+    const ranking = await during("Finding points…", found);
+    counted("points");
+    return ranking;
+  });
+}
+
+/** The angles of points of a picture. @returns {Promise<Float32Array>} degrees */
+export function anglesOf({ ranking }, points) {
+  const { gray, width, height } = ranking;
+  return pointsWorker.call("angles", { gray, width, height, points });
+}
