@@ -1,9 +1,11 @@
-"""A running server, and requests to it as any program could make them."""
+"""A running server, requests to it as any program could make them, and node for the modules."""
 
 from __future__ import annotations
 
 import http.client
 import json
+import shutil
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,10 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from deepdetect.app.options import AppOptions
-from deepdetect.app.server import AppServer
+from deepdetect.app.server import STATIC, AppServer
 
 
 @dataclass(frozen=True)
@@ -106,3 +109,32 @@ def serve(
         server.shutdown()
         server.server_close()
         assert list(folder.iterdir()) == []
+
+
+READ = """
+import { readFileSync, writeFileSync } from "node:fs";
+const [given, made] = process.argv.slice(2);
+const { width, height, ...values } = JSON.parse(readFileSync(given + ".json"));
+const bytes = new Uint8Array(readFileSync(given)).buffer; // small files share a buffer
+"""
+
+
+@pytest.fixture
+def run_node(tmp_path: Path) -> Any:
+    """Run a script with an array and values; return the array of float64 that it writes."""
+    if shutil.which("node") is None:
+        pytest.skip("needs node")
+
+    def run(imports: str, script: str, array: np.ndarray, **values: Any) -> np.ndarray:
+        given, made = tmp_path / "given.bin", tmp_path / "made.bin"
+        array.tofile(given)
+        (tmp_path / "given.bin.json").write_text(json.dumps(values), encoding="utf-8")
+        (tmp_path / "script.mjs").write_text(
+            imports.replace("@", (STATIC / "js").as_uri()) + READ + script, encoding="utf-8"
+        )
+        words = ["node", str(tmp_path / "script.mjs"), str(given), str(made)]
+        ended = subprocess.run(words, capture_output=True, text=True)
+        assert ended.returncode == 0, ended.stderr
+        return np.fromfile(made, np.float64)
+
+    return run

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import subprocess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,36 +9,6 @@ import pytest
 
 import deepdetect
 from deepdetect import select_keypoints
-
-MODULES = Path(deepdetect.__path__[0]) / "app/static/js"
-
-READ = """
-import { readFileSync, writeFileSync } from "node:fs";
-const [given, made] = process.argv.slice(2);
-const { width, height, ...values } = JSON.parse(readFileSync(given + ".json"));
-const bytes = new Uint8Array(readFileSync(given)).buffer; // small files share a buffer
-"""
-
-
-@pytest.fixture
-def run_node(tmp_path: Path) -> Any:
-    """Run a script with an array and values; return the array of float64 that it writes."""
-    if shutil.which("node") is None:
-        pytest.skip("needs node")
-
-    def run(imports: str, script: str, array: np.ndarray, **values: Any) -> np.ndarray:
-        given, made = tmp_path / "given.bin", tmp_path / "made.bin"
-        array.tofile(given)
-        (tmp_path / "given.bin.json").write_text(json.dumps(values), encoding="utf-8")
-        (tmp_path / "script.mjs").write_text(
-            imports.replace("@", MODULES.as_uri()) + READ + script, encoding="utf-8"
-        )
-        words = ["node", str(tmp_path / "script.mjs"), str(given), str(made)]
-        ended = subprocess.run(words, capture_output=True, text=True)
-        assert ended.returncode == 0, ended.stderr
-        return np.fromfile(made, np.float64)
-
-    return run
 
 
 def select_in_node(run_node: Any, logits: np.ndarray, options: dict[str, Any]) -> np.ndarray:

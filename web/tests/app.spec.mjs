@@ -1,8 +1,8 @@
 // The page with Python: `deepdetect app`.
 import { cpSync, mkdirSync, readdirSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
-import { NO_BROWSER, askPython, chromium, downloaded, example, examples, expect, expectAccessible, openExample,
-         test, watch } from "./page.mjs";
+import { NO_BROWSER, askPython, choose, chromium, downloaded, example, examples, expect, expectAccessible,
+         openExample, table, test, watch } from "./page.mjs";
 
 test.skip(!chromium, NO_BROWSER);
 
@@ -27,8 +27,11 @@ import json, sys
 from deepdetect import DeepDetect
 print(json.dumps(DeepDetect().detect(sys.argv[1]).xy.tolist()))
 `, join(examples, "coffee.jpg"));
-  const found = String(content).trim().split("\n").slice(1).map((line) => line.split(",").slice(0, 2).map(Number));
-  expect(found).toEqual(expected);
+  expect(table(content).map((row) => row.slice(0, 2))).toEqual(expected);
+  await choose(page, "kind", "points");
+  await expect(page.locator("#count")).toHaveText("1,000 points");
+  const points = await downloaded(page, page.locator("#view-keypoints [data-download=csv]"));
+  expect(String(points.content).split("\n")[0]).toBe("x,y,score,size,angle");
 });
 
 test("guided matching finds many times as many, and nothing is kept", async ({ page, app }) => {

@@ -74,6 +74,14 @@ export function watch(page) {
   return seen;
 }
 
+/** Rows of numbers of a CSV file. */
+export const table = (content) =>
+  String(content).trim().split("\n").slice(1).map((line) => line.split(",").map(Number));
+
+/** Chooses one of the buttons of a group. */
+export const choose = (page, name, value) =>
+  page.locator(`input[name=${name}][value=${value}]`).check({ force: true });
+
 export const example = (page, title) =>
   page.locator("#examples button").filter({ has: page.locator(`span:text-is("${title}")`) });
 

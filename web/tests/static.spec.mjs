@@ -1,8 +1,8 @@
 // The page alone, in a browser: what `npm run build` makes.
 import { readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
-import { NO_BROWSER, askPython, chromium, downloaded, example, examples, expect, expectAccessible,
-         openExample, slide, test } from "./page.mjs";
+import { NO_BROWSER, askPython, choose, chromium, downloaded, example, examples, expect, expectAccessible,
+         openExample, slide, table, test } from "./page.mjs";
 
 test.skip(!chromium, NO_BROWSER);
 
@@ -14,15 +14,12 @@ found = DeepDetect(backend="onnxruntime").detect(path, mode="dense", **options)
 print(json.dumps({"xy": found.xy.tolist(), "scores": found.scores.tolist()}))
 `;
 
-/** Rows of numbers of a CSV file. */
-const table = (content) => String(content).trim().split("\n").slice(1).map((line) => line.split(",").map(Number));
-
 /** Pixels as text: which ones, whatever their fractions. */
 const pixels = (rows) => rows.map(([x, y]) => `${Math.round(x)},${Math.round(y)}`);
 
-async function choose(page, { kind = "dense", by = "threshold" }) {
-  await page.locator(`input[name=kind][value=${kind}]`).check({ force: true });
-  await page.locator(`input[name=by][value=${by}]`).check({ force: true });
+async function chooseKeypoints(page, { kind = "dense", by = "threshold" }) {
+  await choose(page, "kind", kind);
+  await choose(page, "by", by);
 }
 
 const openFile = async (page, path) => {
@@ -42,7 +39,7 @@ for (const file of ["coffee.jpg", "motorcycle-left.jpg", "motorcycle-right.jpg",
     await page.goto("./");
     await openFile(page, join(examples, file));
     for (const { name, controls, slider, options } of CASES) {
-      await choose(page, controls);
+      await chooseKeypoints(page, controls);
       if (slider) await slide(page, ...slider);
       const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=csv]"));
       const found = table(content);
@@ -112,10 +109,10 @@ test("sliders answer at once, and do not run the network", async ({ page }) => {
   await slide(page, "threshold", 0.9);
   const fewer = await count();
   expect(fewer).toBeLessThan(dense);
-  await choose(page, { by: "density" });
+  await chooseKeypoints(page, { by: "density" });
   await slide(page, "density", 10);
   expect(await count()).toBe(24_000);
-  await choose(page, { kind: "ranked" });
+  await chooseKeypoints(page, { kind: "ranked" });
   await slide(page, "number", 4);
   expect(await count()).toBe(200);
   expect(await page.locator("body").getAttribute("data-network-runs")).toBe("1");
@@ -137,6 +134,7 @@ test("heat map and pictures are saved as PNG", async ({ page }) => {
 test("matches of two views agree with the true disparity", async ({ page }) => {
   await openExample(page, "Motorcycle");
   await expect(page.locator("#match-hint")).toContainText("epipolar geometry");
+  expect(await page.locator("body").getAttribute("data-network-runs")).toBe(null); // points need none
   const { name, content } = await downloaded(page, page.locator("#view-matches [data-download=csv]"));
   expect(name).toBe("motorcycle-left_motorcycle-right_matches.csv");
   const rows = table(content);
@@ -148,7 +146,11 @@ test("matches of two views agree with the true disparity", async ({ page }) => {
   const fewer = async () => Number((await page.locator("#match-count").textContent()).replace(/\D/g, ""));
   await expect.poll(fewer).toBeLessThan(rows.length);
   const json = await downloaded(page, page.locator("#view-matches [data-download=json]"));
-  expect(JSON.parse(json.content)).toMatchObject({ model: "fundamental", options: { ratio: 0.6 } });
+  expect(JSON.parse(json.content)).toMatchObject({ model: "fundamental", options: { mode: "points", ratio: 0.6 } });
+  await choose(page, "match-kind", "ranked");
+  await expect(page.locator("body")).toHaveAttribute("data-network-runs", "2");
+  await expect(page.locator("#match-kind-hint")).toContainText("upright");
+  await expect(page.locator("#match-hint")).toContainText("epipolar geometry");
 });
 
 test("pictures that show different things have no geometry", async ({ page }) => {
@@ -226,8 +228,9 @@ test("nothing is added after starting over", async ({ page }, info) => {
   await page.goto("./");
   await page.locator("#file").setInputFiles([small, large]); // the second one takes seconds
   await expect(page.locator("#files li")).toHaveCount(1);
+  await expect(page.locator("#busy")).toContainText("Reading");
   await page.locator("#restart").click();
-  await expect(page.locator("body")).toHaveAttribute("data-network-runs", "2"); // of the second picture
+  await expect(page.locator("#busy")).toBeHidden(); // the second picture was read
   await expect(page.locator("#start")).toBeVisible({ timeout: 1 });
   await expect(page.locator("#files li")).toHaveCount(0);
 });
@@ -335,6 +338,13 @@ for (const [width, colorScheme] of [[1280, "light"], [1280, "dark"], [390, "ligh
       await page.getByRole("tab", { name }).click();
       if (name === "Wipe") await expect(page.locator("#wipe-hint")).toContainText("registered");
       await check();
+      if (name !== "Keypoints") continue;
+      for (const spread of ["none", "anms"]) {
+        await choose(page, "kind", "points");
+        await choose(page, "spread", spread);
+        await expect(page.locator("#count")).toHaveText("1,000 points");
+        await check();
+      }
     }
     await page.locator("#file").setInputFiles(join(examples, "coffee.jpg"));
     await expect(page.getByRole("alert")).toContainText("There are two pictures already");

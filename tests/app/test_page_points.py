@@ -1,0 +1,214 @@
+"""The page's points of all scales, run by node, beside the package's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+import deepdetect
+from deepdetect import Keypoints, load_image
+from deepdetect.app.server import STATIC
+from deepdetect.detector.points.detection import PointOptions, detect_points
+from deepdetect.detector.pretrained import RANKER
+from deepdetect.features.sift import scaled_sift_descriptors, to_root_sift
+from deepdetect.io.image import luma
+
+PHOTOS = ("coffee.jpg", "coffee-turned.jpg", "motorcycle-left.jpg", "motorcycle-right.jpg")
+
+NEAR_PX = 0.05
+"""From a point of Python at which one of the page is the same. Nearly all are exactly there."""
+
+SHARED = 0.998
+"""Of the points, at least. Gaussians are rounded otherwise in up to seven columns at the right, and
+on processors without fused multiply-add: among thousands some points then change their order."""
+
+SCORE = 2e-3
+"""Largest difference of their scores, in those columns. Elsewhere it is below 1e-5."""
+
+READ_RANKER = f"""
+const ranker = readRanker(new Uint8Array(readFileSync({str(RANKER)!r})).buffer);
+"""
+WRITE = """
+const write = (numbers) =>
+  writeFileSync(made, new Uint8Array(Float64Array.from(numbers).buffer));
+"""
+
+
+def gray_of(name: str) -> np.ndarray:
+    return luma(load_image(STATIC / "examples" / name))
+
+
+def points_in_node(
+    run_node: Any, gray: np.ndarray, budgets: list[tuple[int, str]]
+) -> list[np.ndarray]:
+    """Return for each budget (N, 4): x, y, score and size of the page's points, best first."""
+    imports = """
+import { rankCandidates } from "@/points/ranking.js";
+import { readRanker } from "@/points/ranker.js";
+import { choosePoints } from "@/points/detection.js";
+"""
+    script = """
+const ranking = rankCandidates(new Uint8Array(bytes), width, height, ranker);
+write(values.budgets.flatMap(([count, spread]) => {
+  const { xy, scores, sizes } = choosePoints(ranking, count, spread);
+  return [scores.length, ...Array.from(scores, (score, k) =>
+    [xy[2 * k], xy[2 * k + 1], score, sizes[k]]).flat()];
+}));
+"""
+    height, width = gray.shape
+    found = run_node(
+        imports, READ_RANKER + WRITE + script, gray, width=width, height=height, budgets=budgets
+    )
+    parts = []
+    while len(found):
+        count = int(found[0])
+        parts.append(found[1 : 1 + 4 * count].reshape(-1, 4))
+        found = found[1 + 4 * count :]
+    return parts
+
+
+def compare(found: np.ndarray, expected: Keypoints) -> float:
+    """Check that points of the same place and size have the same score; return their share."""
+    assert expected.sizes is not None
+    assert abs(len(found) - len(expected)) <= (1 - SHARED) * len(expected)
+    # Sizes differ by at least a pixel, so that levels lie apart as a third coordinate.
+    places = np.column_stack([expected.xy, expected.sizes])
+    distances, nearest = cKDTree(found[:, [0, 1, 3]]).query(places)
+    same = distances < NEAR_PX
+    assert np.abs(found[nearest[same], 2] - expected.scores[same]).max() < SCORE
+    return float(same.mean())
+
+
+BUDGETS = ((100, "none"), (512, "none"), (2048, "none"), (512, "grid"), (512, "anms"))
+
+
+@pytest.mark.parametrize("name", PHOTOS)
+def test_the_points_of_a_photograph(name: str, run_node: Any) -> None:
+    gray = gray_of(name)
+    parts = points_in_node(run_node, gray, list(BUDGETS))
+    for (count, spread), found in zip(BUDGETS, parts, strict=True):
+        expected = detect_points(gray, PointOptions(max_keypoints=count, spread=spread))
+        assert compare(found, expected) >= SHARED, (count, spread)
+        assert (np.diff(found[:, 2]) <= 0).all()
+
+
+def test_all_points_of_a_photograph(run_node: Any) -> None:
+    gray = gray_of("motorcycle-left.jpg")
+    (found,) = points_in_node(run_node, gray, [(50_000, "none")])
+    assert compare(found, detect_points(gray, PointOptions(max_keypoints=50_000))) >= SHARED
+
+
+@pytest.mark.parametrize("shape", [(16, 16), (17, 200), (300, 24)], ids=str)
+def test_the_points_of_small_pictures(shape: tuple[int, int], run_node: Any) -> None:
+    """Gaussians reach over both borders, more than once."""
+    gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    (found,) = points_in_node(run_node, gray, [(1000, "none")])
+    expected = detect_points(gray, PointOptions(max_keypoints=1000))
+    assert len(found) == len(expected)
+    assert compare(found, expected) == 1
+
+
+def test_a_plain_picture_has_no_points(run_node: Any) -> None:
+    gray = np.full((40, 50), 77, np.uint8)
+    assert [len(part) for part in points_in_node(run_node, gray, [(10, "none"), (10, "anms")])] == [
+        0,
+        0,
+    ]
+
+
+@pytest.mark.parametrize("sigma", [0.9, 1.36, 4.5, 11.1])
+def test_gaussian_is_that_of_opencv(sigma: float, run_node: Any) -> None:
+    import cv2
+
+    gray = np.ascontiguousarray(gray_of("coffee.jpg")[:301, :477])
+    script = "write(blur(new Uint8Array(bytes), width, height, values.sigma));\n"
+    found = run_node(
+        'import { blur } from "@/gaussian.js";\n',
+        WRITE + script,
+        gray,
+        width=477,
+        height=301,
+        sigma=sigma,
+    )
+    expected = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma)
+    np.testing.assert_allclose(found.reshape(gray.shape), expected, rtol=1e-6, atol=1e-5)
+
+
+def test_the_ranker_is_that_of_the_package(run_node: Any) -> None:
+    from deepdetect.detector.points.candidate_features import FEATURES
+    from deepdetect.detector.points.ranker import load_ranker
+
+    features = np.random.default_rng(0).normal(0, 2, (200, FEATURES)).astype(np.float32)
+    found = run_node(
+        'import { rank, readRanker } from "@/points/ranker.js";\n',
+        READ_RANKER + WRITE + "write(rank(ranker, new Float32Array(bytes)));\n",
+        features,
+        width=0,
+        height=0,
+    )
+    np.testing.assert_allclose(found, load_ranker().rank(features), rtol=1e-4, atol=1e-4)
+
+
+def test_angles_and_descriptors_at_their_own_size(run_node: Any) -> None:
+    gray = gray_of("motorcycle-left.jpg")
+    points = detect_points(gray, PointOptions(max_keypoints=1500))
+    assert points.sizes is not None
+    assert points.angles is not None
+    imports = """
+import { dominantAngles } from "@/orientation.js";
+import { describeAtOwnSize } from "@/descriptors.js";
+"""
+    script = """
+const [xy, sizes] = [Float32Array.from(values.xy), Float32Array.from(values.sizes)];
+const gray = new Uint8Array(bytes);
+const angles = dominantAngles(gray, width, height, { xy, sizes });
+const given = Float32Array.from(values.angles);
+write([...angles, ...describeAtOwnSize(gray, width, height, { xy, sizes, angles: given })]);
+"""
+    found = run_node(
+        imports,
+        WRITE + script,
+        gray,
+        width=gray.shape[1],
+        height=gray.shape[0],
+        xy=points.xy.reshape(-1).tolist(),
+        sizes=points.sizes.tolist(),
+        angles=points.angles.tolist(),
+    )
+    turned = np.abs((found[: len(points)] - points.angles + 180) % 360 - 180)
+    assert np.quantile(turned, 0.99) < 1e-3
+    descriptors = found[len(points) :].reshape(-1, 16, 8)
+    expected = scaled_sift_descriptors(gray, points.xy, points.sizes, points.angles)
+    expected = to_root_sift(expected).reshape(-1, 16, 8)
+    # OpenCV counts directions the other way round, and rounds positions to pixels.
+    expected = expected[:, :, [0, 7, 6, 5, 4, 3, 2, 1]]
+    expected = expected / np.linalg.norm(expected, axis=(1, 2), keepdims=True)
+    assert (descriptors * expected).sum((1, 2)).min() > 0.98
+
+
+@pytest.mark.parametrize("size", [(1601, 1250), (1416, 1416), (1000, 2000), (9000, 300)], ids=str)
+def test_large_photographs_are_reduced_to_the_size_that_points_take(
+    size: tuple[int, int], run_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import deepdetect.detector.points.detection as detection
+
+    seen = []
+
+    def none(gray: np.ndarray, *_: Any, **__: Any) -> Keypoints:
+        seen.append(gray.shape[::-1])
+        return Keypoints(np.empty((0, 2)), [], gray.shape[::-1])
+
+    monkeypatch.setattr(detection, "detect_points", none)
+    rgb = np.zeros((size[1], size[0], 3), np.uint8)
+    deepdetect.DeepDetect().detect(rgb, max_keypoints=5)
+    found = run_node(
+        'import { pointsSize } from "@/pixels.js";\n',
+        WRITE + "write(pointsSize(width, height));\n",
+        np.zeros(1),
+        width=size[0],
+        height=size[1],
+    )
+    assert found.tolist() == list(seen[0])

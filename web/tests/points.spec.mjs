@@ -1,0 +1,151 @@
+// Points of all scales in the page, beside those of Python.
+import { join } from "node:path";
+import { NO_BROWSER, askPython, choose, chromium, downloaded, examples, expect, openExample, slide, table,
+         test } from "./page.mjs";
+
+test.skip(!chromium, NO_BROWSER);
+
+const NUMBERS = [10, 20, 50, 100, 200, 300, 500, 750, 1000, 1500, 2000, 3000]; // by the slider's value
+
+const POINTS = `
+import json, sys
+from deepdetect import DeepDetect
+path, options = sys.argv[1], json.loads(sys.argv[2])
+found = DeepDetect(backend="onnxruntime").detect(path, mode="points", **options)
+columns = zip(*found.xy.T.tolist(), *(each.tolist() for each in (found.scores, found.sizes, found.angles)))
+print(json.dumps([list(row) for row in columns]))
+`;
+
+const pointsOf = (path, options) => askPython(POINTS, path, JSON.stringify(options));
+
+/** The share of points that are within 0.05 pixels of one with the same size, score and angle. */
+function shared(found, expected) {
+  const same = expected.filter(([x, y, score, size, angle]) => found.some((other) => {
+    const turned = Math.abs((other[4] - angle + 540) % 360 - 180);
+    return Math.hypot(other[0] - x, other[1] - y) < 0.05 && Math.abs(other[3] - size) < 1e-3 * size
+      && Math.abs(other[2] - score) < 2e-3 && turned < 1;
+  }));
+  return same.length / Math.max(expected.length, found.length);
+}
+
+const csv = async (page) => {
+  const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=csv]"));
+  return { header: String(content).split("\n")[0], rows: table(content) };
+};
+
+const openPoints = async (page, path) => {
+  await page.goto("./");
+  await page.locator("#file").setInputFiles(path);
+  await choose(page, "kind", "points");
+  await expect(page.locator("#count")).toContainText(" point");
+};
+
+for (const file of ["coffee.jpg", "motorcycle-left.jpg"]) {
+  test(`points of ${file} are those of Python`, async ({ page }) => {
+    const path = join(examples, file);
+    await openPoints(page, path);
+    for (const [value, spread] of [[6, "none"], [10, "none"], [6, "grid"], [6, "anms"]]) {
+      await slide(page, "number", value);
+      await choose(page, "spread", spread);
+      await expect(page.locator("#count")).toHaveText(`${NUMBERS[value].toLocaleString("en")} points`);
+      const { header, rows } = await csv(page);
+      expect(header).toBe("x,y,score,size,angle");
+      expect(rows.length).toBe(NUMBERS[value]);
+      const expected = pointsOf(path, { max_keypoints: NUMBERS[value], spread });
+      expect(shared(rows, expected), `${value} ${spread}`).toBeGreaterThanOrEqual(0.995);
+    }
+  });
+}
+
+test("points of a large photograph are in its own pixels, as in Python", async ({ page }, info) => {
+  const path = info.outputPath("large.png");
+  askPython(`
+import sys
+from PIL import Image
+image = Image.open(sys.argv[1]).convert("RGB").resize((2100, 1400), Image.Resampling.BICUBIC)
+image.save(sys.argv[2], compress_level=1)
+print("null")
+`, join(examples, "coffee.jpg"), path);
+  await openPoints(page, path);
+  await slide(page, "number", 10);
+  const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=json]"));
+  const found = JSON.parse(content);
+  expect(found).toMatchObject({ width: 2100, height: 1400, columns: ["x", "y", "score", "size", "angle"],
+                                options: { max_keypoints: 2000, spread: "none", mode: "points" } });
+  // One pixel in ten thousand may be rounded otherwise when it is reduced, by one level of grey.
+  expect(shared(found.keypoints, pointsOf(path, { max_keypoints: 2000 }))).toBeGreaterThan(0.95);
+});
+
+test("the slider answers at once: nothing is ranked again, and no network is run", async ({ page }) => {
+  await page.goto("./");
+  await choose(page, "kind", "points");
+  await page.locator("#file").setInputFiles(join(examples, "coffee.jpg"));
+  await expect(page.locator("#count")).toHaveText("1,000 points");
+  const best = (await csv(page)).rows;
+  for (const value of [0, 4, 8]) {
+    await slide(page, "number", value);
+    await expect(page.locator("#count")).toHaveText(`${NUMBERS[value].toLocaleString("en")} points`,
+                                                    { timeout: 1 });
+    const drawn = await page.locator("#view-keypoints .overlay").evaluate((canvas) =>
+      canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some((byte) => byte > 0));
+    expect(drawn).toBe(true);
+  }
+  await slide(page, "number", 4);
+  expect((await csv(page)).rows).toEqual(best.slice(0, NUMBERS[4])); // a ranking: more are added behind
+  await expect(page.locator("body")).toHaveAttribute("data-points-runs", "1");
+  expect(await page.locator("body").getAttribute("data-network-runs")).toBe(null);
+  await choose(page, "kind", "dense");
+  await expect(page.locator("#count")).toContainText("keypoint");
+  await expect(page.locator("body")).toHaveAttribute("data-network-runs", "1");
+});
+
+test("points are chosen by keys, and said to those who hear the page", async ({ page }) => {
+  await openExample(page, "Coffee");
+  await page.getByRole("radio", { name: "Dense" }).focus();
+  await page.keyboard.press("ArrowRight");
+  await expect(page.getByRole("radio", { name: "Points" })).toBeChecked();
+  await expect(page.locator("#count")).toHaveText("1,000 points");
+  await expect(page.locator("#kind-hint")).toContainText("The network is not run");
+  await expect(page.locator("#threshold-row")).toBeHidden();
+  await page.keyboard.press("Tab");
+  await expect(page.locator("#number")).toBeFocused();
+  await page.keyboard.press("ArrowLeft");
+  await expect(page.locator("#number")).toHaveAttribute("aria-valuetext", "750");
+  await expect(page.locator("#count")).toHaveText("750 points");
+  await expect(page.getByRole("status")).toHaveText("750 points");
+  await page.keyboard.press("Tab");
+  await expect(page.getByRole("radio", { name: "None" })).toBeFocused();
+  await page.keyboard.press("ArrowRight");
+  await expect(page.locator("#spread-hint")).toContainText("each cell");
+  await expect(page.getByRole("img", { name: /coffee\.jpg: 750 points, points of 3\.8 to 22\.7 pixels/ })).toBeVisible();
+});
+
+test("circles have the sizes of the points", async ({ page }) => {
+  await openPoints(page, join(examples, "coffee.jpg"));
+  await slide(page, "number", 0);
+  const { rows } = await csv(page);
+  const marked = await page.locator("#view-keypoints .overlay").evaluate((canvas, points) => {
+    const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+    const alpha = (x, y) => data[4 * (Math.round(y) * canvas.width + Math.round(x)) + 3] ?? 0;
+    return points.map(([x, y, , size]) => [0, 1, 2, 3].filter((k) =>
+      alpha(x + size / 2 * Math.cos(k * Math.PI / 2), y + size / 2 * Math.sin(k * Math.PI / 2)) > 0).length);
+  }, rows);
+  expect(Math.min(...marked)).toBeGreaterThanOrEqual(3); // of four places on each circle
+});
+
+test("a turned picture is matched by points", async ({ page }, info) => {
+  const path = info.outputPath("turned.png");
+  askPython("import sys, cv2; cv2.imwrite(sys.argv[2], cv2.rotate(cv2.imread(sys.argv[1]), cv2.ROTATE_90_CLOCKWISE)); print(0)",
+            join(examples, "coffee.jpg"), path);
+  await page.goto("./");
+  await page.locator("#file").setInputFiles([join(examples, "coffee.jpg"), path]);
+  await expect(page.locator("#match-hint")).toContainText("homography");
+  const { content } = await downloaded(page, page.locator("#view-matches [data-download=csv]"));
+  const rows = table(content);
+  expect(rows.length).toBeGreaterThan(1000);
+  // By a quarter: (x, y) comes to (399 - y, x).
+  const right = rows.filter(([x0, y0, x1, y1]) => Math.hypot(x1 - (399 - y0), y1 - x0) < 2).length;
+  expect(right / rows.length).toBeGreaterThan(0.95);
+  await choose(page, "match-kind", "ranked");
+  await expect(page.locator("#match-hint")).toContainText("most may be wrong");
+});
