@@ -16,7 +16,8 @@ const VIEWS = [
   { name: "keypoints", go: async (page) => {
     await example(page, "Coffee").click();
     await counted(page, "#count", "keypoint");
-    await page.locator("input[value=ranked]").check({ force: true });
+    await page.locator("input[name=kind][value=points]").check({ force: true });
+    await counted(page, "#count", / points/);
   } },
   { name: "heatmap", go: (page) => page.locator("#tab-heatmap").click() },
   { name: "matches", fresh: true, go: async (page) => {

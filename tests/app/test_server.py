@@ -46,7 +46,10 @@ def test_it_is_bound_to_the_loopback_address(serve: Any) -> None:
     assert client.server.address.startswith(f"http://{client.host}/#key=")
 
 
-@pytest.mark.parametrize("path", ["/", "/config.json", "/js/main.js", "/examples/coffee.jpg"])
+@pytest.mark.parametrize(
+    "path",
+    ["/", "/config.json", "/js/main.js", "/examples/coffee.jpg", "/model/ranker.npz"],
+)
 def test_the_page_is_served_with_a_strict_policy(path: str, serve: Any) -> None:
     client, _ = serve()
     answer = client.ask("GET", path, headers={"Authorization": None})

@@ -37,6 +37,7 @@ const SPREADS = {
 const view = element("view-keypoints");
 const form = view.querySelector("form");
 let shown = null; // the last selection: what is drawn and downloaded
+let isAwaited = false; // the number of keypoints is said when it is there
 
 /** What the controls say. */
 function options() {
@@ -185,6 +186,8 @@ function draw() {
   const text = counted(shown.count, chosen.kind === "points" ? "point" : "keypoint");
   element("count").textContent = text;
   overlay.setAttribute("aria-label", `${picture.name}: ${text}, ${shown.what}`);
+  if (isAwaited) announce(text);
+  isAwaited = false;
 }
 
 const downloads = {
@@ -214,7 +217,10 @@ export function setUp() {
     }
     later();
   });
-  form.addEventListener("change", () => announce(element("count").textContent));
+  form.addEventListener("change", () => {
+    isAwaited = true;
+    later();
+  });
   for (const button of form.querySelectorAll("[data-download]")) {
     button.onclick = () => shown && guarded(async () =>
       downloads[button.dataset.download](stem(shown.picture.name)));
