@@ -351,3 +351,26 @@ for (const [width, colorScheme] of [[1280, "light"], [1280, "dark"], [390, "ligh
     await check();
   });
 }
+
+test("long strips can be seen, and their matches too", async ({ page }, info) => {
+  const [wide, tall] = ["wide", "tall"].map((name) => info.outputPath(`${name}.png`));
+  askPython(`
+import sys, cv2, numpy
+coffee = cv2.imread(sys.argv[1])
+cv2.imwrite(sys.argv[2], numpy.tile(coffee[200:220], (1, 7, 1)))
+cv2.imwrite(sys.argv[3], numpy.tile(coffee[:, 300:320], (10, 1, 1)))
+print(0)
+`, join(examples, "coffee.jpg"), wide, tall);
+  for (const [path, width, height] of [[wide, 4200, 20], [tall, 20, 4000]]) {
+    await page.goto("./");
+    await openFile(page, path);
+    const box = await page.locator("#view-keypoints .picture").boundingBox();
+    expect([box.width, box.height]).toEqual([width, height]);
+    expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBeLessThanOrEqual(1280);
+  }
+  await page.locator("#file").setInputFiles(tall);
+  await expect(page.locator("#match-count")).toContainText("match");
+  const size = await page.locator("#view-matches .lines").evaluate((canvas) => [canvas.width, canvas.height]);
+  expect(size[1]).toBeGreaterThan(2000);
+  expect(size[1]).toBeLessThanOrEqual(4 * 1280);
+});

@@ -6,6 +6,8 @@ const MARK = [60, 255, 60];
 const DIMMED = 0.5;
 const MAX_LINES = 200; // of matches that are drawn, evenly among all: more cannot be told apart
 const MAX_CIRCLES = 5000; // more keypoints than this are drawn as single pixels
+const STRIP_RATIO = 8; // of the sides: pictures that are longer would be too thin on the page
+const MAX_HEIGHT_PER_WIDTH = 4; // of matches: higher canvases than browsers have would be needed
 
 export function newCanvas(width, height) {
   const canvas = document.createElement("canvas");
@@ -19,6 +21,16 @@ export function canvasOf(rgba, width, height) {
   const canvas = newCanvas(width, height);
   canvas.getContext("2d").putImageData(new ImageData(rgba, width, height), 0, 0);
   return canvas;
+}
+
+/** Shows a picture below what is drawn over it; long strips in their own size, to scroll along them. */
+export function showPicture(canvas, picture) {
+  if (canvas.source === picture) return;
+  canvas.source = picture;
+  [canvas.width, canvas.height] = [picture.width, picture.height];
+  canvas.getContext("2d").drawImage(picture.canvas, 0, 0);
+  const [short, long] = [picture.width, picture.height].sort((a, b) => a - b);
+  canvas.parentElement.classList.toggle("strip", long > STRIP_RATIO * short);
 }
 
 function resized(canvas, width, height) {
@@ -108,13 +120,15 @@ export function composeKeypoints(picture, overlay) {
 export function drawMatches(canvas, pictures, points0, points1, good, { stacked, width }) {
   const gap = 8;
   const [first, second] = pictures;
-  const scale = stacked ? width / Math.max(first.width, second.width)
-                        : (width - gap) / (first.width + second.width);
+  const [widths, heights] = [[first.width, second.width], [first.height, second.height]];
+  const [across, down] = stacked ? [Math.max(...widths), heights[0] + heights[1]]
+                                 : [widths[0] + widths[1], Math.max(...heights)];
+  const scale = Math.min((stacked ? width : width - gap) / across, MAX_HEIGHT_PER_WIDTH * width / down);
   const corner = stacked ? [0, Math.round(first.height * scale) + gap]
                          : [Math.round(first.width * scale) + gap, 0];
-  const height = stacked ? corner[1] + Math.round(second.height * scale)
-                         : Math.round(Math.max(first.height, second.height) * scale);
-  const context = resized(canvas, Math.round(width), Math.max(1, height));
+  const size = [Math.round(across * scale) + (stacked ? 0 : gap),
+                Math.round(down * scale) + (stacked ? gap : 0)].map((side) => Math.max(1, side));
+  const context = resized(canvas, ...size);
   context.clearRect(0, 0, canvas.width, canvas.height);
   context.drawImage(first.canvas, 0, 0, first.width * scale, first.height * scale);
   context.drawImage(second.canvas, ...corner, second.width * scale, second.height * scale);

@@ -1,6 +1,6 @@
 // The heat map of a picture, over the picture.
-import { drawHeatMap } from "../draw.js";
 import { findHeatMap } from "../detection.js";
+import { drawHeatMap, showPicture } from "../draw.js";
 import { savePng, stem } from "../downloads.js";
 import { activePicture, element, onceAFrame, page, showError } from "../page.js";
 
@@ -25,9 +25,7 @@ function draw() {
   overlay.style.opacity = String(opacity / 100);
   const canvas = view.querySelector(".picture");
   if (canvas.source !== picture) {
-    canvas.source = picture;
-    [canvas.width, canvas.height] = [picture.width, picture.height];
-    canvas.getContext("2d").drawImage(picture.canvas, 0, 0);
+    showPicture(canvas, picture);
     overlay.getContext("2d").clearRect(0, 0, overlay.width, overlay.height);
     overlay.source = null;
   }

@@ -1,6 +1,6 @@
 // The keypoints of a picture: which ones, how many, and files of them.
 import { anglesOf, findHeatMap, findPoints } from "../detection.js";
-import { composeKeypoints, drawCircles, drawPixels } from "../draw.js";
+import { composeKeypoints, drawCircles, drawPixels, showPicture } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
 import { activePicture, announce, counted, element, enlargement, onceAFrame, page, rescaled, showError,
          toOriginal } from "../page.js";
@@ -157,13 +157,7 @@ export async function show() {
 /** Shows the picture alone. */
 export function preview() {
   shown = null;
-  const picture = activePicture();
-  const canvas = view.querySelector(".picture");
-  if (canvas.source !== picture) {
-    canvas.source = picture;
-    [canvas.width, canvas.height] = [picture.width, picture.height];
-    canvas.getContext("2d").drawImage(picture.canvas, 0, 0);
-  }
+  showPicture(view.querySelector(".picture"), activePicture());
   const overlay = view.querySelector(".overlay");
   overlay.getContext("2d").clearRect(0, 0, overlay.width, overlay.height);
   element("count").textContent = "–";

@@ -130,8 +130,8 @@ export function draw() {
   canvas.hidden = !pair || !kept;
   if (!pair || !kept) return;
   const width = Math.max(200, view.querySelector(".stage").clientWidth - 22);
-  canvas.style.width = `${width}px`;
   const drawn = paint(canvas, width * devicePixelRatio, width < NARROW_PX);
+  canvas.style.width = `${canvas.width / devicePixelRatio}px`;
   const agreeing = kept.inliers.reduce((sum, value) => sum + value, 0);
   const text = counted(kept.ratios.length, "match");
   element("match-count").textContent = text;

@@ -1,5 +1,5 @@
 // Before and after: the second picture in the frame of the first, up to a line that moves.
-import { canvasOf, newCanvas } from "../draw.js";
+import { canvasOf, newCanvas, showPicture } from "../draw.js";
 import { savePng, stem } from "../downloads.js";
 import { during, element, page } from "../page.js";
 import { matched, matchingTask } from "./matches.js";
@@ -43,10 +43,9 @@ export function compare(bitmap) {
 function show(first, warped, hint) {
   shown = { first, warped };
   const [below, above] = view.querySelectorAll("canvas");
-  for (const [canvas, source] of [[below, first.canvas], [above, warped]]) {
-    [canvas.width, canvas.height] = [first.width, first.height];
-    canvas.getContext("2d").drawImage(source, 0, 0);
-  }
+  showPicture(below, first);
+  [above.width, above.height] = [first.width, first.height];
+  above.getContext("2d").drawImage(warped, 0, 0);
   element("wipe-hint").textContent = hint;
   draw();
 }
