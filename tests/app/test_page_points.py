@@ -165,8 +165,8 @@ import { describeAtOwnSize } from "@/descriptors.js";
 const [xy, sizes] = [Float32Array.from(values.xy), Float32Array.from(values.sizes)];
 const gray = new Uint8Array(bytes);
 const angles = dominantAngles(gray, width, height, { xy, sizes });
-const given = Float32Array.from(values.angles);
-write([...angles, ...describeAtOwnSize(gray, width, height, { xy, sizes, angles: given })]);
+const assigned = Float32Array.from(values.angles);
+write([...angles, ...describeAtOwnSize(gray, width, height, { xy, sizes, angles: assigned })]);
 """
     found = run_node(
         imports,
