@@ -36,6 +36,7 @@ const csv = async (page) => {
 const openPoints = async (page, path) => {
   await page.goto("./");
   await page.locator("#file").setInputFiles(path);
+  await expect(page.locator("#files li")).toHaveCount(1);
   await choose(page, "kind", "points");
   await expect(page.locator("#count")).toContainText(" point");
 };
@@ -114,7 +115,7 @@ test("points are chosen by keys, and said to those who hear the page", async ({ 
   await page.keyboard.press("ArrowLeft");
   await expect(page.locator("#number")).toHaveAttribute("aria-valuetext", "750");
   await expect(page.locator("#count")).toHaveText("750 points");
-  await expect(page.getByRole("status")).toHaveText("750 points");
+  await expect(page.locator("#status")).toHaveText("750 points");
   await page.keyboard.press("Tab");
   await expect(page.getByRole("radio", { name: "None" })).toBeFocused();
   await page.keyboard.press("ArrowRight");
