@@ -30,7 +30,8 @@ SIZE = 96
 def quick_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small images are not enlarged to 480x480, nor are few matches counted 64 times."""
     monkeypatch.setattr(paper, "MANY_SEEDS", 1)
-    monkeypatch.setattr("deepdetect.evaluation.evaluate.PAPER_RESOLUTION_PX", SIZE)
+    for module in ("evaluate", "options"):
+        monkeypatch.setattr(f"deepdetect.evaluation.{module}.PAPER_RESOLUTION_PX", SIZE)
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +111,55 @@ def test_the_labels_join_as_weights_without_error(run_evaluate, folder: Path) ->
         assert cells[0] != cells[1]
     densities = [line.split()[-1] for line in text.splitlines() if "tau" in line]
     assert float(densities[0]) > 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_protocol")
+def test_at_equal_density_weights_have_as_many_keypoints_as_the_labels(
+    run_evaluate, folder: Path
+) -> None:
+    arguments = ("--labels", "--oxford", folder, "--compare", "dense", "--equal-density")
+    text = run_evaluate(*arguments)
+    densities = [line.split()[2:] for line in text.splitlines() if "tau" in line]
+    assert len(densities) == 1, "one density, whatever the threshold"
+    assert len(set(densities[0])) == 1
+    assert len(densities[0]) == 3
+    at_half = evaluate_oxford(DeepDetect(), load_oxford(folder)).density[0.5]
+    assert abs(at_half - float(densities[0][0])) > 1e-3, "0.5 gives another number"
+
+
+def test_the_foreground_is_measured(run_evaluate, tmp_path: Path) -> None:
+    from skimage import data
+
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    image = cv2.resize(data.astronaut(), (128, 96), interpolation=cv2.INTER_AREA)
+    left = np.zeros((96, 128), bool)
+    left[:, :64] = True
+    for name, mask in (("left", left), ("right", ~left)):
+        Image.fromarray(image).save(photographs / f"{name}.png")
+        Image.fromarray(mask).save(photographs / f"{name}_mask.png")
+    score = evaluate(foreground=photographs).foreground
+    assert score is not None
+    assert score.photographs == 2
+    assert (score.fraction, score.covered) == (pytest.approx(0.5), 0.5), "of two halves, the mean"
+    label = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX)).heatmap(image) > 0.5
+    equal = evaluate(foreground=photographs, equal_density=True).foreground
+    assert equal is not None
+    assert equal.density == label.mean() != score.density
+    text = run_evaluate("--foreground", photographs)
+    line = next(line for line in text.splitlines() if "fraction" in line)
+    assert line.split() == ["fraction", "(density)", "0.5000", f"({score.density:.4f})"]
+
+
+def test_equal_density_without_images_is_refused(tmp_path: Path) -> None:
+    from click.testing import CliRunner
+
+    from deepdetect.cli import main
+
+    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--equal-density"])
+    assert result.exit_code == 2
+    assert "--oxford" in result.output
 
 
 def test_labels_without_oxford_are_refused(tmp_path: Path) -> None:

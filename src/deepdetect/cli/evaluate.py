@@ -38,6 +38,19 @@ WIDTH = 14
     help="With --oxford: measure the labels too, which weights without error would give.",
 )
 @click.option(
+    "--foreground",
+    type=PATH,
+    metavar="FOLDER",
+    help="Measure the fraction of the keypoints on the foreground of photographs NAME.jpg, as "
+    "NAME_mask.png has it, too.",
+)
+@click.option(
+    "--equal-density",
+    is_flag=True,
+    help="With --oxford and --foreground: of each image take as many keypoints as its label marks, "
+    "not those above 0.5, so that weights which mark more have no advantage.",
+)
+@click.option(
     "--scale",
     "scales",
     type=float,
@@ -51,6 +64,8 @@ def evaluate(
     compare: tuple[str, ...],
     oxford: Path | None,
     labels: bool,
+    foreground: Path | None,
+    equal_density: bool,
     scales: tuple[float, ...],
     as_json: bool,
     **values: Any,
@@ -62,8 +77,9 @@ def evaluate(
     separately for normal and for low-visibility images; with --oxford also what the paper's
     protocol gives: images squashed to 480x480, FLANN (mean of three seeds, of 64 where fewer than
     1,000 matches are correct), ratio 0.99, correct under 1 px; with --labels also what the
-    labels give there. With --scale, whether the quality holds on larger and smaller images;
-    SAMPLES may then be photographs without masks.
+    labels give there, and with --equal-density at the labels' number of keypoints. With --scale,
+    whether the quality holds on larger and smaller images; SAMPLES may then be photographs without
+    masks.
 
     Samples that cannot be read are listed at the end, with exit code 1, and are in no score.
 
@@ -72,8 +88,10 @@ def evaluate(
     deepdetect evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
     deepdetect evaluate samples/ --scale 0.5 --scale 1 --scale 2
     deepdetect evaluate photos/ --scale 1
+    deepdetect evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
     """
     from .._shared.errors import BatchError, OptionError
+    from ..datasets.foreground import load_foreground
     from ..datasets.oxford import load_oxford
     from ..detector.heatmap import HeatmapOptions
     from ..evaluation.evaluate import evaluate as run
@@ -83,11 +101,23 @@ def evaluate(
 
     if labels and oxford is None:
         raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")
+    if equal_density and oxford is None and foreground is None:
+        raise OptionError("--equal-density needs images to take keypoints of: --oxford FOLDER")
     scenes = load_oxford(oxford) if oxford is not None else []  # before hours of work
+    if foreground is not None:
+        load_foreground(foreground)
     weights = [values["weights"] or "default", *compare]
     detectors = [make_detector({**values, "weights": path}) for path in weights]
     found = [
-        run(detector, samples=samples, scales=scales, oxford=oxford, quiet=as_json)
+        run(
+            detector,
+            samples=samples,
+            scales=scales,
+            oxford=oxford,
+            foreground=foreground,
+            equal_density=equal_density,
+            quiet=as_json,
+        )
         for detector in detectors
     ]
     names = _short_names(detectors)
@@ -113,6 +143,9 @@ def evaluate(
         if on_oxford:
             click.echo()
             _print_oxford([*names, "labels"] if labels else names, on_oxford)
+        if foreground is not None:
+            click.echo()
+            _print_foreground(names, found)
     if failures := found[0].failures:
         total = len(failures) + sum(score.images for score in found[0].masks.values())
         raise BatchError(f"{len(failures)} of {total} samples are not in the scores", failures)
@@ -136,6 +169,8 @@ def _values(evaluation: Evaluation) -> dict[str, Any]:
         ]
     if evaluation.oxford is not None:
         values["oxford"] = asdict(evaluation.oxford)
+    if evaluation.foreground is not None:
+        values["foreground"] = asdict(evaluation.foreground)
     return values
 
 
@@ -202,3 +237,10 @@ def _print_oxford(names: Sequence[str], found: Sequence[OxfordScore]) -> None:
     _row("correct matches of all", names)
     for pair in found[0].correct:
         _row(f"  {pair}", [f"{each.correct[pair]:,} / {each.matches[pair]:,}" for each in found])
+
+
+def _print_foreground(names: Sequence[str], found: Sequence[Evaluation]) -> None:
+    scores = [each.foreground for each in found if each.foreground is not None]
+    title = f"foreground ({scores[0].covered:.4f})"
+    _row(title, names)
+    _row("  fraction (density)", [f"{each.fraction:.4f} ({each.density:.4f})" for each in scores])

@@ -12,19 +12,22 @@ import numpy as np
 from .._shared.errors import ImageError, OptionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
+from ..datasets.foreground import MaskedPhotograph, load_foreground
 from ..datasets.oxford import load_oxford
 from ..datasets.types import PlanarScene
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
 from ..features.selection import SelectionOptions
 from ..io.image import find_images, load_image
-from .baselines.method import heatmap_feature
+from .baselines.method import LocalFeature, heatmap_feature
 from .context import BenchmarkContext
 from .metrics.calibration import Calibration
 from .metrics.masks import MaskScore
 from .options import PAPER_RESOLUTION_PX, THRESHOLDS
 from .planar_benchmarks import select_pairs
+from .protocols.foreground import photograph_foreground
 from .protocols.masks import (
+    LabelDensityDetector,
     ScaleScore,
     check_scales,
     has_samples,
@@ -41,7 +44,8 @@ class OxfordScore:
     """What weights give on the Oxford scenes, images squashed to 480x480 and RGB.
 
     Attributes:
-        density: keypoints per pixel at each of the paper's thresholds, mean over all images.
+        density: keypoints per pixel at each of the paper's thresholds, mean over all images; at
+            equal density at the first of them only.
         repeatability: by scene, mean over its five pairs, as in the paper, clipped.
         correct: correct matches (FLANN, ratio 0.99, under 1 px by the published
             homography) by pair, means over several seeds of FLANN.
@@ -54,6 +58,23 @@ class OxfordScore:
     matches: dict[str, int]
 
 
+@dataclass(frozen=True)
+class ForegroundScore:
+    """How many keypoints lie on the foreground of photographs, images squashed to 480x480.
+
+    Attributes:
+        fraction: of the keypoints, mean over the photographs.
+        density: keypoints per pixel, mean over the photographs.
+        covered: of the pixels, which is what random keypoints reach.
+        photographs: how many were measured: those with a keypoint.
+    """
+
+    fraction: float
+    density: float
+    covered: float
+    photographs: int
+
+
 @suggest_keywords
 @dataclass(frozen=True)
 class Evaluation:
@@ -64,6 +85,7 @@ class Evaluation:
         calibration: of the probabilities on all pixels of these samples, likewise.
         scales: against the labels of scaled images, a row for each scale and visibility.
         oxford: by the paper's protocol.
+        foreground: of photographs with a known foreground.
         failures: a sentence on each sample that cannot be read and is not in the scores.
     """
 
@@ -72,6 +94,7 @@ class Evaluation:
     oxford: OxfordScore | None = None
     failures: tuple[str, ...] = ()
     calibration: dict[str, Calibration] = field(default_factory=dict)
+    foreground: ForegroundScore | None = None
 
 
 @suggest_keywords
@@ -81,6 +104,8 @@ def evaluate(
     samples: str | Path | None = None,
     scales: Sequence[float] = (),
     oxford: str | Path | None = None,
+    foreground: str | Path | None = None,
+    equal_density: bool = False,
     quiet: bool = True,
 ) -> Evaluation:
     """Evaluate weights.
@@ -93,10 +118,16 @@ def evaluate(
         scales: factors above 0: the samples scaled by each are compared with labels of their own.
         oxford: folder of the eight Oxford scenes: density, repeatability and correct matches by
             the paper's protocol.
+        foreground: folder of photographs NAME.jpg with their foreground NAME_mask.png: the fraction
+            of the keypoints that lies on it.
+        equal_density: of each image of `oxford` and `foreground` as many keypoints are taken as its
+            label marks, the most probable ones, instead of all above the threshold 0.5. More
+            keypoints are more repeatable and have more matches whatever they are, so weights are
+            compared in this way.
         quiet: show no progress bars.
 
     Raises:
-        ImageError: there is no sample that can be read, or a homography is missing.
+        ImageError: there is no sample that can be read, or a homography or a photograph is missing.
         OptionError: a scale is not above 0, or there are no samples to scale.
         MissingExtraError: `oxford` needs the extra "benchmark".
 
@@ -132,9 +163,18 @@ def evaluate(
     return Evaluation(
         masks,
         tuple(rows),
-        None if oxford is None else evaluate_oxford(detector, load_oxford(oxford), quiet=quiet),
+        None
+        if oxford is None
+        else evaluate_oxford(
+            detector, load_oxford(oxford), equal_density=equal_density, quiet=quiet
+        ),
         failures,
         calibration,
+        None
+        if foreground is None
+        else evaluate_foreground(
+            detector, load_foreground(foreground), equal_density=equal_density, quiet=quiet
+        ),
     )
 
 
@@ -146,19 +186,20 @@ def _shown(images: Sequence[Path], title: str, quiet: bool) -> Iterator[Path]:
             bar.update(1)
 
 
-def evaluate_oxford(detector: Any, scenes: list[PlanarScene], *, quiet: bool = True) -> OxfordScore:
+def evaluate_oxford(
+    detector: Any, scenes: list[PlanarScene], *, equal_density: bool = False, quiet: bool = True
+) -> OxfordScore:
     """Evaluate weights, or anything with a method `heatmap`, by the paper's protocol.
 
     Args:
         detector: a DeepDetect sees images squashed to 480x480, whatever its own resolution.
         scenes: of `load_oxford`.
+        equal_density: a DeepDetect takes as many keypoints of each image as its label marks.
         quiet: show no progress bar.
     """
-    if isinstance(detector, DeepDetect):
-        detector = detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX))
-    feature = heatmap_feature(
-        detector, SelectionOptions(THRESHOLDS[0]), name="evaluated", title="evaluated", version="1"
-    )
+    detector = _of_paper(detector, equal_density)
+    feature = _feature(detector)
+    thresholds = THRESHOLDS[:1] if equal_density else THRESHOLDS
     images = [image for scene in scenes for image in scene.images]
     pairs = [pair for scene in scenes for pair in scene.pairs()]
     matched = select_pairs(scenes, OXFORD_PAIRS)
@@ -172,7 +213,7 @@ def evaluate_oxford(detector: Any, scenes: list[PlanarScene], *, quiet: bool = T
                 bar.update(1)
             return found
 
-        densities = over(images, lambda image: _densities(detector, image))
+        densities = over(images, lambda image: _densities(detector, image, thresholds))
         repeatability = over(pairs, lambda pair: pair_repeatability(context, feature, pair))
         counts = over(matched, lambda pair: mean_correct_matches(context, feature, pair))
     by_scene: dict[str, list[float]] = {scene.name: [] for scene in scenes}
@@ -180,14 +221,56 @@ def evaluate_oxford(detector: Any, scenes: list[PlanarScene], *, quiet: bool = T
         by_scene[pair.scene].append(value)
     names = [pair.name for pair in matched]
     return OxfordScore(
-        {t: float(np.mean(of_t)) for t, *of_t in zip(THRESHOLDS, *densities, strict=True)},
+        {t: float(np.mean(of_t)) for t, *of_t in zip(thresholds, *densities, strict=True)},
         {name: float(np.mean(values)) for name, values in by_scene.items()},
         dict(zip(names, [correct for correct, _ in counts], strict=True)),
         dict(zip(names, [matches for _, matches in counts], strict=True)),
     )
 
 
-def _densities(detector: Any, image: Path) -> list[float]:
-    """Return the keypoints per pixel at each of the paper's thresholds."""
+def evaluate_foreground(
+    detector: Any,
+    photographs: Sequence[MaskedPhotograph],
+    *,
+    equal_density: bool = False,
+    quiet: bool = True,
+) -> ForegroundScore:
+    """Measure how many keypoints lie on the foreground; arguments as of `evaluate_oxford`.
+
+    Raises:
+        ImageError: a mask is not of its photograph's size, or no photograph has a keypoint.
+    """
+    feature, context = _feature(_of_paper(detector, equal_density)), BenchmarkContext(Path())
+    rows = []
+    with progress(len(photographs), "foreground", "image", quiet) as bar:
+        for photograph in photographs:
+            fraction, density = photograph_foreground(context, feature, photograph)
+            if density > 0:
+                rows.append((fraction, density, float(photograph.foreground().mean())))
+            bar.update(1)
+    if not rows:
+        raise ImageError("no photograph with a foreground has a keypoint")
+    fraction, density, covered = np.array(rows).T
+    return ForegroundScore(
+        float(fraction.mean()), float(density.mean()), float(covered.mean()), len(fraction)
+    )
+
+
+def _of_paper(detector: Any, equal_density: bool) -> Any:
+    """Return a detector that sees images as in the paper; others than DeepDetect as they are."""
+    if not isinstance(detector, DeepDetect):
+        return detector
+    squashing = detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX))
+    return LabelDensityDetector(squashing) if equal_density else squashing
+
+
+def _feature(detector: Any) -> LocalFeature:
+    return heatmap_feature(
+        detector, SelectionOptions(THRESHOLDS[0]), name="evaluated", title="evaluated", version="1"
+    )
+
+
+def _densities(detector: Any, image: Path, thresholds: Sequence[float]) -> list[float]:
+    """Return the keypoints per pixel at each of the thresholds."""
     heatmap = detector.heatmap(load_image(image))
-    return [float((heatmap > threshold).mean()) for threshold in THRESHOLDS]
+    return [float((heatmap > threshold).mean()) for threshold in thresholds]

@@ -58,12 +58,20 @@ def foreground_part(
         table = Table("foreground", "Keypoints on the foreground", columns, tuple(rows), note)
         return [with_paper_column(table, FRACTION, FOREGROUND, FOREGROUND_CAUSES)]
 
-    return feature_part(features, named, "foreground of ", partial(_measure, context), summarize)
+    return feature_part(
+        features, named, "foreground of ", partial(photograph_foreground, context), summarize
+    )
 
 
-def _measure(
+def photograph_foreground(
     context: BenchmarkContext, feature: LocalFeature, photograph: MaskedPhotograph
 ) -> tuple[float, float]:
+    """Return the fraction of the keypoints on the foreground, NaN without any, and their density.
+
+    Raises:
+        ImageError: the mask is not of the photograph's size.
+    """
+
     def make() -> dict[str, np.ndarray]:
         features = context.keypoints(feature, photograph.image).features
         foreground = photograph.foreground()
