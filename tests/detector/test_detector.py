@@ -420,6 +420,15 @@ def test_torch_without_safetensors(monkeypatch: pytest.MonkeyPatch, one_line: On
             {"providers": ("CPUExecutionProvider",), "backend": "openvino"},
             "providers belong to onnxruntime, not to openvino",
         ),
+        ({"precision": "float16"}, "unknown precision 'float16'"),
+        (
+            {"precision": "bfloat16", "backend": "onnxruntime"},
+            "precision='bfloat16' needs the backend openvino, not onnxruntime",
+        ),
+        (
+            {"precision": "bfloat16", "weights": TORCH_WEIGHTS},
+            "needs the backend openvino, not torch",
+        ),
         # Providers cannot be obeyed by torch, which alone reads these weights.
         (
             {"providers": ("CPUExecutionProvider",), "weights": TORCH_WEIGHTS},
@@ -748,6 +757,30 @@ def test_too_little_memory_is_one_sentence(backend: str) -> None:
     lines = done.stdout.splitlines()
     assert len(lines) == 4
     assert all("not enough memory" in line and "1600x1200" in line for line in lines)
+
+
+@needs["openvino"]
+def test_bfloat16_moves_few_keypoints(image: np.ndarray) -> None:
+    openvino = pytest.importorskip("openvino")
+    if "BF16" not in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
+        with pytest.raises(OptionError, match="no instructions for bfloat16"):
+            DeepDetect(precision="bfloat16")
+        return
+    exact, quick = DeepDetect(backend="openvino"), DeepDetect(precision="bfloat16")
+    assert (exact.runtime, quick.runtime) == ("openvino", "openvino, bfloat16")
+    expected, found = exact.heatmap(image), quick.heatmap(image)
+    difference = np.abs(found - expected)
+    assert 1e-5 < difference.max() < 0.2
+    assert ((found > 0.5) != (expected > 0.5)).mean() < 0.01
+
+
+@needs["openvino"]
+def test_a_processor_without_bfloat16(monkeypatch: pytest.MonkeyPatch, one_line: OneLine) -> None:
+    openvino = pytest.importorskip("openvino")
+    monkeypatch.setattr(openvino.Core, "get_property", lambda *_: ["FP32", "INT8"])
+    with pytest.raises(OptionError) as caught:
+        DeepDetect("dense", precision="bfloat16", threads=1)
+    assert "no instructions for bfloat16" in one_line(caught.value)
 
 
 @pytest.mark.slow

@@ -200,7 +200,7 @@ def _settings(selection: SelectionOptions, arguments: Mapping[str, Any]) -> dict
         "resolution": detector.heatmap_options.resolution,
         "network_channels": detector.heatmap_options.network_channels,
         "tta": detector.heatmap_options.tta,
-        "backend": detector.backend,
+        "backend": detector.runtime,
         "version": __version__,
     }
 

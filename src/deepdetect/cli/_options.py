@@ -58,6 +58,7 @@ DETECTOR = FieldOptions(
         "backend",
         "providers",
         "threads",
+        "precision",
         "tta",
         "tile_megapixels",
         "ranker",

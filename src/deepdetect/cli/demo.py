@@ -54,7 +54,7 @@ def demo(output: Path, as_json: bool, **values: Any) -> None:
         return
     print_table(
         [
-            ("network", f"{detector.weights.name}, {detector.backend}"),
+            ("network", f"{detector.weights.name}, {detector.runtime}"),
             *result.rows(),
             *seconds_rows(result.seconds),
             ("pictures", ", ".join(str(path) for path in result.pictures)),

@@ -100,7 +100,7 @@ def detect(
         "ranker": file_digest(detector.ranker),
         "resolution": detector.heatmap_options.resolution,
         "tta": detector.heatmap_options.tta,
-        "backend": detector.backend,
+        "backend": detector.runtime,
         "version": __version__,
     }
     records = OutputRecords("detect", output, settings, overwrite)
@@ -118,7 +118,7 @@ def detect(
                 failures.append(f"{path}: there is not enough memory for it: use a smaller image")
             bar.update(1)
     if as_json:
-        print_json({"backend": detector.backend, "images": results, "failures": failures})
+        print_json({"backend": detector.runtime, "images": results, "failures": failures})
     else:
         for result in results:
             how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"

@@ -127,7 +127,7 @@ def evaluate(
         on_oxford.append(evaluate_oxford(squashed, scenes, quiet=as_json))
     if as_json:
         results = [
-            {"weights": detector.weights, "backend": detector.backend, **_values(evaluation)}
+            {"weights": detector.weights, "backend": detector.runtime, **_values(evaluation)}
             for detector, evaluation in zip(detectors, found, strict=True)
         ]
         further: dict[str, Any] = {"compare": results[1:]} if compare else {}

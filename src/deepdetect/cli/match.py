@@ -133,7 +133,7 @@ def match(
         "matrix": None if matches.matrix is None else matches.matrix.tolist(),
         "guided": matches.guided,
         "guide": _guide_numbers(matches),
-        "backend": detector.backend,
+        "backend": detector.runtime,
         "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
         "file": file,
         "picture": picture,

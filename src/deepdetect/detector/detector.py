@@ -51,6 +51,8 @@ class DeepDetect:
         providers: ONNX Runtime's execution providers by name, as "CUDAExecutionProvider", the
             preferred one first.
         threads: number of threads. None: the backend's choice.
+        precision: what the network computes with, "float32", or "bfloat16" with OpenVINO: faster on
+            processors with instructions for it, and a few keypoints are others.
         network_channels: "rgb", or "bgr" as the paper's published code feeds the network. For
             images of OpenCV leave it, and give the methods `channels="bgr"`.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
@@ -90,6 +92,7 @@ class DeepDetect:
         backend: str = "auto",
         providers: tuple[str, ...] = (),
         threads: int | None = None,
+        precision: Literal["float32", "bfloat16"] = "float32",
         network_channels: Channels = "rgb",
         tta: Literal["none", "flip"] = "none",
         tile_megapixels: float | Literal["auto"] = "auto",
@@ -102,8 +105,14 @@ class DeepDetect:
             from .points.ranker import load_ranker
 
             load_ranker(self.ranker)
-        self._runtime = RuntimeOptions(backend, providers, threads)
+        self._runtime = RuntimeOptions(backend, providers, threads, precision)
         self._network, self.backend = open_network(self.weights, self._runtime)
+
+    @property
+    def runtime(self) -> str:
+        """What runs the network, as "openvino" or "openvino, bfloat16": results depend on it."""
+        precision = self._runtime.precision
+        return self.backend if precision == "float32" else f"{self.backend}, {precision}"
 
     @suggest_keywords
     def configured(self, heatmap_options: HeatmapOptions) -> DeepDetect:

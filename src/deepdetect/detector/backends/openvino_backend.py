@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError, WeightsError
+from ..._shared.errors import DeepDetectError, OptionError, WeightsError
 from .options import RuntimeOptions
 from .shapes import PADDED_IMAGE, as_logits, check_network, lack_of_memory, output_to_read
 from .without_telemetry import import_openvino
@@ -103,13 +103,18 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
 
     Raises:
         WeightsError: the file is damaged or is another network.
+        OptionError: the processor has no instructions for the precision.
     """
     openvino = import_openvino()
     from openvino.frontend import FrontEndManager
 
+    core = openvino.Core()
+    capabilities = core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    if options.precision == "bfloat16" and "BF16" not in capabilities:
+        raise OptionError("this processor has no instructions for bfloat16: leave precision out")
     # Its default on newer CPUs is bfloat16, which moves keypoints.
     settings: dict[str, object] = {
-        "INFERENCE_PRECISION_HINT": "f32",
+        "INFERENCE_PRECISION_HINT": "bf16" if options.precision == "bfloat16" else "f32",
         "CPU_RUNTIME_CACHE_CAPACITY": COMPILED_LAYERS,
     }
     if options.threads is not None:
@@ -123,7 +128,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     def compile_model(graph: Any = None) -> Any:
         graph = read() if graph is None else graph
         _take_out_padding(graph)
-        return openvino.Core().compile_model(graph, "CPU", settings)
+        return core.compile_model(graph, "CPU", settings)
 
     try:
         graph = read()

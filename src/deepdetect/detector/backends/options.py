@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from ..._shared.errors import OptionError, unknown_name
 from ..._shared.options import suggest_keywords
 
 BACKENDS = ("onnxruntime", "openvino", "torch")
+
+PRECISIONS = ("float32", "bfloat16")
 
 
 class Network(Protocol):
@@ -38,6 +40,8 @@ class RuntimeOptions:
         providers: names of ONNX Runtime's execution providers, the preferred one first,
             as ("CUDAExecutionProvider",); empty means its CPU provider.
         threads: number of threads; None leaves the backend's choice.
+        precision: what the network computes with, "float32" or "bfloat16": that is faster where
+            the processor has instructions for it, needs OpenVINO, and moves a few keypoints.
 
     Raises:
         OptionError: the backend is unknown or a value is out of its range.
@@ -46,6 +50,7 @@ class RuntimeOptions:
     backend: str = "auto"
     providers: tuple[str, ...] = ()
     threads: int | None = None
+    precision: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
         single = isinstance(self.providers, str)
@@ -55,11 +60,18 @@ class RuntimeOptions:
             raise unknown_name("backend", self.backend, ("auto", *BACKENDS))
         if self.threads is not None and self.threads < 1:
             raise OptionError(f"threads must be at least 1, not {self.threads}")
+        if self.precision not in PRECISIONS:
+            raise unknown_name("precision", self.precision, PRECISIONS)
         if self.backend != "auto":
-            self.check_providers(self.backend)
+            self.check_backend(self.backend)
 
-    def check_providers(self, backend: str) -> None:
-        """Raise an OptionError if providers are named for a backend that has none."""
+    def check_backend(self, backend: str) -> None:
+        """Raise an OptionError if a backend has not what is asked of it."""
+        if self.precision != "float32" and backend != "openvino":
+            raise OptionError(
+                f"precision='{self.precision}' needs the backend openvino, not {backend}: leave "
+                "one of them out"
+            )
         if self.providers and backend != "onnxruntime":
             raise OptionError(
                 f"providers belong to onnxruntime, not to {backend}: leave one of them out"

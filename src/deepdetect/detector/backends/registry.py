@@ -62,7 +62,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
             f"the backend {name} reads {' or '.join(backend.suffixes)} files, not {path.name}: "
             "leave the backend out, or give other weights"
         )
-    options.check_providers(name)
+    options.check_backend(name)
     for package in backend.packages:
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(
@@ -88,6 +88,8 @@ def _choose(path: Path, options: RuntimeOptions) -> str:
         return "torch"
     if suffix != ".onnx":
         raise WeightsError(f"{path} is no weights file: it must end in .onnx or .safetensors")
+    if options.precision != "float32":
+        return "openvino"
     # OpenVINO is 1.5 times as fast on CPUs and gives the same probabilities to 1e-3.
     if not options.providers and importlib.util.find_spec("openvino") is not None:
         return "openvino"

@@ -167,7 +167,7 @@ def deepdetect_feature(
         descriptor: of the keypoints.
     """
     digest = hashlib.sha256(detector.weights.read_bytes()).hexdigest()[:16]
-    version = f"{digest} {detector.backend} {detector.heatmap_options} {selection} {descriptor}"
+    version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"
     return heatmap_feature(
         detector, selection, name=name, title=title, descriptor=descriptor, version=version
     )

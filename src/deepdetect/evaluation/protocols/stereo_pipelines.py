@@ -124,7 +124,7 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
     found: list[Pipeline] = []
     for name, detector in detectors.items():
         version = (
-            f"{file_digest(detector.weights)[:16]} {detector.backend} {detector.heatmap_options}"
+            f"{file_digest(detector.weights)[:16]} {detector.runtime} {detector.heatmap_options}"
         )
         drawn = "" if found else "ours"
         found.append(Pipeline(f"ours, weights {name}", _ours(detector), version, drawn=drawn))
