@@ -13,13 +13,13 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from deepdetect.evaluation.planar_benchmarks import select_pairs
 
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.types import PlanarScene
 from deepdetect.evaluation.baselines.method import LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL, with_kd_trees
 from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.planar_benchmarks import select_pairs
 from deepdetect.evaluation.protocols.paper import OXFORD_PAIRS, mean_correct_matches
 from deepdetect.evaluation.protocols.paper_numbers import DENSITY, FIGURE_6, MATCHES
 

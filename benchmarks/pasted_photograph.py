@@ -17,13 +17,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from deepdetect.evaluation.planar_benchmarks import GUIDED_PAIRS, select_pairs
 from skimage import data
 
 from deepdetect import DeepDetect, HeatmapOptions, Matches, match_images
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.evaluation.metrics.stereo import stereo_score
+from deepdetect.evaluation.planar_benchmarks import GUIDED_PAIRS, select_pairs
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
 

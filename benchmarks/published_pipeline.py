@@ -20,7 +20,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from deepdetect.evaluation.planar_benchmarks import select_pairs
 
 from deepdetect import (
     DeepDetect,
@@ -35,6 +34,7 @@ from deepdetect.datasets.middlebury import load_calibrated_pair, load_middlebury
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.types import CalibratedStereoPair, PlanarPair, StereoPair
 from deepdetect.detector.pretrained import PRETRAINED
+from deepdetect.evaluation.planar_benchmarks import select_pairs
 from deepdetect.evaluation.profiling import Profile, profiled
 from deepdetect.evaluation.protocols.paper import CORRECT_PX
 from deepdetect.evaluation.protocols.stereo_pipelines import (

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from deepdetect.evaluation.planar_benchmarks import plan_oxford
 
 from deepdetect import DeepDetect, OptionError
 from deepdetect.datasets.degradation import DEGRADATIONS, degrade
@@ -19,6 +18,7 @@ from deepdetect.evaluation.cache import StageCache
 from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.metrics import repeatability
 from deepdetect.evaluation.options import BenchmarkOptions
+from deepdetect.evaluation.planar_benchmarks import plan_oxford
 from deepdetect.evaluation.protocols.degraded import (
     DEGRADED_BUDGETS,
     degraded_copy,

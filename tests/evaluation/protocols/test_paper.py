@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-from deepdetect.evaluation.planar_benchmarks import select_pairs
 
 from deepdetect import DeepDetect
 from deepdetect.datasets.middlebury import load_calibrated_pair
@@ -22,6 +21,7 @@ from deepdetect.evaluation.baselines.opencv import (
 )
 from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.options import BenchmarkOptions
+from deepdetect.evaluation.planar_benchmarks import select_pairs
 from deepdetect.evaluation.profiling import StageProfiler
 from deepdetect.evaluation.protocols import paper_numbers
 from deepdetect.evaluation.protocols.paper import (
