@@ -102,7 +102,9 @@ def test_recordings_of_a_camera_are_kept(run, tmp_path: Path, monkeypatch) -> No
             pass
 
     opened = cv2.VideoCapture
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Camera(0) if name == 0 else opened(name))
+    monkeypatch.setattr(
+        cv2, "VideoCapture", lambda name, *more: Camera(0) if name == 0 else opened(name, *more)
+    )
     assert run("track", 0, "-o", "out.mp4").exit_code == 0
     assert (tmp_path / "out.mp4").stat().st_size
     result = run("track", 0, "-o", "out.mp4")

@@ -87,7 +87,9 @@ def test_an_interrupt_ends_a_camera_properly(moving_photo, tmp_path: Path, monke
             pass
 
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(cv2, "VideoCapture", lambda name: Camera(0) if name == 0 else real(name))
+    monkeypatch.setattr(
+        cv2, "VideoCapture", lambda name, *more: Camera(0) if name == 0 else real(name, *more)
+    )
     report = track(0, tmp_path / "t.mp4", options=FEW)
     assert report.frames == 3
     assert signal.getsignal(signal.SIGINT) is before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import os
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,6 +19,9 @@ from .tracks import TrackedFrame
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 """Of the files, by their suffix."""
+
+SPARE_BYTES = 1 << 16
+"""That must fit behind a video: encoders write what they have left in smaller blocks."""
 
 READABLE_WIDTH_PX = 800
 """Lines and letters grow with frames that are wider than this."""
@@ -69,7 +73,11 @@ class VideoWriter:
 
 def count_frames(path: Path) -> int:
     """Return how many frames of a video file can be read one after the other."""
-    capture, count = cv2.VideoCapture(str(path)), 0
+    backend, settings = cv2.CAP_ANY, []
+    if cv2.CAP_FFMPEG in cv2.videoio_registry.getBackends():
+        # It can leave frames undecoded, which takes a fiftieth of the time.
+        backend, settings = cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1]
+    capture, count = cv2.VideoCapture(str(path), backend, settings), 0
     while capture.grab():
         count += 1
     capture.release()
@@ -118,6 +126,16 @@ def write_video(path: str | Path, fps: float) -> Iterator[VideoWriter]:
                 f"cannot write {path} ({found} of {writer.frames} frames are in the file): free "
                 "some space, or choose another place"
             )
+        _check_space(temporary)
+
+
+def _check_space(path: Path) -> None:
+    """Raise an OSError where a file cannot grow: then its own end may be missing, too."""
+    with path.open("r+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.write(bytes(SPARE_BYTES))
+        file.flush()
+        file.truncate(size)
 
 
 class TrackDrawer:
