@@ -95,6 +95,25 @@ def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX file modes")
+def test_a_folder_that_another_process_removes_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A command that fails removes its folders as soon as they are empty."""
+    target, opened, removed = tmp_path / "new" / "a.txt", os.open, []
+
+    def remove_and_open(path: Path, *arguments: int) -> int:
+        if len(removed) < 2:
+            target.parent.rmdir()
+            removed.append(path)
+        return opened(path, *arguments)
+
+    monkeypatch.setattr(os, "open", remove_and_open)
+    with atomic_path(target) as temporary:
+        temporary.write_text("whole", encoding="ascii")
+    assert len(removed) == 2
+    assert target.read_text(encoding="ascii") == "whole"
+
+
 def test_the_mode_is_that_of_any_new_file(tmp_path: Path) -> None:
     (tmp_path / "plain").touch()
     with atomic_path(tmp_path / "out") as temporary:

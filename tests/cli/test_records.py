@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import shutil
+import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -132,3 +135,64 @@ def test_what_is_not_replaced_is_still_known_to_be_of_its_files(tmp_path: Path) 
     with pytest.raises(OptionError, match=r"m\.jpg exists already, made from .*a\.png"):
         claim_outputs("match", second, outputs[1:], overwrite=False)
     claim_outputs("match", first, outputs[1:], overwrite=False)
+
+
+def test_a_signal_that_ends_the_process_leaves_no_trace(tmp_path: Path) -> None:
+    usual = signal.getsignal(signal.SIGTERM)
+    assert usual is signal.SIG_DFL
+
+    def work() -> None:
+        with claimed_outputs("match", [tmp_path / "a.png"], [tmp_path / "new" / "m.npz"], False):
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(SystemExit) as ended:
+        work()
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert not list(tmp_path.iterdir())
+    assert signal.getsignal(signal.SIGTERM) is usual
+
+
+def test_work_in_another_thread_has_no_signals(tmp_path: Path) -> None:
+    def work() -> None:
+        with claimed_outputs("match", [tmp_path / "a.png"], [tmp_path / "m.npz"], False):
+            (tmp_path / "m.npz").touch()
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(work).result()
+    claim_outputs("match", [tmp_path / "a.png"], [tmp_path / "m.npz"], overwrite=False)
+
+
+@pytest.mark.parametrize("other_name", ["a.png", "b.png"])
+@pytest.mark.parametrize("fails_first", [True, False])
+def test_a_failure_takes_no_record_from_a_command_at_work(
+    other_name: str, fails_first: bool, tmp_path: Path
+) -> None:
+    """Whether the other command works on the same files or not; either may begin and end first."""
+    inputs, others, output = [tmp_path / "a.png"], [tmp_path / other_name], tmp_path / "m.npz"
+    other = claimed_outputs("match", others, [output], overwrite=True)
+    failing = claimed_outputs("match", inputs, [output], overwrite=True)
+
+    def fail() -> None:
+        failing.__exit__(RuntimeError, RuntimeError(), None)
+
+    def succeed() -> None:
+        output.write_bytes(b"whole")
+        other.__exit__(None, None, None)
+
+    both = [(failing, fail), (other, succeed)]
+    for context, _ in both if fails_first else reversed(both):
+        context.__enter__()
+    for _, end in both if fails_first else reversed(both):
+        end()
+    claim_outputs("match", others, [output], overwrite=False)
+
+
+def test_an_output_belongs_to_the_command_that_wrote_it_last(tmp_path: Path) -> None:
+    first, second, output = [tmp_path / "a.png"], [tmp_path / "b.png"], tmp_path / "m.npz"
+    with claimed_outputs("match", first, [output], overwrite=False):
+        with claimed_outputs("match", second, [output], overwrite=False):
+            output.write_bytes(b"of b")
+        output.write_bytes(b"of a")
+    claim_outputs("match", first, [output], overwrite=False)
+    with pytest.raises(OptionError, match=r"made from .*a\.png"):
+        claim_outputs("match", second, [output], overwrite=False)

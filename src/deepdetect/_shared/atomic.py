@@ -25,6 +25,9 @@ ABANDONED_S = 24 * 3600.0
 STEM_LENGTH = 40
 """Characters of the final name in a temporary one, which must not become too long."""
 
+FOLDER_TRIES = 5
+"""How often a folder is made again that another process removes."""
+
 # Machine, process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")
 
@@ -64,12 +67,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     final = Path(path)
     temporary: Path | None = None
     try:
-        final.parent.mkdir(parents=True, exist_ok=True)
         clear_abandoned(final.parent)
         owner = _owner()
         name = final.with_name(f".{final.stem[:STEM_LENGTH]}.{owner}.part{final.suffix}")
-        # Nobody else reads what is not whole.
-        os.close(os.open(name, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
+        _make_private(name)
         temporary = name
         yield temporary
         temporary.chmod(0o666 & ~_umask())
@@ -84,6 +85,18 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def _make_private(path: Path) -> None:
+    """Make an empty file, which nobody else reads while it is not whole, and its folder."""
+    for left in reversed(range(FOLDER_TRIES)):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600))
+            return
+        except FileNotFoundError:  # a command that failed has just removed its empty folders
+            if not left:
+                raise
 
 
 def clear_abandoned(folder: Path) -> None:

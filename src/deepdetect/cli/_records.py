@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import signal
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -156,17 +158,9 @@ def claim_outputs(
         DeepDetectError: the folder cannot be written.
     """
     check_outputs(command, inputs, outputs, overwrite, growing)
-    names = _names(inputs)
     for path in outputs:
-        value = {
-            "input": " and ".join(names),
-            "state": [0, 0],
-            "settings": {"inputs": names},
-            "files": {path.name: None},
-            "numbers": None,
-        }
         with atomic_path(_claim(command, path)) as temporary:
-            temporary.write_text(json.dumps(value), encoding="utf-8")
+            temporary.write_bytes(_record_of(inputs, path))
 
 
 @contextmanager
@@ -176,8 +170,10 @@ def claimed_outputs(
     """Claim outputs for the time of the work; one that fails or is stopped leaves no trace.
 
     Outputs that it has not replaced belong to the files that they belonged to before, and folders
-    that were made for the records are removed again. Work that can be resumed keeps its records:
-    it calls `claim_outputs`.
+    that were made for the records are removed again. SIGTERM, and SIGHUP of a terminal that is
+    closed, stop it as Ctrl-C does. Where commands make one output at the same time, it belongs to
+    the files of the one that wrote it last. Work that can be resumed keeps its records: it calls
+    `claim_outputs`.
 
     Args:
         command: its name.
@@ -192,18 +188,56 @@ def claimed_outputs(
     check_outputs(command, inputs, outputs, overwrite)
     before = {path: (_state(path), _content(_claim(command, path))) for path in outputs}
     missing = {folder for path in outputs for folder in path.parents if not folder.exists()}
+    ours = {path: _record_of(inputs, path) for path in outputs}
+    with _ended_by_signals():
+        try:
+            claim_outputs(command, inputs, outputs, overwrite)
+            yield
+            for path, record in ours.items():
+                _put_back(_claim(command, path), record)  # another command may have changed it
+        except BaseException:
+            for path, (state, previous) in before.items():
+                claim = _claim(command, path)
+                if _state(path) == state and _content(claim) == ours[path]:
+                    with contextlib.suppress(OSError, DeepDetectError):
+                        _put_back(claim, previous)
+            _remove_empty({_claim(command, path).parent for path in outputs})
+            _remove_empty({path.parent / FOLDER for path in outputs})
+            _remove_empty(missing)
+            raise
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Let signals that end a process at once raise SystemExit, unless they are handled already."""
+
+    def end(number: int, _: Any) -> None:
+        raise SystemExit(128 + number)  # as a shell has it
+
+    usual = {}
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows lacks some
+            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+                usual[number] = signal.signal(number, end)
     try:
-        claim_outputs(command, inputs, outputs, overwrite)
         yield
-    except BaseException:
-        with contextlib.suppress(OSError, DeepDetectError):
-            for path, (state, record) in before.items():
-                if _state(path) == state:
-                    _put_back(_claim(command, path), record)
-        _remove_empty({folder / FOLDER / command for folder in {path.parent for path in outputs}})
-        _remove_empty({path.parent / FOLDER for path in outputs})
-        _remove_empty(missing)
-        raise
+    finally:
+        for number, handler in usual.items():
+            signal.signal(number, handler)
+
+
+def _record_of(inputs: Sequence[Path], output: Path) -> bytes:
+    """Return the record of an output that is made from these inputs."""
+    names = _names(inputs)
+    value = {
+        "input": " and ".join(names),
+        "state": [0, 0],
+        "settings": {"inputs": names},
+        "files": {output.name: None},
+        "numbers": None,
+    }
+    return json.dumps(value).encode()
 
 
 def _content(path: Path) -> bytes | None:
