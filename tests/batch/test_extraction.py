@@ -14,7 +14,7 @@ import pytest
 
 from deepdetect import DeepDetect, OptionError, SelectionOptions, load_image
 from deepdetect.batch import extract_features
-from deepdetect.batch.extraction import IMAGES_PER_PART, parts_of
+from deepdetect.batch.extraction import IMAGES_PER_PART, _extract_part, parts_of
 from deepdetect.features.sift import described_at_own_size, root_sift_descriptors
 from deepdetect.io.image import luma
 
@@ -285,3 +285,15 @@ def test_memory_does_not_grow_with_the_number_of_images(
     )
     few, many = map(int, code.stdout.split())
     assert many < 1.1 * few
+
+
+def test_a_machine_without_the_instructions_fails_as_a_whole(
+    collection: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Machines of a cluster may differ: not each of its images is at fault."""
+    openvino = pytest.importorskip("openvino")
+    monkeypatch.setattr(openvino.Core, "get_property", lambda *_: ["FP32"])
+    arguments = (("precision", "bfloat16"), ("threads", 3))
+    task = (tmp_path / "part.h5", (("b/01.png", (0, 0)),))
+    with pytest.raises(OptionError, match="no instructions for bfloat16"):
+        _extract_part(task, collection(3), FEW, arguments, ("", ""), 1.0)

@@ -429,6 +429,10 @@ def test_torch_without_safetensors(monkeypatch: pytest.MonkeyPatch, one_line: On
             {"precision": "bfloat16", "weights": TORCH_WEIGHTS},
             "needs the backend openvino, not torch",
         ),
+        (
+            {"precision": "bfloat16", "providers": ("CPUExecutionProvider",)},
+            "precision='bfloat16' needs the backend openvino, and providers belong to onnxruntime",
+        ),
         # Providers cannot be obeyed by torch, which alone reads these weights.
         (
             {"providers": ("CPUExecutionProvider",), "weights": TORCH_WEIGHTS},
@@ -768,6 +772,10 @@ def test_bfloat16_moves_few_keypoints(image: np.ndarray) -> None:
         return
     exact, quick = DeepDetect(backend="openvino"), DeepDetect(precision="bfloat16")
     assert (exact.runtime, quick.runtime) == ("openvino", "openvino, bfloat16")
+    assert repr(quick).endswith("backend='openvino', precision='bfloat16')")
+    assert quick.with_weights("dense").runtime == quick.configured(HeatmapOptions(480)).runtime
+    with pytest.raises(OptionError, match="needs the backend openvino, not torch"):
+        quick.with_weights(TORCH_WEIGHTS)
     expected, found = exact.heatmap(image), quick.heatmap(image)
     difference = np.abs(found - expected)
     assert 1e-5 < difference.max() < 0.2

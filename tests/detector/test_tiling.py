@@ -181,6 +181,23 @@ def test_a_size_of_tiles_is_never_ignored(photo: np.ndarray) -> None:
         ).heatmap(large)
 
 
+def test_images_in_bfloat16_are_run_whole(
+    photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tiles are computed in float32, so that keypoints would depend on the memory."""
+    openvino = pytest.importorskip("openvino")
+    # The instructions are not needed for that.
+    monkeypatch.setattr(openvino.Core, "get_property", lambda *_: ["FP32", "BF16"])
+    options: dict[str, object] = {"resolution": "native", "precision": "bfloat16", "threads": 2}
+    with pytest.raises(OptionError, match=r"cannot be run in tiles: .* in float32"):
+        DeepDetect(tile_megapixels=1.5, **options).heatmap(np.tile(photo, (6, 6, 1)))
+    small, whole = photo[:96, :128], DeepDetect(**options)
+    expected = whole.heatmap(small)
+    monkeypatch.setattr(heatmap, "available_memory", lambda: 0)
+    monkeypatch.setattr(heatmap, "_open_tiled", None)
+    np.testing.assert_array_equal(whole.heatmap(small), expected)
+
+
 @pytest.mark.parametrize("resolution", ["auto", "native"])
 def test_nobody_holds_the_image_while_keypoints_are_selected(
     resolution: str, photo: np.ndarray, monkeypatch: pytest.MonkeyPatch

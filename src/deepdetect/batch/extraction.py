@@ -245,8 +245,8 @@ def _extract_part(
 
     def groups() -> Iterator[Group]:
         for name, state in images:
+            opened = _detector(detector, digests)  # what is wrong with it concerns all images
             try:
-                opened = _detector(detector, digests)
                 keypoints, uncertainty = _features_of(
                     root / name, selection, opened, max_megapixels
                 )

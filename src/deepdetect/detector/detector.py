@@ -52,7 +52,8 @@ class DeepDetect:
             preferred one first.
         threads: number of threads. None: the backend's choice.
         precision: what the network computes with, "float32", or "bfloat16" with OpenVINO: faster on
-            processors with instructions for it, and a few keypoints are others.
+            processors with instructions for it, a few keypoints are others, and images are run whole,
+            whatever the memory.
         network_channels: "rgb", or "bgr" as the paper's published code feeds the network. For
             images of OpenCV leave it, and give the methods `channels="bgr"`.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
@@ -204,10 +205,11 @@ class DeepDetect:
             return find_points(rgb, options, self.heatmap_options, load_ranker(self.ranker))
 
     def __repr__(self) -> str:
-        shown = self.heatmap_options
+        shown, precision = self.heatmap_options, self._runtime.precision
+        also = "" if precision == "float32" else f", precision={precision!r}"
         return (
             f"DeepDetect({self.weights.name}, resolution={shown.resolution!r}, "
-            f"network_channels={shown.network_channels!r}, backend={self.backend!r})"
+            f"network_channels={shown.network_channels!r}, backend={self.backend!r}{also})"
         )
 
     @overload

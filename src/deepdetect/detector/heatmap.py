@@ -191,7 +191,7 @@ def _native_logits(rgb: np.ndarray, network: Network, options: HeatmapOptions) -
 
 def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwork | None:
     """Return the network for tiles, or None for an image that is run whole."""
-    path = getattr(network, "onnx_path", None)  # torch and networks of others run whole
+    path = getattr(network, "onnx_path", None)  # torch, bfloat16 and others run whole
     if options.tile_megapixels == "auto":
         if path is None or pixels * network.bytes_per_pixel <= available_memory():  # type: ignore[attr-defined]
             return None
@@ -202,7 +202,7 @@ def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwo
     if tiled is None:
         raise OptionError(
             "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights "
-            "that deepdetect has trained"
+            "that deepdetect has trained, in float32"
         )
     return tiled
 

@@ -31,7 +31,7 @@ class OpenVinoNetwork:
             are wrong, and one compiled from the same graph crashes.
         output_name: of the output to read.
         path: the weights file.
-        threads: number of threads; None: OpenVINO's choice.
+        options: how it is run.
     """
 
     bytes_per_pixel = 260
@@ -43,13 +43,15 @@ class OpenVinoNetwork:
         compile_model: Callable[[], Any],
         output_name: str,
         path: Path,
-        threads: int | None,
+        options: RuntimeOptions,
     ) -> None:
         self._model = model
         self._compile = compile_model
         self._output_name = output_name
-        self.onnx_path = path
-        self.threads = threads
+        self._path = path
+        # Tiles are computed in float32.
+        self.onnx_path = path if options.precision == "float32" else None
+        self.threads = options.threads
         self._local = threading.local()
         self._lock = threading.Lock()
         self._works = False  # it has given a right answer
@@ -66,7 +68,7 @@ class OpenVinoNetwork:
         if self._works and stale and output.shape[2:] != image.shape[2:]:
             self._discard(model)
             raise lack_of_memory(image.shape)
-        logits = as_logits(output, self._output_name, image.shape, self.onnx_path)
+        logits = as_logits(output, self._output_name, image.shape, self._path)
         self._local.output_shape, self._works = output.shape, True
         return logits
 
@@ -109,9 +111,12 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     from openvino.frontend import FrontEndManager
 
     core = openvino.Core()
-    capabilities = core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-    if options.precision == "bfloat16" and "BF16" not in capabilities:
-        raise OptionError("this processor has no instructions for bfloat16: leave precision out")
+    if options.precision == "bfloat16":
+        capabilities = core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+        if "BF16" not in capabilities:
+            raise OptionError(
+                "this processor has no instructions for bfloat16: leave precision out"
+            )
     # Its default on newer CPUs is bfloat16, which moves keypoints.
     settings: dict[str, object] = {
         "INFERENCE_PRECISION_HINT": "bf16" if options.precision == "bfloat16" else "f32",
@@ -148,7 +153,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
             f"{path} is not an ONNX file that can be read ({reason}): download it again"
         ) from None
     output = output_to_read([value.get_any_name() for value in model.outputs])
-    return OpenVinoNetwork(model, compile_model, output, path, options.threads)
+    return OpenVinoNetwork(model, compile_model, output, path, options)
 
 
 def _take_out_padding(graph: Any) -> None:

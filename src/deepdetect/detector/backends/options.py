@@ -41,7 +41,8 @@ class RuntimeOptions:
             as ("CUDAExecutionProvider",); empty means its CPU provider.
         threads: number of threads; None leaves the backend's choice.
         precision: what the network computes with, "float32" or "bfloat16": that is faster where
-            the processor has instructions for it, needs OpenVINO, and moves a few keypoints.
+            the processor has instructions for it, needs OpenVINO, moves a few keypoints, and is not
+            for images in tiles.
 
     Raises:
         OptionError: the backend is unknown or a value is out of its range.
@@ -62,6 +63,11 @@ class RuntimeOptions:
             raise OptionError(f"threads must be at least 1, not {self.threads}")
         if self.precision not in PRECISIONS:
             raise unknown_name("precision", self.precision, PRECISIONS)
+        if self.providers and self.precision != "float32":
+            raise OptionError(
+                f"precision='{self.precision}' needs the backend openvino, and providers belong to "
+                "onnxruntime: leave one of them out"
+            )
         if self.backend != "auto":
             self.check_backend(self.backend)
 

@@ -121,11 +121,12 @@ PAPER_RANSAC_ITERATIONS = 100_000
 def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
     """Return what is compared, chance baselines last."""
     detectors = options.stereo_detectors()
+    versions = [
+        f"{file_digest(each.weights)[:16]} {each.runtime} {each.heatmap_options}"
+        for each in detectors.values()
+    ]
     found: list[Pipeline] = []
-    for name, detector in detectors.items():
-        version = (
-            f"{file_digest(detector.weights)[:16]} {detector.runtime} {detector.heatmap_options}"
-        )
+    for (name, detector), version in zip(detectors.items(), versions, strict=True):
         drawn = "" if found else "ours"
         found.append(Pipeline(f"ours, weights {name}", _ours(detector), version, drawn=drawn))
     for name, detector in detectors.items():
@@ -140,8 +141,8 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
             found.append(_paper(self_described(name, title), drawn, FIGURE_8[title]))
     found.append(Pipeline("OpenCV's SGBM", sgbm, every_pixel=True))
     detector = next(iter(detectors.values()))
-    version = file_digest(detector.weights)[:16]
-    found.append(Pipeline("baseline: as many random pixels as ours", _random(detector), version, 1))
+    title = "baseline: as many random pixels as ours"
+    found.append(Pipeline(title, _random(detector), versions[0], 1))
     found.append(Pipeline("baseline: all pixels", _ours(AllPixels())))
     found.append(
         Pipeline("all pixels, --density 1", _ours(AllPixels(), density=1), every_pixel=True)
