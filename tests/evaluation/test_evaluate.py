@@ -8,15 +8,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, OptionError, SelectionOptions, match_images
+from deepdetect import DeepDetect, ImageError, OptionError, SelectionOptions, match_images
 from deepdetect.datasets.oxford import SCENES, load_oxford
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.evaluation.baselines.method import heatmap_feature
 from deepdetect.evaluation.context import BenchmarkContext
-from deepdetect.evaluation.evaluate import evaluate, evaluate_oxford
+from deepdetect.evaluation.evaluate import _of_paper, evaluate, evaluate_oxford
 from deepdetect.evaluation.options import PAPER_RESOLUTION_PX, THRESHOLDS
 from deepdetect.evaluation.protocols import paper
-from deepdetect.evaluation.protocols.masks import LabelDetector
+from deepdetect.evaluation.protocols.masks import (
+    LabelDensityDetector,
+    LabelDetector,
+    score_at_scale,
+)
 from deepdetect.evaluation.protocols.paper import OXFORD_PAIRS, mean_correct_matches
 from deepdetect.geometry.residuals import transfer_errors
 from deepdetect.io.image import luma
@@ -120,12 +124,13 @@ def test_at_equal_density_weights_have_as_many_keypoints_as_the_labels(
 ) -> None:
     arguments = ("--labels", "--oxford", folder, "--compare", "dense", "--equal-density")
     text = run_evaluate(*arguments)
-    densities = [line.split()[2:] for line in text.splitlines() if "tau" in line]
-    assert len(densities) == 1, "one density, whatever the threshold"
-    assert len(set(densities[0])) == 1
-    assert len(densities[0]) == 3
+    assert "tau" not in text
+    (line,) = (line for line in text.splitlines() if "that of the labels" in line)
+    densities = line.split()[4:]
+    assert len(densities) == 3
+    assert len(set(densities)) == 1
     at_half = evaluate_oxford(DeepDetect(), load_oxford(folder)).density[0.5]
-    assert abs(at_half - float(densities[0][0])) > 1e-3, "0.5 gives another number"
+    assert abs(at_half - float(densities[0])) > 1e-3, "0.5 gives another number"
 
 
 def test_the_foreground_is_measured(run_evaluate, tmp_path: Path) -> None:
@@ -150,6 +155,7 @@ def test_the_foreground_is_measured(run_evaluate, tmp_path: Path) -> None:
     text = run_evaluate("--foreground", photographs)
     line = next(line for line in text.splitlines() if "fraction" in line)
     assert line.split() == ["fraction", "(density)", "0.5000", f"({score.density:.4f})"]
+    assert "of random keypoints                           0.5000" in text
 
 
 def test_equal_density_without_images_is_refused(tmp_path: Path) -> None:
@@ -159,7 +165,31 @@ def test_equal_density_without_images_is_refused(tmp_path: Path) -> None:
 
     result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--equal-density"])
     assert result.exit_code == 2
-    assert "--oxford" in result.output
+    assert "--equal-density is for the keypoints of --oxford and --foreground" in result.output
+    with pytest.raises(OptionError, match="`equal_density` is for the keypoints of `oxford`"):
+        evaluate(equal_density=True)
+    with pytest.raises(OptionError, match="leave out `equal_density`"):
+        evaluate_oxford(LabelDetector(), [], equal_density=True)
+
+
+def test_a_missing_folder_is_said_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("deepdetect.evaluation.evaluate.readable_samples", None)
+    for name in ("oxford", "foreground"):
+        with pytest.raises(ImageError, match="there are no"):
+            evaluate(samples=tmp_path, **{name: tmp_path / "none"})
+
+
+def test_other_options_of_the_detector_stay(folder: Path) -> None:
+    rgb = np.asarray(Image.open(folder / "graf" / "img1.png"))
+    flipping = DeepDetect(tta="flip", resolution="native", tile_megapixels=2)
+    squashing = _of_paper(flipping, equal_density=False)
+    assert squashing.heatmap_options == HeatmapOptions(PAPER_RESOLUTION_PX, tta="flip")
+    (one,), (other,) = (score_at_scale(each, [rgb], 1) for each in (flipping, DeepDetect()))
+    assert one.score.loss != other.score.loss
+    native = flipping.configured(HeatmapOptions("native", tta="flip"))
+    assert LabelDensityDetector(native).heatmap(rgb).sum() == LabelDetector().heatmap(rgb).sum()
 
 
 def test_labels_without_oxford_are_refused(tmp_path: Path) -> None:

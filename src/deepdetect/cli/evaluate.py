@@ -91,7 +91,6 @@ def evaluate(
     deepdetect evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
     """
     from .._shared.errors import BatchError, OptionError
-    from ..datasets.foreground import load_foreground
     from ..datasets.oxford import load_oxford
     from ..detector.heatmap import HeatmapOptions
     from ..evaluation.evaluate import evaluate as run
@@ -101,11 +100,7 @@ def evaluate(
 
     if labels and oxford is None:
         raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")
-    if equal_density and oxford is None and foreground is None:
-        raise OptionError("--equal-density needs images to take keypoints of: --oxford FOLDER")
     scenes = load_oxford(oxford) if oxford is not None else []  # before hours of work
-    if foreground is not None:
-        load_foreground(foreground)
     weights = [values["weights"] or "default", *compare]
     detectors = [make_detector({**values, "weights": path}) for path in weights]
     found = [
@@ -142,7 +137,8 @@ def evaluate(
             _print_scales(names, found)
         if on_oxford:
             click.echo()
-            _print_oxford([*names, "labels"] if labels else names, on_oxford)
+            columns = [*names, "labels"] if labels else names
+            _print_oxford(columns, on_oxford, equal_density)
         if foreground is not None:
             click.echo()
             _print_foreground(names, found)
@@ -225,10 +221,11 @@ def _print_scales(names: Sequence[str], found: Sequence[Evaluation]) -> None:
         _row(title, cells)
 
 
-def _print_oxford(names: Sequence[str], found: Sequence[OxfordScore]) -> None:
+def _print_oxford(names: Sequence[str], found: Sequence[OxfordScore], equal_density: bool) -> None:
     _row("Oxford, density", names)
     for threshold in found[0].density:
-        _row(f"  tau {threshold}", [f"{each.density[threshold]:.4f}" for each in found])
+        title = "  that of the labels" if equal_density else f"  tau {threshold}"
+        _row(title, [f"{each.density[threshold]:.4f}" for each in found])
     _row("repeatability at 1 px", names)
     for scene in found[0].repeatability:
         _row(f"  {scene}", [f"{each.repeatability[scene]:.4f}" for each in found])
@@ -241,6 +238,6 @@ def _print_oxford(names: Sequence[str], found: Sequence[OxfordScore]) -> None:
 
 def _print_foreground(names: Sequence[str], found: Sequence[Evaluation]) -> None:
     scores = [each.foreground for each in found if each.foreground is not None]
-    title = f"foreground ({scores[0].covered:.4f})"
-    _row(title, names)
+    _row("on the foreground", names)
     _row("  fraction (density)", [f"{each.fraction:.4f} ({each.density:.4f})" for each in scores])
+    _row("  of random keypoints", [f"{each.covered:.4f}" for each in scores])

@@ -52,8 +52,7 @@ class DeepDetect:
             preferred one first.
         threads: number of threads. None: the backend's choice.
         precision: what the network computes with, "float32", or "bfloat16" with OpenVINO: faster on
-            processors with instructions for it, a few keypoints are others, and images are run whole,
-            whatever the memory.
+            processors with instructions for it; a few keypoints are others, and there are no tiles.
         network_channels: "rgb", or "bgr" as the paper's published code feeds the network. For
             images of OpenCV leave it, and give the methods `channels="bgr"`.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from ..datasets.foreground import MaskedPhotograph, load_foreground
 from ..datasets.oxford import load_oxford
 from ..datasets.types import PlanarScene
 from ..detector.detector import DeepDetect
-from ..detector.heatmap import HeatmapOptions
 from ..features.selection import SelectionOptions
 from ..io.image import find_images, load_image
 from .baselines.method import LocalFeature, heatmap_feature
@@ -128,7 +127,8 @@ def evaluate(
 
     Raises:
         ImageError: there is no sample that can be read, or a homography or a photograph is missing.
-        OptionError: a scale is not above 0, or there are no samples to scale.
+        OptionError: a scale is not above 0, or there are no samples to scale, or no images for
+            `equal_density`.
         MissingExtraError: `oxford` needs the extra "benchmark".
 
     Example:
@@ -143,6 +143,13 @@ def evaluate(
     check_scales(scales)
     if scales and samples is None:
         raise OptionError("scales are of the images in samples: name their folder, too")
+    if equal_density and oxford is None and foreground is None:
+        raise OptionError(
+            "`equal_density` is for the keypoints of `oxford` and `foreground`: name a folder of "
+            "one of them, too"
+        )
+    scenes = None if oxford is None else load_oxford(oxford)  # before hours of work
+    photographs = None if foreground is None else load_foreground(foreground)
     detector = DeepDetect() if detector is None else detector
     masks: dict[str, MaskScore] = {}
     rows: list[ScaleScore] = []
@@ -164,17 +171,13 @@ def evaluate(
         masks,
         tuple(rows),
         None
-        if oxford is None
-        else evaluate_oxford(
-            detector, load_oxford(oxford), equal_density=equal_density, quiet=quiet
-        ),
+        if scenes is None
+        else evaluate_oxford(detector, scenes, equal_density=equal_density, quiet=quiet),
         failures,
         calibration,
         None
-        if foreground is None
-        else evaluate_foreground(
-            detector, load_foreground(foreground), equal_density=equal_density, quiet=quiet
-        ),
+        if photographs is None
+        else evaluate_foreground(detector, photographs, equal_density=equal_density, quiet=quiet),
     )
 
 
@@ -192,10 +195,14 @@ def evaluate_oxford(
     """Evaluate weights, or anything with a method `heatmap`, by the paper's protocol.
 
     Args:
-        detector: a DeepDetect sees images squashed to 480x480, whatever its own resolution.
+        detector: a DeepDetect sees images squashed to 480x480, whatever its own resolution; its
+            other options stay.
         scenes: of `load_oxford`.
         equal_density: a DeepDetect takes as many keypoints of each image as its label marks.
         quiet: show no progress bar.
+
+    Raises:
+        OptionError: `equal_density` is asked of another detector, which has no logits.
     """
     detector = _of_paper(detector, equal_density)
     feature = _feature(detector)
@@ -239,6 +246,7 @@ def evaluate_foreground(
 
     Raises:
         ImageError: a mask is not of its photograph's size, or no photograph has a keypoint.
+        OptionError: as of `evaluate_oxford`.
     """
     feature, context = _feature(_of_paper(detector, equal_density)), BenchmarkContext(Path())
     rows = []
@@ -259,8 +267,16 @@ def evaluate_foreground(
 def _of_paper(detector: Any, equal_density: bool) -> Any:
     """Return a detector that sees images as in the paper; others than DeepDetect as they are."""
     if not isinstance(detector, DeepDetect):
+        if equal_density:
+            raise OptionError(
+                "only of a DeepDetect as many keypoints as wanted can be taken: leave "
+                "out `equal_density`"
+            )
         return detector
-    squashing = detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX))
+    options = replace(
+        detector.heatmap_options, resolution=PAPER_RESOLUTION_PX, tile_megapixels="auto"
+    )
+    squashing = detector.configured(options)
     return LabelDensityDetector(squashing) if equal_density else squashing
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +160,8 @@ class LabelDensityDetector:
 
     def __init__(self, detector: DeepDetect, options: LabelOptions = LabelOptions()) -> None:
         self.detector = detector
-        self.labels = LabelDetector(options, detector.heatmap_options)
+        seen = HeatmapOptions(detector.heatmap_options.resolution)  # labels are not flipped
+        self.labels = LabelDetector(options, seen)
 
     def heatmap(self, image: Any) -> np.ndarray:
         """Return (H, W) float32: 1 at the pixels that are taken, else 0."""
@@ -224,7 +225,8 @@ def score_at_scale(
     """Score a detector on images scaled by a factor, against the labels of the scaled images.
 
     Args:
-        detector: its weights are measured, at native resolution, whatever theirs is.
+        detector: its weights are measured, at native resolution, whatever theirs is; its other
+            options stay.
         images: anything `load_image` takes.
         scale: above 0; images are downscaled by area averaging and upscaled cubically.
         options: how labels are made; the visibility of each image decides the settings.
@@ -244,7 +246,7 @@ def score_at_scale(
         ('normal', 1.0)
     """
     check_scales([scale])
-    native = detector.configured(HeatmapOptions("native"))
+    native = detector.configured(replace(detector.heatmap_options, resolution="native"))
     found: dict[str, list[Scored]] = {}
     for image in images:
         rgb = _scaled(load_image(image), scale)
