@@ -423,7 +423,7 @@ def test_torch_without_safetensors(monkeypatch: pytest.MonkeyPatch, one_line: On
         ({"precision": "float16"}, "unknown precision 'float16'"),
         (
             {"precision": "bfloat16", "backend": "onnxruntime"},
-            "precision='bfloat16' needs the backend openvino, not onnxruntime",
+            '`precision="bfloat16"` needs the backend openvino, not onnxruntime',
         ),
         (
             {"precision": "bfloat16", "weights": TORCH_WEIGHTS},
@@ -431,7 +431,7 @@ def test_torch_without_safetensors(monkeypatch: pytest.MonkeyPatch, one_line: On
         ),
         (
             {"precision": "bfloat16", "providers": ("CPUExecutionProvider",)},
-            "precision='bfloat16' needs the backend openvino, and providers belong to onnxruntime",
+            '`precision="bfloat16"` needs openvino, and providers belong to onnxruntime',
         ),
         # Providers cannot be obeyed by torch, which alone reads these weights.
         (

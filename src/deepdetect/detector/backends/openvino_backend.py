@@ -115,7 +115,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         capabilities = core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
         if "BF16" not in capabilities:
             raise OptionError(
-                "this processor has no instructions for bfloat16: leave precision out"
+                "this processor has no instructions for bfloat16: leave `precision` out"
             )
     # Its default on newer CPUs is bfloat16, which moves keypoints.
     settings: dict[str, object] = {

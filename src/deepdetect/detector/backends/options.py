@@ -65,8 +65,8 @@ class RuntimeOptions:
             raise unknown_name("precision", self.precision, PRECISIONS)
         if self.providers and self.precision != "float32":
             raise OptionError(
-                f"precision='{self.precision}' needs the backend openvino, and providers belong to "
-                "onnxruntime: leave one of them out"
+                f'`precision="{self.precision}"` needs openvino, and providers belong to onnxruntime: '
+                "leave one of them out"
             )
         if self.backend != "auto":
             self.check_backend(self.backend)
@@ -75,7 +75,7 @@ class RuntimeOptions:
         """Raise an OptionError if a backend has not what is asked of it."""
         if self.precision != "float32" and backend != "openvino":
             raise OptionError(
-                f"precision='{self.precision}' needs the backend openvino, not {backend}: leave "
+                f'`precision="{self.precision}"` needs the backend openvino, not {backend}: leave '
                 "one of them out"
             )
         if self.providers and backend != "onnxruntime":
