@@ -65,8 +65,8 @@ class RuntimeOptions:
             raise unknown_name("precision", self.precision, PRECISIONS)
         if self.providers and self.precision != "float32":
             raise OptionError(
-                f'`precision="{self.precision}"` needs openvino, and providers belong to onnxruntime: '
-                "leave one of them out"
+                f'`precision="{self.precision}"` needs openvino, and providers belong to '
+                "onnxruntime: leave one of them out"
             )
         if self.backend != "auto":
             self.check_backend(self.backend)
