@@ -110,9 +110,8 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     openvino = import_openvino()
     from openvino.frontend import FrontEndManager
 
-    core = openvino.Core()
     if options.precision == "bfloat16":
-        capabilities = core.get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+        capabilities = openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
         if "BF16" not in capabilities:
             raise OptionError(
                 "this processor has no instructions for bfloat16: leave `precision` out"
@@ -133,7 +132,8 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     def compile_model(graph: Any = None) -> Any:
         graph = read() if graph is None else graph
         _take_out_padding(graph)
-        return core.compile_model(graph, "CPU", settings)
+        # A new core: one that memory was short for crashes.
+        return openvino.Core().compile_model(graph, "CPU", settings)
 
     try:
         graph = read()
