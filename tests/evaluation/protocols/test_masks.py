@@ -29,6 +29,8 @@ class Labels:
     def __init__(self) -> None:
         self.sizes: list[tuple[int, int]] = []
 
+    heatmap_options = HeatmapOptions()
+
     def configured(self, options: HeatmapOptions) -> Labels:
         assert options == HeatmapOptions("native")
         return self
