@@ -26,10 +26,10 @@ from deepdetect.training.views import View, render
 class Labels:
     """A detector that knows the labels."""
 
+    heatmap_options = HeatmapOptions()
+
     def __init__(self) -> None:
         self.sizes: list[tuple[int, int]] = []
-
-    heatmap_options = HeatmapOptions()
 
     def configured(self, options: HeatmapOptions) -> Labels:
         assert options == HeatmapOptions("native")
