@@ -4,7 +4,9 @@ const version = prefix + "VERSION";
 const files = ["FILES"];
 
 self.addEventListener("install", (event) => {
-  event.waitUntil(caches.open(version).then((cache) => cache.addAll(files))
+  // Asked of the server again: what the browser has kept of an older version would stay for good.
+  const requests = files.map((file) => new Request(file, { cache: "no-cache" }));
+  event.waitUntil(caches.open(version).then((cache) => cache.addAll(requests))
     .then(() => self.skipWaiting()));
 });
 

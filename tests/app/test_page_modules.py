@@ -101,6 +101,26 @@ writeFileSync(made, new Uint8Array(Float64Array.from(small).buffer));
     assert (found == expected).mean() > 0.999
 
 
+@pytest.mark.parametrize("values", ["COLOUR", "GRAY"])
+def test_reduction_to_half_is_that_of_opencv(values: str, run_node: Any, photo: np.ndarray) -> None:
+    """For which OpenCV has code of its own, that rounds otherwise."""
+    import cv2
+
+    channels = 4 if values == "COLOUR" else 1
+    given = np.tile(photo[:, :, :1], (2, 2, channels))[:200, :298].copy()
+    script = f"""
+const pixels = new Uint8ClampedArray(bytes);
+const rows = (top, count) => pixels.subarray({channels} * width * top,
+                                             {channels} * width * (top + count));
+const small = reduceByArea(rows, width, height, width / 2, height / 2, {values});
+writeFileSync(made, new Uint8Array(Float64Array.from(small).buffer));
+"""
+    imports = 'import { COLOUR, GRAY, reduceByArea } from "@/pixels.js";\n'
+    found = run_node(imports, script, given, width=298, height=200).reshape(100, 149, channels)
+    expected = cv2.resize(given, (149, 100), interpolation=cv2.INTER_AREA)
+    np.testing.assert_array_equal(found[..., :3], np.atleast_3d(expected)[..., :3])
+
+
 @pytest.mark.parametrize("size", [(1601, 1250), (1250, 1600), (2400, 1000), (5000, 500)], ids=str)
 def test_large_photographs_are_reduced_to_the_size_that_the_package_takes(
     size: tuple[int, int], run_node: Any

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,29 @@ def test_the_points_of_small_pictures(shape: tuple[int, int], run_node: Any) -> 
     assert compare(found, expected) == 1
 
 
+@pytest.mark.parametrize("spread", ["none", "grid", "anms"])
+@pytest.mark.parametrize("shape", [(16, 17), (23, 31), (101, 99)], ids=str)
+def test_few_points_of_small_pictures(shape: tuple[int, int], spread: str, run_node: Any) -> None:
+    """Smaller than the largest Gaussian, and with fewer points than are asked for, or one."""
+    gray = np.ascontiguousarray(gray_of("motorcycle-left.jpg")[200 : 200 + shape[0], : shape[1]])
+    counts = (1, 2, 5, 3000)
+    parts = points_in_node(run_node, gray, [(count, spread) for count in counts])
+    for count, found in zip(counts, parts, strict=True):
+        expected = detect_points(gray, PointOptions(max_keypoints=count, spread=spread))
+        assert len(found) == len(expected)
+        assert compare(found, expected) == 1
+
+
+@pytest.mark.parametrize("shape", [(1, 50), (50, 1), (2, 40), (40, 2)], ids=str)
+def test_pictures_without_an_inside_have_no_points(shape: tuple[int, int], run_node: Any) -> None:
+    gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    assert len(detect_points(gray)) == 0
+    assert [len(part) for part in points_in_node(run_node, gray, [(9, "none"), (9, "grid")])] == [
+        0,
+        0,
+    ]
+
+
 def test_a_plain_picture_has_no_points(run_node: Any) -> None:
     gray = np.full((40, 50), 77, np.uint8)
     assert [len(part) for part in points_in_node(run_node, gray, [(10, "none"), (10, "anms")])] == [
@@ -150,6 +174,46 @@ def test_the_ranker_is_that_of_the_package(run_node: Any) -> None:
         height=0,
     )
     np.testing.assert_allclose(found, load_ranker().rank(features), rtol=1e-4, atol=1e-4)
+
+
+def _without_a_layer(content: bytes) -> bytes:
+    file = io.BytesIO()
+    with np.load(io.BytesIO(content)) as arrays:
+        np.savez(file, **{name: arrays[name] for name in arrays.files if name != "weight1"})
+    return file.getvalue()
+
+
+def _compressed(content: bytes) -> bytes:
+    file = io.BytesIO()
+    with np.load(io.BytesIO(content)) as arrays:
+        np.savez_compressed(file, **{name: arrays[name] for name in arrays.files})
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda content: b"", "it holds no ranker"),
+        (lambda content: b"<!doctype html>" * 99, "it holds no ranker"),
+        (lambda content: content[:10_000], "it ends early"),
+        (lambda content: content[:9000] + b"\xff" + content[9001:], "its checksum is wrong"),
+        (_without_a_layer, "it holds no ranker"),
+        (_compressed, "it is compressed"),
+    ],
+)
+def test_a_damaged_ranker_is_refused(damage: Any, reason: str, run_node: Any) -> None:
+    content = damage(RANKER.read_bytes())
+    found = run_node(
+        'import { readRanker } from "@/points/ranker.js";\n',
+        WRITE
+        + """
+let said = "";
+try { readRanker(bytes); } catch (error) { said = error.message; }
+write(new TextEncoder().encode(said));
+""",
+        np.frombuffer(content, np.uint8),
+    )
+    assert bytes(found.astype(np.uint8)).decode().startswith(reason)
 
 
 def test_angles_and_descriptors_at_their_own_size(run_node: Any) -> None:

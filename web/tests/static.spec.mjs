@@ -248,28 +248,6 @@ test("pictures are dropped on the page", async ({ page }) => {
   await expect(page.locator("#count")).toContainText("keypoint");
 });
 
-test("what other pages of the same host keep is left alone", async ({ page }) => {
-  await page.goto("./icon.svg");
-  await page.evaluate(() => caches.open("of another page"));
-  await page.goto("./");
-  await page.evaluate(async () => {
-    while (!navigator.serviceWorker.controller) await new Promise((done) => setTimeout(done, 50));
-  });
-  expect(await page.evaluate(() => caches.has("of another page"))).toBe(true);
-});
-
-test("it works without a network once it was open", async ({ page, context }) => {
-  await page.goto("./");
-  await page.evaluate(async () => {
-    await navigator.serviceWorker.ready;
-    while (!navigator.serviceWorker.controller) await new Promise((done) => setTimeout(done, 50));
-  });
-  await context.setOffline(true);
-  await page.reload();
-  await example(page, "Coffee").click();
-  await expect(page.locator("#count")).toContainText("keypoint");
-});
-
 test("the graphics card finds nearly the same keypoints", async ({ playwright, baseURL }) => {
   const options = { executablePath: chromium, args: ["--enable-unsafe-webgpu", "--enable-features=Vulkan",
                                                      "--use-webgpu-adapter=swiftshader"] };

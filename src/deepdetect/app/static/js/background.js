@@ -7,8 +7,11 @@ export class Background {
   constructor(url) {
     this.calls = new Map();
     this.next = 0;
+    this.hasAnswered = false;
+    this.failure = null; // why it could not be started
     this.worker = new Worker(url, { type: "module" });
     this.worker.onmessage = ({ data: { id, result, error } }) => {
+      this.hasAnswered = true;
       const call = this.calls.get(id);
       this.calls.delete(id);
       if (error === undefined) call.resolve(result);
@@ -16,15 +19,23 @@ export class Background {
     };
     this.worker.onerror = (event) => {
       event.preventDefault();
-      for (const call of this.calls.values()) {
-        call.reject(new Error("This browser is too old for the page: use a newer one."));
-      }
+      const error = new Error(this.explain(event.message));
+      if (!this.hasAnswered) this.failure = error;
+      for (const call of this.calls.values()) call.reject(error);
       this.calls.clear();
     };
   }
 
+  /** The sentence for an error that no task has caught; without a message a file could not be loaded. */
+  explain(message) {
+    if (this.hasAnswered) return `The page has failed (${message}): load it again.`;
+    return message ? "This browser is too old for the page: use a newer one."
+                   : "A part of the page could not be loaded: load it again.";
+  }
+
   /** @param {string} task @param {object} values @returns {Promise<any>} */
   call(task, values, transfer = []) {
+    if (this.failure) return Promise.reject(this.failure);
     const id = this.next++;
     return new Promise((resolve, reject) => {
       this.calls.set(id, { resolve, reject });

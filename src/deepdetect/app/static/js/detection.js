@@ -18,6 +18,7 @@ export const isOpened = () => opened !== null;
 export function openNetwork(options) {
   const network = pictureWorker.call("open", options);
   opened ??= network;
+  network.then(() => { opened = network; }, () => {}); // the other one may have failed
   return network;
 }
 

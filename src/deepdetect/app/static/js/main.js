@@ -127,7 +127,14 @@ async function addPictures(files) {
   }
   const started = restarts;
   for (const file of files) {
-    const read = await readPicture(file);
+    let read;
+    try {
+      read = await readPicture(file);
+    } catch (error) {
+      if (restarts !== started) return;
+      if (page.pictures.length) showView(current); // what was read before it
+      throw error;
+    }
     if (restarts !== started) return;
     if (page.pictures.length >= MAX_PICTURES) return; // of two that were given at once
     page.pictures.push({ name: file.name, file, ...read,

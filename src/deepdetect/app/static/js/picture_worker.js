@@ -5,13 +5,14 @@ import { isConstant, networkSize, reduceByArea, toPlanes } from "./pixels.js";
 import { prepare } from "./selection.js";
 
 const MAX_THREADS = 4;
+const GZIP = [0x1f, 0x8b]; // the first bytes of such a file
 
 let runNetwork = null;
 
 const tasks = {
   /** Opens the network. @returns {Promise<string>} what runs it, in words */
   async open({ engine, token, processor }) {
-    const opened = engine === "python" ? pythonNetwork(token) : await browserNetwork(processor);
+    const opened = engine === "python" ? pythonNetwork(token) : await openedHere(processor);
     runNetwork = opened.run;
     return opened.words;
   },
@@ -35,11 +36,26 @@ const tasks = {
   },
 };
 
-/** The content of a file that the build has compressed. */
+/** The content of a file that the build has compressed, and that some web servers unpack themselves. */
 async function unpacked(address) {
   const response = await fetch(address);
   if (!response.ok) throw new Error("a file of ONNX Runtime is missing");
-  return new Response(response.body.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+  const content = await response.arrayBuffer();
+  const [first, second] = new Uint8Array(content);
+  if (first !== GZIP[0] || second !== GZIP[1]) return content;
+  if (typeof DecompressionStream === "undefined") {
+    throw new UserError("This browser is too old to run the network: use one of 2023 or later.");
+  }
+  return new Response(new Blob([content]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+}
+
+async function openedHere(processor) {
+  try {
+    return await browserNetwork(processor);
+  } catch (error) {
+    if (error instanceof UserError) throw error;
+    throw new UserError(`The network could not be loaded (${error.message}): load the page again.`);
+  }
 }
 
 async function browserNetwork(processor) {

@@ -6,7 +6,7 @@ export const MIN_SIDE = 16;
 const STRIDE = 8;
 
 /** How pixels lie in memory, and how many values of each are reduced. */
-const COLOUR = { step: 4, values: 3 };
+export const COLOUR = { step: 4, values: 3 };
 export const GRAY = { step: 1, values: 1 };
 
 /** The size at which the network sees a photograph: its own, or about two megapixels. */
@@ -78,6 +78,8 @@ export function reduceByArea(readRows, width, height, newWidth, newHeight,
                              { step, values } = COLOUR) {
   const across = areaWeights(width, newWidth);
   const down = areaWeights(height, newHeight);
+  const halved = width === 2 * newWidth && height === 2 * newHeight;
+  const round = halved ? Math.round : roundHalfEven; // OpenCV has code of its own for halves
   const result = new Uint8ClampedArray(step * newWidth * newHeight).fill(255);
   const sum = new Float32Array(values * newWidth);
   const line = new Float32Array(values * newWidth);
@@ -107,7 +109,7 @@ export function reduceByArea(readRows, width, height, newWidth, newHeight,
     }
     for (let x = 0; x < newWidth; x++) {
       for (let c = 0; c < values; c++) {
-        result[step * (y * newWidth + x) + c] = roundHalfEven(sum[values * x + c]);
+        result[step * (y * newWidth + x) + c] = round(sum[values * x + c]);
       }
     }
   });

@@ -1,5 +1,5 @@
 // Ranks the points of pictures, and finds their angles, beside the page. The network is not needed.
-import { answer } from "./background.js";
+import { UserError, answer } from "./background.js";
 import { decode } from "./decoding.js";
 import { dominantAngles } from "./orientation.js";
 import { GRAY, luma, pointsSize, reduceByArea } from "./pixels.js";
@@ -9,9 +9,19 @@ import { rankCandidates } from "./points/ranking.js";
 let ranker = null;
 
 async function loadRanker() {
-  const response = await fetch(new URL("../model/ranker.npz", import.meta.url));
-  if (!response.ok) throw new Error("the ranker's file is missing");
-  return readRanker(await response.arrayBuffer());
+  const problem = (what) => new UserError(`Points need model/ranker.npz, which ${what}.`);
+  let response;
+  try {
+    response = await fetch(new URL("../model/ranker.npz", import.meta.url));
+  } catch {
+    throw problem("could not be loaded: check the connection, and try again");
+  }
+  if (!response.ok) throw problem("is missing where this page comes from: install it there again");
+  try {
+    return readRanker(await response.arrayBuffer());
+  } catch (error) {
+    throw problem(`is damaged (${error.message}): install it again where this page comes from`);
+  }
 }
 
 /** The luma of a file at the size at which points are looked for. */
@@ -25,12 +35,11 @@ function reducedLuma(file, name) {
 }
 
 answer({
-  /** Ranks the candidates of a picture; what the network sees is enough where it is not reduced. */
+  /** Ranks the candidates of a picture; what the network sees is enough where it is the whole. */
   async rank({ file, name, rgba, width, height, original }) {
-    const [newWidth] = pointsSize(original.width, original.height);
-    const reduced = newWidth !== original.width;
-    const seen = reduced ? await reducedLuma(file, name) : { gray: luma(rgba), width, height };
     ranker ??= await loadRanker();
+    const whole = width === original.width && height === original.height;
+    const seen = whole ? { gray: luma(rgba), width, height } : await reducedLuma(file, name);
     return { gray: seen.gray, ...rankCandidates(seen.gray, seen.width, seen.height, ranker) };
   },
 

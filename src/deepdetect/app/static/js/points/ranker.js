@@ -3,9 +3,11 @@ import { FEATURES } from "./candidate_features.js";
 
 const MAX_DEVIATIONS = 6;
 const LOCAL_HEADER = 0x04034b50;
+const CHECKSUM_AT = 14;
 const NAME_LENGTH_AT = 26;
 const EXTRA_LENGTH_AT = 28;
 const HEADER_BYTES = 30;
+const CRC_POLYNOMIAL = 0xedb88320;
 const fround = Math.fround;
 
 /**
@@ -22,7 +24,7 @@ export function readRanker(content) {
   const sides = [FEATURES, ...layers.map(({ bias }) => bias?.length)];
   const fits = mean?.length === FEATURES && deviation?.length === FEATURES && sides.at(-1) === 1
     && layers.every(({ weight }, k) => weight?.length === sides[k] * sides[k + 1]);
-  if (!fits) throw new Error("the ranker's file holds another network");
+  if (!fits) throw new Error("it holds no ranker, or another one");
   return { mean, deviation, layers };
 }
 
@@ -37,13 +39,28 @@ function readArrays(content) {
     const start = extra + view.getUint16(at + EXTRA_LENGTH_AT, true);
     // numpy notes sizes in 64 bits, after four bytes of the extra field.
     const size = size32 === 0xffffffff ? Number(view.getBigUint64(extra + 4, true)) : size32;
-    if (compression !== 0) throw new Error("the ranker's file is compressed");
+    if (compression !== 0) throw new Error("it is compressed");
+    if (start + size > content.byteLength) throw new Error("it ends early");
+    const part = content.slice(start, start + size);
+    if (checksum(new Uint8Array(part)) !== view.getUint32(at + CHECKSUM_AT, true)) {
+      throw new Error("its checksum is wrong");
+    }
     const name = text(content, at + HEADER_BYTES, nameLength).replace(/\.npy$/, "");
-    const array = readArray(content.slice(start, start + size));
+    const array = readArray(part);
     if (array) arrays[name] = array;
     at = start + size;
   }
   return arrays;
+}
+
+/** CRC-32, as zip files have it. */
+function checksum(bytes) {
+  let value = ~0;
+  for (const byte of bytes) {
+    value ^= byte;
+    for (let bit = 0; bit < 8; bit++) value = (value >>> 1) ^ (value & 1 ? CRC_POLYNOMIAL : 0);
+  }
+  return ~value >>> 0;
 }
 
 const text = (content, start, length) => String.fromCharCode(...new Uint8Array(content, start, length));

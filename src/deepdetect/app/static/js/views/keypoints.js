@@ -128,10 +128,11 @@ function chooseOfAllScales(picture, { maxKeypoints, spread }) {
   const { xy, scores, sizes } = points;
   const drawn = Float32Array.from({ length: xy.length }, (_, k) =>
     rescaled(xy[k - k % 2], xy[k - k % 2 + 1], ranking, picture)[k % 2]);
-  const [small, large] = [Math.min(...sizes), Math.max(...sizes)].map((size) => size.toFixed(1));
+  const enlarged = enlargement(ranking, picture.original);
+  const [small, large] = [Math.min(...sizes), Math.max(...sizes)].map((size) => (size * enlarged).toFixed(1));
   return {
     count: scores.length,
-    what: scores.length ? `points of ${small} to ${large} pixels` : "no points",
+    what: scores.length ? `${small} to ${large} pixels wide` : "there is nothing to find",
     draw: (overlay, unit) => drawCircles(
       overlay, picture, drawn, (k) => sizes[k] / 2 * enlargement(ranking, picture), unit),
     columns: ["x", "y", "score", "size", "angle"],
@@ -139,7 +140,7 @@ function chooseOfAllScales(picture, { maxKeypoints, spread }) {
       const angles = await anglesOf(picture, points);
       return Array.from(scores, (score, k) => [
         ...rescaled(xy[2 * k], xy[2 * k + 1], ranking, picture.original), score,
-        sizes[k] * enlargement(ranking, picture.original), angles[k]]);
+        sizes[k] * enlarged, angles[k]]);
     },
     options: { max_keypoints: maxKeypoints, spread, mode: "points" },
   };
@@ -151,14 +152,16 @@ export async function show() {
   const picture = activePicture();
   if (!picture || shown) return;
   await KINDS[options().kind].find(picture);
-  draw();
+  if (!shown) draw(); // a slider that was moved meanwhile waits here for each of its moves
 }
 
 /** Shows the picture alone. */
 export function preview() {
   shown = null;
-  showPicture(view.querySelector(".picture"), activePicture());
+  const picture = activePicture();
+  showPicture(view.querySelector(".picture"), picture);
   const overlay = view.querySelector(".overlay");
+  overlay.setAttribute("aria-label", `${picture.name}: no keypoints yet`);
   overlay.getContext("2d").clearRect(0, 0, overlay.width, overlay.height);
   element("count").textContent = "–";
 }

@@ -27,7 +27,7 @@ const background = new Background(new URL("../matching_worker.js", import.meta.u
 let found = null; // mutual matches of the pictures with their ratios
 let pending = null; // the matching that is at work, or was the last
 let kept = null; // those under the ratio, with their geometry
-let asked = 0;
+let [matchings, filterings] = [0, 0]; // how many were begun: only what the last one finds is shown
 
 export const matchingTask = (task, values) => background.call(task, values);
 
@@ -64,25 +64,30 @@ export async function match() {
   if (!second) return;
   const key = [first, second, count(), kind()];
   const same = (other) => other?.key.every((value, k) => value === key[k]);
-  if (same(found)) return;
-  if (!same(pending)) pending = { key, done: matchNew(key) };
+  if (!same(pending)) {
+    const own = ++matchings; // what is at work for other options is not wanted any more
+    pending = { key, done: same(found) ? null : matchNew(key, () => own === matchings) };
+  }
+  const own = pending;
   try {
-    await pending.done;
+    await own.done;
   } catch (error) {
+    if (own !== pending) return;
     pending = null; // it may be tried again
     throw error;
   }
 }
 
 /** Matches pictures, and finds the geometry of their matches. */
-async function matchNew(key) {
+async function matchNew(key, isWanted) {
   const [first, second, number, chosen] = key;
-  const own = ++asked;
-  const pictures = [await KINDS[chosen].describe(first, number),
-                    await KINDS[chosen].describe(second, number)];
-  if (own !== asked) return;
+  const pictures = [];
+  for (const picture of [first, second]) {
+    pictures.push(await KINDS[chosen].describe(picture, number));
+    if (!isWanted()) return;
+  }
   const result = await during("Matching…", background.call("match", { pictures }));
-  if (own !== asked) return;
+  if (!isWanted()) return;
   const seen = (points, from, to) => Float32Array.from(points, (_, k) =>
     rescaled(points[k - k % 2], points[k - k % 2 + 1], from, to)[k % 2]);
   result.points0 = seen(result.points0, pictures[0], first);
@@ -95,17 +100,19 @@ async function matchNew(key) {
 async function filter() {
   showControls();
   if (!found) return;
-  const own = ++asked;
-  const rows = [...found.ratios.keys()].filter((k) => found.ratios[k] < ratio());
+  const own = ++filterings;
+  const [{ key }, largest] = [found, ratio()];
+  const rows = [...found.ratios.keys()].filter((k) => found.ratios[k] < largest);
   const take = (points) => Float32Array.from({ length: 2 * rows.length },
                                              (_, k) => points[2 * rows[k >> 1] + (k & 1)]);
   const [points0, points1] = [take(found.points0), take(found.points1)];
-  const [first, second] = found.key;
+  const [first, second, keypoints, mode] = key;
   const geometry = await background.call("geometry", { points0, points1, width: second.width,
                                                        height: second.height });
-  if (own !== asked) return;
+  if (own !== filterings) return;
+  const options = { mode, keypoints, ratio: largest, mutual: true };
   const ratios = Float32Array.from(rows, (k) => found.ratios[k]);
-  kept = { first, second, points0, points1, ratios, ...geometry };
+  kept = { first, second, options, points0, points1, ratios, ...geometry };
   draw();
   announce(element("match-count").textContent);
 }
@@ -167,8 +174,7 @@ const downloads = {
     const values = {
       images: [kept.first.name, kept.second.name], model: kept.model,
       matrix: kept.matrix, matrix_of: [kept.first, kept.second].map((p) => [p.width, p.height]),
-      options: { mode: found.key[3], keypoints: found.key[2], ratio: ratio(), mutual: true },
-      columns: ["x0", "y0", "x1", "y1", "score", "inlier"], matches: rowsSaved(),
+      options: kept.options, columns: ["x0", "y0", "x1", "y1", "score", "inlier"], matches: rowsSaved(),
     };
     save(`${name}.json`, toJson(values), "application/json");
   },
@@ -182,7 +188,8 @@ const downloads = {
 /** Forgets the matches of pictures that are gone. */
 export function reset() {
   [found, pending, kept] = [null, null, null];
-  asked++;
+  matchings++;
+  filterings++;
   element("match-count").textContent = "–";
   element("match-hint").textContent = "";
 }

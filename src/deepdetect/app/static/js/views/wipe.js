@@ -15,8 +15,10 @@ export async function prepare() {
   layers.hidden = !second;
   if (!second) return;
   if (shown?.given === first) return draw(); // what Python has registered
+  const isCurrent = () => page.pictures[0] === first && page.pictures[1] === second;
   const matches = await matched();
-  if (!matches || (shown?.matches === matches)) return draw();
+  if (!isCurrent()) return;
+  if (!matches || shown?.matches === matches) return draw();
   const fits = matches.model === "homography";
   const stretch = [second.width / first.width, 0, 0, 0, second.height / first.height, 0, 0, 0, 1];
   const target = { width: first.width, height: first.height };
@@ -24,6 +26,7 @@ export async function prepare() {
     rgba: second.rgba, size: { width: second.width, height: second.height },
     matrix: fits ? matches.matrix : stretch, target,
   }));
+  if (!isCurrent() || shown?.given === first) return;
   show(first, canvasOf(rgba, first.width, first.height), fits
     ? "The second picture is registered to the first, by the homography of their matches."
     : "No homography aligns these pictures, so the second one is only stretched to the same size.");

@@ -1,0 +1,96 @@
+// What the page says where files are missing or damaged, or the browser is too old: one sentence each.
+import { readFileSync, writeFileSync } from "node:fs";
+import { join } from "node:path";
+import { gunzipSync } from "node:zlib";
+import { NO_BROWSER, choose, chromium, example, examples, expect, openExample, test, web } from "./page.mjs";
+
+test.skip(!chromium, NO_BROWSER);
+test.use({ serviceWorkers: "block" }); // it would answer instead of the routes here
+
+const RANKER = "**/model/ranker.npz";
+const PACKED = "**/*.wasm.packed";
+const ranker = readFileSync(join(web, "../src/deepdetect/detector/points/ranker.npz"));
+const damaged = Buffer.from(ranker);
+damaged[ranker.length >> 1] ^= 1;
+
+const openCoffee = async (page) => {
+  await page.goto("./");
+  await example(page, "Coffee").click();
+};
+
+for (const { name, answer, said } of [
+  { name: "missing", answer: { status: 404 }, said: "is missing where this page comes from" },
+  { name: "damaged", answer: { body: damaged }, said: "is damaged (its checksum is wrong)" },
+  { name: "cut off", answer: { body: ranker.subarray(0, 20_000) }, said: "is damaged (it ends early)" },
+  { name: "another page", answer: { body: "<!doctype html>" }, said: "is damaged (it holds no ranker" },
+]) {
+  test(`the ranker's file is ${name}`, async ({ page }) => {
+    await page.route(RANKER, (route) => route.fulfill(answer));
+    await openExample(page, "Coffee");
+    await choose(page, "kind", "points");
+    await expect(page.getByRole("alert")).toContainText(`Points need model/ranker.npz, which ${said}`);
+    await expect(page.locator("#busy")).toBeHidden();
+    await choose(page, "kind", "dense");
+    await expect(page.locator("#count")).toContainText("keypoint");
+  });
+}
+
+test("points can be found once the connection is there again", async ({ page, context }) => {
+  await openExample(page, "Coffee");
+  await context.setOffline(true);
+  await choose(page, "kind", "points");
+  await expect(page.getByRole("alert")).toContainText("check the connection, and try again");
+  await context.setOffline(false);
+  await choose(page, "spread", "grid");
+  await expect(page.locator("#count")).toHaveText("1,000 points");
+});
+
+test("a browser that unpacks nothing is too old for the network, not for points", async ({ page }) => {
+  await page.route("**/picture_worker.js", async (route) => {
+    const response = await route.fetch();
+    await route.fulfill({ response, body: `self.DecompressionStream = undefined;\n${await response.text()}` });
+  });
+  await page.goto("./");
+  const sentence = "This browser is too old to run the network: use one of 2023 or later.";
+  await expect(page.getByRole("alert").locator("p")).toHaveText(sentence);
+  await example(page, "Coffee").click();
+  await expect(page.getByRole("alert").locator("p")).toHaveText(sentence);
+  await choose(page, "kind", "points");
+  await expect(page.locator("#count")).toHaveText("1,000 points");
+});
+
+test("web servers may unpack ONNX Runtime themselves", async ({ page }) => {
+  await page.route(PACKED, async (route) => {
+    const response = await route.fetch();
+    await route.fulfill({ response, body: gunzipSync(await response.body()) });
+  });
+  await openExample(page, "Coffee");
+});
+
+test("ONNX Runtime is damaged", async ({ page }) => {
+  await page.route(PACKED, async (route) => {
+    const response = await route.fetch();
+    await route.fulfill({ response, body: (await response.body()).subarray(0, 100_000) });
+  });
+  await page.goto("./");
+  await expect(page.getByRole("alert")).toContainText(/^The network could not be loaded \(.+\): load the page again\./);
+});
+
+test("a part of the page is missing", async ({ page }) => {
+  await page.route("**/decoding.js", (route) => route.fulfill({ status: 404 }));
+  await page.goto("./");
+  const said = page.getByRole("alert").locator("p");
+  await expect(said).toHaveText("A part of the page could not be loaded: load it again.");
+  await example(page, "Coffee").click(); // what cannot answer is not waited for
+  await expect(said).toHaveText("A part of the page could not be loaded: load it again.");
+  await expect(page.locator("#busy")).toBeHidden();
+});
+
+test("a file that cannot be read does not hide the one before it", async ({ page }, info) => {
+  const letter = info.outputPath("letter.jpg");
+  writeFileSync(letter, "Dear browser");
+  await page.goto("./");
+  await page.locator("#file").setInputFiles([join(examples, "coffee.jpg"), letter]);
+  await expect(page.locator("#count")).toContainText("keypoint");
+  await expect(page.getByRole("alert")).toContainText("letter.jpg is not a picture");
+});
