@@ -91,7 +91,7 @@ test("small, grey and plain pictures have the points of Python", async ({ page }
 import sys, cv2, numpy
 width, height, plain = map(int, sys.argv[2:])
 noise = numpy.random.default_rng(0).integers(0, 256, (height, width)).astype("uint8")
-cv2.imwrite(sys.argv[1], noise // (1 + 255 * plain))
+cv2.imwrite(sys.argv[1], noise * numpy.uint8(1 - plain))
 print(0)
 `, path, String(width), String(height), String(Number(plain)));
     await openPoints(page, path);
