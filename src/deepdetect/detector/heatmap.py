@@ -51,7 +51,7 @@ class HeatmapOptions:
             images that are given: that is `channels` of each function that takes one.
         tta: test-time augmentation. "flip" takes the mean of the logits of the image in its eight
             flips and quarter turns: eight times the time, and a flipped or turned image gives the
-            same keypoints. Without it about .94 of them are the same.
+            same keypoints. Without it .92 to .94 of them are the same.
         tile_megapixels: with `resolution="native"`, images above so many megapixels are run in
             tiles of this size, with the logits of the whole image to 1e-4, in four to six times the
             time and less memory.
