@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -661,6 +662,26 @@ def test_a_pair_without_a_geometry_has_no_matches() -> None:
     assert not matches.guided
     assert (len(matches), matches.model, matches.matrix) == (0, "none", None)
     assert not match_images(first, second, RandomDetector(), guided=False).lost
+
+
+def test_a_pair_without_a_geometry_needs_no_keypoints_before_they_are_asked_for() -> None:
+    rng = np.random.default_rng(0)
+    first, second = (rng.integers(0, 256, (120, 160, 3), np.uint8) for _ in range(2))
+    detector = Corners()
+    matches = match_images(first, second, detector)
+    assert matches.lost
+    assert repr(matches) == "Matches(0 matches, as no geometry could be trusted)"
+    assert len(detector.seen) == 0
+    found = matches.keypoints1
+    assert len(detector.seen) == 1
+    assert matches.keypoints1 is found
+    assert len(detector.seen) == 1
+    wanted = match_images(first, second, Corners(), guided=False)
+    np.testing.assert_array_equal(found.xy, wanted.keypoints1.xy)
+    again = pickle.loads(pickle.dumps(matches))
+    np.testing.assert_array_equal(again.keypoints0.xy, wanted.keypoints0.xy)
+    assert again.lost
+    assert len(matches[:0]) == len(matches.unique()) == 0
 
 
 @pytest.mark.parametrize("mutual", [False, True])

@@ -116,7 +116,9 @@ def run_match(
     from ..matching.pipeline import match_images
     from ..viz.draw import add_caption, draw_matches, save_picture
 
-    stages = _stages(("keypoints", "guided matching", "geometry", "files"), report)
+    stages = _stages(
+        ("initial geometry", "keypoints", "guided matching", "geometry", "files"), report
+    )
     first, second = (load_image(one.path) for one in photographs)
     matches = match_images(first, second, progress=stages)
     if matches.lost:
@@ -147,7 +149,9 @@ def run_register(
     from ..matching.registration import register
     from ..viz.draw import save_picture
 
-    stages = _stages(("keypoints", "guided matching", "geometry", "files"), report)
+    stages = _stages(
+        ("initial geometry", "keypoints", "guided matching", "geometry", "files"), report
+    )
     found = register(photographs[0].path, photographs[1].path, progress=stages)
     pictures = {
         "checkerboard.png": found.checkerboard(),

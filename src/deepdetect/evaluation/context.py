@@ -17,7 +17,7 @@ from .._shared.errors import DeepDetectError, OptionError
 from ..features.keypoints import Keypoints
 from ..features.matchers import get_matcher, match_descriptors
 from ..io.image import load_image
-from ..matching.pipeline import check_memory
+from ..matching.unguided import check_memory
 from .baselines.method import BaselineError, LocalFeature
 from .cache import Arrays, CacheError, StageCache, file_digest
 from .profiling import Profile, profiled

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -90,6 +90,29 @@ class GuidedMatches:
         )
 
 
+class _FoundLater:
+    """A field of keypoints, or of a function that finds them when they are first asked for."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Keypoints:
+        if instance is None:
+            raise AttributeError(self.name)  # so that the field has no default
+        held = instance.__dict__[self.name]
+        if not isinstance(held, Keypoints):
+            held = instance.__dict__[self.name] = held()
+        return held
+
+    def __set__(self, instance: Any, value: Any) -> None:
+        instance.__dict__[self.name] = value
+
+
+def found_later(find: Callable[[], Keypoints]) -> Keypoints:
+    """Return what `Matches` takes as keypoints, and finds when they are first asked for."""
+    return cast(Keypoints, find)
+
+
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Matches:
@@ -110,7 +133,8 @@ class Matches:
         matrix: (3, 3) float64, the geometry; None when it could not be estimated, or was not
             asked for. A homography maps the first image to the second; else x1^T M x0 = 0
             (essential: in normalised coordinates).
-        keypoints0, keypoints1: all keypoints of the two images.
+        keypoints0, keypoints1: all keypoints of the two images. Of a pair whose geometry was lost
+            before any were needed they are found when they are first asked for.
         seconds: time of each stage, both images together.
         guide: the geometry that guided the matching; None when guided matching was not asked for.
         subpixel: whether the matching itself found sub-pixel positions in the second image, by
@@ -146,8 +170,8 @@ class Matches:
     inliers: np.ndarray
     model: str
     matrix: np.ndarray | None
-    keypoints0: Keypoints
-    keypoints1: Keypoints
+    keypoints0: Keypoints = _FoundLater()  # type: ignore[assignment]
+    keypoints1: Keypoints = _FoundLater()  # type: ignore[assignment]
     seconds: dict[str, float] = field(default_factory=dict)
     guide: Guide | None = None
     subpixel: bool = False
@@ -167,10 +191,16 @@ class Matches:
             raise OptionError("matches need finite positions: leave out those that are not")
         for side in (0, 1):
             name = f"indices{side}"
-            indices, keypoints = getattr(self, name), getattr(self, f"keypoints{side}")
-            if indices is None:
+            indices = getattr(self, name)
+            if indices is None and len(self):
+                keypoints = getattr(self, f"keypoints{side}")
                 indices = nearest_keypoints(getattr(self, f"points{side}"), keypoints)
-            object.__setattr__(self, name, _checked_indices(indices, name, len(self), keypoints))
+            found = np.zeros(0, np.int32) if indices is None else np.asarray(indices)
+            object.__setattr__(self, name, self._checked_indices(found, side))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: keypoints, not a function that would find them."""
+        return {**self.__dict__, "keypoints0": self.keypoints0, "keypoints1": self.keypoints1}
 
     @property
     def guided(self) -> bool:
@@ -268,33 +298,34 @@ class Matches:
         return html_summary(f"{len(self):,} matches", rows, points, lines)
 
     def __repr__(self) -> str:
+        if self.lost:  # whose keypoints may have to be found first
+            return f"Matches({len(self)} matches, as no geometry could be trusted)"
         return (
             f"Matches({len(self)} matches of {len(self.keypoints0)} and {len(self.keypoints1)} "
             f"keypoints, {np.count_nonzero(self.inliers)} inliers, model={self.model!r}, "
             f"guided={self.guided})"
         )
 
+    def _checked_indices(self, indices: np.ndarray, side: int) -> np.ndarray:
+        """Return indices of an image's keypoints as int32.
 
-def _checked_indices(
-    indices: np.ndarray, name: str, matches: int, keypoints: Keypoints
-) -> np.ndarray:
-    """Return indices of keypoints as int32.
-
-    Raises:
-        OptionError: they are not one whole number for each match, or of no keypoint.
-    """
-    found = np.asarray(indices)
-    if found.shape != (matches,) or (found.size and found.dtype.kind not in "iu"):
-        raise OptionError(
-            f"matches need one whole number each as {name}, not {found.dtype} numbers of shape "
-            f"{found.shape}"
-        )
-    if found.size and not (found.min() >= -1 and found.max() < len(keypoints)):
-        raise OptionError(
-            f"{name} must lie in [-1, {len(keypoints) - 1}], as there are {len(keypoints)} "
-            f"keypoints, not in [{found.min()}, {found.max()}]"
-        )
-    return found.astype(np.int32)
+        Raises:
+            OptionError: they are not one whole number for each match, or of no keypoint.
+        """
+        if indices.shape != (len(self),) or (indices.size and indices.dtype.kind not in "iu"):
+            raise OptionError(
+                f"matches need one whole number each as indices{side}, not {indices.dtype} "
+                f"numbers of shape {indices.shape}"
+            )
+        if not indices.size:
+            return indices.astype(np.int32)
+        count = len(self.keypoints1 if side else self.keypoints0)
+        if not (indices.min() >= -1 and indices.max() < count):
+            raise OptionError(
+                f"indices{side} must lie in [-1, {count - 1}], as there are {count} keypoints, "
+                f"not in [{indices.min()}, {indices.max()}]"
+            )
+        return indices.astype(np.int32)
 
 
 def _ends(points: np.ndarray, indices: np.ndarray) -> np.ndarray:

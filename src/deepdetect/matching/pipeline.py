@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -13,22 +15,24 @@ from .._shared.errors import OptionError
 from .._shared.image_array import Channels
 from .._shared.kernels import require_compiler
 from .._shared.options import replace_options, suggest_keywords
-from .._shared.parallel import available_memory
 from .._shared.timing import StageTimer
 from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
 from ..detector.heatmap import HeatmapOptions
 from ..features.keypoints import Keypoints
-from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors
-from ..features.matches import Guide, Matches
-from ..features.sift import get_descriptor, scaled_sift_descriptors, to_root_sift
+from ..features.matches import Guide, Matches, found_later
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.residuals import epipolar_errors, transfer_errors
 from ..io.image import load_image, luma
-from .guided import GuidedMatches, GuidedOptions, InitialMatches, guided_matches
+from .guided import (
+    GuidedMatches,
+    GuidedOptions,
+    InitialGeometry,
+    InitialMatches,
+    guided_matches,
+    guiding_geometry,
+)
 from .options import MatchingOptions, get_preset
-
-BYTES_PER_KEYPOINT = 1500
-"""Memory that matching takes: 128 float32 of the descriptor, twice with FLANN's trees and copy."""
+from .unguided import unguided_matches
 
 
 @suggest_keywords
@@ -111,7 +115,8 @@ def match_images(
 
     Returns:
         The matches, the geometry, and which agree with it. Where guided matching can trust no
-        geometry there are none (`Matches.lost`); `guided=False` matches by descriptors alone.
+        geometry there are none (`Matches.lost`), and the keypoints are found when they are first
+        asked for; `guided=False` matches by descriptors alone.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
@@ -169,15 +174,22 @@ def match_images(
     timer = StageTimer(progress)
     rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
     detector = _configured(detector, chosen.heatmap)
+    grays = luma(rgb[0]), luma(rgb[1])
+    pair = _GuidedPair(grays, initial, seeds).ordered(chosen.mutual) if chosen.guided else None
+    first: InitialGeometry | None = None
+    if pair is not None and not _gives_points(detector, chosen):
+        with timer.stage("initial geometry"):
+            first = pair.geometry(chosen)
+        if first.matrix is None:
+            return _lost_matches(first.as_guide(), detector, rgb, chosen, timer)
     with timer.stage("keypoints"):
         keypoints = [find_keypoints(detector, image, chosen.selection) for image in rgb]
-    grays = luma(rgb[0]), luma(rgb[1])
     found_guide, guided_pair = None, None
     rows: tuple[Any, Any]  # of the keypoints, None where they are looked up
-    if chosen.guided:
+    if pair is not None:
         with timer.stage("guided matching"):
             found_guide, guided_pair, positions, rows = _match_guided(
-                grays, keypoints, chosen, initial, seeds
+                pair, keypoints, chosen, first
             )
         points0, points1, scores = positions
     else:
@@ -203,12 +215,66 @@ def match_images(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _GuidedPair:
+    """Two images whose matching is guided, and sparse matches of them that are known."""
+
+    grays: tuple[np.ndarray, np.ndarray]
+    initial: InitialMatches | None
+    seeds: tuple[np.ndarray, np.ndarray] | None
+    swapped: bool = False
+
+    def ordered(self, mutual: bool) -> _GuidedPair:
+        """Return the pair in the order in which it is matched, which with `mutual` is its own."""
+        if not (mutual and _comes_after(*self.grays)):
+            return self
+        initial = None if self.initial is None else self.initial.swapped()
+        seeds = None if self.seeds is None else self.seeds[::-1]
+        return _GuidedPair(self.grays[::-1], initial, seeds, not self.swapped)
+
+    def geometry(self, options: MatchingOptions) -> InitialGeometry:
+        """Return the geometry to begin with, without any keypoint of ours."""
+        return guiding_geometry(
+            *self.grays,
+            options.guiding_model,
+            options.geometry.seed,
+            self.initial,
+            options.guided_options,
+            self.seeds,
+        )
+
+
+def _gives_points(detector: HeatmapDetector, options: MatchingOptions) -> bool:
+    """Whether the keypoints have sizes and angles, so that the geometry may come from them."""
+    return isinstance(detector, DeepDetect) and options.selection.uses_points
+
+
+def _lost_matches(
+    guide: Guide,
+    detector: HeatmapDetector,
+    rgb: tuple[np.ndarray, np.ndarray],
+    options: MatchingOptions,
+    timer: StageTimer,
+) -> Matches:
+    """Return no matches; nobody may ever ask for the keypoints, which need the network."""
+    nothing, nowhere = np.empty(0, np.float32), np.empty((0, 2), np.float32)
+    keypoints = [
+        found_later(partial(find_keypoints, detector, image, options.selection)) for image in rgb
+    ]
+    return Matches(
+        *(nowhere, nowhere, nothing, nothing, "none", None),
+        keypoints[0],
+        keypoints[1],
+        timer.seconds,
+        guide=guide,
+    )
+
+
 def _match_guided(
-    grays: tuple[np.ndarray, np.ndarray],
+    pair: _GuidedPair,
     keypoints: Sequence[Keypoints],
     options: MatchingOptions,
-    initial: InitialMatches | None,
-    seeds: tuple[np.ndarray, np.ndarray] | None,
+    geometry: InitialGeometry | None,
 ) -> tuple[
     Guide,
     GuidedMatches | None,
@@ -216,29 +282,24 @@ def _match_guided(
     tuple[Any, Any],
 ]:
     """Return what guided, the matches, their positions with their scores, and their keypoints."""
-    first, second = keypoints
-    swapped = options.mutual and _comes_after(grays[0], grays[1])
-    if swapped:
-        grays, first, second = (grays[1], grays[0]), second, first
-        initial = None if initial is None else initial.swapped()
-        seeds = None if seeds is None else (seeds[1], seeds[0])
+    first, second = keypoints[::-1] if pair.swapped else keypoints
     guide, found = guided_matches(
-        grays[0],
-        grays[1],
+        *pair.grays,
         np.rint(first.xy),
         np.rint(second.xy),
         options.guiding_model,
         options.geometry.seed,
-        initial,
+        pair.initial,
         options.guided_options,
-        seeds,
+        pair.seeds,
         (first, second),
+        geometry,
     )
     if found is not None and options.mutual:
         found = found.unique()
     points0, points1, scores = _guided_points(found, (first, second))
     rows0, rows1 = (None, None) if found is None else (found.rows0, found.rows1)
-    if swapped:
+    if pair.swapped:
         return guide.swapped(), found, (points1, points0, scores), (rows1, rows0)
     return guide, found, (points0, points1, scores), (rows0, rows1)
 
@@ -261,63 +322,6 @@ def _guided_points(
         return points0, keypoints[1].xy[found.rows1], found.scores
     # What is not at a keypoint of the second image is where the pixel of the first one is seen.
     return np.rint(points0), found.points1.astype(np.float32), found.scores
-
-
-def unguided_matches(
-    grays: Sequence[np.ndarray],
-    keypoints: Sequence[Keypoints],
-    options: MatchingOptions,
-    timer: StageTimer | None = None,
-) -> DescriptorMatches:
-    """Match all descriptors with all others.
-
-    Keypoints with sizes and angles are described at these, others all alike.
-
-    Raises:
-        OptionError: there are too many keypoints for the memory.
-    """
-    timer = timer or StageTimer()
-    check_memory([len(each) for each in keypoints])
-    with timer.stage("descriptors"):
-        descriptors = [
-            _describe(gray, each, options) for gray, each in zip(grays, keypoints, strict=True)
-        ]
-    with timer.stage("matching"):
-        return match_descriptors(
-            descriptors[0],
-            descriptors[1],
-            get_matcher(options.matcher),
-            ratio=options.ratio,
-            mutual=options.mutual,
-            seed=options.geometry.seed,
-            positions=_dense_positions(keypoints),
-        )
-
-
-def _dense_positions(
-    keypoints: Sequence[Keypoints],
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the positions of keypoints of one scale; None of those with their own."""
-    if any(each.sizes is not None for each in keypoints):
-        return None
-    return keypoints[0].xy, keypoints[1].xy
-
-
-def _describe(gray: np.ndarray, keypoints: Keypoints, options: MatchingOptions) -> np.ndarray:
-    """Return descriptors at the keypoints' own sizes and angles, or at those of the options.
-
-    Another size or angle than the default, or another descriptor, is for all keypoints.
-    """
-    default = MatchingOptions()
-    alike = (options.keypoint_size, options.angle) != (default.keypoint_size, default.angle)
-    own = keypoints.sizes is not None and keypoints.angles is not None
-    if alike or not own or options.descriptor not in ("sift", "rootsift"):
-        describe = get_descriptor(options.descriptor)
-        return describe(gray, keypoints.xy, options.keypoint_size, options.angle)
-    assert keypoints.sizes is not None
-    assert keypoints.angles is not None
-    found = scaled_sift_descriptors(gray, keypoints.xy, keypoints.sizes, keypoints.angles)
-    return to_root_sift(found, True) if options.descriptor == "rootsift" else found
 
 
 def _final_geometry(
@@ -349,18 +353,3 @@ def _configured(
             "detector can follow: use it, or set heatmap to None"
         )
     return detector.configured(heatmap)
-
-
-def check_memory(keypoints: Sequence[int]) -> None:
-    """Stop before the descriptors and their search trees fill the memory.
-
-    Raises:
-        OptionError: there are too many.
-    """
-    needed = sum(keypoints) * BYTES_PER_KEYPOINT
-    if needed > available_memory():
-        raise OptionError(
-            f"{' and '.join(f'{count:,}' for count in keypoints)} keypoints need about "
-            f"{needed / 1e9:.0f} GB of memory to be matched: make them fewer with "
-            "max_keypoints, density, or a smaller resolution"
-        )

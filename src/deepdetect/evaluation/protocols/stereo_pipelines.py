@@ -18,8 +18,8 @@ from ...detector.detector import DeepDetect, HeatmapDetector
 from ...detector.heatmap import HeatmapOptions
 from ...features.matchers import match_descriptors
 from ...features.matchers.approximate import flann_neighbours
-from ...matching.pipeline import check_memory
 from ...matching.stereo.matching import find_disparity_range
+from ...matching.unguided import check_memory
 from ...reconstruction.pipeline import reconstruct
 from ..baselines.method import LocalFeature, deepdetect_feature
 from ..baselines.opencv import self_described

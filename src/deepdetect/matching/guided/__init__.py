@@ -1,8 +1,17 @@
 """Guided matching: a geometry from a few matches proposes dense ones, which are verified."""
 
 from ...features.matches import GuidedMatches
+from .initial_geometry import InitialGeometry
 from .options import GuidedOptions
-from .pipeline import guided_matches
+from .pipeline import guided_matches, guiding_geometry
 from .sparse_matches import InitialMatches, initial_matches
 
-__all__ = ["GuidedMatches", "GuidedOptions", "InitialMatches", "guided_matches", "initial_matches"]
+__all__ = [
+    "GuidedMatches",
+    "GuidedOptions",
+    "InitialGeometry",
+    "InitialMatches",
+    "guided_matches",
+    "guiding_geometry",
+    "initial_matches",
+]

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..._shared.errors import OptionError, unknown_name
+from ...features.matches import Guide
 from ...geometry import GeometryOptions, estimate_geometry
 from ...geometry.acontrario import log10_nfa
 from ...geometry.model_selection import Parallax, measure_parallax
@@ -57,6 +58,17 @@ class InitialGeometry:
     num_views: int
     parallax: Parallax | None = None
     initial: InitialMatches | None = None
+
+    def as_guide(self) -> Guide:
+        """Return what the user is told of it."""
+        return Guide(
+            self.model,
+            self.matrix,
+            self.num_matches,
+            len(self.points0),
+            float(self.log10_nfa),
+            self.num_views,
+        )
 
 
 def find_initial_geometry(

@@ -41,6 +41,7 @@ def guided_matches(
     options: GuidedOptions = GuidedOptions(),
     seeds: tuple[np.ndarray, np.ndarray] | None = None,
     points: tuple[Keypoints, Keypoints] | None = None,
+    first: InitialGeometry | None = None,
 ) -> tuple[Guide, GuidedMatches | None]:
     """Match the keypoints of two images by their geometry.
 
@@ -54,6 +55,7 @@ def guided_matches(
         seeds: (K, 2) sparse matches in both images that take the place of our own.
         points: keypoints of both images, best first; where they have sizes and angles and are
             enough, the sparse matches are made of them.
+        first: the geometry to begin with, where `guiding_geometry` has found it already.
 
     Returns:
         The geometry that guided, and the matches; None when no geometry could be trusted.
@@ -61,17 +63,18 @@ def guided_matches(
     Raises:
         OptionError: the model is unknown, or the seeds are no matches.
     """
-    first = _initial_geometry(gray0, gray1, model, seed, initial, seeds, points, options)
+    if first is None:
+        first = guiding_geometry(gray0, gray1, model, seed, initial, options, seeds, points)
     if first.matrix is None:
-        return _guide(first, None), None
+        return first.as_guide(), None
     pair = ImagePair(gray0, gray1, xy0, xy1)
     matrix, found = first.matrix, None
     if first.model == "homography":
         matrix, found = _match_plane(pair, first, options, seed)
         if found is None:
             views, known = first.num_views, initial or first.initial
-            first = _initial_geometry(
-                gray0, gray1, "fundamental", seed, known, seeds, points, options
+            first = guiding_geometry(
+                gray0, gray1, "fundamental", seed, known, options, seeds, points
             )
             first = replace(first, num_views=first.num_views + views)
             if first.matrix is None:
@@ -83,20 +86,23 @@ def guided_matches(
         matrix, found = _match_scene_with_depth(pair, first, options, seed)
     if len(found) < options.min_matches:
         return _no_guide(first), None
-    return _guide(first, matrix), found
+    return replace(first, matrix=matrix).as_guide(), found
 
 
-def _initial_geometry(
+def guiding_geometry(
     gray0: np.ndarray,
     gray1: np.ndarray,
-    model: str,
-    seed: int,
-    initial: InitialMatches | None,
-    seeds: tuple[np.ndarray, np.ndarray] | None,
-    points: tuple[Keypoints, Keypoints] | None,
-    options: GuidedOptions,
+    model: str = "auto",
+    seed: int = 0,
+    initial: InitialMatches | None = None,
+    options: GuidedOptions = GuidedOptions(),
+    seeds: tuple[np.ndarray, np.ndarray] | None = None,
+    points: tuple[Keypoints, Keypoints] | None = None,
 ) -> InitialGeometry:
-    """Return the initial geometry: of seeds, of points where they suffice, else of SIFT."""
+    """Return the geometry to begin with: of seeds, of points where they suffice, else of SIFT.
+
+    Arguments and errors are those of `guided_matches`.
+    """
     chosen = options.initial_geometry
     if seeds is not None:
         sizes = gray0.shape[::-1], gray1.shape[::-1]
@@ -173,15 +179,4 @@ def _at_keypoints(pair: ImagePair, found: DescriptorMatches) -> GuidedMatches:
 
 
 def _no_guide(first: InitialGeometry) -> Guide:
-    return _guide(replace(first, model="none", points0=first.points0[:0]), None)
-
-
-def _guide(first: InitialGeometry, matrix: np.ndarray | None) -> Guide:
-    return Guide(
-        first.model,
-        matrix,
-        first.num_matches,
-        len(first.points0),
-        float(first.log10_nfa),
-        first.num_views,
-    )
+    return replace(first, model="none", matrix=None, points0=first.points0[:0]).as_guide()
