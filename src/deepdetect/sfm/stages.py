@@ -136,13 +136,15 @@ class Stages:
             raise ReconstructionError("no photograph can be read: " + "; ".join(report.failures))
         with open_hdf5(self.work / "features.h5") as file:
             for name in names:
-                sentence = [text for text in report.failures if name in text]
-                if sentence:
-                    failures[name] = sentence[0]
-                elif name in file:
+                own = (f"{folder.absolute() / name} ", f"{name}: ")
+                sentence = [text for text in report.failures if text.startswith(own)]
+                if not sentence and name in file:  # 1.jpg is in the sentence on 11.jpg, too
                     width, height = file[name]["image_size"][()]
                     sizes[name] = int(width), int(height)
                     keypoints[name] = len(file[name]["keypoints"])
+                else:
+                    sentence += [text for text in report.failures if name in text]
+                    failures[name] = (sentence or ["it could not be read"])[0]
         return PhotographFeatures(sizes, keypoints, failures)
 
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
