@@ -1,5 +1,5 @@
-"""Bundler is in no package index. Where its programs are installed they read the files, and map
-them. Else they are read by the rules of its source (`ReadKeyFile`, `LoadKeys`, `LoadMatchTable`)."""
+"""Bundler is in no package index. Where its programs are installed they read the files and map
+them; else they are read by the rules of its source: `ReadKeyFile`, `LoadKeys`, `LoadMatchTable`."""
 
 from __future__ import annotations
 

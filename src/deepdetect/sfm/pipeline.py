@@ -203,6 +203,7 @@ def _reconstruct(
             {sparse.views[number].name: sparse.views[number] for number in order},
             {sparse.views[number].name: sparse.lenses[number] for number in order},
             dict(sorted(left_out.items())),
+            tuple(tuple(sorted(group)) for group in sorted(others, key=len, reverse=True)),
             sparse.views[reference].name,
             PointCloud(sparse.points, colors, "spacing", frame),
             sparse.errors.astype(np.float32),
@@ -213,6 +214,7 @@ def _reconstruct(
             features.keypoints,
             verified,
             len(pairs),
+            options.pair_selection.way(len(names)),
             timer.seconds,
             output_files(stages.output)[:-1],
         )

@@ -227,7 +227,13 @@ class Stages:
         space.mkdir()
         with progress(len(images), "mapping", "photograph", self.quiet) as bar:
             model, others = map_photographs(
-                self.output / "database.db", folder, space, known, options, bar.update
+                self.output / "database.db",
+                folder,
+                space,
+                known,
+                options,
+                # Those of an attempt that is given up are counted again in the next.
+                lambda count: bar.update(min(count, len(images) - bar.n)),
             )
         shutil.rmtree(space, ignore_errors=True)
         if options.refine_tracks:
