@@ -149,7 +149,13 @@ def test_bundler_itself_maps_the_files(
     size = next(iter(fountain_collection.keypoints.values())).image_size
     lens = Lens.of_camera(Camera(size, 2759.48 * size[0] / 3072))
     names = list(fountain_collection.keypoints)
-    write_bundler(fountain_collection, tmp_path, lenses=dict.fromkeys(names, lens))
+    # As where the photographs of a pair are named the other way round.
+    turned = {
+        (name1, name0): PairMatches(found.rows[:, ::-1], found.scores)
+        for (name0, name1), found in fountain_collection.matches.items()
+    }
+    collection = Collection(fountain_collection.keypoints, turned)
+    write_bundler(collection, tmp_path, lenses=dict.fromkeys(names, lens))
     for name in names:
         shutil.copy(fountain / name, tmp_path)
     (tmp_path / "bundle").mkdir()
@@ -179,10 +185,10 @@ def test_bundler_itself_maps_the_files(
         expected = (own[0] - (width - 1) / 2, (height - 1) / 2 - own[1])
         np.testing.assert_allclose((x, y), expected, atol=2e-3)
     # Its cameras look along -z, and y is up.
-    turned = [np.diag([1, -1, -1]) @ table[1:4] for table in tables]
+    rotations = [np.diag([1, -1, -1]) @ table[1:4] for table in tables]
     (scene,) = load_posed_scenes(shared / "data" / "fountain")
     known = {image.path.name: image.rotation for image in scene.images}
-    for name, rotation in zip(names[1:], turned[1:], strict=True):
-        own = rotation @ turned[0].T
+    for name, rotation in zip(names[1:], rotations[1:], strict=True):
+        own = rotation @ rotations[0].T
         cosine = (np.trace(own @ (known[name] @ known[names[0]].T).T) - 1) / 2
         assert np.degrees(np.arccos(np.clip(cosine, -1, 1))) < 1
