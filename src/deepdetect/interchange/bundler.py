@@ -46,15 +46,16 @@ def write_bundler(
         DeepDetectError: a file cannot be written.
     """
     folder = Path(output)
-    check_names("bundler", collection.keypoints)
-    check_upright("bundler", collection.photographs)
-    keys: dict[str, str] = {}
     for name, points in collection.keypoints.items():
         if sift_bytes(points) is None:
             raise OptionError(
                 f"the keypoints of {name} have no SIFT descriptors, which .key files need: name "
                 "the folder of the photographs as `images`"
             )
+    check_names("bundler", collection.keypoints)
+    check_upright("bundler", collection.photographs)
+    keys: dict[str, str] = {}
+    for name in collection.keypoints:
         key = str(PurePosixPath(name).with_suffix(".key"))
         if key in keys:
             raise OptionError(f"{keys[key]} and {name} would have the same {key}: rename one")
