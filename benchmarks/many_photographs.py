@@ -240,7 +240,8 @@ def show_road(
         quiet=False,
     )
     truth = true_views(scene)
-    scale = camera_errors(list(found.views.values()), [truth[name] for name in found.views]).scale
+    errors = camera_errors(list(found.views.values()), [truth[name] for name in found.views])
+    scale, centres = errors.scale, 1000 * errors.centres
     points = found.dense.points.astype(np.float64)
     nearest = np.full(len(points), np.inf)
     beside = np.zeros((len(points), 3))  # metres from the camera that a point is beside
@@ -251,7 +252,8 @@ def show_road(
     abeam = nearest < MAX_ABEAM_M
     lane = abeam & (np.abs(beside[:, 0]) < LANE_M)
     above = height_m - beside[:, 1]
-    print(f"{found}\nreprojection error {np.median(found.dense_errors):.3f} px (median)")
+    print(f"{found}\ncentres {centres.mean():.0f} mm (mean), {centres.max():.0f} mm (largest)")
+    print(f"reprojection error {np.median(found.dense_errors):.3f} px (median)")
     print(f"{abeam.mean():.1%} of the dense points beside the path, {lane.sum():,} where it went")
     for limit in ROAD_M:
         near = np.abs(above[lane]) < limit
