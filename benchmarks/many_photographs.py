@@ -1,7 +1,7 @@
 """Compare reconstructions of many photographs with pycolmap's own SIFT, by the true cameras.
 
     python benchmarks/many_photographs.py SCENE [--output FOLDER] [--pictures FOLDER] [--bad FOLDER]
-        [--resume] [--workers N] [--limits]
+        [--resume] [--workers N] [--limits] [--road METRES]
 
 SCENE is a folder of photographs with known cameras (docs/benchmarks.md lists the layouts). Both
 pipelines run with the true intrinsics and with estimated ones. Printed are the photographs that are
@@ -9,7 +9,9 @@ registered, mean errors of camera centres and rotations after the alignment of t
 reprojection errors and CPU seconds. `--pictures` draws the cameras, the sparse and the dense model.
 With `--bad` the photographs of that folder are added, and a black and a damaged one. `--limits`,
 after a run without it, shows what the errors of the poses consist of: the last adjustment is made
-again from two random halves of the sparse points, and with other losses.
+again from two random halves of the sparse points, and with other losses. With `--road` SCENE is a
+drive, and METRES the height of its camera: where the car drove there is nothing but road, and so
+dense points there that are no road are wrong.
 """
 
 from __future__ import annotations
@@ -41,6 +43,18 @@ LINE_POINTS = 300
 
 PICTURE_SIZE = (900, 560)
 
+DRIVE_PAIRS = 8
+"""Following frames that each frame of a drive is matched with."""
+
+LANE_M = 0.75
+"""To both sides of the camera: the car was there."""
+
+MAX_ABEAM_M = 1.0
+"""Ahead of or behind a camera, of points beside it: the distance of two frames."""
+
+ROAD_M = (0.1, 0.2, 0.3)
+"""Distances from the road of which the share of points is printed."""
+
 NEAR = 1.5
 """Points are drawn up to this many times their median depth."""
 
@@ -54,12 +68,17 @@ def main() -> None:
     parser.add_argument("--bad", type=Path, help="folder of photographs of something else")
     parser.add_argument("--workers", type=int, help="processes")
     parser.add_argument("--limits", action="store_true", help="what the errors consist of")
+    parser.add_argument("--road", type=float, help="metres of the camera above the road")
     parser.add_argument("--resume", action="store_true", help="keep what earlier runs have made")
     args = parser.parse_args()
     (scene,) = load_posed_scenes(args.scene)
     names = sorted(image.path.name for image in scene.images)
     if args.bad is not None:
         show_bad(scene, args.bad, args.output / "bad", args.workers)
+        return
+    if args.road is not None:
+        output = args.output / "drive"
+        show_road(scene, args.road, output, args.workers, args.resume, args.pictures)
         return
     if args.limits:
         show_limits(scene, args.output / "true-plain" / "sparse")
@@ -200,6 +219,56 @@ def show_limits(scene: PosedScene, folder: Path) -> None:
             f"from half to half: centres {1000 * unit * apart.centres.mean():.2f} mm, "
             f"rotations {apart.rotations_deg.mean():.3f} degrees"
         )
+
+
+def show_road(
+    scene: PosedScene,
+    height_m: float,
+    output: Path,
+    workers: int | None,
+    resume: bool,
+    pictures: Path | None,
+) -> None:
+    """Reconstruct a drive, and print where its dense points lie by the true path."""
+    found = reconstruct_many(
+        scene.images[0].path.parent,
+        output,
+        calibration=true_camera(scene),
+        sequential=DRIVE_PAIRS,
+        workers=workers,
+        overwrite=not resume,
+        quiet=False,
+    )
+    truth = true_views(scene)
+    errors = camera_errors(list(found.views.values()), [truth[name] for name in found.views])
+    scale, centres = errors.scale, 1000 * errors.centres
+    points = found.dense.points.astype(np.float64)
+    nearest = np.full(len(points), np.inf)
+    beside = np.zeros((len(points), 3))  # metres from the camera that a point is beside
+    for view in found.views.values():
+        own = scale * ((points - view.centre) @ view.rotation.T)
+        nearer = np.abs(own[:, 2]) < nearest
+        nearest[nearer], beside[nearer] = np.abs(own[nearer, 2]), own[nearer]
+    abeam = nearest < MAX_ABEAM_M
+    lane = abeam & (np.abs(beside[:, 0]) < LANE_M)
+    above = height_m - beside[:, 1]
+    print(f"{found}\ncentres {centres.mean():.0f} mm (mean), {centres.max():.0f} mm (largest)")
+    print(f"reprojection error {np.median(found.dense_errors):.3f} px (median)")
+    print(f"{abeam.mean():.1%} of the dense points beside the path, {lane.sum():,} where it went")
+    for limit in ROAD_M:
+        near = np.abs(above[lane]) < limit
+        print(f"of these {near.mean():.1%} within {limit:g} m of the road")
+    high, low = (above[lane] > ROAD_M[-1]).mean(), (above[lane] < -ROAD_M[-1]).mean()
+    print(f"{high:.1%} in the air, {low:.1%} under the road")
+    high, low = (above[abeam] > 10).mean(), (above[abeam] < -0.5).mean()
+    print(
+        f"of all beside the path {high:.1%} over 10 m above the road, {low:.1%} over .5 m under it"
+    )
+    for metres in (20, 40, 80, 160):
+        far = np.linalg.norm(scale * points - scale * found.centres.mean(axis=0), axis=1) > metres
+        print(f"{far.mean():.1%} over {metres} m from the middle of the path")
+    if pictures is not None:
+        draw(found, scene.images[0].path.parent, pictures)
 
 
 def show_bad(scene: PosedScene, bad: Path, output: Path, workers: int | None) -> None:

@@ -39,7 +39,6 @@ def summary(result) -> dict[str, object]:
         ("colmap", {"made"}),
         ("hloc", {"features.h5", "matches.h5", "pairs.txt"}),
         ("opencv", {"cat.jpg.yml", "left.png.yml", "right.png.yml", "matches.yml"}),
-        ("bundler", {"cat.key", "left.key", "right.key", "list.txt", "matches.init.txt"}),
     ],
 )
 def test_saved_files_in_all_formats(
@@ -58,6 +57,24 @@ def test_saved_files_in_all_formats(
     one = summary(run("export", form, *npz, "--images", photos, "-o", f"npz-{output}", "--json"))
     assert (one["images"], one["pairs"]) == (3, 1)
     assert one["matches"] > many["matches"] > 50
+
+
+def test_jpeg_files_for_bundler(run, photos: Path, tmp_path: Path) -> None:
+    from PIL import Image
+
+    (tmp_path / "jpg").mkdir()
+    for name in ("left", "right"):
+        with Image.open(photos / f"{name}.png") as image:
+            image.convert("RGB").save(tmp_path / "jpg" / f"{name}.jpg")
+    words = ("jpg", "-o", "made", "--max-keypoints", 300, "--workers", 1, "--focal", 500, "--json")
+    made = summary(run("export", "bundler", *words))
+    assert {Path(file).name for file in made["files"]} == {
+        *("left.key", "right.key", "list.txt", "matches.init.txt")
+    }
+    assert (tmp_path / "made/list.txt").read_text() == "left.jpg 0 500.0000\nright.jpg 0 500.0000\n"
+    first, count, *rows = (tmp_path / "made/matches.init.txt").read_text().splitlines()
+    assert (first, int(count)) == ("0 1", len(rows))
+    assert made["matches"] == len(rows) > 20
 
 
 def test_straight_from_photographs(run, photos: Path, tmp_path: Path) -> None:
@@ -127,6 +144,7 @@ def test_nothing_is_replaced_silently(run, saved: Path) -> None:
         ("hloc f.h5 out/cat.npz -o a", "one HDF5 file of features"),
         ("hloc out/left_right_matches.npz --matches m.h5 -o a", "leave out --matches"),
         ("bundler out/cat.npz -o a", "no SIFT descriptors"),
+        ("bundler f.h5 --matches m.h5 -o a", "rename or convert left.png"),
         ("opencv m.h5 -o a", "holds no features"),
         ("hloc {photos} -o a --pairs none.txt", "no file none.txt"),
     ],
@@ -168,7 +186,7 @@ def test_a_bad_photograph_does_not_stop_the_export(run, photos: Path, tmp_path: 
     [
         ("colmap photos -o a.db --focal -5", "focal length must be above 0"),
         ("colmap photos -o a.db --calibration none.json", "no file none.json"),
-        ("bundler photos -o a", "rename 'my cat.jpg'"),
+        ("bundler photos -o a", "rename or convert left.png"),
         ("hloc photos -o a", "rename 'my cat.jpg'"),
     ],
 )

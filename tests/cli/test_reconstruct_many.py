@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from deepdetect.cli._reconstruct_many import MAX_LEFT_OUT_ROWS, left_out_rows
+
 from .conftest import one_sentence
 
 
@@ -47,6 +49,7 @@ def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
     assert again.exit_code == 0, again.output
     assert "3 of 4" in again.stdout
     assert "left out: black.png" in again.stdout
+    assert "verified of 3 (all of them)" in again.stdout
     other = run(*arguments, "--max-keypoints", 1000)
     assert other.exit_code == 2
     assert "--overwrite" in other.stderr
@@ -65,6 +68,18 @@ def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
     assert Path("model/model.ply").exists()
     replaced = run("reconstruct", copy, *arguments[2:], "--max-keypoints", 1500, "--overwrite")
     assert replaced.exit_code == 0, replaced.output
+
+
+def test_many_that_are_left_out_are_few_lines() -> None:
+    group = [f"wall-{k}.jpg" for k in range(30)]
+    alone = [f"sky-{k:02}.jpg" for k in range(MAX_LEFT_OUT_ROWS + 2)]
+    rows = left_out_rows(dict.fromkeys([*group, *alone], "why"), [group])
+    assert rows[0][0] == "left out: 30 photographs"
+    assert rows[0][1].startswith("wall-0.jpg and 29 more hang together")
+    assert rows[1] == ("left out: sky-00.jpg", "why")
+    assert rows[-1] == ("left out", "2 more, listed in model.json")
+    assert len(rows) == 1 + MAX_LEFT_OUT_ROWS + 1
+    assert left_out_rows({"a.jpg": "why"}, []) == [("left out: a.jpg", "why")]
 
 
 def test_a_list_of_photographs_is_a_folder(run, fountain: Path) -> None:

@@ -4,15 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from deepdetect import DeepDetect, ImageError, Keypoints, OptionError
 from deepdetect.features.sift import described_at_own_size
 from deepdetect.interchange import Collection, PairMatches, describe_collection
-from deepdetect.interchange.collection import sift_bytes
+from deepdetect.interchange.collection import READS_AS_STORED, check_upright, sift_bytes
 from deepdetect.interchange.colmap import write_colmap_text
 from deepdetect.interchange.hloc import write_hloc
 from deepdetect.interchange.opencv import write_opencv
-from deepdetect.io.image import luma
+from deepdetect.io.image import ORIENTATION_TAG, luma
 
 
 def test_each_keypoint_is_matched_once() -> None:
@@ -85,3 +86,19 @@ def test_the_file_of_the_matches_replaces_no_other(write, small_collection, tmp_
     with pytest.raises(OptionError, match="the file of the matches"):
         write(Collection(keypoints), tmp_path / "made")
     assert not (tmp_path / "made").exists()
+
+
+def test_photographs_that_exif_turns(tmp_path: Path, one_line) -> None:
+    """They are refused where a reader would take their size from the file, as it is stored."""
+    exif = Image.Exif()
+    exif[ORIENTATION_TAG] = 8
+    Image.new("RGB", (20, 10)).save(tmp_path / "turned.jpg", exif=exif)
+    Image.new("RGB", (20, 10)).save(tmp_path / "upright.jpg")
+    (tmp_path / "broken.jpg").write_bytes(b"no image")
+    others = [tmp_path / "upright.jpg", tmp_path / "broken.jpg"]
+    for form, program in READS_AS_STORED.items():
+        check_upright(form, others)
+        with pytest.raises(OptionError) as caught:
+            check_upright(form, [*others, tmp_path / "turned.jpg"])
+        assert f"which {program} does not do" in one_line(caught.value)
+    check_upright("colmap", [tmp_path / "turned.jpg"])  # the database has its own size

@@ -1,5 +1,5 @@
-"""The files are read by the rules of hloc's source (`utils/io.py`, `triangulation.py`), which is
-not on PyPI; from there they go into a database, and are mapped."""
+"""hloc is not on PyPI. Where it is installed, it reads the files itself, and maps them. Else they
+are read by the rules of its source (`utils/io.py`, `triangulation.py`), and mapped."""
 
 from __future__ import annotations
 
@@ -114,6 +114,66 @@ def test_it_is_mapped(fountain, fountain_collection, map_database, tmp_path: Pat
     model = map_database(database, fountain, tmp_path / "sparse")
     assert model.num_reg_images() == 4
     assert model.num_points3D() > 300
+
+
+@pytest.mark.filterwarnings("ignore")  # of its own
+def test_hloc_itself_maps_the_files(fountain, fountain_collection, tmp_path: Path) -> None:
+    """`reconstruction`, and `triangulation` with the poses that it has found."""
+    pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap: pip install '.[sfm]'")
+    pytest.importorskip("hloc", reason="needs hloc, which is not on PyPI")
+    from hloc import reconstruction, triangulation
+
+    features, matches, pairs = write_hloc(fountain_collection, tmp_path / "hloc")
+    size = next(iter(fountain_collection.keypoints.values())).image_size
+    model = reconstruction.main(
+        tmp_path / "sfm",
+        fountain,
+        pairs,
+        features,
+        matches,
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        image_options={
+            "camera_model": "SIMPLE_PINHOLE",
+            "camera_params": f"{2759.48 * size[0] / 3072},{size[0] / 2},{size[1] / 2}",
+        },
+        mapper_options={"min_model_size": 3, "random_seed": 0, "num_threads": 1},
+    )
+    assert model.num_reg_images() == 4
+    assert model.num_points3D() > 300
+    assert model.compute_mean_reprojection_error() < 1
+    with pycolmap.Database.open(tmp_path / "sfm" / "database.db") as database:
+        for image in database.read_all_images():
+            expected = fountain_collection.keypoints[image.name].xy + 0.5
+            np.testing.assert_array_equal(database.read_keypoints(image.image_id)[:, :2], expected)
+    again = triangulation.main(
+        tmp_path / "triangulated",
+        tmp_path / "sfm",
+        fountain,
+        pairs,
+        features,
+        matches,
+        # COLMAP 4 passes over the geometries that hloc 1.5 writes itself: they have no kind.
+        estimate_two_view_geometries=True,
+    )
+    assert again.num_points3D() > 300
+    assert again.compute_mean_reprojection_error() < 1
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_hloc_itself_matches_the_features(fountain_collection, tmp_path: Path) -> None:
+    """Its mutual nearest neighbours find our matches again."""
+    pytest.importorskip("torch", reason="needs torch")
+    pytest.importorskip("hloc", reason="needs hloc, which is not on PyPI")
+    from hloc import match_features
+    from hloc.utils.io import get_matches
+
+    features, _, pairs = write_hloc(fountain_collection, tmp_path / "hloc")
+    conf = {"output": "its", "model": match_features.confs["NN-ratio"]["model"]}
+    its = match_features.main(conf, pairs, features, matches=tmp_path / "its.h5")
+    for pair, ours in fountain_collection.matches.items():
+        theirs = set(map(tuple, get_matches(its, *pair)[0].tolist()))
+        both = len(theirs & set(map(tuple, ours.rows.tolist())))
+        assert both > 0.9 * min(len(theirs), len(ours)) > 9
 
 
 def test_keypoints_without_an_angle_stay_without_one(tmp_path: Path) -> None:

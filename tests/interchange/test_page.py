@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shlex
@@ -32,6 +33,8 @@ def test_the_page_runs(fountain: Path, tmp_path: Path, monkeypatch: pytest.Monke
     done = 0
     for _, language, text in BLOCKS:
         if language == "python":
+            if "from hloc import" in text and importlib.util.find_spec("hloc") is None:
+                continue
             (tmp_path / "sparse").mkdir(exist_ok=True)
             ran = subprocess.run(
                 [sys.executable, "-c", text], capture_output=True, text=True, env=os.environ

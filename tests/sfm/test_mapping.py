@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -107,38 +108,49 @@ def test_a_written_model_replaces_the_one_before(model, pycolmap, tmp_path: Path
     assert [path.name for path in tmp_path.iterdir()] == ["sparse"]
 
 
-def test_cameras_that_move_straight_ahead_are_mapped(
-    pycolmap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """COLMAP's defaults find no pair to begin with: the second attempt does."""
-    attempts = []
+@pytest.fixture
+def attempts(pycolmap, monkeypatch: pytest.MonkeyPatch) -> list[dict]:
+    """The models of each call of COLMAP's mapper."""
+    made = []
     original = pycolmap.incremental_mapping
 
     def counted(*arguments, **keywords):
-        attempts.append(original(*arguments, **keywords))
-        return attempts[-1]
+        made.append(original(*arguments, **keywords))
+        return made[-1]
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", counted)
+    return made
+
+
+def write_scenes(path: Path, steps: dict[str, tuple[np.ndarray, int]]) -> None:
+    """Write a database of cameras that pass random points, by name: step and number of cameras."""
     rng = np.random.default_rng(0)
-    points = rng.uniform((-5, -3, 7), (5, 3, 13), (400, 3))
     lens = Lens.of_camera(Camera((640, 480), 500.0))
-    images, rows = [], []
-    for number in range(5):
-        seen = points - [0, 0, 0.4 * number]
-        xy = seen[:, :2] / seen[:, 2:] * 500 + (319.5, 239.5)
-        inside = ((xy > 0) & (xy < (639, 479))).all(axis=1)
-        rows.append(np.flatnonzero(inside))
-        noisy = xy[inside] + rng.normal(0, 0.2, (inside.sum(), 2))
-        images.append(DatabaseImage(f"{number}.jpg", lens, noisy))
-    matches = {
-        (images[a].name, images[b].name): np.column_stack(
-            np.intersect1d(rows[a], rows[b], return_indices=True)[1:]
-        )
-        for a in range(5)
-        for b in range(a + 1, 5)
-    }
+    images: list[DatabaseImage] = []
+    matches = {}
+    for scene, (step, count) in steps.items():
+        points = rng.uniform((-5, -3, 7), (5, 3, 13), (400, 3))
+        own: list[tuple[str, np.ndarray]] = []
+        for number in range(count):
+            seen = points - number * step
+            xy = seen[:, :2] / seen[:, 2:] * 500 + (319.5, 239.5)
+            inside = ((xy > 0) & (xy < (639, 479))).all(axis=1)
+            own.append((f"{scene}{number}.jpg", np.flatnonzero(inside)))
+            noisy = xy[inside] + rng.normal(0, 0.2, (inside.sum(), 2))
+            images.append(DatabaseImage(own[-1][0], lens, noisy))
+        for (name0, rows0), (name1, rows1) in itertools.combinations(own, 2):
+            rows = np.intersect1d(rows0, rows1, return_indices=True)[1:]
+            matches[name0, name1] = np.column_stack(rows)
+    write_database(path, images, matches)
+
+
+AHEAD, ASIDE = np.array([0, 0, 0.4]), np.array([0.8, 0, 0])
+
+
+def test_cameras_that_move_straight_ahead_are_mapped(attempts, tmp_path: Path) -> None:
+    """COLMAP's defaults find no pair to begin with: the second attempt does."""
     options = MappingOptions()
-    write_database(tmp_path / "database.db", images, matches)
+    write_scenes(tmp_path / "database.db", {"ahead": (AHEAD, 5)})
     verify_pairs(tmp_path / "database.db", options)
     (tmp_path / "space").mkdir()
     model, others = map_photographs(
@@ -152,6 +164,26 @@ def test_cameras_that_move_straight_ahead_are_mapped(
     lengths = np.linalg.norm(steps, axis=1)
     np.testing.assert_allclose(lengths, lengths.mean(), rtol=0.1)
     assert ((steps @ steps[0]) / (lengths * lengths[0]) > 0.99).all()
+
+
+@pytest.mark.parametrize(("ahead", "calls"), [(5, 2), (3, 1)])
+def test_a_drive_beside_a_smaller_scene(attempts, ahead: int, calls: int, tmp_path: Path) -> None:
+    """A second attempt is made where more photographs are left than the first has mapped."""
+    options = MappingOptions()
+    write_scenes(tmp_path / "database.db", {"ahead": (AHEAD, ahead), "aside": (ASIDE, 4)})
+    verify_pairs(tmp_path / "database.db", options)
+    (tmp_path / "space").mkdir()
+    model, others = map_photographs(
+        tmp_path / "database.db", tmp_path, tmp_path / "space", True, options
+    )
+    assert len(attempts) == calls
+    aside = frozenset(f"aside{number}.jpg" for number in range(4))
+    names = {view.name for view in read_sparse_model(model).views.values()}
+    if calls == 1:
+        assert (names, others) == (aside, [])
+    else:
+        assert names == {f"ahead{number}.jpg" for number in range(ahead)}
+        assert others == [aside]
 
 
 @pytest.mark.parametrize("wrong", [{"min_views": 1}, {"min_verified": 0}, {"robust_scale_px": 0}])

@@ -259,6 +259,35 @@ def test_the_most_alike_are_matched(
     assert len(found.views) == 4
 
 
+def test_of_two_scenes_the_larger_is_the_model(write_fountain, tmp_path: Path, pycolmap) -> None:
+    """The negatives of three photographs are another scene: their descriptors are others."""
+    from PIL import Image, ImageOps
+
+    folder = write_fountain(tmp_path / "photos")
+    for name in ("0003", "0004", "0005"):
+        with Image.open(folder / f"{name}.jpg") as image:
+            ImageOps.invert(image).save(folder / f"negative-{name}.jpg")
+    found = reconstruct_many(folder, tmp_path / "model", dense=False, **QUICK)
+    assert set(found.views) == {"0003.jpg", "0004.jpg", "0005.jpg", "0006.jpg"}
+    negatives = tuple(f"negative-{name}.jpg" for name in ("0003", "0004", "0005"))
+    assert found.other_groups == (negatives,)
+    assert all("with 2 others only" in found.left_out[name] for name in negatives)
+    values = json.loads((tmp_path / "model/model.json").read_text())
+    assert values["other_groups"] == [list(negatives)]
+    assert (values["pairs"], values["pair_choice"]) == (21, "all")
+
+
+def test_names_that_are_part_of_others(write_fountain, tmp_path: Path, pycolmap) -> None:
+    """What is wrong with 11.jpg is not said of 1.jpg."""
+    folder = write_fountain(tmp_path / "photos", ("0004", "0005", "0006"))
+    (folder / "0004.jpg").rename(folder / "1.jpg")
+    (folder / "11.jpg").write_bytes(b"no image")
+    found = reconstruct_many(folder, tmp_path / "model", dense=False, **QUICK)
+    assert set(found.views) == {"1.jpg", "0005.jpg", "0006.jpg"}
+    assert list(found.left_out) == ["11.jpg"]
+    assert "11.jpg is not an image" in found.left_out["11.jpg"]
+
+
 def test_too_few_photographs_are_one_sentence(
     tmp_path: Path, photo: np.ndarray, one_line: Callable, pycolmap
 ) -> None:

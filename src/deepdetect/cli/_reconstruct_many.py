@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +29,9 @@ MANY = FieldOptions(
 """Options that two photographs do not have."""
 
 OUTPUT = Path("deepdetect-output/model")
+
+MAX_LEFT_OUT_ROWS = 10
+"""Photographs that are named with a reason on the terminal; model.json names all."""
 
 
 def reconstruct_folder(
@@ -82,10 +85,10 @@ def _rows(found: MultiViewReconstruction, numbers: dict[str, Any]) -> list[tuple
     shown = ", ".join(f"{px:g} px ({source})" for px, source in focal[:3])
     rows = [
         ("photographs", f"{numbers['registered']} of {numbers['photographs']}"),
-        *((f"left out: {name}", reason) for name, reason in numbers["left_out"].items()),
+        *left_out_rows(numbers["left_out"], numbers["other_groups"]),
         ("focal length", shown + (", ..." if len(focal) > 3 else "")),
         ("keypoints", f"{numbers['keypoints']:,}"),
-        ("pairs", f"{numbers['verified_pairs']:,} verified of {numbers['pairs']:,}"),
+        ("pairs", _pairs(numbers)),
         (
             "sparse points",
             f"{numbers['sparse_points']:,}, reprojection error "
@@ -103,3 +106,44 @@ def _rows(found: MultiViewReconstruction, numbers: dict[str, Any]) -> list[tuple
     rows += [("scale", numbers["scale"]), *seconds_rows(numbers["seconds"])]
     rows.append(("written", ", ".join(numbers["files"])))
     return rows
+
+
+def left_out_rows(
+    left_out: Mapping[str, str], other_groups: Sequence[Sequence[str]]
+) -> list[tuple[str, str]]:
+    """Name groups of photographs that are no part of the model, and the others one by one.
+
+    Args:
+        left_out: reasons by name.
+        other_groups: names of those that hang together among themselves.
+
+    Returns:
+        Rows for the table of the terminal.
+    """
+    rows: list[tuple[str, str]] = []
+    grouped: set[str] = set()
+    for group in other_groups:
+        grouped |= set(group)
+        rows.append(
+            (
+                f"left out: {len(group)} photographs",
+                f"{group[0]} and {len(group) - 1} more hang together, but not with the others: "
+                "they show something else, or too little of the same; model.json lists them",
+            )
+        )
+    alone = [(name, why) for name, why in left_out.items() if name not in grouped]
+    rows += [(f"left out: {name}", why) for name, why in alone[:MAX_LEFT_OUT_ROWS]]
+    if len(alone) > MAX_LEFT_OUT_ROWS:
+        rows.append(("left out", f"{len(alone) - MAX_LEFT_OUT_ROWS} more, listed in model.json"))
+    return rows
+
+
+def _pairs(numbers: dict[str, Any]) -> str:
+    """Say how many pairs were matched, of how many, and how they were chosen."""
+    count = numbers["photographs"]
+    choice = {
+        "all": "all of them",
+        "sequential": "neighbours by name",
+        "similar": f"the most similar of {count * (count - 1) // 2:,}",
+    }[numbers["pair_choice"]]
+    return f"{numbers['verified_pairs']:,} verified of {numbers['pairs']:,} ({choice})"

@@ -203,9 +203,10 @@ def export_opencv(
 @_with(*_COMMON, *_CAMERAS)
 @_folder_output("bundler-files")
 def export_bundler(sources: tuple[Path, ...], output: Path, **values: Any) -> None:
-    """Write list.txt, Lowe's .key files and matches.init.txt, for Bundler and VisualSFM.
+    """Write list.txt, Lowe's .key files and matches.init.txt, for Bundler.
 
-    SOURCE as of deepdetect export colmap.
+    SOURCE as of deepdetect export colmap. Photographs are JPEG files that end in .jpg: Bundler does
+    not know the sizes of others.
 
     \b
     deepdetect export bundler photos/ -o bundler/
@@ -284,7 +285,7 @@ def _export(
 def _check_before_work(form: str, sources: tuple[Path, ...], camera: Mapping[str, Any]) -> None:
     """Say what is wrong with cameras and names before photographs are matched."""
     from ..geometry.camera import Camera
-    from ..interchange.collection import check_names
+    from ..interchange.collection import check_names, check_upright
     from ..io.image import find_images
 
     calibration, focal_px = camera.get("calibration"), camera.get("focal_px")
@@ -295,8 +296,9 @@ def _check_before_work(form: str, sources: tuple[Path, ...], camera: Mapping[str
     if calibration is not None and not calibration.is_file():
         raise MissingFileError(f"there is no file {calibration}: check the path")
     if len(sources) == 1 and sources[0].is_dir():
-        names = (path.relative_to(sources[0]).as_posix() for path in find_images(sources[0]))
-        check_names(form, names)
+        paths = find_images(sources[0])
+        check_names(form, (path.relative_to(sources[0]).as_posix() for path in paths))
+        check_upright(form, paths)
 
 
 def _has_files(folder: Path) -> bool:

@@ -1,7 +1,9 @@
-"""Bundler (and VisualSFM): list.txt, Lowe's .key files, and matches.init.txt.
+"""Bundler: list.txt, Lowe's .key files, and matches.init.txt.
 
 Snavely et al., "Photo tourism", 2006. Lowe's files have rows before columns, the centre of the
 first pixel at (0, 0), sigma in pixels, and orientations in radians that grow counter-clockwise.
+
+Bundler looks for matches of a pair under the lower number first, and passes over all others.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..sfm.lens import Lens
-from .collection import Collection, check_names, sift_bytes
+from .collection import Collection, PairMatches, check_names, check_upright, sift_bytes
 from .colmap import DEFAULT_SIZE_PX, orientations_of
 
 NUMBERS_PER_LINE = 20
@@ -39,18 +41,21 @@ def write_bundler(
 
     Raises:
         OptionError: keypoints have no SIFT descriptors, which this format always has; a name has a
-            blank; or two photographs would have one .key file.
+            blank, or does not end in .jpg, .pgm or .bmp; a photograph is turned by EXIF; or two
+            would have one .key file.
         DeepDetectError: a file cannot be written.
     """
     folder = Path(output)
-    check_names("bundler", collection.keypoints)
-    keys: dict[str, str] = {}
     for name, points in collection.keypoints.items():
         if sift_bytes(points) is None:
             raise OptionError(
                 f"the keypoints of {name} have no SIFT descriptors, which .key files need: name "
                 "the folder of the photographs as `images`"
             )
+    check_names("bundler", collection.keypoints)
+    check_upright("bundler", collection.photographs)
+    keys: dict[str, str] = {}
+    for name in collection.keypoints:
         key = str(PurePosixPath(name).with_suffix(".key"))
         if key in keys:
             raise OptionError(f"{keys[key]} and {name} would have the same {key}: rename one")
@@ -67,17 +72,31 @@ def write_bundler(
         lines.append(f"{name} 0 {lens.params[0]:.4f}" if lens and known else name)
     texts = {"list.txt": "".join(f"{line}\n" for line in lines)}
     if collection.matches:
-        numbers = {name: k for k, name in enumerate(collection.keypoints)}
         texts["matches.init.txt"] = "".join(
-            f"{numbers[name0]} {numbers[name1]}\n{len(found)}\n"
-            + "".join(f"{row0} {row1}\n" for row0, row1 in found.rows.tolist())
-            for (name0, name1), found in collection.matches.items()
+            f"{first} {second}\n{len(rows)}\n" + "".join(f"{a} {b}\n" for a, b in rows.tolist())
+            for (first, second), rows in _numbered_matches(collection)
         )
     for file, text in texts.items():
         with atomic_path(folder / file) as temporary:
             temporary.write_text(text, encoding="utf-8")
         written.append(folder / file)
     return tuple(written)
+
+
+def _numbered_matches(collection: Collection) -> list[tuple[tuple[int, int], np.ndarray]]:
+    """Return the rows of each pair, the photograph with the lower number first."""
+    numbers = {name: number for number, name in enumerate(collection.keypoints)}
+    found: dict[tuple[int, int], PairMatches] = {}
+    for (name0, name1), matches in collection.matches.items():
+        first, second = numbers[name0], numbers[name1]
+        rows, scores = matches.rows, matches.scores
+        if first > second:
+            first, second, rows = second, first, rows[:, ::-1]
+        if (same := found.get((first, second))) is not None:  # the pair both ways round
+            rows = np.concatenate([same.rows, rows])
+            scores = np.concatenate([same.scores, scores])
+        found[first, second] = PairMatches.one_to_one(rows, scores)
+    return [(pair, matches.rows) for pair, matches in sorted(found.items())]
 
 
 def _key_text(points: Keypoints) -> str:

@@ -13,7 +13,8 @@ from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from ..features.keypoints import Keypoints
 from ..features.sift import described_at_own_size, root_sift_descriptors
-from ..io.image import load_image, luma
+from ..io.image import ORIENTATION_TAG, load_image, luma
+from ..io.image_file import open_image
 
 Pair = tuple[str, str]
 
@@ -31,6 +32,9 @@ BLANK_SEPARATED = {
     "hloc": "hloc's lists of pairs",
 }
 """Formats with lists of names that have a blank between them."""
+
+BUNDLER_ENDINGS = (".jpg", ".pgm", ".bmp")
+"""Of files whose sizes Bundler reads; it takes 1504x1000 pixels for that of all others."""
 
 
 @suggest_keywords
@@ -103,6 +107,11 @@ class Collection:
                         f"which has {len(self.keypoints[name])}: they are of other features"
                     )
 
+    @property
+    def photographs(self) -> list[Path]:
+        """Files of the photographs, as far as they are known."""
+        return [path for name in self.keypoints if (path := self.path(name)) is not None]
+
     def path(self, name: str) -> Path | None:
         """Return the file of a photograph, or None where it is not known."""
         path = None if self.folder is None else self.folder / name
@@ -145,10 +154,11 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
 
 
 def check_names(form: str, names: Iterable[str]) -> None:
-    """Refuse names with blanks where the lists of a format could not be read back.
+    """Refuse names that the reader of a format would misunderstand.
 
     Raises:
-        OptionError: a name has a blank.
+        OptionError: a name has a blank, where lists of names are separated by blanks, or an ending
+            that Bundler does not know.
 
     Example:
         >>> check_names("hloc", ["db/1.jpg"])
@@ -158,6 +168,40 @@ def check_names(form: str, names: Iterable[str]) -> None:
     for name in names:
         if len(name.split()) != 1:
             raise OptionError(f"{BLANK_SEPARATED[form]} separate by blanks: rename {name!r}")
+        if form == "bundler" and not name.endswith(BUNDLER_ENDINGS):
+            raise OptionError(
+                "Bundler reads the sizes of files that end in .jpg, .pgm or .bmp, in small letters "
+                f"only: rename or convert {name}"
+            )
+
+
+READS_AS_STORED = {"bundler": "Bundler", "hloc": "hloc"}
+"""Readers that take the size of a photograph from its file, and do not turn it by EXIF."""
+
+
+def check_upright(form: str, photographs: Iterable[Path]) -> None:
+    """Refuse photographs that EXIF turns where the reader of a format does not turn them.
+
+    Args:
+        form: the format.
+        photographs: their files; those that cannot be read are not checked.
+
+    Raises:
+        OptionError: one is to be turned.
+    """
+    if form not in READS_AS_STORED:
+        return
+    for path in photographs:
+        try:
+            with open_image(path) as image:
+                turned = image.getexif().get(ORIENTATION_TAG, 1) != 1
+        except ImageError:
+            continue
+        if turned:
+            raise OptionError(
+                f"{path} is turned by its EXIF orientation, which {READS_AS_STORED[form]} does not "
+                "do: save it upright, without that tag (mogrify -auto-orient)"
+            )
 
 
 def check_matches_name(names: Iterable[str]) -> None:

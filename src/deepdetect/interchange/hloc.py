@@ -16,7 +16,7 @@ from .._shared.options import suggest_keywords
 from ..batch.extraction import feature_group
 from ..batch.pair_list import pair_name
 from ..batch.parted_file import Group, write_groups
-from .collection import Collection, check_names
+from .collection import Collection, check_names, check_upright
 
 FILES = ("features.h5", "matches.h5", "pairs.txt")
 
@@ -36,12 +36,13 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
         The files. Without matches there are no matches.h5 and pairs.txt.
 
     Raises:
-        OptionError: two pairs would have one group in the file, or a name in the list of pairs has
-            a blank.
+        OptionError: two pairs would have one group in the file, a name in the list of pairs has a
+            blank, or a photograph is turned by EXIF.
         DeepDetectError: a file cannot be written.
         MissingExtraError: h5py is not installed.
     """
     check_names("hloc", (name for pair in collection.matches for name in pair))
+    check_upright("hloc", collection.photographs)
     features, matches, pairs = (Path(output) / name for name in FILES)
 
     def feature_groups() -> Iterator[Group]:

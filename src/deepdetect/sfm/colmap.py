@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -25,6 +27,7 @@ def import_pycolmap(purpose: str = "a reconstruction from many photographs") -> 
         MissingExtraError: it is not installed, or h5py is not.
     """
     import_opencv()
+    first = "pycolmap" not in sys.modules
     try:
         import h5py  # noqa: F401
         import pycolmap
@@ -32,7 +35,16 @@ def import_pycolmap(purpose: str = "a reconstruction from many photographs") -> 
         raise MissingExtraError(
             f"{purpose} needs pycolmap and h5py: pip install 'deepdetect[sfm]'"
         ) from None
+    if first:
+        _restore_sigterm()
     return pycolmap
+
+
+def _restore_sigterm() -> None:
+    """Undo what pycolmap does at import: a process that is ended would print a stack trace."""
+    handler = signal.getsignal(signal.SIGTERM)  # Python does not know that it has been replaced
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from ..geometry.posed_view import PosedView
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .lens import Lens
+from .pair_selection import largest_group
 from .track_refinement import Observations, TrackRefinementOptions, refine_observations
 
 Pair = tuple[str, str]
@@ -36,8 +37,8 @@ class MappingOptions:
         max_models: groups of photographs that do not hang together, of which models are made.
         max_first_pairs: pairs with which each of them may begin.
         forward_angle_deg: COLMAP begins with a pair whose points are seen at large angles, and
-            which did not move straight ahead. Where there is none, as in a clip from a car, it may
-            have, and this angle is enough.
+            which did not move straight ahead. Where there is none, as in a clip from a car, or
+            where more photographs are left than mapped, it may have, and this angle is enough.
         refine_tracks: align the patches around all observations of a point before the last
             adjustment.
         track_refinement: how they are aligned.
@@ -177,31 +178,58 @@ def map_photographs(
         if known_cameras:
             how.ba_refine_focal_length = False
             how.ba_refine_extra_params = False
+        verified = _verified_pairs(pycolmap, database, options.min_verified)
+        found: list[Any] = []
         for forward in (False, True):
             if forward:
                 how.mapper.init_max_forward_motion = 1.0
                 how.mapper.init_min_tri_angle = options.forward_angle_deg
+            space = workspace / str(int(forward))
+            space.mkdir()
             models = pycolmap.incremental_mapping(
                 database,
                 folder,
-                workspace,
+                space,
                 how,
                 initial_image_pair_callback=lambda: registered(2),
                 next_image_callback=lambda: registered(1),
             )
-            if models:
+            attempt = sorted(models.values(), key=lambda model: -model.num_reg_images())
+            if _largest(attempt) > _largest(found):
+                found = attempt
+            # What is left may be more than the model: a drive beside some photographs of a house.
+            mapped = frozenset[str]().union(*map(_names, found))
+            left = [pair for pair in verified if mapped.isdisjoint(pair)]
+            if found and largest_group(left) <= _largest(found):
                 break
-    found = sorted(models.values(), key=lambda model: -model.num_reg_images())
     if not found or found[0].num_reg_images() < options.min_views:
         raise NoDepthError(
             "the photographs do not hang together: take them so that each shows most of what the "
             "one before shows, from another place"
         )
-    others = [
-        frozenset(model.images[number].name for number in model.reg_image_ids())
-        for model in found[1:]
-    ]
-    return found[0], others
+    return found[0], [_names(model) for model in found[1:]]
+
+
+def _largest(models: Sequence[Any]) -> int:
+    """Return the number of photographs of the first of some models, the largest ones first."""
+    return models[0].num_reg_images() if models else 0
+
+
+def _verified_pairs(pycolmap: Any, database: Path, min_verified: int) -> list[Pair]:
+    """Return the names of the pairs with enough matches that agree with their geometry."""
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        found = zip(*opened.read_two_view_geometry_num_inliers(), strict=True)
+        pairs = [
+            pycolmap.pair_id_to_image_pair(number)
+            for number, count in found
+            if count >= min_verified
+        ]
+    return [(names[first], names[second]) for first, second in pairs]
+
+
+def _names(model: Any) -> frozenset[str]:
+    return frozenset(model.images[number].name for number in model.reg_image_ids())
 
 
 def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseModel:

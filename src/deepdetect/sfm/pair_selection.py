@@ -114,6 +114,27 @@ def similar_pairs(names: Sequence[str], vectors: np.ndarray, count: int) -> list
     return [(names[a], names[b]) for a, b in sorted(found)]
 
 
+def largest_group(pairs: Sequence[Pair]) -> int:
+    """Return the number of photographs in the largest group that pairs connect.
+
+    Example:
+        >>> largest_group([("a", "b"), ("c", "d"), ("b", "e")]), largest_group([])
+        (3, 0)
+    """
+    neighbours: dict[str, set[str]] = {}
+    for first, second in pairs:
+        neighbours.setdefault(first, set()).add(second)
+        neighbours.setdefault(second, set()).add(first)
+    largest = 0
+    while neighbours:
+        count, edge = 0, {next(iter(neighbours))}
+        while edge:
+            count += len(edge)
+            edge = set[str]().union(*(neighbours.pop(name) for name in edge)) & neighbours.keys()
+        largest = max(largest, count)
+    return largest
+
+
 def vlad_vectors(
     descriptors: Sequence[np.ndarray], options: PairSelectionOptions = PairSelectionOptions()
 ) -> np.ndarray:

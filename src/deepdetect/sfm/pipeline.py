@@ -203,6 +203,7 @@ def _reconstruct(
             {sparse.views[number].name: sparse.views[number] for number in order},
             {sparse.views[number].name: sparse.lenses[number] for number in order},
             dict(sorted(left_out.items())),
+            _groups_of(left_out, others),
             sparse.views[reference].name,
             PointCloud(sparse.points, colors, "spacing", frame),
             sparse.errors.astype(np.float32),
@@ -213,6 +214,7 @@ def _reconstruct(
             features.keypoints,
             verified,
             len(pairs),
+            options.pair_selection.way(len(names)),
             timer.seconds,
             output_files(stages.output)[:-1],
         )
@@ -257,6 +259,14 @@ def _why_left_out(name: str, verified: Mapping[Pair, int], others: Iterable[froz
         f"it matches {partners} of the others, but its pose cannot be told from them: take more "
         "photographs between"
     )
+
+
+def _groups_of(
+    left_out: Iterable[str], others: Iterable[frozenset[str]]
+) -> tuple[tuple[str, ...], ...]:
+    """Return the names of those left out that hang together, without what two models share."""
+    groups = [tuple(sorted(other & frozenset(left_out))) for other in others]
+    return tuple(sorted((group for group in groups if len(group) > 1), key=len, reverse=True))
 
 
 def _sparse_colors(folder: Path, sparse: SparseModel) -> np.ndarray:

@@ -30,6 +30,8 @@ class MultiViewReconstruction:
         views: of the photographs that are part of it, by name; their cameras are pinhole cameras.
         lenses: the same cameras with their distortion.
         left_out: why each of the others is not, by name.
+        other_groups: names of those left out that hang together among themselves, the largest group
+            first: each can be reconstructed alone.
         reference: name of the photograph whose camera's frame is the world.
         sparse: the points by which the poses were estimated.
         sparse_errors: (N,) float32 their mean reprojection errors in pixels.
@@ -41,6 +43,7 @@ class MultiViewReconstruction:
         keypoints: number of keypoints of each photograph.
         matched: number of verified matches of each pair that has some.
         pairs: number of pairs that were matched.
+        pair_choice: how they were chosen: "all", "sequential" or "similar".
         seconds: time of each stage of this run; what an earlier run had done took none.
         files: what was written.
     """
@@ -48,6 +51,7 @@ class MultiViewReconstruction:
     views: Mapping[str, PosedView]
     lenses: Mapping[str, Lens]
     left_out: Mapping[str, str]
+    other_groups: tuple[tuple[str, ...], ...]
     reference: str
     sparse: PointCloud
     sparse_errors: np.ndarray
@@ -58,6 +62,7 @@ class MultiViewReconstruction:
     keypoints: Mapping[str, int]
     matched: Mapping[tuple[str, str], int]
     pairs: int
+    pair_choice: str
     seconds: Mapping[str, float]
     files: tuple[Path, ...]
 
@@ -84,10 +89,12 @@ class MultiViewReconstruction:
             "photographs": len(self.views) + len(self.left_out),
             "registered": len(self.views),
             "left_out": dict(self.left_out),
+            "other_groups": [list(group) for group in self.other_groups],
             "reference": self.reference,
             "scale": SCALE,
             "keypoints": sum(self.keypoints.values()),
             "pairs": self.pairs,
+            "pair_choice": self.pair_choice,
             "verified_pairs": len(self.matched),
             "verified_matches": sum(self.matched.values()),
             "sparse_points": len(self.sparse),

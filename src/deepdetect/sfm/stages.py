@@ -136,13 +136,15 @@ class Stages:
             raise ReconstructionError("no photograph can be read: " + "; ".join(report.failures))
         with open_hdf5(self.work / "features.h5") as file:
             for name in names:
-                sentence = [text for text in report.failures if name in text]
-                if sentence:
-                    failures[name] = sentence[0]
-                elif name in file:
+                own = (f"{folder.absolute() / name} ", f"{name}: ")
+                sentence = [text for text in report.failures if text.startswith(own)]
+                if not sentence and name in file:  # 1.jpg is in the sentence on 11.jpg, too
                     width, height = file[name]["image_size"][()]
                     sizes[name] = int(width), int(height)
                     keypoints[name] = len(file[name]["keypoints"])
+                else:
+                    sentence += [text for text in report.failures if name in text]
+                    failures[name] = (sentence or ["it could not be read"])[0]
         return PhotographFeatures(sizes, keypoints, failures)
 
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
@@ -225,7 +227,13 @@ class Stages:
         space.mkdir()
         with progress(len(images), "mapping", "photograph", self.quiet) as bar:
             model, others = map_photographs(
-                self.output / "database.db", folder, space, known, options, bar.update
+                self.output / "database.db",
+                folder,
+                space,
+                known,
+                options,
+                # Those of an attempt that is given up are counted again in the next.
+                lambda count: bar.update(min(count, len(images) - bar.n)),
             )
         shutil.rmtree(space, ignore_errors=True)
         if options.refine_tracks:
