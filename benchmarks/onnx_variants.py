@@ -191,7 +191,7 @@ def runtimes(path: Path, folder: Path) -> Iterator[tuple[str, list[Maps]]]:
     if importlib.util.find_spec("openvino") is not None:
         yield "OpenVINO, any size", [in_openvino(path)] * count
     opencv = f"OpenCV {cv2.__version__}"
-    engines = {"": ()}
+    engines: dict[str, tuple[int, ...]] = {"": ()}
     if cv2.__version__ >= "5":
         yield f"{opencv}, new engine, any size", [in_opencv(path, cv2.dnn.ENGINE_NEW)] * count
         engines = {", classic engine": (cv2.dnn.ENGINE_CLASSIC,)}
