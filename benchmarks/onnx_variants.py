@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -43,6 +43,7 @@ TIMED_SIZE = (480, 640)
 PARITY_SIZES = ((480, 640, 1), (500, 741, 1), (481, 333, 1), (17, 23, 1), (64, 96, 2), (120, 43, 2))
 """Heights, widths and batches: multiples of the stride, and none."""
 
+Precision = Literal["float32", "bfloat16"]
 Maps = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Maps (B, 3, H, W) float32 in [0, 1] to logits and probabilities, (B, 1, H, W)."""
 
@@ -78,7 +79,9 @@ def main() -> None:
 
 def precision_table(files: Mapping[str, Path], samples: list[Path], rounds: int) -> Table:
     """Score each file on the samples, and bfloat16 where it can be run, beside the first file."""
-    rivals = {name: (path, "onnxruntime", "float32") for name, path in files.items()}
+    rivals: dict[str, tuple[Path, str, Precision]] = {
+        name: (path, "onnxruntime", "float32") for name, path in files.items()
+    }
     first = next(iter(files))
     rivals["bfloat16"] = (files[first], "openvino", "bfloat16")
     detectors, references = {}, {}
@@ -112,7 +115,7 @@ def precision_table(files: Mapping[str, Path], samples: list[Path], rounds: int)
     return Table("precision", "Precision", columns, tuple(rows))
 
 
-def one_thread(path: Path, backend: str, precision: str = "float32") -> DeepDetect:
+def one_thread(path: Path, backend: str, precision: Precision = "float32") -> DeepDetect:
     """Open a file for images as they are."""
     return DeepDetect(path, backend=backend, precision=precision, threads=1, resolution="native")
 
@@ -149,10 +152,10 @@ def normalisation_table(path: Path, unfolded: Path, image: np.ndarray, rounds: i
         makers[f"OpenCV {cv2.__version__}"] = lambda file: in_opencv(file, cv2.dnn.ENGINE_NEW)
     rows: list[tuple[Cell, ...]] = []
     for name, make in makers.items():
-        runs = [make(file) for file in (path, unfolded)]
-        before, after = (run(planes)[0] for run in runs)
+        folded, other = make(path), make(unfolded)
+        before, after = folded(planes)[0], other(planes)[0]
         crossing = float(np.mean((before > 0) != (after > 0)))
-        ratio = time_ratio(*runs, planes, rounds)
+        ratio = time_ratio(folded, other, planes, rounds)
         rows.append((name, float(np.abs(after - before).max()), crossing, ratio))
     columns = (
         Column("multiplication and addition instead"),

@@ -131,8 +131,8 @@ def render_views(
     for pitch in PITCHES_DEG:
         for yaw in YAWS_DEG:
             roll = rng.uniform(-MAX_ROLL_DEG, MAX_ROLL_DEG)
-            turns = np.radians([[0, yaw, 0], [pitch, 0, 0], [0, 0, roll]])
-            about_y, about_x, about_z = (cv2.Rodrigues(turn)[0] for turn in turns)
+            turns = np.radians(np.diag([pitch, yaw, roll]))
+            about_x, about_y, about_z = (cv2.Rodrigues(turn)[0] for turn in turns)
             truths.append(plane @ about_y @ about_x @ about_z @ centred)
     corners = np.array([[0, 0], [right, 0], [right, bottom], [0, bottom]], float)
     seen = np.concatenate([transform_points(corners, truth) for truth in truths])
