@@ -4,7 +4,7 @@
 
 The tables of docs/large-images.md: intersection over union of the keypoints (probability above
 0.5) of two windows of a photograph, 16 px apart in x and y, where both show it, and of a photograph
-and the same photograph flipped or turned.
+and the same photograph flipped or turned. Time is processor time beside the network as it is.
 PHOTOS are evenly chosen; the middle of each is taken, where it is larger than the side. With masks
 `mask_image_NAME.png` beside photographs `image_NAME.png` these are the labels, else `fuse` makes
 them.
@@ -13,6 +13,7 @@ them.
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -65,16 +66,22 @@ def main() -> None:
     photographs = load(arguments.photographs, arguments.count, arguments.side)
     print(
         f"| windows {SHIFT_PX} px apart | overlap | {BORDER_PX} px from the border "
-        "| with the labels | keypoints |\n|---|---|---|---|---|"
+        "| with the labels | keypoints | time |\n|---|---|---|---|---|---|"
     )
     rows: dict[str, Logits] = {"as it is": network}
     for padding_px in (64, 128, 256):
         rows[f"{padding_px} px by reflection"] = padded(network, padding_px, "reflect")
     rows["128 px of the border's values"] = padded(network, 128, "edge")
-    rows["mean of 8 copies"] = mean_of_copies(network, COPIES["mean of 8 copies"])
+    eight = mean_of_copies(network, COPIES["mean of 8 copies"])
+    rows["mean of 8 copies"] = eight
+    rows["mean of 8 copies, 128 px by reflection"] = padded(eight, 128, "reflect")
+    seconds = []
     for name, logits in rows.items():
+        started = time.process_time()
         values = shifts(logits, photographs)
-        print(f"| {name} | " + " | ".join(f"{value:.3f}" for value in values) + " |", flush=True)
+        seconds.append(time.process_time() - started)
+        texts = [f"{value:.3f}" for value in values] + [f"{seconds[-1] / seconds[0]:.1f}"]
+        print(f"| {name} | " + " | ".join(texts) + " |", flush=True)
     print("\n| | " + " | ".join(CHANGES) + " |\n|---|" + "---|" * len(CHANGES))
     for name, copies in COPIES.items():
         logits = mean_of_copies(network, copies)

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from PIL import Image
+
+onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+
+from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
+from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
+from deepdetect.io.image import luma  # noqa: E402
+from deepdetect.labels import fuse  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def script(load_script: Callable[[str], ModuleType]) -> ModuleType:
+    return load_script("onnx_variants")
+
+
+@pytest.fixture(scope="module")
+def samples(tmp_path_factory: pytest.TempPathFactory, photo: np.ndarray) -> list[Path]:
+    """A sample in normal light and a dark one."""
+    folder = tmp_path_factory.mktemp("samples")
+    for name, rgb in (("1", photo[:96, :128]), ("2", photo[:96, :128] // 8)):
+        Image.fromarray(rgb).save(folder / f"image_{name}.png")
+        mask = fuse(luma(np.ascontiguousarray(rgb))).mask
+        Image.fromarray(mask).save(folder / f"mask_image_{name}.png")
+    return sorted(folder.glob("image_*.png"))
+
+
+def test_half_precision_beside_the_whole(
+    script: ModuleType, samples: list[Path], tmp_path: Path
+) -> None:
+    half = tmp_path / "half.onnx"
+    write_onnx("default", half, OnnxOptions(precision="fp16"))
+    table = script.precision_table({"fp32": pretrained_weights(), "fp16": half}, samples, rounds=0)
+    titles = [column.title for column in table.columns]
+    assert titles[2:4] == ["normal: BCE / IoU", "low: BCE / IoU"]
+    (name, size, *scores, crossing, ratio), (_, half_size, *_, half_crossing, no_ratio) = (
+        table.rows[:2]
+    )
+    assert (name, crossing, ratio) == ("fp32", 0, 1)
+    assert size == pretrained_weights().stat().st_size / 1e6
+    assert half_size < 0.55 * size
+    assert 0 <= half_crossing < 0.002
+    assert np.isnan(no_ratio)
+    for score in scores:
+        loss, overlap = map(float, score.split(" / "))
+        assert 0 < loss < 1
+        assert 0.3 < overlap < 1
+
+
+def test_batch_normalisation_as_multiplication_and_addition(
+    script: ModuleType, photo: np.ndarray, tmp_path: Path
+) -> None:
+    made = tmp_path / "made.onnx"
+    script.multiply_and_add(pretrained_weights(), made)
+    kinds = [node.op_type for node in onnx.load(made).graph.node]
+    before = [node.op_type for node in onnx.load(pretrained_weights()).graph.node]
+    assert "BatchNormalization" not in kinds
+    assert kinds.count("Mul") - before.count("Mul") == before.count("BatchNormalization") > 0
+    planes = script.planes_of(photo, 64, 96, 1)
+    expected, found = (
+        script.in_onnxruntime(path)(planes)[0] for path in (pretrained_weights(), made)
+    )
+    assert 0 < np.abs(found - expected).max() < 1e-3
+
+
+def test_parity(
+    script: ModuleType, photo: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(script, "PARITY_SIZES", ((40, 56, 1), (33, 41, 2)))
+    rows = script.parity_table(pretrained_weights(), tmp_path, photo).rows
+    assert rows[0][0] == "ONNX Runtime, any size"
+    assert any("OpenCV" in name and "one size" in name for name, *_ in rows)
+    for _, logits, probability in rows:
+        assert logits < 1e-3
+        assert probability < 2e-4
+
+
+def test_planes(script: ModuleType, photo: np.ndarray) -> None:
+    planes = script.planes_of(photo, *photo.shape[:2], 2)
+    assert planes.dtype == np.float32
+    expected = photo.transpose(2, 0, 1) / 255
+    np.testing.assert_allclose(planes, [expected, expected[:, ::-1]], atol=1e-6)
+
+
+def test_the_ratio_of_times(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    monkeypatch.setattr(script.time, "process_time", lambda: clock[0])
+    calls = count(1)
+
+    def takes(seconds: float) -> Callable[[np.ndarray], None]:
+        def run(_: np.ndarray) -> None:
+            # The first round is not counted, however long it takes.
+            clock[0] += seconds if next(calls) > 2 else 100 * seconds**3
+
+        return run
+
+    assert script.time_ratio(takes(2), takes(3), np.zeros(1), rounds=4) == pytest.approx(1.5)
+    assert np.isnan(script.time_ratio(takes(2), takes(3), np.zeros(1), rounds=0))
