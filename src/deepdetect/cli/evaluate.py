@@ -151,8 +151,9 @@ def _report_failures(found: Sequence[Evaluation], on_oxford: Sequence[OxfordScor
     from .._shared.errors import BatchError
 
     samples = found[0].failures
-    on_foreground = [each.foreground for each in found if each.foreground is not None]
-    parts = list(dict.fromkeys(f for each in (*on_oxford, *on_foreground) for f in each.failures))
+    lists = [each.failures for each in on_oxford]
+    lists += [each.foreground.failures for each in found if each.foreground is not None]
+    parts = list(dict.fromkeys(failure for listed in lists for failure in listed))
     if parts:
         count = len(samples) + len(parts)
         what = "one part" if count == 1 else f"{count} parts"

@@ -155,7 +155,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
 def computes_bfloat16() -> bool:
     """Return whether this processor has instructions for `precision="bfloat16"`."""
     capabilities = import_openvino().Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-    return "BF16" in capabilities
+    return bool("BF16" in capabilities)
 
 
 def _take_out_padding(graph: Any) -> None:
