@@ -45,6 +45,19 @@ def test_ctrl_c_while_packages_are_imported(
     assert result.stderr.strip() == "deepdetect: stopped; what was written stays"
 
 
+@pytest.mark.parametrize(("source", "said"), [("text.mp4", "no video"), ("97", "no camera")])
+def test_opencv_says_nothing_beside_the_sentence(source: str, said: str, tmp_path: Path) -> None:
+    """It writes past Python, so that only another process shows it."""
+    (tmp_path / "text.mp4").write_text("I am no video")
+    words = [sys.executable, "-m", "deepdetect", "track", source]
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("OPENCV_")}
+    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    result = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert result.returncode == 2
+    (line,) = result.stderr.splitlines()
+    assert said in line
+
+
 def test_the_command_is_the_module() -> None:
     """What pip installs as `deepdetect` catches Ctrl-C as `python -m deepdetect` does."""
     import tomllib

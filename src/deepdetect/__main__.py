@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from types import FrameType
+
+OPENCV_SETTINGS = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
+"""Errors are one sentence, without lines of OpenCV and of its FFmpeg beside it.
+
+Both are read from the environment when OpenCV is loaded, and a user's own setting stays. Programs
+that import this package are left as they are.
+"""
 
 
 def main() -> None:
@@ -16,6 +24,8 @@ def main() -> None:
         stopped = True
         raise KeyboardInterrupt
 
+    for name, value in OPENCV_SETTINGS.items():
+        os.environ.setdefault(name, value)
     # Packages that are interrupted while they are imported raise what they like.
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, stop)

@@ -145,7 +145,8 @@ def test_a_backend_of_other_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     from deepdetect.detector.backends import registry
 
     monkeypatch.setattr(checks.importlib.util, "find_spec", lambda name: name != "torch" or None)
-    monkeypatch.setitem(sys.modules, "openvino", ModuleType("openvino"))
+    for name in ("onnxruntime", "openvino"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
 
     def open_network(path: Path, options: object) -> tuple[object, str]:
         answer = 1.0 if options.backend == "openvino" else 0.0
@@ -156,6 +157,26 @@ def test_a_backend_of_other_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["back end openvino"].status == "problem"
     assert "differ from the others' by up to 0.23" in found["back end openvino"].value
     assert found["back end in use"].value == "onnxruntime"
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_whether_bfloat16_can_be_chosen(
+    there: bool, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    openvino = pytest.importorskip("openvino", reason="needs OpenVINO")
+    real = openvino.Core.get_property
+
+    def of_processor(core: object, device: str, name: str) -> object:
+        if name == "OPTIMIZATION_CAPABILITIES":
+            return ["FP32", *(["BF16"] if there else [])]
+        return real(core, device, name)
+
+    monkeypatch.setattr(openvino.Core, "get_property", of_processor)
+    found = find(run("doctor", "--json", "--no-self-test"), "bfloat16")
+    assert found["status"] == "ok"
+    assert found["details"]["available"] is there
+    said = "computes it" if there else "--precision bfloat16 is refused"
+    assert said in found["value"]
 
 
 def test_weights_that_are_gone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

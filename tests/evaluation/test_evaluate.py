@@ -175,7 +175,7 @@ def test_equal_density_without_images_is_refused(tmp_path: Path) -> None:
 def test_a_missing_folder_is_said_before_the_work(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("deepdetect.evaluation.evaluate.readable_samples", None)
+    monkeypatch.setattr("deepdetect.evaluation.evaluate.readable_images", None)
     for name in ("oxford", "foreground"):
         with pytest.raises(ImageError, match="there are no"):
             evaluate(samples=tmp_path, **{name: tmp_path / "none"})
@@ -297,6 +297,88 @@ def test_samples_that_cannot_be_read_are_listed_and_not_scored(
     assert "mask_image_b.png" in second
     (tmp_path / "image_c.png").unlink()
     assert CliRunner().invoke(main, ["evaluate", str(tmp_path)]).exit_code == 2
+
+
+def test_photographs_that_cannot_be_read_are_listed_and_not_scored(
+    tmp_path: Path, photo: np.ndarray
+) -> None:
+    from click.testing import CliRunner
+
+    from deepdetect.cli import main
+
+    Image.fromarray(photo[:64, :64]).save(tmp_path / "a.png")
+    (tmp_path / "b.png").write_bytes(b"damaged")
+    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--scale", "1", "--scale", "2"])
+    assert result.exit_code == 1
+    assert "x1 normal" in result.stdout
+    *_, told, first = result.stderr.splitlines()
+    assert told == "deepdetect: 1 of 2 samples are not in the scores:"
+    assert "b.png" in first
+
+
+def test_damaged_photographs_do_not_end_the_measurement_of_the_others(
+    run_evaluate, tmp_path: Path
+) -> None:
+    from click.testing import CliRunner
+    from skimage import data
+
+    from deepdetect.cli import main
+
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    image = cv2.resize(data.astronaut(), (128, 96), interpolation=cv2.INTER_AREA)
+    for name in ("a", "b", "c"):
+        Image.fromarray(image).save(photographs / f"{name}.png")
+        Image.fromarray(image[..., 0] > 99).save(photographs / f"{name}_mask.png")
+    whole = evaluate(foreground=photographs).foreground
+    assert whole is not None
+    assert whole.failures == ()
+    (photographs / "a.png").write_bytes(b"damaged")
+    Image.fromarray(image[:50, :, 0] > 99).save(photographs / "b_mask.png")
+    found = evaluate(foreground=photographs).foreground
+    assert found is not None
+    assert found.photographs == 1
+    assert (found.fraction, found.density) == pytest.approx((whole.fraction, whole.density))
+    run_evaluate()  # writes a sample
+    words = ["evaluate", str(tmp_path), "--foreground", str(photographs), "--compare", "dense"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 1
+    assert "fraction (density)" in result.stdout
+    *_, told, first, second = result.stderr.splitlines()
+    assert told == "deepdetect: 2 parts could not be measured, the scores are of the rest:"
+    assert first.startswith("  foreground of a.png: ")
+    assert second.startswith("  foreground of b.png: ")
+    for name in ("b.png", "c.png"):
+        (photographs / name).write_bytes(b"damaged")
+    with pytest.raises(ImageError, match=r"foreground of a\.png"):
+        evaluate(foreground=photographs)
+
+
+@pytest.mark.usefixtures("quick_protocol")
+def test_damaged_images_do_not_end_the_measurement_of_the_other_scenes(
+    run_evaluate, folder: Path, tmp_path: Path
+) -> None:
+    import shutil
+
+    from click.testing import CliRunner
+
+    from deepdetect.cli import main
+
+    oxford = tmp_path / "oxford"
+    for scene in ("bark", "boat", "graf"):
+        shutil.copytree(folder / scene, oxford / scene)
+    (oxford / "graf" / "img1.png").write_bytes(b"damaged")
+    (oxford / "boat" / "img6.png").write_bytes(b"damaged")
+    run_evaluate()  # writes a sample
+    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--oxford", str(oxford)])
+    assert result.exit_code == 1
+    assert "boat 1-2" in result.stdout
+    assert "graf" not in result.stdout
+    told = result.stderr.splitlines()[-10:]
+    assert told[0] == "deepdetect: 9 parts could not be measured, the scores are of the rest:"
+    assert told[1].startswith("  density of boat/img6.png: ")
+    assert told[3].startswith("  repeatability of boat 1-6: ")
+    assert told[-1].startswith("  matches of graf 1-6: ")
 
 
 def test_probabilities_are_calibrated_against_masks_and_labels(tmp_path: Path, photo) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -61,41 +62,91 @@ def test_positions_are_of_the_frame_not_of_the_small_one(frame_folder) -> None:
     np.testing.assert_allclose(found.xy, [[0.5, 0.5], [318.5, 238.5]])
 
 
-def test_an_interrupt_ends_a_camera_properly(moving_photo, tmp_path: Path, monkeypatch) -> None:
-    """Ctrl-C after the third frame: its files are whole, and the usual handler is back."""
+class Camera:
+    """What OpenCV gives for a camera; before its third frame, and further ones, signals come."""
+
+    def __init__(self, moving_photo: Callable[[int], np.ndarray], signals: Sequence[int]) -> None:
+        self.moving_photo, self.signals, self.frames = moving_photo, list(signals), 0
+
+    def isOpened(self) -> bool:
+        return True
+
+    def get(self, _: int) -> float:
+        return 0.0
+
+    def read(self) -> tuple[bool, np.ndarray]:
+        self.frames += 1
+        if self.frames == 3:
+            for number in self.signals:
+                assert signal.getsignal(number) is not signal.SIG_DFL, "it would end the tests"
+                signal.raise_signal(number)
+        return True, self.moving_photo(self.frames % 6)[..., ::-1]
+
+    def release(self) -> None:
+        pass
+
+
+@pytest.fixture
+def camera(moving_photo, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Make a camera 0 to which these signals come."""
     import cv2
 
     real = cv2.VideoCapture
 
-    class Camera:
-        def __init__(self, number: int) -> None:
-            self.frames = 0
+    def connect(*signals: int) -> None:
+        monkeypatch.setattr(
+            cv2,
+            "VideoCapture",
+            lambda name, *more: Camera(moving_photo, signals) if name == 0 else real(name, *more),
+        )
 
-        def isOpened(self) -> bool:
-            return True
+    return connect
 
-        def get(self, _: int) -> float:
-            return 0.0
 
-        def read(self):
-            self.frames += 1
-            if self.frames == 3:
-                signal.raise_signal(signal.SIGINT)
-            return True, moving_photo(self.frames % 6)[..., ::-1]
-
-        def release(self) -> None:
-            pass
-
-    before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(
-        cv2, "VideoCapture", lambda name, *more: Camera(0) if name == 0 else real(name, *more)
-    )
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_camera_properly(number: int, camera, tmp_path: Path) -> None:
+    """Before the third frame is there: its files are whole, and the usual handler is back."""
+    before = signal.getsignal(number)
+    camera(number)
     report = track(0, tmp_path / "t.mp4", options=FEW)
     assert report.frames == 3
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
     assert len(load_tracks(tmp_path / "t.csv")) == 3
     with FrameSource(tmp_path / "t.mp4") as written:
         assert len(list(written)) == 3
+
+
+@pytest.mark.parametrize(
+    ("numbers", "error"),
+    [
+        ((signal.SIGTERM, signal.SIGINT), KeyboardInterrupt),
+        ((signal.SIGINT, signal.SIGTERM), SystemExit),
+    ],
+)
+def test_a_second_signal_ends_all_at_once(numbers, error, camera, tmp_path: Path) -> None:
+    before = [signal.getsignal(number) for number in numbers]
+    camera(*numbers)
+    with pytest.raises(error):
+        track(0, tmp_path / "t.mp4", options=FEW)
+    assert [signal.getsignal(number) for number in numbers] == before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_sigterm_that_the_caller_handles_is_left_to_it(camera, tmp_path: Path) -> None:
+    class Ended(Exception):
+        pass
+
+    def end(*_: object) -> None:
+        raise Ended
+
+    camera(signal.SIGTERM)
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        with pytest.raises(Ended):
+            track(0, tmp_path / "t.mp4", options=FEW)
+        assert signal.getsignal(signal.SIGTERM) is end
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def test_an_interrupt_of_a_video_leaves_nothing(frame_folder, tmp_path: Path) -> None:

@@ -1,40 +1,31 @@
-"""The server of the page: on the loopback address only, for one user, keeping nothing.
-
-The standard library's server is enough: one user, few requests, long work in processes of its own.
-What it does not do is done here: it answers only requests that name this computer and come from its
-own page with the key of this start, and that are neither too large nor too slow.
-"""
+"""The server of the page: what it is asked for and answers, for one user, keeping nothing."""
 
 from __future__ import annotations
 
-import contextlib
-import hmac
 import json
-import secrets
-import shutil
-import socket
-import sys
 import threading
-import time
 from functools import cached_property
 from http import HTTPStatus
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
-from urllib.parse import SplitResult, parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
 from ..detector.pretrained import RANKER
+from .guarded_http import (
+    HOST,
+    PAGE_POLICY,
+    VIEWER_POLICY,
+    GuardedHandler,
+    GuardedServer,
+    Refused,
+)
 from .jobs import Jobs
 from .options import AppOptions
 from .tasks import TASKS
 
 STATIC = Path(__file__).parent / "static"
-
-HOST = "127.0.0.1"
-NAMES = (HOST, "localhost")
-HTTP_PORT = 80
 
 MAX_HEATMAP_PIXELS = 2_100_000
 """The page reduces photographs to two megapixels, with sides that are multiples of 8."""
@@ -44,49 +35,9 @@ MAX_DESCRIPTION_BYTES = 1 << 18
 """Of the names and sizes of photographs, and of the options of a task."""
 
 MAX_NAME_LENGTH = 200
-PIECE_BYTES = 1 << 20
-DRAINED_BYTES = 16 << 20
-"""Of a refused request that are read before it is answered: browsers look for the answer only when
-they have sent everything. What was refused for its other contents is read whole."""
-
-SLOWEST = 10
-"""A request may last so many times as long in all as it may stand still."""
-
-TYPES = {
-    ".css": "text/css",
-    ".csv": "text/csv",
-    ".glb": "model/gltf-binary",
-    ".html": "text/html",
-    ".jpg": "image/jpeg",
-    ".js": "text/javascript",
-    ".json": "application/json",
-    ".png": "image/png",
-    ".svg": "image/svg+xml",
-    ".txt": "text/plain",
-    ".zip": "application/zip",
-}
-
-PAGE_POLICY = (
-    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; "
-    "style-src 'self'; img-src 'self' blob:; connect-src 'self'; frame-src 'self'; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-VIEWER_POLICY = (
-    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
-    "frame-ancestors 'self'; sandbox allow-scripts"
-)
-"""The viewer of a model is one file with its script in it, and cannot reach the page around it."""
 
 
-class Refused(Exception):
-    """A request that is not answered, with the status and the sentence that say why."""
-
-    def __init__(self, status: HTTPStatus, sentence: str) -> None:
-        self.status = status
-        super().__init__(sentence)
-
-
-class AppServer(ThreadingHTTPServer):
+class AppServer(GuardedServer):
     """Serves the page until it is closed.
 
     Args:
@@ -106,19 +57,10 @@ class AppServer(ThreadingHTTPServer):
         True
     """
 
-    daemon_threads = True
-
     def __init__(self, options: AppOptions = AppOptions()) -> None:
         self.options = options
-        self.key = secrets.token_urlsafe(24)
         self.network = threading.Lock()  # one photograph at a time: it takes all processors
-        try:
-            super().__init__((HOST, options.port), Handler)
-        except OSError as error:
-            raise OptionError(
-                f"port {options.port} cannot be used ({error.strerror}): give another `port`, or 0 "
-                "for any that is free"
-            ) from None
+        super().__init__(options.port, Handler, options.max_request_s)
         try:
             self.jobs = Jobs(options)
         except DeepDetectError:
@@ -149,11 +91,6 @@ class AppServer(ThreadingHTTPServer):
         if hasattr(self, "jobs"):
             self.jobs.close()
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of connections that the browser has ended."""
-        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
-            super().handle_error(request, client_address)
-
     def description(self) -> dict[str, Any]:
         """Return what the page is told of this server."""
         options = self.options
@@ -177,109 +114,45 @@ class AppServer(ThreadingHTTPServer):
         return {"engine": "python", "version": __version__, "tasks": tasks, "limits": limits}
 
 
-class Handler(BaseHTTPRequestHandler):
+class Handler(GuardedHandler):
     """Answers one connection."""
 
     server: AppServer
-    protocol_version = "HTTP/1.1"
-
-    def setup(self) -> None:
-        super().setup()
-        self.connection.settimeout(self.server.options.max_request_s)
-        # What is answered is short, and waited for.
-        self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)
-
-    def version_string(self) -> str:
-        return "deepdetect"
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Keep no log."""
 
     def do_GET(self) -> None:
-        self._answer(self._get)
+        self.answer(self._get)
 
     def do_POST(self) -> None:
-        self._answer(self._post)
+        self.answer(self._post)
 
     def do_DELETE(self) -> None:
-        self._answer(self._delete)
-
-    def _answer(self, method: Any) -> None:
-        """Answer, or say in one sentence why not."""
-        self.received, self.accepted_length = 0, 0
-        self.deadline = time.monotonic() + SLOWEST * self.server.options.max_request_s
-        try:
-            try:
-                self._check_source()
-                method(self._url())
-            except Refused as refusal:
-                self._refuse(refusal.status, str(refusal))
-            except DeepDetectError as error:
-                self._refuse(HTTPStatus.BAD_REQUEST, str(error))
-            if self._body_is_left():  # it would be taken for the next request
-                self.close_connection = True
-        except (ConnectionError, TimeoutError):
-            self.close_connection = True
-
-    def _url(self) -> SplitResult:
-        try:
-            return urlsplit(self.path)
-        except ValueError:
-            raise Refused(HTTPStatus.BAD_REQUEST, "this is not an address") from None
-
-    def _body_is_left(self) -> bool:
-        length = self.headers.get("Content-Length", "0")
-        return "Transfer-Encoding" in self.headers or length != str(self.received)
-
-    def _check_source(self) -> None:
-        """Refuse requests for other computers (DNS rebinding), and of other pages."""
-        hosts = self.headers.get_all("Host", [])
-        port = self.server.server_port
-        allowed = [f"{name}:{port}" for name in NAMES]
-        if port == HTTP_PORT:  # browsers leave it out
-            allowed += NAMES
-        if len(hosts) != 1 or hosts[0] not in allowed:
-            raise Refused(HTTPStatus.MISDIRECTED_REQUEST, "this address is not served here")
-        origin = self.headers.get("Origin")
-        if origin is not None and origin != f"http://{hosts[0]}":
-            raise Refused(HTTPStatus.FORBIDDEN, "only the page of deepdetect app may ask this")
-
-    def _check_key(self) -> None:
-        given = self.headers.get("Authorization", "").removeprefix("Bearer ")
-        if not hmac.compare_digest(given.encode(), self.server.key.encode()):
-            raise Refused(
-                HTTPStatus.UNAUTHORIZED,
-                "the key of this page is not that of deepdetect app: open the address that it has "
-                "printed",
-            )
-        if self.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
-            raise Refused(HTTPStatus.FORBIDDEN, "only the page of deepdetect app may ask this")
+        self.answer(self._delete)
 
     def _get(self, url: Any) -> None:
         if url.path == "/config.json":
-            self._send_json(self.server.description())
+            self.send_json(self.server.description())
             return
         page = self.server.pages.get("/index.html" if url.path == "/" else url.path)
         if page is not None:
-            self._send_file(page, PAGE_POLICY)
+            self.send_file(page, PAGE_POLICY)
             return
         job, rest = self._job(url.path)
         name = rest.removeprefix("files/")
         if not rest:
-            self._check_key()
-            self._send_json(job.state())
+            self.check_key()
+            self.send_json(job.state())
             return
         path = job.file(name) if rest.startswith("files/") else None
         if path is None:
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such file")
         if path.suffix == ".html":  # a frame cannot send the key: the task's name is one, too
-            self._send_file(path, VIEWER_POLICY)
+            self.send_file(path, VIEWER_POLICY)
             return
-        self._check_key()
-        self._send_file(path, PAGE_POLICY)
+        self.check_key()
+        self.send_file(path, PAGE_POLICY)
 
     def _post(self, url: Any) -> None:
-        self._check_key()
+        self.check_key()
         query = {name: values[-1] for name, values in parse_qs(url.query).items()}
         if url.path == "/api/heatmap":
             self._heatmap(query)
@@ -289,10 +162,10 @@ class Handler(BaseHTTPRequestHandler):
             raise Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
 
     def _delete(self, url: Any) -> None:
-        self._check_key()
+        self.check_key()
         job, _ = self._job(url.path)
         self.server.jobs.remove(job.name)
-        self._send_json({})
+        self.send_json({})
 
     def _job(self, path: str) -> Any:
         """Return the task that a path names, and the rest of the path."""
@@ -312,26 +185,26 @@ class Handler(BaseHTTPRequestHandler):
             raise Refused(HTTPStatus.BAD_REQUEST, "the size of the picture is missing") from None
         if min(width, height) < MIN_SIDE or width * height > MAX_HEATMAP_PIXELS:
             raise Refused(HTTPStatus.BAD_REQUEST, f"a picture cannot be {width}x{height} here")
-        length = self._length(3 * width * height)
+        length = self.body_length(3 * width * height)
         if length != 3 * width * height:
             raise Refused(HTTPStatus.BAD_REQUEST, "these are not the pixels of such a picture")
-        pixels = b"".join(self._pieces(length))
+        pixels = b"".join(self.pieces(length))
         rgb = np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
         with self.server.network:
             logits = self.server.detector.heatmap_and_logits(rgb)[1]
-        self._send(np.ascontiguousarray(logits, "<f4").tobytes(), "application/octet-stream")
+        self.send(np.ascontiguousarray(logits, "<f4").tobytes(), "application/octet-stream")
 
     def _new_job(self, kind: str) -> None:
         """Start a task: a length, a description in JSON of that length, and the photographs."""
         options, jobs = self.server.options, self.server.jobs
         if kind not in TASKS:
             raise unknown_name("task", kind[:MAX_NAME_LENGTH], TASKS)
-        left = self._length(int(options.max_task_mb * 1e6) + MAX_DESCRIPTION_BYTES)
+        left = self.body_length(int(options.max_task_mb * 1e6) + MAX_DESCRIPTION_BYTES)
         jobs.check_room()
-        size = int.from_bytes(b"".join(self._pieces(min(4, left))))
+        size = int.from_bytes(b"".join(self.pieces(min(4, left))))
         if not 0 < size <= min(MAX_DESCRIPTION_BYTES, left - 4):
             raise Refused(HTTPStatus.BAD_REQUEST, "the description of the task is missing")
-        names, sizes, given = _described(b"".join(self._pieces(size)))
+        names, sizes, given = _described(b"".join(self.pieces(size)))
         if len(names) > options.max_files:
             raise OptionError(
                 f"there are {len(names)} photographs, over {options.max_files}: give fewer, or "
@@ -348,84 +221,10 @@ class Handler(BaseHTTPRequestHandler):
             for number, bytes_ in enumerate(sizes):
                 files.append(f"{number:04d}{_suffix(names[number])}")
                 with (folder / files[-1]).open("xb") as file:
-                    for piece in self._pieces(bytes_):
+                    for piece in self.pieces(bytes_):
                         file.write(piece)
             job = jobs.start(folder, kind, list(zip(files, names, strict=True)), numbers)
-        self._send_json({"job": job.name})
-
-    def _length(self, largest: int) -> int:
-        """Return the length of the request's body, which must be given and not too large."""
-        text = self.headers.get("Content-Length", "")
-        if not (text.isascii() and text.isdigit()) or "Transfer-Encoding" in self.headers:
-            raise Refused(HTTPStatus.LENGTH_REQUIRED, "the length of the request is missing")
-        if len(text) > 15 or int(text) > largest:
-            raise Refused(
-                HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-                f"this is over {largest / 1e6:.3g} MB: give fewer or smaller photographs",
-            )
-        self.accepted_length = int(text)
-        return self.accepted_length
-
-    def _drain(self) -> None:
-        """Read what is left of a refused request, as far as that is worth it."""
-        text = self.headers.get("Content-Length", "")
-        length = int(text) if text.isascii() and text.isdigit() and len(text) < 15 else 0
-        left = min(length, max(self.accepted_length, DRAINED_BYTES)) - self.received
-        with contextlib.suppress(Refused):
-            for _ in self._pieces(max(0, left)):
-                pass
-
-    def _pieces(self, length: int) -> Any:
-        """Yield so many bytes of the request's body."""
-        while length:
-            if time.monotonic() > self.deadline:
-                raise Refused(HTTPStatus.REQUEST_TIMEOUT, "the request takes too long")
-            piece = self.rfile.read1(min(length, PIECE_BYTES))
-            if not piece:
-                raise ConnectionError("the browser has ended the request")
-            length -= len(piece)
-            self.received += len(piece)
-            yield piece
-
-    def _refuse(self, status: HTTPStatus, sentence: str) -> None:
-        self.close_connection = True
-        self._drain()
-        self._send_json({"error": sentence}, status)
-
-    def _send_json(self, values: Any, status: HTTPStatus = HTTPStatus.OK) -> None:
-        self._send(json.dumps(values).encode(), "application/json", status)
-
-    def _send(self, content: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
-        self._send_headers(len(content), kind, PAGE_POLICY, status)
-        self.wfile.write(content)
-
-    def _send_file(self, path: Path, policy: str) -> None:
-        try:
-            with path.open("rb") as file:
-                kind = TYPES.get(path.suffix, "application/octet-stream")
-                self._send_headers(path.stat().st_size, kind, policy)
-                shutil.copyfileobj(file, self.wfile, PIECE_BYTES)
-        except FileNotFoundError:
-            raise Refused(HTTPStatus.NOT_FOUND, "there is no such file") from None
-
-    def _send_headers(
-        self, length: int, kind: str, policy: str, status: HTTPStatus = HTTPStatus.OK
-    ) -> None:
-        self.send_response(status)
-        headers = {
-            "Content-Type": f"{kind}; charset=utf-8" if kind.startswith("text/") else kind,
-            "Content-Length": str(length),
-            "Content-Security-Policy": policy,
-            "Cross-Origin-Opener-Policy": "same-origin",
-            "Cross-Origin-Resource-Policy": "same-origin",
-            "Referrer-Policy": "no-referrer",
-            "X-Content-Type-Options": "nosniff",
-            "Cache-Control": "no-store",
-            **({"Connection": "close"} if self.close_connection else {}),
-        }
-        for name, value in headers.items():
-            self.send_header(name, value)
-        self.end_headers()
+        self.send_json({"job": job.name})
 
 
 def _described(text: bytes) -> tuple[list[str], list[int], dict[str, object]]:

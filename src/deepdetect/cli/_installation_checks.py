@@ -187,8 +187,23 @@ def check_backends() -> Iterator[Finding]:
         seconds = f"loads and runs in {time.perf_counter() - start:.2f} s"
         also = f", probabilities agree to {difference:.0e}" if difference else ""
         yield Finding(label, "ok", f"{version}, {seconds}{also}", details=details)
+        if name == "openvino":
+            yield _bfloat16()
     if chosen:
         yield Finding("back end in use", "ok", chosen, details={"name": chosen})
+
+
+def _bfloat16() -> Finding:
+    """Say whether the precision that only OpenVINO has can be chosen here."""
+    from ..detector.backends.openvino_backend import computes_bfloat16
+
+    there = computes_bfloat16()
+    value = (
+        "this processor computes it: --precision bfloat16 is faster, and moves a few keypoints"
+        if there
+        else "this processor has no instructions for it: --precision bfloat16 is refused"
+    )
+    return Finding("bfloat16", "ok", value, details={"available": there})
 
 
 def check_compiler() -> Iterator[Finding]:

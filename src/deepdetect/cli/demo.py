@@ -115,7 +115,7 @@ def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> DemoR
         folder: for the pictures.
     """
     from ..evaluation.metrics.stereo import score_errors
-    from ..evaluation.protocols.stereo import match_random_points
+    from ..evaluation.protocols.stereo_matches import match_random_points
     from ..geometry import disparity_errors
     from ..matching.pipeline import match_images
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -81,7 +81,8 @@ def evaluate(
     whether the quality holds on larger and smaller images; SAMPLES may then be photographs without
     masks.
 
-    Samples that cannot be read are listed at the end, with exit code 1, and are in no score.
+    Samples that cannot be read, and images of --oxford and --foreground that cannot be measured,
+    are listed at the end, with exit code 1, and are in no score.
 
     \b
     deepdetect evaluate samples/
@@ -90,7 +91,7 @@ def evaluate(
     deepdetect evaluate photos/ --scale 1
     deepdetect evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
     """
-    from .._shared.errors import BatchError, OptionError
+    from .._shared.errors import OptionError
     from ..datasets.oxford import load_oxford
     from ..detector.heatmap import HeatmapOptions
     from ..evaluation.evaluate import evaluate as run
@@ -142,9 +143,28 @@ def evaluate(
         if foreground is not None:
             click.echo()
             _print_foreground(names, found)
-    if failures := found[0].failures:
-        total = len(failures) + sum(score.images for score in found[0].masks.values())
-        raise BatchError(f"{len(failures)} of {total} samples are not in the scores", failures)
+    _report_failures(found, on_oxford)
+
+
+def _report_failures(found: Sequence[Evaluation], on_oxford: Sequence[OxfordScore]) -> None:
+    """Raise a BatchError when something is in no score; what all weights lack is listed once."""
+    from .._shared.errors import BatchError
+
+    samples = found[0].failures
+    lists = [each.failures for each in on_oxford]
+    lists += [each.foreground.failures for each in found if each.foreground is not None]
+    parts = list(dict.fromkeys(failure for listed in lists for failure in listed))
+    if parts:
+        count = len(samples) + len(parts)
+        what = "one part" if count == 1 else f"{count} parts"
+        summary = f"{what} could not be measured, the scores are of the rest"
+        raise BatchError(summary, [*samples, *parts])
+    if samples:
+        scales = found[0].scales
+        rows = [row.score for row in scales if row.scale == scales[0].scale]
+        scored = sum(score.images for score in found[0].masks.values() or rows)
+        total = len(samples) + scored
+        raise BatchError(f"{len(samples)} of {total} samples are not in the scores", samples)
 
 
 def _values(evaluation: Evaluation) -> dict[str, Any]:
@@ -227,13 +247,26 @@ def _print_oxford(names: Sequence[str], found: Sequence[OxfordScore], equal_dens
         title = "  that of the labels" if equal_density else f"  tau {threshold}"
         _row(title, [f"{each.density[threshold]:.4f}" for each in found])
     _row("repeatability at 1 px", names)
-    for scene in found[0].repeatability:
-        _row(f"  {scene}", [f"{each.repeatability[scene]:.4f}" for each in found])
-    means = [sum(each.repeatability.values()) / len(each.repeatability) for each in found]
-    _row("  mean", [f"{mean:.4f}" for mean in means])
+    for scene in _names(each.repeatability for each in found):
+        _row(f"  {scene}", [_decimals(each.repeatability.get(scene)) for each in found])
+    _row("  mean", [_decimals(_mean(each.repeatability.values())) for each in found])
     _row("correct matches of all", names)
-    for pair in found[0].correct:
-        _row(f"  {pair}", [f"{each.correct[pair]:,} / {each.matches[pair]:,}" for each in found])
+    for pair in _names(each.correct for each in found):
+        cells = [(each.correct.get(pair), each.matches.get(pair)) for each in found]
+        _row(f"  {pair}", ["-" if a is None else f"{a:,} / {b:,}" for a, b in cells])
+
+
+def _names(found: Iterable[Iterable[str]]) -> list[str]:
+    """Return what any of the weights was measured on, each once."""
+    return list(dict.fromkeys(name for names in found for name in names))
+
+
+def _mean(values: Collection[float]) -> float | None:
+    return sum(values) / len(values) if values else None
+
+
+def _decimals(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4f}"
 
 
 def _print_foreground(names: Sequence[str], found: Sequence[Evaluation]) -> None:

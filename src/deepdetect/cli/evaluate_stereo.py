@@ -13,7 +13,7 @@ from .._shared.errors import DeepDetectError
 from ._options import PATH, json_option, print_json, report_failures
 
 if TYPE_CHECKING:
-    from ..evaluation.protocols.stereo import StereoMatchScore
+    from ..evaluation.protocols.stereo_matches import StereoMatchScore
 
 
 @click.command(
@@ -53,7 +53,7 @@ def evaluate_stereo(
     from ..detector.detector import DeepDetect, HeatmapDetector
     from ..detector.pretrained import PRETRAINED
     from ..evaluation.protocols.masks import LabelDetector
-    from ..evaluation.protocols.stereo import score_stereo_matches
+    from ..evaluation.protocols.stereo_matches import score_stereo_matches
     from ..labels import LabelOptions, find_label_settings
 
     pairs, failures = [], []

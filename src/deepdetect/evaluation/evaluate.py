@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +31,14 @@ from .protocols.masks import (
     ScaleScore,
     check_scales,
     has_samples,
-    readable_samples,
+    load_sample,
+    readable_images,
     sample_images,
     score_at_scale,
     score_samples,
 )
 from .protocols.paper import OXFORD_PAIRS, mean_correct_matches, pair_repeatability
+from .tasks import ProgressBar
 
 
 @dataclass(frozen=True)
@@ -49,12 +52,14 @@ class OxfordScore:
         correct: correct matches (FLANN, ratio 0.99, under 1 px by the published
             homography) by pair, means over several seeds of FLANN.
         matches: all matches that pass the ratio test, likewise.
+        failures: a sentence on each image and pair that could not be measured: it is in no mean.
     """
 
     density: dict[float, float]
     repeatability: dict[str, float]
     correct: dict[str, int]
     matches: dict[str, int]
+    failures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -66,12 +71,14 @@ class ForegroundScore:
         density: keypoints per pixel, mean over the photographs.
         covered: of the pixels, which is what random keypoints reach.
         photographs: how many were measured: those with a keypoint.
+        failures: a sentence on each photograph that could not be measured.
     """
 
     fraction: float
     density: float
     covered: float
     photographs: int
+    failures: tuple[str, ...] = ()
 
 
 @suggest_keywords
@@ -85,7 +92,8 @@ class Evaluation:
         scales: against the labels of scaled images, a row for each scale and visibility.
         oxford: by the paper's protocol.
         foreground: of photographs with a known foreground.
-        failures: a sentence on each sample that cannot be read and is not in the scores.
+        failures: a sentence on each sample that cannot be read and is not in the scores; `oxford`
+            and `foreground` have their own.
     """
 
     masks: dict[str, MaskScore] = field(default_factory=dict)
@@ -126,7 +134,8 @@ def evaluate(
         quiet: show no progress bars.
 
     Raises:
-        ImageError: there is no sample that can be read, or a homography or a photograph is missing.
+        ImageError: there is no sample, scene or photograph that can be read, or a homography or a
+            photograph is missing.
         OptionError: a scale is not above 0, or there are no samples to scale, or no images for
             `equal_density`.
         MissingExtraError: `oxford` needs the extra "benchmark".
@@ -157,11 +166,9 @@ def evaluate(
     calibration: dict[str, Calibration] = {}
     if samples is not None:
         if scales and not has_samples(samples):
-            images = find_images(samples)
+            images, failures = readable_images(find_images(samples))
         else:
-            images, failures = readable_samples(sample_images(samples))
-            if not images:
-                raise ImageError(failures[0])
+            images, failures = readable_images(sample_images(samples), load_sample)
             scored = score_samples(detector.heatmap, _shown(images, "scoring", quiet))
             masks = {name: score for name, (score, _) in scored.items()}
             calibration = {name: found for name, (_, found) in scored.items()}
@@ -203,36 +210,54 @@ def evaluate_oxford(
 
     Raises:
         OptionError: `equal_density` is asked of another detector, which has no logits.
+        ImageError: there is no image that can be measured.
     """
     detector = _of_paper(detector, equal_density)
     feature = _feature(detector)
     thresholds = THRESHOLDS[:1] if equal_density else THRESHOLDS
-    images = [image for scene in scenes for image in scene.images]
-    pairs = [pair for scene in scenes for pair in scene.pairs()]
-    matched = select_pairs(scenes, OXFORD_PAIRS)
+    images = {f"{scene.name}/{path.name}": path for scene in scenes for path in scene.images}
+    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs()}
+    matched = {pair.name: pair for pair in select_pairs(scenes, OXFORD_PAIRS)}
     context = BenchmarkContext(Path())
     with progress(len(images) + len(pairs) + len(matched), "Oxford", "step", quiet) as bar:
 
-        def over(items: Sequence[Any], measure: Callable[[Any], Any]) -> list[Any]:
-            found = []
-            for item in items:
-                found.append(measure(item))
-                bar.update(1)
-            return found
+        def over(what: str, items: Mapping[str, Any], measure: Callable[[Any], Any]) -> Any:
+            return _measured(context, bar, what, items, measure)
 
-        densities = over(images, lambda image: _densities(detector, image, thresholds))
-        repeatability = over(pairs, lambda pair: pair_repeatability(context, feature, pair))
-        counts = over(matched, lambda pair: mean_correct_matches(context, feature, pair))
-    by_scene: dict[str, list[float]] = {scene.name: [] for scene in scenes}
-    for pair, value in zip(pairs, repeatability, strict=True):
-        by_scene[pair.scene].append(value)
-    names = [pair.name for pair in matched]
+        densities = over("density", images, lambda image: _densities(detector, image, thresholds))
+        repeatability = over(
+            "repeatability", pairs, lambda pair: pair_repeatability(context, feature, pair)
+        )
+        counts = over("matches", matched, lambda pair: mean_correct_matches(context, feature, pair))
+    if context.failures and not densities:
+        raise ImageError(context.failures[0])
+    by_scene: dict[str, list[float]] = {}
+    for name, value in repeatability.items():
+        by_scene.setdefault(pairs[name].scene, []).append(value)
     return OxfordScore(
-        {t: float(np.mean(of_t)) for t, *of_t in zip(thresholds, *densities, strict=True)},
+        {t: float(np.mean(of_t)) for t, *of_t in zip(thresholds, *densities.values(), strict=True)},
         {name: float(np.mean(values)) for name, values in by_scene.items()},
-        dict(zip(names, [correct for correct, _ in counts], strict=True)),
-        dict(zip(names, [matches for _, matches in counts], strict=True)),
+        {name: correct for name, (correct, _) in counts.items()},
+        {name: matches for name, (_, matches) in counts.items()},
+        tuple(context.failures),
     )
+
+
+def _measured(
+    context: BenchmarkContext,
+    bar: ProgressBar,
+    what: str,
+    items: Mapping[str, Any],
+    measure: Callable[[Any], Any],
+) -> dict[str, Any]:
+    """Return what was measured by the items' names; what could not be is in the context."""
+    found = {}
+    for name, item in items.items():
+        value = context.try_run(f"{what} of {name}", partial(measure, item))
+        if value is not None:
+            found[name] = value
+        bar.update(1)
+    return found
 
 
 def evaluate_foreground(
@@ -245,22 +270,30 @@ def evaluate_foreground(
     """Measure how many keypoints lie on the foreground; arguments as of `evaluate_oxford`.
 
     Raises:
-        ImageError: a mask is not of its photograph's size, or no photograph has a keypoint.
+        ImageError: there is no photograph that can be measured, or none has a keypoint.
         OptionError: as of `evaluate_oxford`.
     """
     feature, context = _feature(_of_paper(detector, equal_density)), BenchmarkContext(Path())
-    rows = []
+    named = {photograph.image.name: photograph for photograph in photographs}
+
+    def measure(photograph: MaskedPhotograph) -> tuple[float, float, float]:
+        values = photograph_foreground(context, feature, photograph)
+        return *values, float(photograph.foreground().mean())
+
     with progress(len(photographs), "foreground", "image", quiet) as bar:
-        for photograph in photographs:
-            fraction, density = photograph_foreground(context, feature, photograph)
-            if density > 0:
-                rows.append((fraction, density, float(photograph.foreground().mean())))
-            bar.update(1)
+        found = _measured(context, bar, "foreground", named, measure)
+    rows = [row for row in found.values() if row[1] > 0]
+    if context.failures and not found:
+        raise ImageError(context.failures[0])
     if not rows:
         raise ImageError("no photograph with a foreground has a keypoint")
     fraction, density, covered = np.array(rows).T
     return ForegroundScore(
-        float(fraction.mean()), float(density.mean()), float(covered.mean()), len(fraction)
+        float(fraction.mean()),
+        float(density.mean()),
+        float(covered.mean()),
+        len(fraction),
+        tuple(context.failures),
     )
 
 

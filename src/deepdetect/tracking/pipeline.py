@@ -121,9 +121,9 @@ def track(
 ) -> TrackingReport:
     """Follow the points of a video, and write a video with the tracks, and their table.
 
-    Ctrl-C on a camera ends the recording; both files are written. An image of a folder that cannot
-    be read, or has another size than the first one, does not stop the others: it is named in the
-    report.
+    Ctrl-C or SIGTERM on a camera ends the recording; both files are written. An image of a folder
+    that cannot be read, or has another size than the first one, does not stop the others: it is
+    named in the report.
 
     Args:
         source: a video file, a folder of images, or the number of a camera.
@@ -157,13 +157,13 @@ def track(
         opened = stack.enter_context(FrameSource(source, every=every, max_frames=max_frames))
         found = DeepDetect() if detector is None else detector
         tracker = Tracker(point_candidates(found, options), options)
+        stopped = stack.enter_context(_ended_by_signals(opened.live))
         writer = stack.enter_context(write_tracks(table))
         drawn: Any = None
         if video is not None:
             drawn = stack.enter_context(write_video(video, opened.fps))
         drawer, ticks = TrackDrawer(tail), deque([begun], RATE_FRAMES + 1)
         bar = stack.enter_context(progress(opened.count, "tracking", "frame", quiet))
-        stopped = stack.enter_context(_interruptible(opened.live))
         for rgb, frame in track_frames(opened, tracker, max_side=max_side):
             writer.write(frame)
             ticks.append(time.perf_counter())
@@ -215,20 +215,32 @@ def output_files(output: str | Path) -> tuple[Path | None, Path]:
 
 
 @contextmanager
-def _interruptible(live: bool) -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C of a live source, so that the frame under way is finished."""
+def _ended_by_signals(live: bool) -> Iterator[Callable[[], bool]]:
+    """Note the first Ctrl-C or SIGTERM of a live source, so that its files are finished.
+
+    A second one ends all at once, and leaves no file. A SIGTERM that the caller handles is the
+    caller's.
+    """
     noted: list[int] = []
     if not live or threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    usual = signal.getsignal(signal.SIGINT)
+    usual: dict[int, Any] = {signal.SIGINT: signal.getsignal(signal.SIGINT)}
+    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        usual[signal.SIGTERM] = _exit
 
     def note(number: int, _: Any) -> None:
         noted.append(number)
-        signal.signal(signal.SIGINT, usual)  # a second one ends all at once
+        for each, handler in usual.items():
+            signal.signal(each, handler)
 
-    signal.signal(signal.SIGINT, note)
+    before = {number: signal.signal(number, note) for number in usual}
     try:
         yield lambda: bool(noted)
     finally:
-        signal.signal(signal.SIGINT, usual)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _exit(number: int, _: Any) -> None:
+    raise SystemExit(128 + number)  # as a shell has it

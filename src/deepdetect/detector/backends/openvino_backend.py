@@ -110,12 +110,8 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     openvino = import_openvino()
     from openvino.frontend import FrontEndManager
 
-    if options.precision == "bfloat16":
-        capabilities = openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-        if "BF16" not in capabilities:
-            raise OptionError(
-                "this processor has no instructions for bfloat16: leave `precision` out"
-            )
+    if options.precision == "bfloat16" and not computes_bfloat16():
+        raise OptionError("this processor has no instructions for bfloat16: leave `precision` out")
     # Its default on newer CPUs is bfloat16, which moves keypoints.
     settings: dict[str, object] = {
         "INFERENCE_PRECISION_HINT": "bf16" if options.precision == "bfloat16" else "f32",
@@ -154,6 +150,12 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         ) from None
     output = output_to_read([value.get_any_name() for value in model.outputs])
     return OpenVinoNetwork(model, compile_model, output, path, options)
+
+
+def computes_bfloat16() -> bool:
+    """Return whether this processor has instructions for `precision="bfloat16"`."""
+    capabilities = import_openvino().Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    return bool("BF16" in capabilities)
 
 
 def _take_out_padding(graph: Any) -> None:

@@ -84,15 +84,28 @@ def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return rgb, mask
 
 
-def readable_samples(images: Iterable[Path]) -> tuple[list[Path], tuple[str, ...]]:
-    """Return the samples that can be loaded, and a sentence on each of the others."""
-    whole, failures = [], []
+def readable_images(
+    images: Iterable[Path], load: Callable[[Path], object] = load_image
+) -> tuple[list[Path], tuple[str, ...]]:
+    """Return the images that can be loaded, and a sentence on each of the others.
+
+    Args:
+        images: their files.
+        load: `load_sample` for samples, which need a mask.
+
+    Raises:
+        ImageError: there is none that can be loaded.
+    """
+    whole: list[Path] = []
+    failures: list[str] = []
     for path in images:
         try:
-            load_sample(path)
+            load(path)
             whole.append(path)
         except ImageError as error:
             failures.append(str(error))
+    if not whole:
+        raise ImageError(failures[0])
     return whole, tuple(failures)
 
 

@@ -44,6 +44,49 @@ export class Background {
   }
 }
 
+/** A worker that does one task after the other: each can be cancelled, the one under way too. */
+export class CancellableBackground {
+  constructor(url) {
+    this.url = url;
+    this.waiting = [];
+    this.running = null;
+    this.background = new Background(url);
+  }
+
+  /**
+   * @param {string} task @param {object} values
+   * @param {AbortSignal} [signal] cancels it: the promise is then rejected with the signal's reason
+   * @returns {Promise<any>}
+   */
+  call(task, values, signal) {
+    return new Promise((resolve, reject) => {
+      signal?.throwIfAborted();
+      const call = { task, values, resolve, reject };
+      signal?.addEventListener("abort", () => this.cancel(call, signal.reason), { once: true });
+      this.waiting.push(call);
+      this.runNext();
+    });
+  }
+
+  async runNext() {
+    if (this.running || !this.waiting.length) return;
+    const call = this.running = this.waiting.shift();
+    await this.background.call(call.task, call.values).then(call.resolve, call.reject);
+    this.running = null;
+    this.runNext();
+  }
+
+  cancel(call, reason) {
+    call.reject(reason);
+    this.waiting = this.waiting.filter((other) => other !== call);
+    if (this.running !== call) return;
+    this.background.worker.terminate(); // it is in the middle of it, and hears nothing
+    this.background = new Background(this.url);
+    this.running = null;
+    this.runNext();
+  }
+}
+
 /**
  * Answers calls, in a worker.
  *

@@ -1,10 +1,10 @@
 // What is found in a picture, each once, when it is first asked for: its heat map, for which the
 // network is run, and its points, for which it is not.
-import { Background } from "./background.js";
+import { Background, CancellableBackground } from "./background.js";
 import { during } from "./page.js";
 
 const pictureWorker = new Background(new URL("picture_worker.js", import.meta.url));
-const pointsWorker = new Background(new URL("points_worker.js", import.meta.url));
+const pointsWorker = new CancellableBackground(new URL("points_worker.js", import.meta.url));
 let opened = null; // a promise of what runs the network
 const runs = { network: 0, points: 0 }; // how often: sliders must not change it
 
@@ -50,12 +50,13 @@ export async function findHeatMap(picture) {
   });
 }
 
-/** Ranks the points of a picture, where that has not been done. */
+/** Ranks the points of a picture, where that has not been done; it fails where the picture is removed. */
 export async function findPoints(picture) {
   if (picture.ranking) return;
   await once(picture, "ranking", async () => {
     const { file, name, rgba, width, height, original } = picture;
-    const found = pointsWorker.call("rank", { file, name, rgba, width, height, original });
+    const values = { file, name, rgba, width, height, original };
+    const found = pointsWorker.call("rank", values, picture.removal.signal);
     const ranking = await during("Finding points…", found);
     counted("points");
     return ranking;

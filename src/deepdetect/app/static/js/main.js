@@ -137,7 +137,7 @@ async function addPictures(files) {
     }
     if (restarts !== started) return;
     if (page.pictures.length >= MAX_PICTURES) return; // of two that were given at once
-    page.pictures.push({ name: file.name, file, ...read,
+    page.pictures.push({ name: file.name, file, ...read, removal: new AbortController(),
                          canvas: canvasOf(read.rgba, read.width, read.height) });
     if (file === files.at(-1)) break;
     page.active = page.pictures.length - 1;
@@ -151,6 +151,7 @@ async function addPictures(files) {
 }
 
 function removePicture(picture) {
+  picture.removal.abort();
   page.pictures = page.pictures.filter((other) => other !== picture);
   page.active = 0;
   showPictures();
@@ -255,6 +256,7 @@ function setUp() {
     showView("python");
   };
   element("restart").onclick = () => {
+    for (const { removal } of page.pictures) removal.abort();
     page.pictures = [];
     restarts++;
     showError("");

@@ -8,6 +8,7 @@ export const element = (id) => document.getElementById(id);
  * @property {number} width @property {number} height as the network sees it
  * @property {{width: number, height: number}} original
  * @property {Uint8ClampedArray} rgba @property {HTMLCanvasElement} canvas
+ * @property {AbortController} removal ends what is done for it alone
  * @property {import("./selection.js").HeatMap} [map] once the network was run (`findHeatMap`)
  * @property {import("./points/ranking.js").Ranking & {gray: Uint8Array}} [ranking] once its points
  *   were ranked (`findPoints`)

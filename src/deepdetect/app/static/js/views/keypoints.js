@@ -151,7 +151,11 @@ export async function show() {
   draw();
   const picture = activePicture();
   if (!picture || shown) return;
-  await KINDS[options().kind].find(picture);
+  try {
+    await KINDS[options().kind].find(picture);
+  } catch (error) {
+    if (page.pictures.includes(picture)) throw error; // of one that was removed nobody asks
+  }
   if (!shown) draw(); // a slider that was moved meanwhile waits here for each of its moves
 }
 

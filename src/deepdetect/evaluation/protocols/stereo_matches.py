@@ -1,0 +1,82 @@
+"""Matches of stereo pairs by descriptors alone, evaluated by the true disparity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from ..._shared.progress import progress
+from ...datasets.types import StereoPair
+from ...detector.detector import HeatmapDetector
+from ...features.matches import Matches
+from ...matching.pipeline import match_images
+from ..baselines.random import AllPixels, RandomDetector
+from ..metrics.stereo import StereoScore, stereo_score
+
+
+@dataclass(frozen=True)
+class StereoMatchScore:
+    """What one source of keypoints gives on one pair.
+
+    Attributes:
+        source: its name.
+        pair: the pair's name.
+        density: keypoints per pixel, mean of both views.
+        score: its matches, and how many of them are correct.
+    """
+
+    source: str
+    pair: str
+    density: float
+    score: StereoScore
+
+
+def score_stereo_matches(
+    sources: Mapping[str, HeatmapDetector], pairs: Sequence[StereoPair], *, quiet: bool = True
+) -> list[StereoMatchScore]:
+    """Match rectified pairs with several sources of keypoints, and evaluate the matches.
+
+    Matching is by descriptors alone (SIFT, FLANN, ratio 0.99) over the whole image: neither the
+    rows nor the true disparity are used. Beside each source are random points at its density,
+    since more keypoints always find more; all pixels are the last row.
+
+    Args:
+        sources: detectors by name.
+        pairs: with their true disparity, for evaluation only.
+        quiet: show no progress bar.
+
+    Returns:
+        For each source its rows and then the random points', pair by pair.
+    """
+    with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:
+
+        def evaluated(source: str, pair: StereoPair, found: Matches) -> StereoMatchScore:
+            bar.update(1)
+            density = (found.keypoints0.density + found.keypoints1.density) / 2
+            score = stereo_score(found.points0, found.points1, pair.disparity)
+            return StereoMatchScore(source, pair.name, density, score)
+
+        rows: list[StereoMatchScore] = []
+        for name, detector in sources.items():
+            own = [evaluated(name, pair, match_stereo(pair, detector)) for pair in pairs]
+            rows += own
+            rows += [
+                evaluated(f"random, as {name}", pair, match_random_points(pair, row.density))
+                for pair, row in zip(pairs, own, strict=True)
+            ]
+        every = AllPixels()
+        return rows + [evaluated("all pixels", pair, match_stereo(pair, every)) for pair in pairs]
+
+
+def match_stereo(
+    pair: StereoPair, detector: HeatmapDetector, density: float | None = None
+) -> Matches:
+    """Match both views by descriptors alone and without estimating their geometry."""
+    return match_images(
+        pair.left, pair.right, detector, guided=False, model="none", density=density
+    )
+
+
+def match_random_points(pair: StereoPair, density: float) -> Matches:
+    """Match random points of a density, in keypoints per pixel: the chance baseline."""
+    return match_stereo(pair, RandomDetector(), max(density, 1e-6))
