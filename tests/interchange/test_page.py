@@ -42,7 +42,7 @@ def test_the_page_runs(fountain: Path, tmp_path: Path, monkeypatch: pytest.Monke
             assert ran.returncode == 0, ran.stderr
             done += 1
             continue
-        for line in text.splitlines():
+        for line in text.replace("\\\n", " ").splitlines():
             words = shlex.split(line.partition("#")[0])
             if words[:1] != ["deepdetect"]:
                 continue
