@@ -39,7 +39,8 @@ def run(
 def test_matching(tmp_path: Path) -> None:
     pytest.importorskip("numba")
     result, told = run("match", ["coffee.jpg", "coffee-turned.jpg"], tmp_path)
-    assert [stage for stage, _, _ in told] == ["keypoints", "guided matching", "geometry", "files"]
+    stages = ["initial geometry", "keypoints", "guided matching", "geometry", "files"]
+    assert [stage for stage, _, _ in told] == stages
     matches = load_matches(tmp_path / "matches.npz")
     assert result.numbers["Matches"] == f"{len(matches):,}"
     assert len(matches) > 10_000

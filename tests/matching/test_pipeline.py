@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from deepdetect import (
     DeepDetect,
     HeatmapOptions,
     ImageError,
+    Keypoints,
     Matches,
     MatchingOptions,
     OptionError,
@@ -20,10 +22,14 @@ from deepdetect import (
     match_images,
     select_keypoints,
 )
+from deepdetect.detector.detector import find_keypoints
 from deepdetect.evaluation.baselines.random import RandomDetector
 from deepdetect.features.sift import sift_descriptors
 from deepdetect.geometry import transfer_errors
+from deepdetect.matching import pipeline
 from deepdetect.matching.options import PRESETS
+
+OneLine = Callable[[BaseException], str]
 
 WARP = np.array([[0.99, 0.06, 4.0], [-0.05, 0.97, 12.0], [6e-5, -4e-5, 1.0]])
 
@@ -664,24 +670,41 @@ def test_a_pair_without_a_geometry_has_no_matches() -> None:
     assert not match_images(first, second, RandomDetector(), guided=False).lost
 
 
-def test_a_pair_without_a_geometry_needs_no_keypoints_before_they_are_asked_for() -> None:
+def test_a_pair_without_a_geometry_needs_no_keypoints_before_they_are_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rng = np.random.default_rng(0)
     first, second = (rng.integers(0, 256, (120, 160, 3), np.uint8) for _ in range(2))
-    detector = Corners()
+    detector = DeepDetect()
+    calls = []
+
+    def counted(*arguments: Any) -> Keypoints:
+        calls.append(arguments)
+        return find_keypoints(*arguments)
+
+    monkeypatch.setattr(pipeline, "find_keypoints", counted)
     matches = match_images(first, second, detector)
     assert matches.lost
     assert repr(matches) == "Matches(0 matches, as no geometry could be trusted)"
-    assert len(detector.seen) == 0
+    assert len(calls) == 0
     found = matches.keypoints1
-    assert len(detector.seen) == 1
     assert matches.keypoints1 is found
-    assert len(detector.seen) == 1
-    wanted = match_images(first, second, Corners(), guided=False)
-    np.testing.assert_array_equal(found.xy, wanted.keypoints1.xy)
+    assert len(calls) == 1
+    np.testing.assert_array_equal(found.xy, detector.detect(second).xy)
     again = pickle.loads(pickle.dumps(matches))
-    np.testing.assert_array_equal(again.keypoints0.xy, wanted.keypoints0.xy)
+    np.testing.assert_array_equal(again.keypoints0.xy, detector.detect(first).xy)
     assert again.lost
     assert len(matches[:0]) == len(matches.unique()) == 0
+
+
+def test_a_mask_of_another_size_is_an_error_of_a_pair_without_a_geometry(
+    one_line: OneLine,
+) -> None:
+    rng = np.random.default_rng(0)
+    first, second = (rng.integers(0, 256, (120, 160, 3), np.uint8) for _ in range(2))
+    with pytest.raises(OptionError) as caught:
+        match_images(first, second, ignore=np.zeros((5, 5), bool))
+    assert "ignore" in one_line(caught.value)
 
 
 @pytest.mark.parametrize("mutual", [False, True])

@@ -177,7 +177,7 @@ def match_images(
     grays = luma(rgb[0]), luma(rgb[1])
     pair = _GuidedPair(grays, initial, seeds).ordered(chosen.mutual) if chosen.guided else None
     first: InitialGeometry | None = None
-    if pair is not None and not _gives_points(detector, chosen):
+    if pair is not None and _can_wait(detector, chosen):
         with timer.stage("initial geometry"):
             first = pair.geometry(chosen)
         if first.matrix is None:
@@ -244,9 +244,14 @@ class _GuidedPair:
         )
 
 
-def _gives_points(detector: HeatmapDetector, options: MatchingOptions) -> bool:
-    """Whether the keypoints have sizes and angles, so that the geometry may come from them."""
-    return isinstance(detector, DeepDetect) and options.selection.uses_points
+def _can_wait(detector: HeatmapDetector, options: MatchingOptions) -> bool:
+    """Whether keypoints take no part in the first geometry, and finding them cannot fail.
+
+    Points of all scales take part in it; what is wrong with the caller's own detector or mask must
+    be said at once.
+    """
+    own = isinstance(detector, DeepDetect) and options.selection.ignore is None
+    return own and not options.selection.uses_points
 
 
 def _lost_matches(
