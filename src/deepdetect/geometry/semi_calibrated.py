@@ -156,7 +156,10 @@ def estimate_semi_calibrated(
         found = _judge(here.fundamental, sizes, points0, points1, inlier_threshold, options)
         if found.log10_nfa > best.log10_nfa:
             break
+        hopeless = best.log10_nfa == found.log10_nfa > 0
         best = found
+        if hopeless:  # further fits sharpen what nobody will trust
+            break
     return best
 
 

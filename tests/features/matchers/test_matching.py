@@ -277,3 +277,16 @@ def test_auto_takes_patchmatch_only_where_it_suits(monkeypatch: pytest.MonkeyPat
     assert taken == []
     automatic(base[order], base, 2, 0, both[::-1])
     assert taken == ["patchmatch"]
+
+
+@pytest.mark.parametrize("name", ["auto", "exact", "hamming"])
+def test_the_way_back_of_some_is_that_of_all(name: str) -> None:
+    first, second = (random_descriptors(seed, 300).astype(np.uint8) for seed in (0, 1))
+    second[:100] = first[100:200] ^ (random_descriptors(2, 100).astype(np.uint8) % 8)
+    matcher = get_matcher(name)
+    matches = match_descriptors(first, second, matcher, ratio=0.95, mutual=True)
+    back = matcher(second, first, 1, 0)[0][:, 0]
+    one_way = match_descriptors(first, second, matcher, ratio=0.95)
+    expected = {(i, j) for i, j in pairs(one_way) if back[j] == i}
+    assert pairs(matches) == expected
+    assert 50 <= len(expected) < len(one_way)
