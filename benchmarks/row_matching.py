@@ -20,7 +20,7 @@ Printed are the number of points; which fraction of those whose true disparity i
 0.25, 0.5, 1, 2 and 4 px of it; completeness, the fraction of the pixels with known truth, occluded
 ones too, that have a point within 1 px of it; how often the rarest and the most frequent tenth of a
 pixel is met among the fractions of the disparities, as multiples of how often it is met among those
-of the truth (far from 1 where there are terraces); and seconds.
+of a truth that is not rounded (far from 1 where there are terraces); and seconds.
 
 The true disparity of dolls is of another view than its photographs: two baselines aside. Its rows
 are given as the file says, and with the truth moved to the photographs' view.
@@ -142,23 +142,27 @@ def scores(found: np.ndarray, truth: np.ndarray | None) -> str:
     """Return points, shares within the tolerances, completeness and tenths of a pixel as text."""
     points = int(np.isfinite(found).sum())
     if truth is None:
-        return f"{points:9,d}  {'no truth':57s}"
+        return f"{points:9,d}  {'no truth':56s}"
     errors = np.abs(found - truth)
     errors = errors[np.isfinite(errors)]
     shares = " ".join(f"{np.mean(errors <= tolerance):.4f}" for tolerance in TOLERANCES)
     complete = np.count_nonzero(errors <= 1) / np.count_nonzero(np.isfinite(truth))
-    rare, frequent = tenths(found, truth)
-    return f"{points:9,d}  {shares}  {complete:.4f}  {rare:.2f} to {frequent:.2f}"
+    return f"{points:9,d}  {shares}  {complete:.4f}  {tenths(found, truth):12s}"
 
 
-def tenths(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Return how often the rarest and the most frequent tenth is met, over that of the truth."""
+def tenths(found: np.ndarray, truth: np.ndarray) -> str:
+    """Return how often the rarest and the most frequent tenth is met, over that of the truth.
+
+    A truth that is rounded to parts of a pixel says nothing about it.
+    """
     both = np.isfinite(found) & np.isfinite(truth)
     counts, expected = (
         np.histogram(disparity[both] % 1, bins=10, range=(0, 1))[0] for disparity in (found, truth)
     )
-    ratios = counts[expected > 0] / expected[expected > 0]
-    return float(ratios.min()), float(ratios.max())
+    if not expected.all():
+        return "-"
+    ratios = counts / expected
+    return f"{ratios.min():.2f} to {ratios.max():.2f}"
 
 
 if __name__ == "__main__":
