@@ -15,13 +15,14 @@ def script(load_script: Callable[[str], ModuleType]) -> ModuleType:
 def test_costs_of_each_size(
     script: ModuleType, photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(script, "BUDGETS", (50, 100))
+    monkeypatch.setattr(script, "BUDGETS", (50, 100_000))
     monkeypatch.setattr(script, "MAX_DENSE_PIXELS", 100 * 100)
     monkeypatch.setattr(script, "use_one_thread", lambda: None)  # of all that follows, too
     rows = script.cost_table([photo, photo[::-1]], (96, 128), 1).rows
     assert [row[0] for row in rows] == ["96x96", "128x128"]
     for _, few, many, _, *pair_seconds in rows:
-        assert (few.split()[1], many.split()[1]) == ("(50)", "(100)")
+        assert float(few) > 0  # all 50 were found
+        assert 50 < int(many.split()[1].strip("()")) < 100_000
         assert min(pair_seconds) > 0
     assert [row[3] is None for row in rows] == [False, True]
 
