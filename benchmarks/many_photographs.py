@@ -1,7 +1,7 @@
 """Compare reconstructions of many photographs with pycolmap's own SIFT, by the true cameras.
 
     python benchmarks/many_photographs.py SCENE [--output FOLDER] [--pictures FOLDER] [--bad FOLDER]
-        [--resume] [--workers N] [--limits] [--road METRES]
+        [--resume] [--workers N] [--limits] [--road METRES] [--model FOLDER]
 
 SCENE is a folder of photographs with known cameras (docs/benchmarks.md lists the layouts). Both
 pipelines run with the true intrinsics and with estimated ones. Printed are the photographs that are
@@ -11,7 +11,8 @@ With `--bad` the photographs of that folder are added, and a black and a damaged
 after a run without it, shows what the errors of the poses consist of: the last adjustment is made
 again from two random halves of the sparse points, and with other losses. With `--road` SCENE is a
 drive, and METRES the height of its camera: where the car drove there is nothing but road, and so
-dense points there that are no road are wrong.
+dense points there that are no road are wrong. `--model` makes nothing: it prints how near the
+cameras of a model that `deepdetect reconstruct` has written come to the true ones.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ import numpy as np
 
 from deepdetect import Camera, MultiViewReconstruction, PointCloud, reconstruct_many
 from deepdetect.datasets.posed_images import PosedScene, load_posed_scenes
-from deepdetect.evaluation.metrics.multi_view import camera_errors
+from deepdetect.evaluation.metrics.multi_view import camera_errors, relative_pose_errors
+from deepdetect.evaluation.metrics.pose import pose_auc
 from deepdetect.geometry.point_cloud import robust_box
 from deepdetect.geometry.posed_view import PosedView
 from deepdetect.io.html_viewer import camera_lines
@@ -55,6 +57,9 @@ MAX_ABEAM_M = 1.0
 ROAD_M = (0.1, 0.2, 0.3)
 """Distances from the road of which the share of points is printed."""
 
+AUC_DEG = (1, 5)
+"""Of relative poses, to which the area under the curve of their errors is printed."""
+
 NEAR = 1.5
 """Points are drawn up to this many times their median depth."""
 
@@ -69,12 +74,16 @@ def main() -> None:
     parser.add_argument("--workers", type=int, help="processes")
     parser.add_argument("--limits", action="store_true", help="what the errors consist of")
     parser.add_argument("--road", type=float, help="metres of the camera above the road")
+    parser.add_argument("--model", type=Path, help="folder of a model to compare with the truth")
     parser.add_argument("--resume", action="store_true", help="keep what earlier runs have made")
     args = parser.parse_args()
     (scene,) = load_posed_scenes(args.scene)
     names = sorted(image.path.name for image in scene.images)
     if args.bad is not None:
         show_bad(scene, args.bad, args.output / "bad", args.workers)
+        return
+    if args.model is not None:
+        show_model(scene, args.model / "sparse")
         return
     if args.road is not None:
         output = args.output / "drive"
@@ -187,6 +196,31 @@ def pose_errors(scene: PosedScene, views: dict) -> tuple[float, float]:
     truth = true_views(scene)
     found = camera_errors(list(views.values()), [truth[name] for name in views])
     return float(found.centres.mean()), float(found.rotations_deg.mean())
+
+
+def show_model(scene: PosedScene, folder: Path) -> None:
+    """Print how near the cameras of a sparse model come to the true ones."""
+    with quiet_pycolmap() as pycolmap:
+        sparse = read_sparse_model(pycolmap.Reconstruction(folder))
+    views = {view.name: view for view in sparse.views.values()}
+    truth = true_views(scene)
+    if missing := set(views) - set(truth):
+        raise SystemExit(f"{min(missing)} of the model is no photograph of {scene.name}")
+    print(
+        f"{len(views)} of {len(truth)} photographs, {len(sparse.points):,} sparse points, each in "
+        f"{sparse.tracks.mean():.1f} of them\n{compare_cameras(views, truth)}"
+    )
+
+
+def compare_cameras(views: dict[str, PosedView], truth: dict[str, PosedView]) -> str:
+    """Return the errors of centres and of relative poses as text."""
+    centres = 1000 * camera_errors(list(views.values()), [truth[name] for name in views]).centres
+    errors = relative_pose_errors(views, truth)
+    curve = ", ".join(f"{pose_auc(errors, limit):.3f} at {limit}°" for limit in AUC_DEG)
+    return (
+        f"centres {centres.mean():.2f} mm (mean), {centres.max():.2f} mm (largest)\n"
+        f"relative poses {np.median(errors):.2f}° (median), AUC {curve}"
+    )
 
 
 def show_limits(scene: PosedScene, folder: Path) -> None:

@@ -8,13 +8,19 @@ rows of each scene:
 - keypoints: `match_rectified` at the keypoints of the `dense` weights;
 - every: at every pixel, as it is by default;
 - edges: at every pixel, also near disparity discontinuities;
+- parabola: the same before `refine_disparity`: a parabola through the costs of three whole
+  disparities;
 - dense: the same, with occlusions filled;
+- matched: those of them that are not filled in;
 - SGBM: OpenCV's, with the range of the truth made a multiple of 16;
 - SGBM, framed: both views continued to the left by that range, so that OpenCV gives values
   also where the right view shows nothing.
 
-Fractions are of the points whose true disparity is known; completeness is the fraction of the
-pixels with known truth, occluded ones too, that have a point within 1 px of it.
+Printed are the number of points; which fraction of those whose true disparity is known is within
+0.25, 0.5, 1, 2 and 4 px of it; completeness, the fraction of the pixels with known truth, occluded
+ones too, that have a point within 1 px of it; how often the rarest and the most frequent tenth of a
+pixel is met among the fractions of the disparities, as multiples of how often it is met among those
+of a truth that is not rounded (far from 1 where there are terraces); and seconds.
 
 The true disparity of dolls is of another view than its photographs: two baselines aside. Its rows
 are given as the file says, and with the truth moved to the photographs' view.
@@ -29,15 +35,16 @@ from pathlib import Path
 
 import numpy as np
 
-from deepdetect import DeepDetect
+from deepdetect import DeepDetect, disparity_map
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.protocols.stereo import ground_truths
 from deepdetect.evaluation.protocols.stereo_pipelines import sgbm_disparity
-from deepdetect.io.image import load_image
+from deepdetect.io.image import load_image, luma
 from deepdetect.matching.stereo import DENSE, DisparityOptions, match_rectified
+from deepdetect.matching.stereo.sgm import semi_global_matching
 
-TOLERANCES = (0.5, 1.0, 2.0, 4.0)
+TOLERANCES = (0.25, 0.5, 1.0, 2.0, 4.0)
 AT_EDGES = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0)
 SEARCH_WITHOUT_TRUTH = 64
 
@@ -72,7 +79,9 @@ def ways(
         f"keypoints ({len(keypoints):,})": lambda: ours(left, right, keypoints),
         f"every ({len(every):,})": lambda: ours(left, right, every),
         "edges": lambda: ours(left, right, every, AT_EDGES),
+        "parabola": lambda: by_parabola(left, right),
         "dense": lambda: ours(left, right, every, DENSE),
+        "matched": lambda: ours(left, right, every, DENSE, filled=False),
         "SGBM": lambda: sgbm_disparity(left, right, count),
         "SGBM, framed": lambda: sgbm_disparity(left, right, count, (count, 0)),
     }
@@ -102,13 +111,23 @@ def ours(
     right: np.ndarray,
     xy: np.ndarray,
     options: DisparityOptions = DisparityOptions(),
+    filled: bool = True,
 ) -> np.ndarray:
     """Return a map of the matches' disparities, NaN where there is none."""
     found = match_rectified(left, right, xy, options)
+    kept = found.matched | filled
     out = np.full(left.shape[:2], np.nan, np.float32)
-    column, row = xy[found.indices].astype(int).T
-    out[row, column] = found.disparity
+    column, row = xy[found.indices[kept]].astype(int).T
+    out[row, column] = found.disparity[kept]
     return out
+
+
+def by_parabola(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return a map of the disparities that `refine_disparity` starts from, where they are kept."""
+    kept = disparity_map(left, right, AT_EDGES)
+    assert kept.disparity_range is not None
+    found = semi_global_matching(luma(left), luma(right), kept.disparity_range)
+    return np.where(np.isfinite(kept.disparity), found.disparity, np.float32(np.nan))
 
 
 def search_count(known: dict[str, np.ndarray | None]) -> int:
@@ -120,15 +139,30 @@ def search_count(known: dict[str, np.ndarray | None]) -> int:
 
 
 def scores(found: np.ndarray, truth: np.ndarray | None) -> str:
-    """Return points, shares within the tolerances and completeness as text."""
+    """Return points, shares within the tolerances, completeness and tenths of a pixel as text."""
     points = int(np.isfinite(found).sum())
     if truth is None:
-        return f"{points:9,d}  {'no truth':37s}"
+        return f"{points:9,d}  {'no truth':56s}"
     errors = np.abs(found - truth)
     errors = errors[np.isfinite(errors)]
     shares = " ".join(f"{np.mean(errors <= tolerance):.4f}" for tolerance in TOLERANCES)
     complete = np.count_nonzero(errors <= 1) / np.count_nonzero(np.isfinite(truth))
-    return f"{points:9,d}  {shares}  {complete:.4f}"
+    return f"{points:9,d}  {shares}  {complete:.4f}  {tenths(found, truth):12s}"
+
+
+def tenths(found: np.ndarray, truth: np.ndarray) -> str:
+    """Return how often the rarest and the most frequent tenth is met, over that of the truth.
+
+    A truth that is rounded to parts of a pixel says nothing about it.
+    """
+    both = np.isfinite(found) & np.isfinite(truth)
+    counts, expected = (
+        np.histogram(disparity[both] % 1, bins=10, range=(0, 1))[0] for disparity in (found, truth)
+    )
+    if not expected.all():
+        return "-"
+    ratios = counts / expected
+    return f"{ratios.min():.2f} to {ratios.max():.2f}"
 
 
 if __name__ == "__main__":

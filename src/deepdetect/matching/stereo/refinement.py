@@ -6,9 +6,9 @@ surface that makes terraces. Here it only starts a least-squares fit of the grey
 light free in each window. Each pixel of a window is mapped to the right image by its own smoothed
 disparity, so that slanted surfaces fit as well as those that face the camera, and pixels on the
 other side of a disparity discontinuity do not count. Measured on the Motorcycle pair, on which the
-defaults were chosen: 83 % of the disparities within 0.25 px of the truth instead of the parabola's
-73 %, and fractions as often near whole pixels as between them (each tenth of a pixel has 0.97 to
-1.04 times the expected number; with the parabola 0.44 to 2.04 times).
+defaults were chosen (`benchmarks/row_matching.py`): 82 % of the disparities within 0.25 px of the
+truth instead of the parabola's 73 %, and fractions as often near whole pixels as between them (each
+tenth of a pixel 0.97 to 1.03 times as often as in the truth; with the parabola 0.45 to 2.00 times).
 """
 
 from __future__ import annotations
