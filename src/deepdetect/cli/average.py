@@ -25,13 +25,18 @@ def average(weights: tuple[str, ...], output: Path, as_json: bool) -> None:
     deepdetect average first/best.safetensors second/best.safetensors -o mean
     deepdetect evaluate samples/ --weights mean/deepdetect.onnx
     """
-    from .._shared.errors import MissingExtraError, MissingWeightsError, OptionError
+    from .._shared.errors import (
+        MissingExtraError,
+        MissingWeightsError,
+        OptionError,
+        install_command,
+    )
 
     for package in ("torch", "safetensors", "onnx"):
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(
                 f"averaging weights needs the package {package}, which is not installed: "
-                "run pip install torch safetensors onnx"
+                f"run {install_command('torch', 'safetensors', 'onnx')}"
             )
     from ..detector.pretrained import resolve_weights
 

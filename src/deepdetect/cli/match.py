@@ -179,6 +179,7 @@ def match(
 GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
 UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
 
+
 def _inliers_label(model: str, given: bool) -> str:
     return "within the threshold of --homography" if given else f"inliers ({model})"
 
