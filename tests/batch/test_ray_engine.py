@@ -78,7 +78,7 @@ def wait_for_parts(output: Path, count: int, process: subprocess.Popen[str]) -> 
 
 def wait_for_files(folder: Path, pattern: str, count: int, process: subprocess.Popen[str]) -> None:
     """Wait until a folder has so many files of a pattern."""
-    deadline = time.monotonic() + 240
+    deadline = time.monotonic() + 600
     while len(list(folder.glob(pattern))) < count:
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
@@ -121,7 +121,7 @@ def check(
     skipped: int = 0,
 ) -> None:
     """Check that nothing is lost, nothing double, and all as without a cluster."""
-    told, errors = process.communicate(timeout=300)
+    told, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     report = json.loads(told)
     names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.png"))]
@@ -176,7 +176,7 @@ def test_a_worker_that_makes_labels_is_killed_half_way(
         assert len(workers) == 2
         assert len(list(output.glob(pattern))) < count
         os.kill(workers[0], signal.SIGKILL)
-        told, errors = process.communicate(timeout=300)
+        told, errors = process.communicate(timeout=600)
         assert process.returncode == 0, errors
     finally:
         process.kill()
