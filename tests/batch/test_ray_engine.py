@@ -158,7 +158,7 @@ def test_a_worker_is_killed_half_way(
 @pytest.mark.usefixtures("_ray")
 @pytest.mark.parametrize(
     ("words", "pattern", "count"),
-    [(("label",), "*.png", 100), (("shards", "--shard-size", "2"), "*.tar", 60)],
+    [(("label",), "*.png", 60), (("shards", "--shard-size", "2"), "*.tar", 40)],
 )
 def test_a_worker_that_makes_labels_is_killed_half_way(
     words: Sequence[str],
@@ -168,7 +168,7 @@ def test_a_worker_that_makes_labels_is_killed_half_way(
     tmp_path: Path,
 ) -> None:
     """Of a training set: masks, or shards; they are what the processes of one machine make."""
-    folder, output, whole = collection(200), tmp_path / "ray", tmp_path / "processes"
+    folder, output, whole = collection(120), tmp_path / "ray", tmp_path / "processes"
     process = start(folder, output, words=words)
     try:
         wait_for_files(output, pattern, count // 2, process)
@@ -182,7 +182,7 @@ def test_a_worker_that_makes_labels_is_killed_half_way(
         process.kill()
     if words == ("label",):
         labelled = [Path(report["mask"]).name for report in json.loads(told)["labelled"]]
-        assert sorted(labelled) == sorted(f"{k:02d}.png" for k in range(200))
+        assert sorted(labelled) == sorted(f"{k:02d}.png" for k in range(120))
     command = [sys.executable, "-m", "deepdetect", words[0], folder, "-o", whole, *words[1:]]
     subprocess.run(command, check=True, capture_output=True)
     made, expected = (
