@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -53,12 +53,16 @@ def test_outcomes_and_errors(monkeypatch: pytest.MonkeyPatch) -> None:
         list(map_on_ray(load_image, ["none.png"], 1))
 
 
-def start(folder: Path, output: Path, address: str = "local") -> subprocess.Popen[str]:
-    """Start an extraction on Ray."""
-    command = [sys.executable, "-m", "deepdetect", "extract", str(folder), "-o", str(output)]
-    command += ["--engine", "ray", "--workers", "2", "--max-keypoints", "500", "--json"]
+def start(
+    folder: Path,
+    output: Path,
+    address: str = "local",
+    words: Sequence[str] = ("extract", "--max-keypoints", "500"),
+) -> subprocess.Popen[str]:
+    """Start an extraction, or another command, on Ray."""
+    command = [sys.executable, "-m", "deepdetect", words[0], str(folder), "-o", str(output)]
     return subprocess.Popen(
-        command,
+        [*command, *words[1:], "--engine", "ray", "--workers", "2", "--json"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -68,9 +72,14 @@ def start(folder: Path, output: Path, address: str = "local") -> subprocess.Pope
 
 
 def wait_for_parts(output: Path, count: int, process: subprocess.Popen[str]) -> None:
-    """Wait until so many parts are written."""
-    deadline = time.monotonic() + 240
-    while len(list(output.with_name(output.name + ".parts").glob("[0-9a-f]*.h5"))) < count:
+    """Wait until so many parts of an extraction are written."""
+    wait_for_files(output.with_name(output.name + ".parts"), "[0-9a-f]*.h5", count, process)
+
+
+def wait_for_files(folder: Path, pattern: str, count: int, process: subprocess.Popen[str]) -> None:
+    """Wait until a folder has so many files of a pattern."""
+    deadline = time.monotonic() + 600
+    while len(list(folder.glob(pattern))) < count:
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.01)
@@ -112,7 +121,7 @@ def check(
     skipped: int = 0,
 ) -> None:
     """Check that nothing is lost, nothing double, and all as without a cluster."""
-    told, errors = process.communicate(timeout=300)
+    told, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     report = json.loads(told)
     names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.png"))]
@@ -142,6 +151,46 @@ def test_a_worker_is_killed_half_way(
         check(process, folder, output, same_content)
     finally:
         process.kill()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to find the worker")
+@pytest.mark.usefixtures("_ray")
+@pytest.mark.parametrize(
+    ("words", "pattern", "count"),
+    [(("label",), "*.png", 60), (("shards", "--shard-size", "2"), "*.tar", 40)],
+)
+def test_a_worker_that_makes_labels_is_killed_half_way(
+    words: Sequence[str],
+    pattern: str,
+    count: int,
+    collection: Callable[..., Path],
+    tmp_path: Path,
+) -> None:
+    """Of a training set: masks, or shards; they are what the processes of one machine make."""
+    folder, output, whole = collection(120), tmp_path / "ray", tmp_path / "processes"
+    process = start(folder, output, words=words)
+    try:
+        wait_for_files(output, pattern, count // 2, process)
+        workers = descendants(process.pid, "ray::MapWorker")
+        assert len(workers) == 2
+        assert len(list(output.glob(pattern))) < count
+        os.kill(workers[0], signal.SIGKILL)
+        told, errors = process.communicate(timeout=600)
+        assert process.returncode == 0, errors
+    finally:
+        process.kill()
+    if words == ("label",):
+        labelled = [Path(report["mask"]).name for report in json.loads(told)["labelled"]]
+        assert sorted(labelled) == sorted(f"{k:02d}.png" for k in range(120))
+    command = [sys.executable, "-m", "deepdetect", words[0], folder, "-o", whole, *words[1:]]
+    subprocess.run(command, check=True, capture_output=True)
+    made, expected = (
+        {path.name: path.read_bytes() for path in made_in.iterdir() if path.is_file()}
+        for made_in in (output, whole)
+    )
+    assert len(expected) > count
+    assert made == expected
 
 
 @pytest.mark.slow

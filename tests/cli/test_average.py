@@ -50,3 +50,24 @@ def test_a_mistake_ends_with_exit_code_2_and_leaves_nothing(run, tmp_path: Path,
     result = run("average", *words, "-o", tmp_path / "out")
     assert result.exit_code == 2
     assert not (tmp_path / "out").exists()
+
+
+def test_files_of_another_run_are_not_written_over(run, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    trained = folder / "best.safetensors"
+    trained.write_bytes(pretrained_weights("default", ".safetensors").read_bytes())
+    before = trained.read_bytes()
+    for words, message in (
+        ((trained, "dense"), "would be written over, which is an input"),
+        (("default", "dense"), "best.safetensors exists already"),
+    ):
+        result = run("average", *words, "-o", folder)
+        assert result.exit_code == 2
+        assert message in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+        assert [path.name for path in folder.iterdir()] == ["best.safetensors"]
+        assert trained.read_bytes() == before
+    for more in (["--overwrite"], []):  # then they are its own
+        assert run("average", "default", "dense", "-o", folder, *more).exit_code == 0
+    assert trained.read_bytes() != before

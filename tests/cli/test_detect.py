@@ -98,6 +98,25 @@ def test_one_bad_image_does_not_stop_the_others(run, photos: Path, tmp_path: Pat
     assert not Path("out/bad.npz").exists()
 
 
+@pytest.mark.parametrize("more", [[], ["--max-keypoints", 9]])
+def test_images_without_a_keypoint_have_an_exit_code_of_their_own(
+    run, photos: Path, more: list[object]
+) -> None:
+    Path("in").mkdir()
+    Image.new("RGB", (64, 48), (90, 90, 90)).save("in/flat.png")
+    words = ["detect", "in", "-o", "out", "--no-pictures", *more]
+    for _ in range(2):  # also where all is done already
+        result = run(*words)
+        assert result.exit_code == 3
+        assert "no keypoint was found" in result.stderr
+        assert "0 keypoints" in result.stdout
+    assert len(load_keypoints("out/flat.npz")) == 0
+    shutil.copy(photos / "cat.jpg", "in")
+    result = run(*words)
+    assert result.exit_code == 0
+    assert "no keypoint" not in result.stderr
+
+
 def test_two_images_of_one_name_are_refused(run, photos: Path, tmp_path: Path) -> None:
     other = tmp_path / "cat.png"
     Image.open(photos / "cat.jpg").save(other)
@@ -259,7 +278,9 @@ def test_an_edited_output_of_a_changed_image_is_not_replaced(run, photos: Path) 
 def test_what_was_made_with_other_settings_is_replaced_on_request_only(
     run, photos: Path, more: list[object], told: str
 ) -> None:
-    Image.fromarray(np.full((150, 200), 255, np.uint8)).save("ignore.png")
+    mask = np.zeros((150, 200), np.uint8)
+    mask[:75] = 255
+    Image.fromarray(mask).save("ignore.png")
     detect(run, photos / "cat.jpg")
     before = contents(Path("out"))
     result = run("detect", photos / "cat.jpg", "-o", "out", "--no-pictures", *more)

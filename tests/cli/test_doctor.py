@@ -240,6 +240,7 @@ def test_packages_that_are_too_old_or_absent(monkeypatch: pytest.MonkeyPatch) ->
             'h5py>=3.11 ; extra == "hdf5"',
             "faiss-cpu>=1.9; extra == 'faiss'",
             "onnx>=1.17; extra == 'onnx'",
+            "torch>=2.5; extra == 'train'",
         ],
     )
     versions = {"h5py": "3.9.0", "onnx": "1.17"}
@@ -249,6 +250,7 @@ def test_packages_that_are_too_old_or_absent(monkeypatch: pytest.MonkeyPatch) ->
     assert found["faiss"].details["lacking"] == ["faiss-cpu"]
     assert found["faiss"].details["install"] == 'pip install "deepdetect[faiss]"'
     assert found["onnx"].status == "ok"
+    assert "https://download.pytorch.org/whl/cpu" in found["train"].details["install"]
 
 
 def test_every_extra_has_a_purpose() -> None:

@@ -85,10 +85,19 @@ def test_csv(run, photos: Path) -> None:
     assert set(table[:, 5]) <= {0.0, 1.0}
 
 
-def test_a_failed_estimate_is_said(run, tmp_path: Path) -> None:
+def test_images_without_a_match_have_an_exit_code_of_their_own(run, tmp_path: Path) -> None:
     for name in "ab":
         Image.new("RGB", (64, 64), (90, 90, 90)).save(tmp_path / f"{name}.png")
-    result = run("match", "a.png", "b.png", "-o", "out", "--unguided")
+    result = run("match", "a.png", "b.png", "-o", "out", "--unguided", "--json")
+    assert result.exit_code == 3
+    assert "there are no matches" in result.stderr
+    report = json.loads(result.stdout)
+    assert (report["matches"], report["lost"]) == (0, False)
+
+
+def test_a_failed_estimate_is_said(run, photos: Path) -> None:
+    words = ("match", photos / "left.png", photos / "right.png", "-o", "out", "--unguided")
+    result = run(*words, "--max-keypoints", 4, "--model", "fundamental")
     assert result.exit_code == 0
     assert "no fundamental could be estimated" in result.stderr
 
@@ -104,7 +113,8 @@ def test_a_pair_without_a_geometry_has_its_own_exit_code(run, tmp_path: Path, mo
     assert result.stderr.count("no geometry between these images can be trusted") == 1
     assert len(load_matches(Path("out/a_b_matches.npz"))) == 0
     if more:
-        assert json.loads(result.stdout)["matches"] == 0
+        report = json.loads(result.stdout)
+        assert (report["matches"], report["lost"]) == (0, True)
 
 
 def test_an_essential_matrix_from_camera_files(run, photos: Path) -> None:

@@ -367,11 +367,11 @@ def test_the_automatic_backend_of_safetensors() -> None:
     ("package", "arguments", "command"),
     [
         ("openvino", {"backend": "openvino"}, "pip install openvino"),
-        ("torch", {"weights": TORCH_WEIGHTS}, "pip install torch"),
+        ("torch", {"weights": TORCH_WEIGHTS}, "pip install torch, without a GPU with"),
         (
             "torch",
             {"weights": TORCH_WEIGHTS, "backend": "torch"},
-            "pip install torch",
+            "pytorch.org/whl/cpu",
         ),
     ],
 )

@@ -327,7 +327,7 @@ def test_lightglue_takes_them() -> None:
 
 def test_without_torch_it_is_one_sentence(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(MissingExtraError, match="pip install torch") as caught:
+    with pytest.raises(MissingExtraError, match=r"pip install torch, .*/whl/cpu") as caught:
         POINTS.to_lightglue()
     one_line(caught.value)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from deepdetect import MissingExtraError
+from deepdetect._shared.errors import install_command
 from deepdetect.integrations.packages import base_class, import_package
 
 # Without any of the packages, as where nothing but deepdetect is installed.
@@ -57,7 +58,9 @@ def test_without_the_packages_each_drop_in_says_what_to_install() -> None:
         "vismatch": "vismatch",
     }
     for name, message in said.items():
-        assert message.endswith(f"run pip install {needed.get(name, 'transformers')}")
+        package = needed.get(name, "transformers")
+        assert f"run pip install {package}" in message
+        assert message.endswith(f"run {install_command(package)}")
         assert len(message.splitlines()) == 1
 
 

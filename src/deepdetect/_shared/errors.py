@@ -114,6 +114,27 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
     return OptionError(f"unknown {kind} {name!r}{hint} (known: {', '.join(names)})")
 
 
+WITHOUT_GPU = (
+    "without a GPU with the option --extra-index-url https://download.pytorch.org/whl/cpu, "
+    "which spares 6 GB"
+)
+"""How pip takes the build of torch for processors; on Linux it takes that for CUDA otherwise."""
+
+
+def install_command(*packages: str) -> str:
+    """Return the command that installs packages, for the sentence of a `MissingExtraError`.
+
+    Example:
+        >>> install_command("onnx")
+        'pip install onnx'
+        >>> install_command("torch", "onnx")
+        'pip install torch onnx, without a GPU with the option --extra-index-url \
+https://download.pytorch.org/whl/cpu, which spares 6 GB'
+    """
+    command = f"pip install {' '.join(packages)}"
+    return f"{command}, {WITHOUT_GPU}" if "torch" in packages else command
+
+
 for _error in (
     DeepDetectError,
     ImageError,

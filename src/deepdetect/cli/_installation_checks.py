@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._shared.errors import DeepDetectError
+from .._shared.errors import WITHOUT_GPU, DeepDetectError
 from ._findings import Finding, as_sentence
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ PURPOSES = {
     "onnx": "`export onnx`",
     "opencv": "everything that reads or writes pictures",
     "openvino": "a faster network on CPUs",
-    "ray": "`extract` and `match-many` on a cluster",
+    "ray": "`extract`, `match-many`, `label` and `shards` on a cluster",
     "sfm": "`reconstruct` of three photographs and more, `export colmap`, and visual odometry",
     "standard": "detection and matching",
     "train": "`train`, `average`, and weights in .safetensors",
@@ -341,6 +341,8 @@ def check_extras() -> Iterator[Finding]:
         install = f'pip install "deepdetect[{extra}]"'
         if extra == "labels" and (others := installed_distributions()):  # it would be a second one
             install = f"pip uninstall -y {' '.join(others)}, then {install}"
+        if "torch" in lacking:
+            install = f"{install}, {WITHOUT_GPU}"
         details["install"] = install
         yield Finding(
             name, "missing", f"for {purpose}; lacks {', '.join(lacking)}", details=details

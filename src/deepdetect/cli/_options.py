@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 PATH = click.Path(path_type=Path)
 
+NOTHING_FOUND = 3
+"""Exit code where all went well and nothing was found."""
+
 
 class Resolution(click.ParamType):  # type: ignore[type-arg]  # generic in new versions only
     """The word "auto" or "native", or a number of pixels."""

@@ -14,6 +14,7 @@ from .. import __version__
 from ._generated import generated_command, given_only
 from ._options import (
     DETECTOR,
+    NOTHING_FOUND,
     PATH,
     SELECTION,
     check_inputs_survive,
@@ -72,6 +73,7 @@ def detect(
     Images that are done are skipped when the same command runs again. What was made from other
     images, with other options or by something else is replaced with --overwrite only. An image
     that cannot be read does not stop the others: they are listed at the end, with exit code 1.
+    Where no image has any keypoint the exit code is 3.
 
     \b
     deepdetect detect photo.jpg
@@ -127,6 +129,11 @@ def detect(
                 f"density {result['density']:.3f}, {how} -> {result['file']}"
             )
     report_failures(failures, len(paths))
+    if not any(result["keypoints"] for result in results):
+        click.echo(
+            "no keypoint was found: the image is uniform, or the options leave none", err=True
+        )
+        raise click.exceptions.Exit(NOTHING_FOUND)
 
 
 class _Failure(Exception):

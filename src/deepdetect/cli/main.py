@@ -12,6 +12,7 @@ from .._shared.errors import BatchError, DeepDetectError, NoDepthError, Registra
 from .._shared.kernels import announce_compilation
 from .._shared.progress import say
 from ._generated import with_flags
+from ._options import NOTHING_FOUND
 from .app import app
 from .average import average
 from .benchmark import benchmark
@@ -85,7 +86,8 @@ class Commands(click.Group):
         except DeepDetectError as error:
             command = self.get_command(context, context.invoked_subcommand or "")
             click.echo(f"deepdetect: {with_flags(str(error), command)}", err=True)
-            context.exit(3 if isinstance(error, NoDepthError | RegistrationError) else 2)
+            nothing_found = isinstance(error, NoDepthError | RegistrationError)
+            context.exit(NOTHING_FOUND if nothing_found else 2)
         except KeyboardInterrupt:
             click.echo("deepdetect: stopped; what was written stays", err=True)
             context.exit(130)

@@ -11,6 +11,7 @@ import click
 from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
     DETECTOR,
+    NOTHING_FOUND,
     PATH,
     SELECTION,
     check_inputs_survive,
@@ -79,8 +80,8 @@ def match(
     the estimated geometry and which matches agree with it, and a picture of them. The options
     --descriptor, --keypoint-size, --angle, --matcher and --ratio apply with --unguided.
 
-    Ends with exit code 3 where no geometry between the images can be trusted; the file then holds
-    no matches.
+    Ends with exit code 3 where there are no matches, as where no geometry between the images can
+    be trusted; the file then holds none.
 
     \b
     deepdetect match left.jpg right.jpg
@@ -132,6 +133,7 @@ def match(
         "model": matches.model,
         "matrix": None if matches.matrix is None else matches.matrix.tolist(),
         "guided": matches.guided,
+        "lost": matches.lost,
         "guide": _guide_numbers(matches),
         "backend": detector.runtime,
         "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
@@ -162,7 +164,12 @@ def match(
             "show the same scene, --unguided matches by descriptors alone",
             err=True,
         )
-        raise click.exceptions.Exit(NO_GEOMETRY)
+        raise click.exceptions.Exit(NOTHING_FOUND)
+    if not len(matches):
+        click.echo(
+            "there are no matches: the images show too little, or the options leave none", err=True
+        )
+        raise click.exceptions.Exit(NOTHING_FOUND)
     if as_json:
         return
     if matches.matrix is None and matches.model != "none":
@@ -171,9 +178,6 @@ def match(
 
 GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
 UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
-
-NO_GEOMETRY = 3
-"""Exit code where no geometry can be trusted."""
 
 
 def _inliers_label(model: str, given: bool) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import MissingExtraError, OptionError
+from .._shared.errors import MissingExtraError, OptionError, install_command
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
@@ -183,7 +183,7 @@ class Keypoints:
         except ImportError:
             raise MissingExtraError(
                 "features for LightGlue need the package torch, which is not installed: "
-                "run pip install torch"
+                f"run {install_command('torch')}"
             ) from None
         # Checks the descriptors.
         described = self if descriptors is None else replace(self, descriptors=descriptors)

@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from .._shared.errors import MissingExtraError
+from .._shared.errors import MissingExtraError, install_command
 
 if TYPE_CHECKING:
 
@@ -32,7 +32,7 @@ def missing_package(module: str) -> MissingExtraError:
         the drop-in for h5py needs the package h5py, which is not installed: run pip install h5py
     """
     package = module.partition(".")[0]
-    install = HOW_TO_INSTALL.get(package, f"pip install {package}")
+    install = HOW_TO_INSTALL.get(package, install_command(package))
     program = "PyTorch" if package == "torch" else package
     return MissingExtraError(
         f"the drop-in for {program} needs the package {package}, which is not installed: "

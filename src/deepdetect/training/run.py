@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .._shared.errors import MissingExtraError
+from .._shared.errors import WITHOUT_GPU, MissingExtraError
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from .recipe import DeviceOptions, InitWeights, Stage, TrainingOptions
@@ -209,10 +209,7 @@ def _peak_memory_bytes() -> int | None:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-INSTALL_TRAINING = (
-    'pip install "deepdetect[train]", without a GPU with the option '
-    "--extra-index-url https://download.pytorch.org/whl/cpu, which spares 6 GB"
-)
+INSTALL_TRAINING = f'pip install "deepdetect[train]", {WITHOUT_GPU}'
 
 
 def require_packages() -> None:

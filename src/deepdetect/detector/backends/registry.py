@@ -12,7 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..._shared.errors import MissingExtraError, MissingWeightsError, OptionError, WeightsError
+from ..._shared.errors import (
+    MissingExtraError,
+    MissingWeightsError,
+    OptionError,
+    WeightsError,
+    install_command,
+)
 from .onnxruntime_backend import open_onnxruntime
 from .openvino_backend import open_openvino
 from .options import Network, RuntimeOptions
@@ -67,7 +73,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(
                 f"reading {path.name} with the backend {name} needs the package {package}, "
-                f"which is not installed: run pip install {package}"
+                f"which is not installed: run {install_command(package)}"
             )
     file = path.stat()
     state = path.absolute(), file.st_mtime_ns, file.st_size

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ..._shared.atomic import atomic_path
-from ..._shared.errors import MissingExtraError, OptionError, WeightsError, unknown_name
+from ..._shared.errors import (
+    MissingExtraError,
+    OptionError,
+    WeightsError,
+    install_command,
+    unknown_name,
+)
 from ..._shared.options import check_ranges, suggest_keywords
 from ..pretrained import resolve_weights
 from .onnx_graph import (
@@ -190,5 +196,6 @@ def _images(paths: Sequence[Path], at_most: int) -> Iterator[np.ndarray]:
 def _need(package: str, what: str) -> None:
     if importlib.util.find_spec(package) is None:
         raise MissingExtraError(
-            f"{what} needs the package {package}, which is not installed: run pip install {package}"
+            f"{what} needs the package {package}, which is not installed: "
+            f"run {install_command(package)}"
         )
