@@ -10,6 +10,7 @@ import pytest
 from deepdetect import DeepDetect, ImageError, OptionError
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
+from deepdetect.evaluation.metrics.calibration import Calibration
 from deepdetect.evaluation.metrics.masks import MaskScore
 from deepdetect.evaluation.protocols.masks import (
     LabelDetector,
