@@ -150,7 +150,7 @@ def test_bundled_weights_reach_the_bar(shared: Path) -> None:
     assert scores["normal"].iou >= 0.84
     assert scores["low"].loss <= 0.155
     assert scores["low"].iou >= 0.66
-    assert max(calibration.error for _, calibration in samples.values()) <= 0.01
+    assert max(calibration.expected_error for _, calibration in samples.values()) <= 0.01
 
 
 def test_a_folder_without_samples_is_an_error(tmp_path: Path) -> None:
