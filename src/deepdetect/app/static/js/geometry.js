@@ -4,6 +4,7 @@
 const MAX_ERROR_PX = 3;
 const ROUNDS = 3000;
 const MAX_LOG10_NFA = -3; // one such geometry among a thousand pairs that have none
+const MIN_AGREEING = 9; // several along one edge are no independent evidence (Brown and Lowe, 2007: over 8)
 const PREFER_HOMOGRAPHY = 0.8; // of a fundamental matrix's inliers: it says less about each
 
 const MODELS = {
@@ -22,7 +23,7 @@ const MODELS = {
 export function estimateGeometry(points0, points1, width, height) {
   const found = Object.keys(MODELS).map((name) => ransac(name, points0, points1));
   const likely = found.filter(({ model, inliers }) =>
-    log10Nfa(model, inliers, width, height) < MAX_LOG10_NFA);
+    sum(inliers) >= MIN_AGREEING && log10Nfa(model, inliers, width, height) < MAX_LOG10_NFA);
   const none = { model: "none", matrix: null, inliers: new Uint8Array(points0.length / 2) };
   if (!likely.length) return none;
   const [first, second] = likely;
