@@ -145,12 +145,13 @@ def match_descriptors(
     ratios[~np.isfinite(second)] = 1  # no second-best was found
     kept = ratios < ratio
     if mutual:
-        asked = np.arange(len(descriptors1))
         if _is_exhaustive(matcher, len(descriptors0), len(descriptors1)):
             asked = np.unique(rows[kept, 0])  # the way back of the others changes nothing
-        nearest = np.full(len(descriptors1), -1)
-        back = None if positions is None else positions[::-1]
-        nearest[asked] = matcher(descriptors1[asked], descriptors0, 1, seed, back)[0][:, 0]
+            nearest = np.full(len(descriptors1), -1)
+            nearest[asked] = matcher(descriptors1[asked], descriptors0, 1, seed)[0][:, 0]
+        else:
+            back = None if positions is None else positions[::-1]
+            nearest = matcher(descriptors1, descriptors0, 1, seed, back)[0][:, 0]
         kept &= nearest[rows[:, 0]] == np.arange(len(rows))
     rows0 = np.flatnonzero(kept).astype(np.int32)
     return DescriptorMatches(rows0, rows[rows0, 0].astype(np.int32), ratios[rows0])
