@@ -11,7 +11,14 @@ import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError, WeightsError, unknown_name
 from .options import RuntimeOptions
-from .shapes import PROBE_SHAPE, as_logits, check_network, lack_of_memory, output_to_read
+from .shapes import (
+    KEYPOINT_OUTPUTS,
+    PROBE_SHAPE,
+    as_logits,
+    check_network,
+    lack_of_memory,
+    output_to_read,
+)
 from .without_telemetry import import_onnxruntime
 
 CPU = "CPUExecutionProvider"
@@ -103,7 +110,8 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
             f"the provider {providers[0]} could not start: check its driver and libraries, "
             "or leave it out"
         )
-    inputs, outputs = session.get_inputs(), session.get_outputs()
+    inputs = session.get_inputs()
+    outputs = [value for value in session.get_outputs() if value.name not in KEYPOINT_OUTPUTS]
     check_network(
         path,
         [value.shape for value in inputs],

@@ -12,7 +12,14 @@ import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError, WeightsError
 from .options import RuntimeOptions
-from .shapes import PADDED_IMAGE, as_logits, check_network, lack_of_memory, output_to_read
+from .shapes import (
+    KEYPOINT_OUTPUTS,
+    PADDED_IMAGE,
+    as_logits,
+    check_network,
+    lack_of_memory,
+    output_to_read,
+)
 from .without_telemetry import import_openvino
 
 COMPILED_LAYERS = 100
@@ -123,7 +130,9 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     def read() -> Any:
         # Named, not guessed: guessing tries all formats and prints each one's complaint.
         reader = FrontEndManager().load_by_framework("onnx")
-        return reader.convert(reader.load(str(path)))
+        graph = reader.convert(reader.load(str(path)))
+        _take_out_keypoints(graph)
+        return graph
 
     def compile_model(graph: Any = None) -> Any:
         graph = read() if graph is None else graph
@@ -156,6 +165,13 @@ def computes_bfloat16() -> bool:
     """Return whether this processor has instructions for `precision="bfloat16"`."""
     capabilities = import_openvino().Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
     return bool("BF16" in capabilities)
+
+
+def _take_out_keypoints(graph: Any) -> None:
+    """Compute maps only, of a file that gives keypoints, too."""
+    for result in graph.get_results():
+        if not KEYPOINT_OUTPUTS.isdisjoint(result.output(0).get_names()):
+            graph.remove_result(result)
 
 
 def _take_out_padding(graph: Any) -> None:

@@ -15,6 +15,9 @@ Shape = Sequence[int | str | None]
 LOGITS = "logits"
 """Name of the output that holds logits; an output of another name holds probabilities."""
 
+KEYPOINT_OUTPUTS = frozenset({"keypoints", "keypoint_logits"})
+"""Names of the outputs of files that give keypoints, too: these are not read."""
+
 PADDED_IMAGE = "padded_image"
 """Name of the tensor that holds the image, padded to multiples of 8, in files that pad it."""
 

@@ -58,8 +58,8 @@ def add_padding(model: ModelProto) -> None:
     for node in rest:
         rename(node, IMAGE, PADDED_IMAGE)
         rename(node, LOGITS, PADDED_LOGITS)
-    _constants(graph, {"first_side": [2], "end_of_sides": [4], "side_axis": [0]})
-    _constants(graph, {"stride": [STRIDE], "no_padding": [0] * 6})
+    add_constants(graph, {"first_side": [2], "end_of_sides": [4], "side_axis": [0]})
+    add_constants(graph, {"stride": [STRIDE], "no_padding": [0] * 6})
     before = [
         helper.make_node("Shape", [IMAGE], ["shape"]),
         helper.make_node("Slice", ["shape", "first_side", "end_of_sides", "side_axis"], ["sides"]),
@@ -88,7 +88,7 @@ def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
     below, right = -height % STRIDE, -width % STRIDE
     inner, before = split_nodes(graph)[1], []
     if below or right:
-        _constants(graph, {"padding": [0] * 6 + [below, right], "sides": [height, width]})
+        add_constants(graph, {"padding": [0] * 6 + [below, right], "sides": [height, width]})
         before = [helper.make_node("Pad", [IMAGE, "padding"], [PADDED_IMAGE], mode="edge")]
     else:
         for node in inner:
@@ -158,8 +158,8 @@ def _ending(graph: GraphProto, crop: bool = True) -> list[NodeProto]:
     """Make the nodes that crop the logits and turn them into probabilities."""
     from onnx import helper
 
-    _constants(graph, {"from_zero": [0, 0], "side_axes": [2, 3]})
-    _constants(graph, {"least": 0, "most": 1}, np.float32)
+    add_constants(graph, {"from_zero": [0, 0], "side_axes": [2, 3]})
+    add_constants(graph, {"least": 0, "most": 1}, np.float32)
     cropping = helper.make_node(
         "Slice", [PADDED_LOGITS, "from_zero", "sides", "side_axes"], [LOGITS]
     )
@@ -223,7 +223,7 @@ def rename(node: NodeProto, old: str, new: str) -> None:
                 names[k] = new
 
 
-def _constants(graph: GraphProto, values: Mapping[str, Any], kind: type = np.int64) -> None:
+def add_constants(graph: GraphProto, values: Mapping[str, Any], kind: type = np.int64) -> None:
     """Add small constants; one whose name is there already is replaced."""
     from onnx import numpy_helper
 

@@ -20,6 +20,7 @@ from ..._shared.errors import (
     unknown_name,
 )
 from ..._shared.options import check_ranges, suggest_keywords
+from ...features.selection import check_max_keypoints
 from ..pretrained import resolve_weights
 from .onnx_graph import (
     ANY_SIZE,
@@ -30,6 +31,7 @@ from .onnx_graph import (
     read_metadata,
     write_metadata,
 )
+from .onnx_keypoints import add_keypoints, remove_keypoints
 from .onnx_precision import to_float16, to_int8
 
 if TYPE_CHECKING:
@@ -50,6 +52,9 @@ class OnnxOptions:
         precision: "fp32", "fp16" (half the bytes), or "int8" (quantised, for
             which it needs calibration images; it marks other pixels).
         max_calibration_images: at most this many images calibrate int8, evenly chosen.
+        max_keypoints: the file gives this many dense keypoints, too, the best ones: what
+            `DeepDetect.detect` finds with the same `max_keypoints` and mode="dense". None: maps
+            only.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -59,6 +64,7 @@ class OnnxOptions:
     batch: int = 1
     precision: Literal["fp32", "fp16", "int8"] = "fp32"
     max_calibration_images: int = 32
+    max_keypoints: int | None = None
 
     def __post_init__(self) -> None:
         if self.precision not in PRECISIONS:
@@ -71,19 +77,23 @@ class OnnxOptions:
                 "size": (8, 16384),
                 "batch": (1, 1024),
                 "max_calibration_images": (1, 10_000),
+                "max_keypoints": (1, 100_000),
             },
         )
+        check_max_keypoints(self.max_keypoints)
         if self.batch != 1 and self.size is None:
             raise OptionError("`batch` needs `size`: a file for any size takes any batch")
 
     @property
     def metadata(self) -> dict[str, str]:
         """What the file says of its options."""
-        if self.size is None:
-            return {**ANY_SIZE, "precision": self.precision}
-        height, width = self.size
-        size = f"{height}x{width}"
-        return {"precision": self.precision, "size": size, "batch": str(self.batch)}
+        found = {**ANY_SIZE, "precision": self.precision}
+        if self.size is not None:
+            height, width = self.size
+            found |= {"size": f"{height}x{width}", "batch": str(self.batch)}
+        if self.max_keypoints is not None:
+            found["max_keypoints"] = str(self.max_keypoints)
+        return found
 
 
 def write_onnx(
@@ -100,7 +110,7 @@ def write_onnx(
         weights: "default" or "dense"; an ONNX file that this package has written in fp32 for any
             size; or a safetensors file, which needs torch.
         path: the file to be written, ending in .onnx.
-        options: its size and precision.
+        options: its size and precision, and whether it gives keypoints.
         calibration: photographs for int8, like those that it will be used on.
         licence: what the file says of the licence of the weights. None: that of the given file.
 
@@ -130,6 +140,8 @@ def write_onnx(
         fix_size(model, *options.size, options.batch)
     if options.precision == "fp16":
         to_float16(model)
+    if options.max_keypoints is not None:
+        add_keypoints(model, int(options.max_keypoints))
     write_metadata(model, values)
     with atomic_path(path) as temporary:
         temporary.write_bytes(model.SerializeToString())
@@ -154,6 +166,7 @@ def _load(weights: str | Path) -> ModelProto:
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({error}): download it again"
         ) from None
+    remove_keypoints(model)
     check_graph(model, str(path))
     found = read_metadata(model)
     if any(found.get(name, value) != value for name, value in ANY_SIZE.items()):
