@@ -34,6 +34,16 @@ def test_size_and_precision(run, tmp_path: Path) -> None:
     assert [side.dim_value for side in sides] == [2, 1, 48, 64]
 
 
+def test_keypoints(run, tmp_path: Path) -> None:
+    result = run("export", "onnx", "-o", "made.onnx", "--max-keypoints", 70, "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output)["metadata"]["max_keypoints"] == "70"
+    outputs = {value.name: value for value in onnx.load(tmp_path / "made.onnx").graph.output}
+    assert list(outputs) == ["probability", "logits", "keypoints", "keypoint_logits"]
+    sides = outputs["keypoints"].type.tensor_type.shape.dim
+    assert [side.dim_param or side.dim_value for side in sides] == ["batch", 70, 2]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -42,6 +52,8 @@ def test_size_and_precision(run, tmp_path: Path) -> None:
         ("-o a.onnx --batch 2", "--batch needs --size"),
         ("-o a.onnx --size 480", "'480' is no height and width"),
         ("-o a.onnx --size 4x99999", "--size must lie in"),
+        ("-o a.onnx --max-keypoints 0", "--max-keypoints must lie in"),
+        ("-o a.onnx --max-keypoints 100001", "--max-keypoints must lie in"),
         ("-o a.png", "ends in .onnx"),
         ("densse -o a.onnx", "did you mean 'dense'"),
         ("none.onnx -o a.onnx", "there is no weights file"),

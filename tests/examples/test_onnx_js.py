@@ -82,6 +82,47 @@ writeFileSync(made, new Uint8Array((await session.run({ image })).logits.data.bu
 
 
 @pytest.mark.slow
+def test_a_file_that_gives_keypoints(installed: Path, photo: np.ndarray, tmp_path: Path) -> None:
+    pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+    from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx
+
+    (installed / "best.mjs").write_text(
+        """
+import { readFileSync } from "node:fs";
+import * as ort from "onnxruntime-web";
+ort.env.wasm.numThreads = 1;
+const [model, given, height, width] = process.argv.slice(2);
+const planes = new Float32Array(new Uint8Array(readFileSync(given)).buffer);
+const image = new ort.Tensor("float32", planes, [1, 3, Number(height), Number(width)]);
+const session = await ort.InferenceSession.create(readFileSync(model));
+const { keypoints, keypoint_logits } = await session.run({ image });
+for (let k = 0; k < keypoint_logits.data.length; k++) {
+  console.log(keypoints.data[2 * k], keypoints.data[2 * k + 1], keypoint_logits.data[k]);
+}
+"""
+    )
+    made = tmp_path / "made.onnx"
+    write_onnx("default", made, OnnxOptions(max_keypoints=200))
+    detector = DeepDetect(backend="onnxruntime")
+    for height, width in ((123, 157), (17, 23)):
+        rgb = photo[:height, :width]
+        planes = np.ascontiguousarray(rgb.transpose(2, 0, 1) * np.float32(1 / 255))
+        planes.tofile(tmp_path / "given.bin")
+        words = [made, tmp_path / "given.bin", height, width]
+        command = ["node", "best.mjs", *map(str, words)]
+        ended = subprocess.run(command, cwd=installed, capture_output=True, text=True, check=True)
+        rows = [line.replace("Infinity", "inf").split() for line in ended.stdout.splitlines()]
+        found = np.array(rows, float)
+        expected = detector.detect(rgb, max_keypoints=200, mode="dense")
+        assert found.shape == (200, 3)
+        assert np.isfinite(found[:, 2]).sum() == len(expected) > 5
+        xy = found[: len(expected), :2]
+        gaps = np.linalg.norm(xy[:, None] - expected.xy, axis=2)
+        assert gaps.min(0).max() < 1e-3
+        assert (found[len(expected) :] == (-1, -1, -np.inf)).all()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "photo", "words", "message"),
     [

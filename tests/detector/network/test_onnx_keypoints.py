@@ -1,0 +1,307 @@
+"""Files that give keypoints give those of `DeepDetect.detect`, in other runtimes, too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+
+import cv2  # noqa: E402
+import onnxruntime  # noqa: E402
+
+from deepdetect import DeepDetect, OptionError  # noqa: E402
+from deepdetect.detector.network.onnx_graph import read_metadata  # noqa: E402
+from deepdetect.detector.network.onnx_keypoints import add_keypoints  # noqa: E402
+from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
+from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
+from deepdetect.features.keypoints import Keypoints  # noqa: E402
+from deepdetect.features.maps import sigmoid  # noqa: E402
+from deepdetect.features.selection import select_keypoints  # noqa: E402
+
+COUNT = 90
+SIZES = [(64, 96), (123, 157), (17, 23), (80, 41)]
+"""Heights and widths: multiples of 8, of 8 in one direction, and of none; one has fewer pixels."""
+
+OUTPUTS = ["keypoints", "keypoint_logits"]
+
+
+def planes_of(*images: np.ndarray) -> np.ndarray:
+    """Return (B, 3, H, W) float32, as the file takes images of one size."""
+    return np.ascontiguousarray(np.stack(images).transpose(0, 3, 1, 2) * np.float32(1 / 255))
+
+
+def session_of(model: Path | bytes) -> onnxruntime.InferenceSession:
+    settings = onnxruntime.SessionOptions()
+    settings.intra_op_num_threads, settings.log_severity_level = 1, 4
+    given = model if isinstance(model, bytes) else str(model)
+    return onnxruntime.InferenceSession(given, settings, providers=["CPUExecutionProvider"])
+
+
+def check_keypoints(
+    xy: np.ndarray, logits: np.ndarray, expected: Keypoints, count: int, tolerance: float = 1e-4
+) -> None:
+    """Check the keypoints of one image: the positions in pixels, their order, and the rest."""
+    assert (xy.shape, logits.shape) == ((count, 2), (count,))
+    assert xy.dtype == logits.dtype == np.float32
+    assert np.isfinite(logits).sum() == len(expected)
+    order = np.argsort(-expected.logits, kind="stable")
+    found = slice(len(expected))
+    np.testing.assert_allclose(logits[found], expected.logits[order], atol=1e-3)
+    np.testing.assert_allclose(xy[found], expected.xy[order], atol=tolerance)
+    assert np.isneginf(logits[len(expected) :]).all()
+    assert (xy[len(expected) :] == -1).all()
+
+
+def best(rgb: np.ndarray, count: int = COUNT, weights: Any = "default") -> Keypoints:
+    detector = DeepDetect(weights, backend="onnxruntime", threads=1)
+    return detector.detect(rgb, max_keypoints=count, mode="dense")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file for any size that gives keypoints."""
+    made = tmp_path_factory.mktemp("keypoints") / "keypoints.onnx"
+    write_onnx("default", made, OnnxOptions(max_keypoints=COUNT))
+    onnx.checker.check_model(onnx.load(made), full_check=True)
+    return made
+
+
+@pytest.mark.parametrize(("height", "width"), SIZES)
+def test_they_are_what_detect_finds(height: int, width: int, path: Path, photo: np.ndarray) -> None:
+    rgb = photo[:height, :width]
+    names = ["probability", "logits", *OUTPUTS]
+    probability, logits, xy, values = session_of(path).run(names, {"image": planes_of(rgb)})
+    expected = best(rgb)
+    assert (len(expected) < COUNT) == (width < 64)
+    check_keypoints(xy[0], values[0], expected, COUNT)
+    # The maps are those of the shipped file.
+    shipped = session_of(pretrained_weights()).run(names[:2], {"image": planes_of(rgb)})
+    np.testing.assert_allclose(probability, shipped[0], atol=1e-5)
+    np.testing.assert_allclose(logits, shipped[1], atol=1e-4)
+
+
+def test_a_batch_gives_those_of_each_image(path: Path, photo: np.ndarray) -> None:
+    # The second one has fewer.
+    images = [photo[:123, :157], photo[100:223, 60:217].copy()]
+    images[1][:, 15:] = 128
+    xy, values = session_of(path).run(OUTPUTS, {"image": planes_of(*images)})
+    for k, rgb in enumerate(images):
+        check_keypoints(xy[k], values[k], best(rgb), COUNT)
+    assert np.isfinite(values).sum(1)[1] < COUNT
+
+
+@pytest.mark.parametrize("precision", ["fp32", "fp16"])
+@pytest.mark.parametrize(("size", "batch"), [((64, 96), 1), ((123, 157), 2), ((17, 23), 1)])
+def test_one_size(
+    size: tuple[int, int], batch: int, precision: str, tmp_path: Path, photo: np.ndarray
+) -> None:
+    height, width = size
+    # More than there are pixels in the smallest.
+    options = OnnxOptions(size, batch, precision, max_keypoints=500)
+    made = tmp_path / "one.onnx"
+    assert write_onnx("default", made, options)["max_keypoints"] == "500"
+    model = onnx.load(made)
+    onnx.checker.check_model(model, full_check=True)
+    assert "Shape" not in {node.op_type for node in model.graph.node}
+    shapes = {
+        value.name: [side.dim_value for side in value.type.tensor_type.shape.dim]
+        for value in model.graph.output
+    }
+    assert shapes["keypoints"] == [batch, 500, 2]
+    assert shapes["keypoint_logits"] == [batch, 500]
+    images = [photo[9 * k : 9 * k + height, 5 * k : 5 * k + width] for k in range(batch)]
+    logits, xy, values = session_of(made).run(["logits", *OUTPUTS], {"image": planes_of(*images)})
+    for k in range(batch):
+        selected = select_keypoints(sigmoid(logits[k, 0]), logits=logits[k, 0], max_keypoints=500)
+        check_keypoints(xy[k], values[k], selected, 500)
+        if precision == "fp32":
+            check_keypoints(xy[k], values[k], best(images[k], 500), 500)
+
+
+def test_half_precision_is_near(tmp_path: Path, photo: np.ndarray) -> None:
+    half = tmp_path / "half.onnx"
+    write_onnx("default", half, OnnxOptions(precision="fp16", max_keypoints=COUNT))
+    rgb = photo[:123, :157]
+    xy, values = session_of(half).run(OUTPUTS, {"image": planes_of(rgb)})
+    assert xy.dtype == values.dtype == np.float32
+    # The package reads the same file, and gives the same keypoints.
+    check_keypoints(xy[0], values[0], best(rgb, weights=half), COUNT)
+    gaps = np.linalg.norm(xy[0][:, None] - best(rgb).xy, axis=2).min(1)
+    assert np.mean(gaps < 0.05) > 0.95
+    assert gaps.max() > 0
+
+
+@pytest.mark.slow
+def test_eight_bits(tmp_path: Path, photo: np.ndarray) -> None:
+    from PIL import Image
+
+    Image.fromarray(photo[:150, :180]).save(tmp_path / "a.png")
+    small, rgb = tmp_path / "small.onnx", photo[:123, :157]
+    options = OnnxOptions(precision="int8", max_keypoints=COUNT)
+    write_onnx("default", small, options, calibration=[tmp_path / "a.png"])
+    onnx.checker.check_model(onnx.load(small), full_check=True)
+    logits, xy, values = session_of(small).run(["logits", *OUTPUTS], {"image": planes_of(rgb)})
+    (map_,) = logits[0]
+    selected = select_keypoints(sigmoid(map_), logits=map_, max_keypoints=COUNT)
+    check_keypoints(xy[0], values[0], selected, COUNT)
+
+
+@pytest.mark.slow
+def test_they_are_what_detect_finds_in_photographs(shared: Path, tmp_path: Path) -> None:
+    from deepdetect.io.image import load_image
+
+    data = shared / "data"
+    photographs = [
+        *sorted((data / "label-samples/val").glob("image_*.png"))[:6:2],
+        data / "middlebury/teddy/left.png",
+        data / "oxford/graf/img1.png",
+        data / "kitti-clip/000000.jpg",
+    ]
+    made = tmp_path / "made.onnx"
+    write_onnx("default", made, OnnxOptions(max_keypoints=2000))
+    session = session_of(made)
+    for photograph in photographs:
+        rgb = load_image(photograph)
+        xy, values = session.run(OUTPUTS, {"image": planes_of(rgb)})
+        check_keypoints(xy[0], values[0], best(rgb, 2000), 2000)
+
+
+def same_share(xy: np.ndarray, values: np.ndarray, expected: Keypoints) -> float:
+    """Return the share of keypoints that another runtime finds within a hundredth of a pixel."""
+    assert np.isfinite(values).sum() == len(expected)
+    assert (np.diff(values[np.isfinite(values)]) <= 0).all()
+    found = xy[np.isfinite(values)]
+    gaps = np.linalg.norm(found[:, None] - expected.xy, axis=2)
+    return float(np.mean(gaps.min(0) < 0.01))
+
+
+def test_openvino(path: Path, photo: np.ndarray) -> None:
+    openvino = pytest.importorskip("openvino", reason="needs OpenVINO")
+    settings = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": 1}
+    model = openvino.Core().compile_model(str(path), "CPU", settings)
+    for height, width in SIZES:
+        images = [photo[:height, :width], photo[40 : 40 + height, 30 : 30 + width]]
+        found = model([planes_of(*images)])
+        for k, rgb in enumerate(images):
+            shares = same_share(found["keypoints"][k], found["keypoint_logits"][k], best(rgb))
+            assert shares > 0.99
+
+
+@pytest.mark.skipif(cv2.__version__ < "5", reason="needs the new engine of OpenCV 5")
+def test_opencv_5(path: Path, photo: np.ndarray) -> None:
+    network = cv2.dnn.readNetFromONNX(str(path), cv2.dnn.ENGINE_NEW)
+    for height, width in SIZES:
+        images = [photo[:height, :width], photo[40 : 40 + height, 30 : 30 + width]]
+        network.setInput(planes_of(*images))
+        *_, xy, values = network.forward(["probability", "logits", *OUTPUTS])
+        for k, rgb in enumerate(images):
+            assert same_share(xy[k], values[k], best(rgb)) > 0.99
+
+
+@pytest.fixture(scope="module")
+def keypoints_of() -> Any:
+    """What finds the keypoints of any (B, 1, H, W) logits, and what `select_keypoints` finds."""
+    from onnx import TensorProto, helper
+
+    def find(logits: np.ndarray, count: int) -> tuple[list[np.ndarray], list[Keypoints]]:
+        sides = ("batch", 1, "height", "width")
+        graph = helper.make_graph(
+            [helper.make_node("Identity", ["image"], ["logits"])],
+            "identity",
+            [helper.make_tensor_value_info("image", TensorProto.FLOAT, sides)],
+            [helper.make_tensor_value_info("logits", TensorProto.FLOAT, sides)],
+        )
+        opset = helper.make_opsetid("", 17)
+        model = helper.make_model(graph, opset_imports=[opset], ir_version=8)
+        add_keypoints(model, count)
+        found = session_of(model.SerializeToString()).run(OUTPUTS, {"image": logits})
+        return found, [
+            select_keypoints(sigmoid(each), logits=each, max_keypoints=count)
+            for each in logits[:, 0]
+        ]
+
+    return find
+
+
+def sorted_rows(xy: np.ndarray) -> np.ndarray:
+    return xy[np.lexsort(xy.T)]
+
+
+@pytest.mark.parametrize(
+    "size", [(1, 1), (1, 7), (2, 2), (5, 1), (24, 31), pytest.param((3, 5000), id="wide")]
+)
+def test_any_logits(size: tuple[int, int], keypoints_of: Any) -> None:
+    """Also of images too small for `detect`, at the border, and with equal neighbours."""
+    generator = np.random.default_rng(0)
+    for step in (1e-6, 0.5, 2):  # of the logits: the last ones have plateaus
+        logits = generator.normal(1, 2, (3, 1, *size))
+        logits = (np.round(logits / step) * step).astype(np.float32)
+        found, expected = keypoints_of(logits, 4000)
+        for xy, values, keypoints in zip(*found, expected, strict=True):
+            kept = np.isfinite(values)
+            assert kept.sum() == len(keypoints)
+            np.testing.assert_array_equal(values[kept], -np.sort(-keypoints.logits))
+            np.testing.assert_allclose(
+                sorted_rows(xy[kept]), sorted_rows(keypoints.xy), atol=2e-6 * max(size)
+            )
+
+
+def test_of_equal_ones_at_the_last_place_any_are_kept(keypoints_of: Any) -> None:
+    logits = np.full((1, 1, 12, 12), -1, np.float32)
+    logits[0, 0, ::3, ::3] = 2
+    logits[0, 0, 6, 6] = 3
+    (xy, values), (expected,) = keypoints_of(logits, 4)
+    np.testing.assert_array_equal(values, [[3, 2, 2, 2]])
+    assert len(expected) == 4
+    assert xy[0, 0].tolist() == [6, 6]
+    assert (logits[0, 0][xy[0].astype(int)[:, 1], xy[0].astype(int)[:, 0]] == values[0]).all()
+    assert len(np.unique(xy[0], axis=0)) == 4
+
+
+def test_metadata(path: Path) -> None:
+    found = session_of(path).get_modelmeta().custom_metadata_map
+    assert found["max_keypoints"] == str(COUNT)
+    assert "max_keypoints" not in read_metadata(onnx.load(pretrained_weights()))
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+def test_the_package_reads_the_maps_of_such_a_file(
+    backend: str, path: Path, photo: np.ndarray
+) -> None:
+    if backend == "openvino":
+        pytest.importorskip("openvino", reason="needs OpenVINO")
+    rgb = photo[:123, :157]
+    found, expected = (
+        DeepDetect(weights, backend=backend, threads=1).heatmap_and_logits(rgb)
+        for weights in (path, "default")
+    )
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-4)
+
+
+def test_such_a_file_runs_in_tiles(path: Path, photo: np.ndarray) -> None:
+    from deepdetect.detector.tiling import open_tiled
+
+    found, expected = (
+        open_tiled(weights, threads=1)(photo[:64, :200], tile_megapixels=0.05)
+        for weights in (path, pretrained_weights())
+    )
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_a_file_is_made_of_such_a_file(path: Path, tmp_path: Path) -> None:
+    metadata = write_onnx(path, tmp_path / "maps.onnx")
+    assert "max_keypoints" not in metadata
+    assert onnx.load(tmp_path / "maps.onnx").graph == onnx.load(pretrained_weights()).graph
+    write_onnx(path, tmp_path / "fewer.onnx", OnnxOptions(max_keypoints=7))
+    write_onnx("default", tmp_path / "expected.onnx", OnnxOptions(max_keypoints=7))
+    assert (tmp_path / "fewer.onnx").read_bytes() == (tmp_path / "expected.onnx").read_bytes()
+
+
+@pytest.mark.parametrize("count", [0, -3, 100_001, 1.5, "many", float("nan")])
+def test_the_number_is_checked(count: Any) -> None:
+    with pytest.raises(OptionError, match="`max_keypoints` must"):
+        OnnxOptions(max_keypoints=count)
