@@ -1,4 +1,4 @@
-"""What the variants of the ONNX file cost and give: precisions, runtimes, batch normalisation.
+"""What variants of the ONNX file cost and give: precisions, runtimes, keypoints, normalisation.
 
     python benchmarks/onnx_variants.py SAMPLES [IMAGES] [--weights default] [--rounds 21]
 
@@ -14,7 +14,7 @@ import argparse
 import importlib.util
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +34,7 @@ from deepdetect.detector.network.onnx_graph import (
     PROBABILITY,
     STRIDE,
 )
+from deepdetect.detector.network.onnx_keypoints import KEYPOINT_LOGITS, KEYPOINTS
 from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx
 from deepdetect.evaluation.protocols.masks import sample_images, score_samples
 from deepdetect.evaluation.report import Cell, Column, Table
@@ -44,8 +45,15 @@ PARITY_SIZES = ((480, 640, 1), (500, 741, 1), (481, 333, 1), (17, 23, 1), (64, 9
 """Heights, widths and batches: multiples of the stride, and none."""
 
 Precision = Literal["float32", "bfloat16"]
-Maps = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Maps (B, 3, H, W) float32 in [0, 1] to logits and probabilities, (B, 1, H, W)."""
+Maps = Callable[[np.ndarray], Sequence[np.ndarray]]
+"""Maps (B, 3, H, W) float32 in [0, 1] to logits and probabilities, (B, 1, H, W), or to others."""
+
+MAPS = (LOGITS, PROBABILITY)
+ALL_OUTPUTS = (*MAPS, KEYPOINTS, KEYPOINT_LOGITS)
+KEYPOINT_COUNTS = (100, 1000, 10_000)
+
+SAME_PX = 1e-3
+"""Of a keypoint from the package's, where they count as the same."""
 
 
 def main() -> None:
@@ -74,7 +82,8 @@ def main() -> None:
         image = load_image(samples[0])
         table = normalisation_table(files["fp32"], unfolded, image, arguments.rounds)
         print(table.to_markdown() + "\n")
-        print(parity_table(files["fp32"], folder, image).to_markdown())
+        print(parity_table(files["fp32"], folder, image).to_markdown() + "\n")
+        print(keypoint_table(files["fp32"], folder, samples, arguments.rounds).to_markdown())
 
 
 def precision_table(files: Mapping[str, Path], samples: list[Path], rounds: int) -> Table:
@@ -207,6 +216,47 @@ def runtimes(path: Path, folder: Path) -> Iterator[tuple[str, list[Maps]]]:
         yield f"{opencv}{name}, one size", runs
 
 
+def keypoint_table(path: Path, folder: Path, samples: list[Path], rounds: int) -> Table:
+    """Compare files that give keypoints with the package, and their time with a file of maps."""
+    makers: dict[str, Callable[[Path, Sequence[str]], Maps]] = {"ONNX Runtime": in_onnxruntime}
+    if importlib.util.find_spec("openvino") is not None:
+        makers["OpenVINO"] = in_openvino
+    if cv2.__version__ >= "5":
+        makers[f"OpenCV {cv2.__version__}"] = lambda file, names: in_opencv(
+            file, cv2.dnn.ENGINE_NEW, names=names
+        )
+    images = [load_image(sample) for sample in samples]
+    timed = planes_of(images[0], *TIMED_SIZE, 1)
+    detector = one_thread(path, "onnxruntime")
+    rows: list[tuple[Cell, ...]] = []
+    for count in KEYPOINT_COUNTS:
+        file = folder / f"keypoints-{count}.onnx"
+        write_onnx(path, file, OnnxOptions(max_keypoints=count))
+        expected = [
+            detector.detect(image, max_keypoints=count, mode="dense").xy for image in images
+        ]
+        for name, make in makers.items():
+            run = make(file, ALL_OUTPUTS)
+            found = [run(planes_of(image, *image.shape[:2], 1))[2][0] for image in images]
+            pairs = zip(found, expected, strict=True)
+            same = np.concatenate([are_near(xy, keypoints) for xy, keypoints in pairs])
+            ratio = time_ratio(make(path, MAPS), run, timed, rounds)
+            rows.append((name, count, float(np.mean(same)), ratio))
+        if count == KEYPOINT_COUNTS[1]:
+            unread = time_ratio(in_onnxruntime(path), in_onnxruntime(file), timed, rounds)
+            rows.append(("ONNX Runtime, asked for maps", count, float("nan"), unread))
+    columns = (Column("runtime"), Column("keypoints", ","), Column("the package's", ".4%"))
+    return Table("keypoints", "Keypoints", (*columns, Column("time", ".3f")), tuple(rows))
+
+
+def are_near(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """Return which of the expected positions are found, as rows of the file in any order."""
+    if not len(expected):
+        return np.empty(0, bool)
+    squared = cv2.batchDistance(expected, found, cv2.CV_32F, normType=cv2.NORM_L2SQR, K=1)[0]
+    return squared[:, 0] < SAME_PX**2
+
+
 def onnxruntime_session(model: Path | bytes) -> Any:
     """Open a file, or the content of one, on one thread."""
     onnxruntime = import_onnxruntime()
@@ -216,31 +266,31 @@ def onnxruntime_session(model: Path | bytes) -> Any:
     return onnxruntime.InferenceSession(given, settings, providers=["CPUExecutionProvider"])
 
 
-def in_onnxruntime(path: Path) -> Maps:
+def in_onnxruntime(path: Path, names: Sequence[str] = MAPS) -> Maps:
     """Open a file in ONNX Runtime."""
     session = onnxruntime_session(path)
-    return lambda planes: session.run([LOGITS, PROBABILITY], {IMAGE: planes})
+    return lambda planes: session.run(names, {IMAGE: planes})
 
 
-def in_openvino(path: Path) -> Maps:
+def in_openvino(path: Path, names: Sequence[str] = MAPS) -> Maps:
     """Open a file in OpenVINO, in float32."""
     settings = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": 1}
     model = import_openvino().Core().compile_model(str(path), "CPU", settings)
 
-    def run(planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def run(planes: np.ndarray) -> list[np.ndarray]:
         found = model([planes])
-        return found[LOGITS].copy(), found[PROBABILITY].copy()
+        return [found[name].copy() for name in names]
 
     return run
 
 
-def in_opencv(path: Path, *engine: int) -> Maps:
-    """Open a file in OpenCV, in version 5 by one of its engines."""
+def in_opencv(path: Path, *engine: int, names: Sequence[str] = MAPS) -> Maps:
+    """Open a file in OpenCV, in version 5 by one of its engines; all outputs must be named."""
     network = cv2.dnn.readNetFromONNX(str(path), *engine)
 
-    def run(planes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def run(planes: np.ndarray) -> Sequence[np.ndarray]:
         network.setInput(planes)
-        return network.forward([LOGITS, PROBABILITY])
+        return network.forward(names)
 
     return run
 

@@ -83,6 +83,21 @@ def test_parity(
         assert probability < 2e-4
 
 
+def test_keypoints(
+    script: ModuleType, samples: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(script, "KEYPOINT_COUNTS", (20, 300))
+    monkeypatch.setattr(script, "TIMED_SIZE", (64, 96))
+    rows = script.keypoint_table(pretrained_weights(), tmp_path, samples, rounds=1).rows
+    names = [(name, count) for name, count, *_ in rows]
+    assert names[0] == ("ONNX Runtime", 20)
+    assert names[-1] == ("ONNX Runtime, asked for maps", 300)
+    for name, _, same, ratio in rows:
+        assert ratio > 0
+        assert "asked" in name or same > 0.99
+    assert script.are_near(np.zeros((3, 2), np.float32), np.eye(2, dtype=np.float32)).sum() == 0
+
+
 def test_planes(script: ModuleType, photo: np.ndarray) -> None:
     planes = script.planes_of(photo, *photo.shape[:2], 2)
     assert planes.dtype == np.float32
