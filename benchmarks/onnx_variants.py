@@ -242,7 +242,7 @@ def keypoint_table(path: Path, folder: Path, samples: list[Path], rounds: int) -
             same = np.concatenate([are_near(xy, keypoints) for xy, keypoints in pairs])
             ratio = time_ratio(make(path, MAPS), run, timed, rounds)
             rows.append((name, count, float(np.mean(same)), ratio))
-        if count == KEYPOINT_COUNTS[1]:
+        if count == KEYPOINT_COUNTS[len(KEYPOINT_COUNTS) // 2]:
             unread = time_ratio(in_onnxruntime(path), in_onnxruntime(file), timed, rounds)
             rows.append(("ONNX Runtime, asked for maps", count, float("nan"), unread))
     columns = (Column("runtime"), Column("keypoints", ","), Column("the package's", ".4%"))

@@ -262,6 +262,23 @@ def test_of_equal_ones_at_the_last_place_any_are_kept(keypoints_of: Any) -> None
     assert len(np.unique(xy[0], axis=0)) == 4
 
 
+@pytest.mark.parametrize("grey", [0, 128, 255])
+def test_a_constant_image_has_weak_ones(grey: int, path: Path) -> None:
+    """The package gives none; the file gives what the network says."""
+    rgb = np.full((100, 130, 3), grey, np.uint8)
+    assert len(best(rgb)) == 0
+    (values,) = session_of(path).run(["keypoint_logits"], {"image": planes_of(rgb)})
+    assert np.isfinite(values).any()
+    assert values.max() < 6
+
+
+@pytest.mark.skipif(cv2.__version__ < "5", reason="its message is of OpenCV 5")
+def test_the_classic_engine_refuses_them(tmp_path: Path) -> None:
+    write_onnx("default", tmp_path / "one.onnx", OnnxOptions((64, 96), max_keypoints=20))
+    with pytest.raises(cv2.error, match="Pad"):
+        cv2.dnn.readNetFromONNX(str(tmp_path / "one.onnx"), cv2.dnn.ENGINE_CLASSIC)
+
+
 def test_metadata(path: Path) -> None:
     found = session_of(path).get_modelmeta().custom_metadata_map
     assert found["max_keypoints"] == str(COUNT)
