@@ -22,6 +22,9 @@ from ..matching.guided import InitialMatches, initial_matches
 from ..matching.guided.options import InitialGeometryOptions
 from .checks import StaticOptions, is_planar, is_static
 
+SAMPLES_AT_ONCE = 100
+"""Of three matches whose rows are computed together, which bounds the memory."""
+
 
 @suggest_keywords
 @dataclass(frozen=True)
@@ -318,18 +321,20 @@ def _best_other_rows(
     if len(points0) < 3:
         return best
     design = np.column_stack([points0 / max(size), np.ones(len(points0))])
-    generator = np.random.default_rng(seed)
 
-    def agreeing(plane: np.ndarray) -> np.ndarray:
-        return np.abs(design @ plane - shift) <= options.max_row_distance_px
+    def agreeing(planes: np.ndarray) -> np.ndarray:
+        agree: np.ndarray = np.abs(planes @ design.T - shift) <= options.max_row_distance_px
+        return agree
 
-    for _ in range(options.iterations):
-        sample = generator.integers(0, len(points0), 3)
-        if abs(np.linalg.det(design[sample])) < 1e-4:
-            continue
-        agree = agreeing(np.linalg.solve(design[sample], shift[sample]))
-        if np.count_nonzero(agree) > np.count_nonzero(best):
-            best = agree
+    samples = np.random.default_rng(seed).integers(0, len(points0), (options.iterations, 3))
+    samples = samples[np.abs(np.linalg.det(design[samples])) >= 1e-4]
+    for start in range(0, len(samples), SAMPLES_AT_ONCE):
+        chosen = samples[start : start + SAMPLES_AT_ONCE]
+        planes = np.linalg.solve(design[chosen], shift[chosen][..., None])[..., 0]
+        agree = agreeing(planes)
+        counts = np.count_nonzero(agree, axis=1)
+        if counts.max() > np.count_nonzero(best):
+            best = agree[np.argmax(counts)]
     if np.count_nonzero(best) >= 3:
         agree = agreeing(np.linalg.lstsq(design[best], shift[best], rcond=None)[0])
         if np.count_nonzero(agree) > np.count_nonzero(best):
