@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, ImageError, Keypoints, OptionError
+from deepdetect import DeepDetect, DeepDetectError, ImageError, Keypoints, OptionError
+from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.features.selection import SelectionOptions, select_keypoints
 
 
@@ -66,6 +67,106 @@ def test_heat_maps_of_a_list(detector: DeepDetect, images: list[np.ndarray]) -> 
         one, expected = detector.detect(image, return_heatmap=True)
         assert map_.tobytes() == other.tobytes() == expected.tobytes()
         same(points, one)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino", "torch"])
+@pytest.mark.parametrize("tta", ["none", "flip"])
+def test_images_of_one_size_are_run_together(photo: np.ndarray, backend: str, tta: Any) -> None:
+    pytest.importorskip(backend)
+    weights = "default" if backend != "torch" else pretrained_weights().with_suffix(".safetensors")
+    detector = DeepDetect(weights, backend=backend, tta=tta)
+    shapes = count_runs(detector)
+    pieces = [photo[y : y + 61, y : y + 83] for y in (0, 30, 60, 90, 120)]
+    pieces[3] = np.full_like(pieces[3], 90)  # constant: the network is not run for it
+    alone = [detector.heatmap(piece) for piece in pieces]
+    shapes.clear()
+    maps = detector.heatmap(pieces, batch_size=3)
+    sizes = [(64, 88)] if tta == "none" else [(64, 88), (88, 64)]
+    assert {shape[2:] for shape in shapes} == set(sizes)
+    assert [shape[0] for shape in shapes] == ([3, 1] if tta == "none" else [3] * 8 + [1] * 8)
+    for map_, other in zip(maps, alone, strict=True):
+        np.testing.assert_allclose(map_, other, atol=1e-4)
+    assert not maps[3].any()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"max_keypoints": 50}, {"max_keypoints": 50, "mode": "dense"}, {"density": 0.1}],
+    ids=str,
+)
+@pytest.mark.parametrize("return_heatmap", [False, True])
+def test_together_they_give_what_they_give_alone(
+    detector: DeepDetect, photo: np.ndarray, options: dict[str, Any], return_heatmap: bool
+) -> None:
+    pieces = [photo[k : k + 72, k : k + 104] for k in (0, 10, 20)]
+    pieces.insert(1, photo[:40, :56])
+    together = detector.detect(pieces, batch_size=8, return_heatmap=return_heatmap, **options)
+    alone = detector.detect(pieces, return_heatmap=return_heatmap, **options)
+    if return_heatmap:
+        (together, maps), (alone, others) = together, alone
+        for map_, other in zip(maps, others, strict=True):
+            np.testing.assert_allclose(map_, other, atol=1e-5)
+    for found, expected in zip(together, alone, strict=True):
+        assert found.image_size == expected.image_size
+        assert len(set(map(tuple, found.xy.round(2))) ^ set(map(tuple, expected.xy.round(2)))) <= 2
+
+
+def test_sizes_agree_where_the_network_sees_them(photo: np.ndarray) -> None:
+    """Squashed to a square, images of all sizes are run together; others only in their turn."""
+    pieces = [photo[:80, :96], photo[:70, :110], photo[:80, :96]]
+    for resolution, runs in ((64, [3]), ("native", [1, 1, 1])):
+        detector = DeepDetect(backend="onnxruntime", resolution=resolution)
+        shapes = count_runs(detector)
+        maps = detector.heatmap(pieces, batch_size=4)
+        assert [shape[0] for shape in shapes] == runs
+        assert [map_.shape for map_ in maps] == [piece.shape[:2] for piece in pieces]
+        np.testing.assert_allclose(maps[1], detector.heatmap(pieces[1]), atol=1e-5)
+
+
+def test_one_by_one_unless_asked(detector: DeepDetect, images: list[np.ndarray]) -> None:
+    own = DeepDetect(backend="onnxruntime")
+    shapes = count_runs(own)
+    own.detect([images[0]] * 3)
+    assert [shape[0] for shape in shapes] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("size", [0, -1, 1.5, "8"])
+def test_a_batch_size_is_a_number(detector: DeepDetect, size: Any, one_line) -> None:
+    for call in (detector.detect, detector.heatmap):
+        with pytest.raises(OptionError, match="`batch_size` must be") as caught:
+            call([], batch_size=size)
+        one_line(caught.value)
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+def test_a_network_for_one_image_names_the_way_out(
+    photo: np.ndarray, backend: str, tmp_path: Path, one_line
+) -> None:
+    pytest.importorskip(backend)
+    onnx = pytest.importorskip("onnx", reason="needs onnx to change a network")
+    model = onnx.load_model(str(pretrained_weights()))
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
+    onnx.save_model(model, str(tmp_path / "one.onnx"))
+    detector = DeepDetect(tmp_path / "one.onnx", backend=backend)
+    pair = [photo[:64, :64], photo[64:128, :64]]
+    assert len(detector.heatmap(pair)) == 2
+    with pytest.raises(DeepDetectError, match=r"2 images of 64x64 .*`batch_size=1`") as caught:
+        detector.heatmap(pair, batch_size=2)
+    one_line(caught.value)
+    assert len(detector.heatmap(pair)) == 2
+
+
+def count_runs(detector: DeepDetect) -> list[tuple[int, ...]]:
+    """Let a detector write down the shape of each array that its network is given."""
+    shapes: list[tuple[int, ...]] = []
+    network = detector._network
+
+    def counted(planes: np.ndarray) -> np.ndarray:
+        shapes.append(planes.shape)
+        return network(planes)
+
+    detector._network = counted
+    return shapes
 
 
 def test_files_and_arrays_may_be_mixed(

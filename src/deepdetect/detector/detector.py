@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, overload
@@ -18,8 +19,21 @@ from ..features.maps import Maps
 from ..features.selection import SelectionOptions, select_from_maps, select_keypoints
 from ..io.image import load_image
 from .backends import RuntimeOptions, open_network
-from .heatmap import HeatmapOptions, compute_heatmap_and_logits, compute_maps
-from .image_lists import Images, for_each_image, ignore_masks, image_list
+from .heatmap import (
+    HeatmapOptions,
+    compute_heatmap_and_logits,
+    compute_maps,
+    compute_maps_of_batch,
+    seen_size,
+)
+from .image_lists import (
+    Images,
+    batches,
+    check_batch_size,
+    ignore_masks,
+    image_list,
+    image_named,
+)
 from .image_points import find_points, memory_named
 from .pretrained import RANKER, resolve_weights
 
@@ -134,13 +148,19 @@ class DeepDetect:
         return other
 
     @overload
-    def heatmap(self, image: Images, *, channels: Channels = ...) -> list[np.ndarray]: ...
+    def heatmap(
+        self, image: Images, *, channels: Channels = ..., batch_size: int = ...
+    ) -> list[np.ndarray]: ...
 
     @overload
-    def heatmap(self, image: Any, *, channels: Channels = ...) -> np.ndarray: ...
+    def heatmap(
+        self, image: Any, *, channels: Channels = ..., batch_size: int = ...
+    ) -> np.ndarray: ...
 
     @suggest_keywords
-    def heatmap(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray | list[np.ndarray]:
+    def heatmap(
+        self, image: Any, *, channels: Channels = "rgb", batch_size: int = 1
+    ) -> np.ndarray | list[np.ndarray]:
         """Compute the probability of a keypoint at each pixel.
 
         Args:
@@ -149,6 +169,9 @@ class DeepDetect:
                 tuple or a batch of four dimensions; their sizes may differ.
             channels: the order of the colours in arrays and tensors: "bgr" for the images of
                 `cv2.imread`.
+            batch_size: of several images, the network is run once for up to so many that follow
+                each other and that it sees at one size. It pays for small images and on graphics
+                cards; on processors larger images take as long, and the memory of all of them.
 
         Returns:
             (H, W) float32 in [0, 1], at the image's own size; of several images a list, in their
@@ -156,10 +179,13 @@ class DeepDetect:
 
         Raises:
             ImageError: an image cannot be read or is not fit.
+            OptionError: the batch size is out of its range.
         """
-        return for_each_image(
-            image, lambda one, _: self.heatmap_and_logits(one, channels=channels)[0]
-        )
+        check_batch_size(batch_size)
+        images = image_list(image)
+        if images is None:
+            return self.heatmap_and_logits(image, channels=channels)[0]
+        return [maps.both()[0] for _, _, maps in self._run_each(images, channels, batch_size)]
 
     @suggest_keywords
     def heatmap_and_logits(
@@ -225,6 +251,7 @@ class DeepDetect:
         mode: Literal["auto", "dense", "points"] = ...,
         spread: Literal["none", "grid", "anms"] = ...,
         channels: Channels = ...,
+        batch_size: int = ...,
         return_heatmap: Literal[False] = ...,
     ) -> list[Keypoints]: ...
 
@@ -242,6 +269,7 @@ class DeepDetect:
         mode: Literal["auto", "dense", "points"] = ...,
         spread: Literal["none", "grid", "anms"] = ...,
         channels: Channels = ...,
+        batch_size: int = ...,
         return_heatmap: Literal[True],
     ) -> tuple[list[Keypoints], list[np.ndarray]]: ...
 
@@ -259,6 +287,7 @@ class DeepDetect:
         mode: Literal["auto", "dense", "points"] = ...,
         spread: Literal["none", "grid", "anms"] = ...,
         channels: Channels = ...,
+        batch_size: int = ...,
         return_heatmap: Literal[False] = ...,
     ) -> Keypoints: ...
 
@@ -276,6 +305,7 @@ class DeepDetect:
         mode: Literal["auto", "dense", "points"] = ...,
         spread: Literal["none", "grid", "anms"] = ...,
         channels: Channels = ...,
+        batch_size: int = ...,
         return_heatmap: Literal[True],
     ) -> tuple[Keypoints, np.ndarray]: ...
 
@@ -293,6 +323,7 @@ class DeepDetect:
         mode: Literal["auto", "dense", "points"] = "auto",
         spread: Literal["none", "grid", "anms"] = "none",
         channels: Channels = "rgb",
+        batch_size: int = 1,
         return_heatmap: bool = False,
     ) -> Any:
         """Detect keypoints.
@@ -317,14 +348,13 @@ class DeepDetect:
                 threshold, density, nms_radius and subpixel is given, else dense.
             spread: of points: "none", "grid" (in turn the best of each cell), or "anms" (as far
                 from each other as their number allows).
-            channels: the order of the colours in arrays and tensors, as of `heatmap`.
+            channels, batch_size: as of `heatmap`.
             return_heatmap: return the heat map, too.
 
         Returns:
             The keypoints; with `return_heatmap`, the keypoints and the (H, W) float32 heat map. Of
             several images a list in their order, with `return_heatmap` two lists: the same as one
-            by one. The network sees one image at a time: a batch of photographs is no faster on a
-            processor, takes the memory of all, and its last bits may differ.
+            by one, but for the last bits of those that were run together.
             Dense keypoints come in the order of rows and columns, on pixel centres unless
             `subpixel`; points come best first, with sub-pixel positions and sizes.
 
@@ -335,21 +365,32 @@ class DeepDetect:
         options = SelectionOptions(
             threshold, density, max_keypoints, nms_radius, subpixel, None, mode, spread
         )
+        check_batch_size(batch_size)
         images = image_list(image)
         masks = ignore_masks(ignore, None if images is None else len(images))
-
-        def find(one: Any, number: int) -> tuple[Keypoints, np.ndarray | None]:
-            chosen = replace(options, ignore=masks[number])
-            return self._find(load_image(one, channels=channels), chosen, return_heatmap)
-
         if images is None:
-            keypoints, heatmap = find(image, 0)
+            chosen = replace(options, ignore=masks[0])
+            keypoints, heatmap = self._find(
+                load_image(image, channels=channels), chosen, return_heatmap
+            )
             return (keypoints, heatmap) if return_heatmap else keypoints
-        found = for_each_image(images, find)
-        all_keypoints = [keypoints for keypoints, _ in found]
-        return (
-            (all_keypoints, [heatmap for _, heatmap in found]) if return_heatmap else all_keypoints
-        )
+        found, heatmaps = [], []
+        if options.uses_points and not return_heatmap:  # the network is not run
+            for number, rgb in _load_each(images, channels):
+                with image_named(number):
+                    found.append(self._points(rgb, replace(options, ignore=masks[number])))
+            return found
+        for number, rgb, maps in self._run_each(images, channels, batch_size):
+            chosen = replace(options, ignore=masks[number])
+            with image_named(number), memory_named(rgb.shape):
+                if options.uses_points:
+                    keypoints, heatmap = self._points(rgb, chosen), maps.both()[0]
+                else:
+                    del rgb  # the keypoints need the room
+                    keypoints, heatmap = _select(maps, chosen, return_heatmap)
+            found.append(keypoints)
+            heatmaps.append(heatmap)
+        return (found, heatmaps) if return_heatmap else found
 
     def _find(
         self, rgb: np.ndarray, options: SelectionOptions, return_heatmap: bool
@@ -358,12 +399,43 @@ class DeepDetect:
         if options.uses_points:
             return self._points(rgb, options), self._run(rgb)[0] if return_heatmap else None
         with memory_named(rgb.shape):
-            if return_heatmap:
-                heatmap, logits = self._run(rgb)
-                return select_keypoints(heatmap, options, logits), heatmap
             maps = self._maps(rgb)
-            del rgb  # the keypoints need the room
-            return select_from_maps(maps, options), None
+            del rgb  # as above
+            return _select(maps, options, return_heatmap)
+
+    def _run_each(
+        self, images: list[Any], channels: Channels, batch_size: int
+    ) -> Iterator[tuple[int, np.ndarray, Maps]]:
+        """Load images and run the network; yield the place of each, itself and its maps."""
+        options = self.heatmap_options
+
+        def size(loaded: tuple[int, np.ndarray]) -> tuple[int, int]:
+            return seen_size(loaded[1].shape, options)
+
+        for batch in batches(_load_each(images, channels), size, batch_size):
+            with image_named(batch[0][0]), memory_named(batch[0][1].shape, len(batch)):
+                maps = compute_maps_of_batch([rgb for _, rgb in batch], self._network, options)
+            while batch:
+                yield (*batch.pop(0), maps.pop(0))
+
+
+def _load_each(images: list[Any], channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
+    """Load images when they are asked for, each with its place in the list."""
+    for number, image in enumerate(images):
+        with image_named(number):
+            loaded = number, load_image(image, channels=channels)
+        yield loaded
+        del loaded
+
+
+def _select(
+    maps: Maps, options: SelectionOptions, return_heatmap: bool
+) -> tuple[Keypoints, np.ndarray | None]:
+    """Select dense keypoints, and make the whole heat map where it is asked for."""
+    if not return_heatmap:
+        return select_from_maps(maps, options), None
+    heatmap, logits = maps.both()
+    return select_keypoints(heatmap, options, logits), heatmap
 
 
 def find_keypoints(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -114,12 +114,7 @@ def compute_heatmap_and_logits(
         The heat map, and the (H, W) float32 logits of its probabilities. Float32 rounds the
         highest probabilities to 1; logits still distinguish them, so keypoints are ranked by them.
     """
-    maps = compute_maps(rgb, network, options)
-    heatmap, rows_of = np.empty(maps.shape, np.float32), maps.heatmap()
-    for rows in bands(maps.shape):
-        heatmap[rows] = rows_of(rows)
-    del rows_of  # it may hold another map
-    return heatmap, maps.logits()
+    return compute_maps(rgb, network, options).both()
 
 
 def compute_maps(
@@ -131,62 +126,93 @@ def compute_maps(
         The heat map and its logits. Where the network sees a smaller image, only what it
         says of that is kept, and enlarged when a map is asked for.
     """
-    height, width = rgb.shape[:2]
-    if _is_native(rgb, options):
-        return Maps.of_logits(_native_logits(rgb, network, options))
-    if options.tile_megapixels != "auto":
-        raise OptionError("`tile_megapixels` needs `resolution='native'`: scaled images are small")
-    if _is_constant(rgb):
-        return Maps.of_logits(np.full((height, width), -np.inf, np.float32))
-    shown = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
-    shown = np.ascontiguousarray(shown)
-    if options.resolution == "auto":
-        scale = (MAX_AUTO_PIXELS / (height * width)) ** 0.5
-        size = [max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (width, height)]
-        small = cv2.resize(shown, size, interpolation=cv2.INTER_AREA)
-    else:
-        side = int(options.resolution)
-        small = cv2.resize(shown, (side, side), interpolation=cv2.INTER_CUBIC)
-    logits = _mean_of_flips(partial(_run, network), small, options)
-    if height * width > RELEASE_PIXELS and hasattr(network, "release_memory"):
-        network.release_memory()
-        release_freed_memory()
+    return compute_maps_of_batch([rgb], network, options)[0]
+
+
+def compute_maps_of_batch(
+    images: Sequence[np.ndarray], network: Network, options: HeatmapOptions = HeatmapOptions()
+) -> list[Maps]:
+    """Run the network once on several images.
+
+    Args:
+        images: (H, W, 3) uint8 RGB each, of which `seen_size` is the same.
+        network, options: as of `compute_heatmap`.
+
+    Returns:
+        As `compute_maps`, of each image. Of images run together the last bits may be others.
+    """
+    maps: list[Maps | None] = [None] * len(images)
+    together = []
+    for number, rgb in enumerate(images):
+        native = _is_native(rgb.shape, options)
+        if not native and options.tile_megapixels != "auto":
+            raise OptionError(
+                "`tile_megapixels` needs `resolution='native'`: scaled images are small"
+            )
+        if _is_constant(rgb):
+            maps[number] = Maps.of_logits(np.full(rgb.shape[:2], -np.inf, np.float32))
+            continue
+        seen = _seen(rgb, options)
+        tiled = _tiled(network, rgb.shape[0] * rgb.shape[1], options) if native else None
+        if tiled is None:
+            together.append((number, seen))
+            continue
+        (logits,) = _mean_of_flips(partial(_run_tiled, tiled, options), [seen], options)
+        maps[number] = Maps.of_logits(logits)
+    if together:
+        found = _mean_of_flips(partial(_run, network), [seen for _, seen in together], options)
+        largest = max(images[number].shape[0] * images[number].shape[1] for number, _ in together)
+        scaled = not _is_native(images[together[0][0]].shape, options)
+        if scaled and largest > RELEASE_PIXELS and hasattr(network, "release_memory"):
+            network.release_memory()
+            release_freed_memory()
+        for (number, _), logits in zip(together, found, strict=True):
+            shape = images[number].shape[:2]
+            native = _is_native(shape, options)
+            maps[number] = Maps.of_logits(logits) if native else _enlarged(logits, shape)
+    return [one for one in maps if one is not None]
+
+
+def seen_size(shape: tuple[int, ...], options: HeatmapOptions) -> tuple[int, int]:
+    """Return the width and height at which the network sees an image of a shape (H, W, ...)."""
+    height, width = shape[:2]
+    if _is_native(shape, options):
+        return width, height
+    if options.resolution != "auto":
+        return int(options.resolution), int(options.resolution)
+    scale = (MAX_AUTO_PIXELS / (height * width)) ** 0.5
+    width, height = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (width, height))
+    return width, height
+
+
+def _is_native(shape: tuple[int, ...], options: HeatmapOptions) -> bool:
+    """Return whether the network sees an image at its own size."""
+    whole = shape[0] * shape[1] <= MAX_AUTO_PIXELS
+    return options.resolution == "native" or (options.resolution == "auto" and whole)
+
+
+def _seen(rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
+    """Return an image with the size and the order of channels that the network sees."""
+    seen = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
+    if _is_native(rgb.shape, options):
+        return seen
+    kind = cv2.INTER_AREA if options.resolution == "auto" else cv2.INTER_CUBIC
+    size = seen_size(rgb.shape, options)
+    scaled: np.ndarray = cv2.resize(np.ascontiguousarray(seen), size, interpolation=kind)
+    return scaled
+
+
+def _enlarged(logits: np.ndarray, shape: tuple[int, ...]) -> Maps:
+    """Return the maps of an image of a shape (H, W), of the logits of a scaled one."""
 
     def enlarged(map_: np.ndarray) -> np.ndarray:
-        return cv2.resize(map_, (width, height), interpolation=cv2.INTER_CUBIC)
+        return cv2.resize(map_, shape[::-1], interpolation=cv2.INTER_CUBIC)
 
     def heatmap() -> Rows:
         map_ = enlarged(sigmoid(logits))
         return lambda rows: np.clip(map_[rows], 0, 1)
 
-    return Maps((height, width), heatmap, lambda: enlarged(logits))
-
-
-def _is_native(rgb: np.ndarray, options: HeatmapOptions) -> bool:
-    """Return whether the network sees an image at its own size."""
-    whole = rgb.shape[0] * rgb.shape[1] <= MAX_AUTO_PIXELS
-    return options.resolution == "native" or (options.resolution == "auto" and whole)
-
-
-def _native_logits(rgb: np.ndarray, network: Network, options: HeatmapOptions) -> np.ndarray:
-    """Run the network on an image at its own size, in tiles where it is too large for the memory.
-
-    Args:
-        rgb: (H, W, 3) uint8 RGB.
-        network: the loaded network.
-        options: the order of the channels, tiles and flips.
-
-    Returns:
-        (H, W) float32 logits.
-    """
-    if _is_constant(rgb):
-        return np.full(rgb.shape[:2], -np.inf, np.float32)
-    shown = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
-    tiled = _tiled(network, shown.shape[0] * shown.shape[1], options)
-    if tiled is None:
-        return np.ascontiguousarray(_mean_of_flips(partial(_run, network), shown, options))
-    area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
-    return _mean_of_flips(lambda turned: tiled(turned, area), shown, options)
+    return Maps(shape, heatmap, lambda: enlarged(logits))
 
 
 def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwork | None:
@@ -225,24 +251,39 @@ def _pad(rgb: np.ndarray) -> np.ndarray:
     return np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
 
 
-def _run(network: Network, rgb: np.ndarray) -> np.ndarray:
-    """Return the (H, W) logits of an image, each flip of which is padded by itself."""
-    padded = _pad(rgb)
-    planes = np.empty((1, 3, *padded.shape[:2]), np.float32)
-    np.multiply(padded.transpose(2, 0, 1), np.float32(1 / 255), out=planes[0])
-    return network(planes)[0, 0, : rgb.shape[0], : rgb.shape[1]]
+def _run(network: Network, images: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the (H, W) logits of images of one size, each flip of which is padded by itself."""
+    height, width = images[0].shape[:2]
+    padded = [_pad(rgb) for rgb in images]
+    planes = np.empty((len(images), 3, *padded[0].shape[:2]), np.float32)
+    for rgb, into in zip(padded, planes, strict=True):
+        np.multiply(rgb.transpose(2, 0, 1), np.float32(1 / 255), out=into)
+    return [np.ascontiguousarray(logits[0, :height, :width]) for logits in network(planes)]
+
+
+def _run_tiled(
+    tiled: TiledNetwork, options: HeatmapOptions, images: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Return the (H, W) logits of images, each run in tiles."""
+    area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
+    return [tiled(rgb, area) for rgb in images]
 
 
 def _mean_of_flips(
-    run: Callable[[np.ndarray], np.ndarray], rgb: np.ndarray, options: HeatmapOptions
-) -> np.ndarray:
-    """Return the logits of an image, with `tta` the mean of those of its flips and turns."""
+    run: Callable[[list[np.ndarray]], list[np.ndarray]],
+    images: list[np.ndarray],
+    options: HeatmapOptions,
+) -> list[np.ndarray]:
+    """Return the logits of images, with `tta` the mean of those of their flips and turns."""
     if options.tta == "none":
-        return run(rgb)
-    total = np.zeros(rgb.shape[:2], np.float32)
+        return run(images)
+    means = [np.zeros(rgb.shape[:2], np.float32) for rgb in images]
     for turns in range(4):
-        turned = np.rot90(rgb, turns)
+        turned = [np.rot90(rgb, turns) for rgb in images]
         for step in (1, -1):
-            total += np.rot90(run(turned[:, ::step])[:, ::step], -turns)
-    total /= 8
-    return total
+            found = run([each[:, ::step] for each in turned])
+            for mean, logits in zip(means, found, strict=True):
+                mean += np.rot90(logits[:, ::step], -turns)
+    for mean in means:
+        mean /= 8
+    return means

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
+
+import numpy as np
 
 from .._shared.errors import ImageError, OptionError
 
 Images = list[Any] | tuple[Any, ...]
-Found = TypeVar("Found")
+Item = TypeVar("Item")
 
 
 def image_list(image: Any) -> list[Any] | None:
@@ -28,18 +31,47 @@ def image_list(image: Any) -> list[Any] | None:
     return list(image) if getattr(image, "ndim", 0) == 4 else None
 
 
-def for_each_image(image: Any, find: Callable[[Any, int], Found]) -> Any:
-    """Call a function with an image, or with each of several; errors name which one it is."""
-    images = image_list(image)
-    if images is None:
-        return find(image, 0)
-    found = []
-    for number, one in enumerate(images):
-        try:
-            found.append(find(one, number))
-        except (ImageError, OptionError) as error:
-            raise type(error)(f"images[{number}]: {error}") from None
-    return found
+@contextmanager
+def image_named(number: int) -> Iterator[None]:
+    """Let errors of an image say which of a list it is."""
+    try:
+        yield
+    except (ImageError, OptionError) as error:
+        raise type(error)(f"images[{number}]: {error}") from None
+
+
+def batches(
+    items: Iterable[Item], size: Callable[[Item], Any], at_most: int
+) -> Iterator[list[Item]]:
+    """Yield items in their order, those that follow each other with the same size together.
+
+    Example:
+        >>> list(batches(["a", "b", "cc", "d", "e", "f"], len, 2))
+        [['a', 'b'], ['cc'], ['d', 'e'], ['f']]
+    """
+    batch: list[Item] = []
+    for item in items:
+        if batch and size(item) != size(batch[0]):
+            yield batch
+            batch = []
+        batch.append(item)
+        del item  # who takes items out of a batch can free them
+        if len(batch) == at_most:
+            yield batch
+            batch = []
+    if batch:
+        yield batch
+
+
+def check_batch_size(batch_size: int) -> int:
+    """Return how many images are run together.
+
+    Raises:
+        OptionError: it is no whole number from 1 on.
+    """
+    if not isinstance(batch_size, (int, np.integer)) or batch_size < 1:
+        raise OptionError(f"`batch_size` must be a whole number from 1 on, not {batch_size!r}")
+    return int(batch_size)
 
 
 def ignore_masks(ignore: Any, images: int | None) -> list[Any]:

@@ -61,8 +61,8 @@ def find_points(
 
 
 @contextmanager
-def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
-    """Make lack of memory, in work on an image of this shape, an error of one sentence."""
+def memory_named(shape: tuple[int, ...], images: int = 1) -> Iterator[None]:
+    """Make lack of memory, in work on images of this shape, an error of one sentence."""
     try:
         yield
         return
@@ -72,6 +72,11 @@ def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
         if not is_lack_of_memory(error):
             raise
     height, width = shape[:2]
+    if images > 1:
+        raise DeepDetectError(
+            f"there is not enough memory for {images} images of {width}x{height} pixels at once: "
+            "use a smaller `batch_size`"
+        )
     raise DeepDetectError(
         f"there is not enough memory for an image of {width}x{height} pixels: "
         "use `resolution='auto'`, fewer keypoints, or a smaller image"

@@ -35,6 +35,14 @@ class Maps:
         """Return maps whose heat map is the sigmoid of the logits, and is never held whole."""
         return cls(logits.shape, lambda: lambda rows: sigmoid(logits[rows]), lambda: logits)
 
+    def both(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the whole heat map and the logits, (H, W) float32 both."""
+        heatmap, rows_of = np.empty(self.shape, np.float32), self.heatmap()
+        for rows in bands(self.shape):
+            heatmap[rows] = rows_of(rows)
+        del rows_of  # it may hold another map
+        return heatmap, self.logits()
+
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
     """Return the probabilities of logits; the exponent is never positive: nothing overflows."""

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError, OptionError, WeightsError, unknown_name
+from ..._shared.errors import OptionError, WeightsError, unknown_name
 from .options import RuntimeOptions
 from .shapes import (
     KEYPOINT_OUTPUTS,
     PROBE_SHAPE,
     as_logits,
     check_network,
+    failed_run,
     lack_of_memory,
     output_to_read,
 )
@@ -45,11 +46,8 @@ class OnnxRuntimeNetwork:
         except Exception as error:  # its exceptions share no base class
             if any(words in str(error) for words in ("allocate memory", "bad_alloc")):
                 raise lack_of_memory(image.shape) from None
-            height, width = image.shape[2:]
-            raise DeepDetectError(
-                f"the network failed on an image of {width}x{height} pixels "
-                f"({str(error).splitlines()[0]}): use a smaller one, or another provider"
-            ) from None
+            reason = str(error).splitlines()[0]
+            raise failed_run(image.shape, reason, "another provider") from None
         return as_logits(output, self._output_name, image.shape, self.onnx_path)
 
     def release_memory(self) -> None:

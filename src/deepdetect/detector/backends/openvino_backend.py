@@ -17,6 +17,7 @@ from .shapes import (
     PADDED_IMAGE,
     as_logits,
     check_network,
+    failed_run,
     lack_of_memory,
     output_to_read,
 )
@@ -72,7 +73,8 @@ class OpenVinoNetwork:
             raise _failure(error, image.shape) from None
         # Where memory is short it may also answer with nothing, or with the map of the last image.
         stale = not output.size or output.shape == self._local.output_shape
-        if self._works and stale and output.shape[2:] != image.shape[2:]:
+        fits = output.shape[:1] + output.shape[2:] == image.shape[:1] + image.shape[2:]
+        if self._works and stale and not fits:
             self._discard(model)
             raise lack_of_memory(image.shape)
         logits = as_logits(output, self._output_name, image.shape, self._path)
@@ -189,11 +191,7 @@ def _failure(error: Exception, image_shape: tuple[int, ...]) -> DeepDetectError:
         words in str(error) for words in ("allocate", "bad_alloc")
     ):
         return lack_of_memory(image_shape)
-    height, width = image_shape[2:]
-    return DeepDetectError(
-        f"the network failed on an image of {width}x{height} pixels ({lines[-1]}): "
-        "use a smaller one, or the backend onnxruntime"
-    )
+    return failed_run(image_shape, lines[-1], "the backend onnxruntime")
 
 
 def _shape(value: Any) -> list[int | str]:

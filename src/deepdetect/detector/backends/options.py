@@ -19,7 +19,7 @@ class Network(Protocol):
     """A loaded network."""
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Map (1, 3, H, W) float32 in [0, 1] to (1, 1, H, W) float32 logits, all finite.
+        """Map (N, 3, H, W) float32 in [0, 1] to (N, 1, H, W) float32 logits, all finite.
 
         H and W are multiples of 8. The logits are those of the probability of a keypoint.
 

@@ -69,17 +69,17 @@ def as_logits(
     Args:
         output: what the network returned.
         name: the output's name; probabilities unless it is "logits".
-        image_shape: (1, 3, H, W) of the image.
+        image_shape: (N, 3, H, W) of the images.
         path: the weights file, for the message.
 
     Returns:
-        (1, 1, H, W) float32 logits. Probabilities that float32 rounds to 0 or 1 become the
+        (N, 1, H, W) float32 logits. Probabilities that float32 rounds to 0 or 1 become the
         logits of the nearest number that it holds.
 
     Raises:
         WeightsError: the map has another size, or a value is not finite or no probability.
     """
-    wanted = (1, 1, *image_shape[2:])
+    wanted = (image_shape[0], 1, *image_shape[2:])
     if output.shape != wanted:
         raise WeightsError(
             f"{path} gives a map of shape {output.shape} for an image that needs {wanted}: "
@@ -120,9 +120,30 @@ def check_answer(network: Callable[[np.ndarray], np.ndarray], path: Path) -> Non
         )
 
 
+def failed_run(image_shape: tuple[int, ...], reason: str, otherwise: str) -> DeepDetectError:
+    """Return the error of a run that failed.
+
+    Args:
+        image_shape: (N, 3, H, W) of the images.
+        reason: what the runtime says.
+        otherwise: what to use where one image failed.
+    """
+    number, _, height, width = image_shape
+    what = (
+        f"an image of {width}x{height}" if number == 1 else f"{number} images of {width}x{height}"
+    )
+    remedy = f"use a smaller one, or {otherwise}" if number == 1 else "use `batch_size=1`"
+    return DeepDetectError(f"the network failed on {what} pixels ({reason}): {remedy}")
+
+
 def lack_of_memory(image_shape: tuple[int, ...]) -> DeepDetectError:
-    """Return the error for an image, (1, 3, H, W), that the network lacks memory for."""
-    height, width = image_shape[2:]
+    """Return the error for images, (N, 3, H, W), that the network lacks memory for."""
+    number, _, height, width = image_shape
+    if number > 1:
+        return DeepDetectError(
+            f"there is not enough memory to run the network on {number} images of "
+            f"{width}x{height} pixels: use a smaller `batch_size`"
+        )
     return DeepDetectError(
         f"there is not enough memory to run the network on {width}x{height} pixels: "
         "use `resolution='auto'`, or a smaller image"
