@@ -170,8 +170,8 @@ class DeepDetect:
             channels: the order of the colours in arrays and tensors: "bgr" for the images of
                 `cv2.imread`.
             batch_size: of several images, the network is run once for up to so many that follow
-                each other and that it sees at one size. It pays for small images and on graphics
-                cards; on processors larger images take as long, and the memory of all of them.
+                each other and that it sees at one size. On a processor that pays for small images
+                only: larger ones take as long, and the memory of all of them.
 
         Returns:
             (H, W) float32 in [0, 1], at the image's own size; of several images a list, in their

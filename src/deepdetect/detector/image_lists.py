@@ -63,15 +63,14 @@ def batches(
         yield batch
 
 
-def check_batch_size(batch_size: int) -> int:
-    """Return how many images are run together.
+def check_batch_size(batch_size: int) -> None:
+    """Check how many images are to be run together.
 
     Raises:
         OptionError: it is no whole number from 1 on.
     """
     if not isinstance(batch_size, (int, np.integer)) or batch_size < 1:
         raise OptionError(f"`batch_size` must be a whole number from 1 on, not {batch_size!r}")
-    return int(batch_size)
 
 
 def ignore_masks(ignore: Any, images: int | None) -> list[Any]:
