@@ -276,33 +276,52 @@ def show_road(
     truth = true_views(scene)
     errors = camera_errors(list(found.views.values()), [truth[name] for name in found.views])
     scale, centres = errors.scale, 1000 * errors.centres
+    print(f"{found}\ncentres {centres.mean():.0f} mm (mean), {centres.max():.0f} mm (largest)")
     points = found.dense.points.astype(np.float64)
+    if not len(points):
+        print("no dense points")
+        return
     nearest = np.full(len(points), np.inf)
     beside = np.zeros((len(points), 3))  # metres from the camera that a point is beside
     for view in found.views.values():
         own = scale * ((points - view.centre) @ view.rotation.T)
         nearer = np.abs(own[:, 2]) < nearest
         nearest[nearer], beside[nearer] = np.abs(own[nearer, 2]), own[nearer]
-    abeam = nearest < MAX_ABEAM_M
-    lane = abeam & (np.abs(beside[:, 0]) < LANE_M)
-    above = height_m - beside[:, 1]
-    print(f"{found}\ncentres {centres.mean():.0f} mm (mean), {centres.max():.0f} mm (largest)")
     print(f"reprojection error {np.median(found.dense_errors):.3f} px (median)")
-    print(f"{abeam.mean():.1%} of the dense points beside the path, {lane.sum():,} where it went")
-    for limit in ROAD_M:
-        near = np.abs(above[lane]) < limit
-        print(f"of these {near.mean():.1%} within {limit:g} m of the road")
-    high, low = (above[lane] > ROAD_M[-1]).mean(), (above[lane] < -ROAD_M[-1]).mean()
-    print(f"{high:.1%} in the air, {low:.1%} under the road")
-    high, low = (above[abeam] > 10).mean(), (above[abeam] < -0.5).mean()
-    print(
-        f"of all beside the path {high:.1%} over 10 m above the road, {low:.1%} over .5 m under it"
-    )
+    print(compare_with_road(height_m - beside[:, 1], beside[:, 0], nearest < MAX_ABEAM_M))
     for metres in (20, 40, 80, 160):
         far = np.linalg.norm(scale * points - scale * found.centres.mean(axis=0), axis=1) > metres
         print(f"{far.mean():.1%} over {metres} m from the middle of the path")
     if pictures is not None:
         draw(found, scene.images[0].path.parent, pictures)
+
+
+def compare_with_road(above_m: np.ndarray, aside_m: np.ndarray, abeam: np.ndarray) -> str:
+    """Return as text where points lie that are beside the path.
+
+    Args:
+        above_m: (N,) heights above the road.
+        aside_m: (N,) distances from the middle of the car.
+        abeam: (N,) bool, beside the path.
+    """
+    if not abeam.any():
+        return "no dense point lies beside the path"
+    lane = abeam & (np.abs(aside_m) < LANE_M)
+    lines = [
+        f"{abeam.mean():.1%} of the dense points beside the path, {lane.sum():,} where it went"
+    ]
+    if lane.any():
+        lines += [
+            f"of these {(np.abs(above_m[lane]) < limit).mean():.1%} within {limit:g} m of the road"
+            for limit in ROAD_M
+        ]
+        high, low = (above_m[lane] > ROAD_M[-1]).mean(), (above_m[lane] < -ROAD_M[-1]).mean()
+        lines.append(f"{high:.1%} in the air, {low:.1%} under the road")
+    high, low = (above_m[abeam] > 10).mean(), (above_m[abeam] < -0.5).mean()
+    lines.append(
+        f"of all beside the path {high:.1%} over 10 m above the road, {low:.1%} over .5 m under it"
+    )
+    return "\n".join(lines)
 
 
 def show_bad(scene: PosedScene, bad: Path, output: Path, workers: int | None) -> None:
