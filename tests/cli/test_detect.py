@@ -57,6 +57,21 @@ def test_json_has_the_numbers_and_the_pictures(run, photos: Path) -> None:
     assert report["failures"] == []
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), ", density 0."),
+        (("--max-keypoints", 1), ": 1 keypoint, "),
+        (("--max-keypoints", 50), ": 50 keypoints, "),
+    ],
+)
+def test_the_keypoints_are_counted(options, words: str, run, photos: Path) -> None:
+    """Of a number that was asked for, a density is of no interest, and mostly 0.000."""
+    result = run("detect", photos / "cat.jpg", "--no-pictures", *options)
+    assert words in result.stdout
+    assert ("density" in result.stdout) == (not options)
+
+
 def test_csv_and_no_pictures(run, photos: Path) -> None:
     result = run(
         *("detect", photos / "cat.jpg", "-o", "out", "--format", "csv", "--no-pictures"),

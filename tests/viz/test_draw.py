@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError, Keypoints, OptionError
+from deepdetect.viz import draw
 from deepdetect.viz.draw import (
     CAPTION_HEIGHT,
     GREEN,
@@ -227,10 +228,77 @@ def test_a_depth_map_is_bright_where_it_is_near() -> None:
     assert draw_depth(np.full((30, 60), np.nan), "mm").shape[1] == 60
 
 
-def test_a_scale_is_below_the_picture_and_as_wide() -> None:
-    picture = add_scale(np.zeros((20, 400, 3), np.uint8), "logit", -3, 12)
-    assert picture.shape == (20 + CAPTION_HEIGHT, 400, 3)
+@pytest.mark.parametrize("width", [1, 5, 16, 33, 60, 400])
+def test_a_scale_is_below_the_picture_and_as_wide(width: int) -> None:
+    picture = add_scale(np.zeros((20, width, 3), np.uint8), "logit", -3, 12)
+    assert picture.shape == (20 + CAPTION_HEIGHT, width, 3)
     assert picture[20:].any()
+
+
+@pytest.fixture
+def captions(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """All lines of text that are drawn."""
+    texts, caption = [], draw._caption
+
+    def noted(text: str, width: int, unit: float) -> np.ndarray:
+        texts.append(text)
+        return caption(text, width, unit)
+
+    monkeypatch.setattr(draw, "_caption", noted)
+    return texts
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (1.142, 66.06, ["1.1", "66"]),
+        (-10.21, 34.11, ["-10", "34"]),
+        (0.4033, 70.33, ["0.4", "70"]),
+        (-0.0003, 70.33, ["0.0", "70"]),
+        (1842.3, 901.7, ["1,840", "900"]),
+        (12345.6, 987.6, ["12,000", "1,000"]),
+        (988.2, 985.1, ["988.2", "985.1"]),
+        (0.5012, 0.9987, ["0.50", "1.00"]),
+        (0.99, 0.99, ["0.99", "0.99"]),
+        (0, 0, ["0.0", "0.0"]),
+    ],
+)
+def test_the_ends_of_a_scale_have_few_digits(
+    low: float, high: float, expected: list[str], captions: list[str]
+) -> None:
+    add_scale(np.zeros((20, 400, 3), np.uint8), "values", low, high)
+    assert sorted(captions) == sorted(["values", *expected])
+
+
+def test_a_scale_has_its_values_at_its_ends() -> None:
+    """Nothing is written over the colours, and the lower value is directly before them."""
+    strip = add_scale(np.zeros((20, 400, 3), np.uint8), "a", 1.1, 66)[20:]
+    rows = strip[len(strip) // 2 - 5 : len(strip) // 2 + 5]
+    colored = np.flatnonzero((np.ptp(rows.astype(int), axis=2) > 30).all(0))
+    assert len(colored) == np.ptp(colored) + 1 == 400 // 5
+    written = np.flatnonzero((rows.min(2) > 120).any(0))
+    before, after = written[written < colored[0]], written[written > colored[-1]]
+    assert 3 <= colored[0] - before[-1] <= 12
+    assert 3 <= after[0] - colored[-1] <= 12
+
+
+@pytest.mark.parametrize(
+    ("count", "logits", "expected"),
+    [
+        (0, False, "no keypoints"),
+        (1, False, "1 keypoint, coloured by score"),
+        (20, True, "20 keypoints, coloured by logit"),
+        (2500, True, "1,000 of 2,500 keypoints, coloured by logit"),
+    ],
+)
+def test_the_caption_counts_the_keypoints(
+    count: int, logits: bool, expected: str, captions: list[str]
+) -> None:
+    xy = np.random.default_rng(0).uniform(0, 899, (count, 2))
+    values = np.arange(count, dtype=np.float32)
+    keypoints = Keypoints(xy, np.ones(count), (900, 900), values if logits else None)
+    draw_best_keypoints(np.zeros((900, 900, 3), np.uint8), keypoints)
+    assert expected in captions
 
 
 def test_matches_have_the_colour_of_their_position() -> None:

@@ -124,10 +124,11 @@ def detect(
     else:
         for result in results:
             how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"
-            click.echo(
-                f"{result['image']}: {result['keypoints']:,} keypoints, "
-                f"density {result['density']:.3f}, {how} -> {result['file']}"
-            )
+            count = result["keypoints"]
+            found = f"{count:,} keypoint{'' if count == 1 else 's'}"
+            if chosen.max_keypoints is None:  # else the number was asked for
+                found += f", density {result['density']:.3f}"
+            click.echo(f"{result['image']}: {found}, {how} -> {result['file']}")
     report_failures(failures, len(paths))
     if not any(result["keypoints"] for result in results):
         click.echo(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -41,6 +42,12 @@ LINES, DOTS = 60, 1500
 
 CAPTION_HEIGHT = 28
 """Of pictures that are not wider than `READABLE_WIDTH_PX`."""
+
+CAPTION_MARGIN = 6
+"""To the left and to the right of the text, as `CAPTION_HEIGHT`."""
+
+CAPTION_SCALE = 0.5
+"""Of OpenCV's font."""
 
 GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
@@ -119,7 +126,7 @@ def draw_logits(logits: np.ndarray) -> np.ndarray:
     low, high = (float(v) for v in np.percentile(known, (100 - SHOWN_PERCENTILE, SHOWN_PERCENTILE)))
     low, high = min(low, -1.0), max(high, 1.0)
     levels = np.where(np.isfinite(shown), (known - low) / (high - low), shown > 0)
-    words = "logit of a keypoint, 0: probability .5"
+    words = "logit of a keypoint, 0 is a probability of 0.5"
     return add_scale(draw_heatmap(levels), words, low, high)
 
 
@@ -167,11 +174,8 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     shorter, longer = sorted(canvas.shape[:2])
     cells = max(1, int((most * longer / shorter) ** 0.5))
     rows = spread_over_grid(keypoints.xy, values, keypoints.image_size, most, cells)
-    counted = (
-        f"{len(rows):,} of {len(keypoints):,} keypoints"
-        if len(rows) < len(keypoints)
-        else (f"{len(keypoints):,} keypoints")
-    )
+    counted = f"{len(rows):,} of " if len(rows) < len(keypoints) else ""
+    counted += _counted(keypoints)
     if not len(rows):
         return add_caption(canvas, "no keypoints")
     few = 100 - SHOWN_PERCENTILE
@@ -186,13 +190,17 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     for k in np.argsort(values[rows]):
         _circle(canvas, centres[k], radii[k], (0, 0, 0), max(2, round(2.5 * unit)))
         _circle(canvas, centres[k], radii[k], colors[k], max(1, round(1.25 * unit)))
-    return add_scale(canvas, f"{counted}, {name}", low, high, LEAST_LEVEL)
+    return add_scale(canvas, f"{counted}, coloured by {name}", low, high, LEAST_LEVEL)
 
 
 def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     """Draw all keypoints as pixels, with a caption that counts them, as `fit_picture` sizes it."""
-    caption = f"{len(keypoints):,} keypoints, {keypoints.density:.1%} of the pixels"
+    caption = f"{_counted(keypoints)}, {keypoints.density:.1%} of the pixels"
     return add_caption(fit_picture(_draw_pixels(rgb, keypoints)), caption)
+
+
+def _counted(keypoints: Keypoints) -> str:
+    return f"{len(keypoints):,} keypoint{'' if len(keypoints) == 1 else 's'}"
 
 
 def fit_picture(picture: np.ndarray) -> np.ndarray:
@@ -358,28 +366,59 @@ def add_scale(
 ) -> np.ndarray:
     """Add a line of text below a picture, and the colours of values from `low` to `high`.
 
-    The colours are those of `draw_heatmap` from `least_level` to 1.
+    The colours are those of `draw_heatmap` from `least_level` to 1. The values are at their ends,
+    with two digits, or so many that they tell apart what is a hundredth of the scale.
     """
     width, unit = rgb.shape[1], _unit(rgb)
     bar = max(1, width // 5)
-    ends = [f"{value:.4g}" for value in (low, high)]
-    strip = _caption(f"{text}: {ends[0]}", width - bar - max(1, width // 9), unit)
+    values = _rounded(low, high)
+    margins = round(2 * CAPTION_MARGIN * unit)
+    long = [_caption_width(each, unit) - margins for each in (*values, text)]
+    # In narrow pictures the values are as small as the text.
+    share = min(1.0, max(0, width - bar - 3 * margins) / sum(long))
+    ends = [
+        _caption(each, min(margins + int(share * own), (width - bar) // 3), unit)
+        for each, own in zip(values, long, strict=False)
+    ]
+    strip = _caption(text, width - bar - sum(end.shape[1] for end in ends), unit)
     gap = len(strip) // 4
     colors = np.zeros((len(strip), bar, 3), np.uint8)
     colors[gap : len(strip) - gap] = _viridis(np.linspace(least_level, 1, bar))
-    last = _caption(ends[1], width - strip.shape[1] - bar, unit)
-    return np.concatenate([rgb, np.concatenate([strip, colors, last], axis=1)])
+    return np.concatenate([rgb, np.concatenate([strip, ends[0], colors, ends[1]], axis=1)])
+
+
+def _rounded(low: float, high: float) -> list[str]:
+    """Return the ends of a scale with as few digits as it needs."""
+
+    def decimals(value: float) -> int:  # of its first two digits
+        return 1 - math.floor(math.log10(abs(value) or 1))
+
+    least = decimals(high - low or high)
+    texts = []
+    for value in (low, high):
+        places = min(max(least, decimals(value)), least + 1)  # near 0 two digits would be too many
+        texts.append(f"{round(value, places) + 0.0:,.{max(0, places)}f}")  # not "-0"
+    return texts
 
 
 def _caption(text: str, width: int, unit: float) -> np.ndarray:
     """Return a black strip with a line of text, so many times as large as the smallest."""
     strip = np.zeros((round(CAPTION_HEIGHT * unit), width, 3), np.uint8)
-    scale, font = 0.5 * unit, cv2.FONT_HERSHEY_SIMPLEX
-    (long, _), _ = cv2.getTextSize(text, font, scale, max(1, round(unit)))
-    scale *= min(1.0, (width - 12 * unit) / max(long, 1))
-    place = round(6 * unit), round(19 * unit)
+    margins = round(2 * CAPTION_MARGIN * unit)
+    room, long = width - margins, _caption_width(text, unit) - margins
+    if room <= 0:
+        return strip
+    scale = CAPTION_SCALE * unit * min(1.0, room / max(long, 1))
+    place, font = (round(CAPTION_MARGIN * unit), round(19 * unit)), cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(strip, text, place, font, scale, WHITE, max(1, round(unit)), cv2.LINE_AA)
     return strip
+
+
+def _caption_width(text: str, unit: float) -> int:
+    """Return how wide a strip is that a line of text just fits."""
+    font, thickness = cv2.FONT_HERSHEY_SIMPLEX, max(1, round(unit))
+    (width, _), _ = cv2.getTextSize(text, font, CAPTION_SCALE * unit, thickness)
+    return int(width) + round(2 * CAPTION_MARGIN * unit)
 
 
 def hstack(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
