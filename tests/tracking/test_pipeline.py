@@ -103,7 +103,15 @@ def camera(moving_photo, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]
     return connect
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+ENDING = [
+    number
+    for name in ("SIGINT", "SIGTERM", "SIGHUP")
+    if (number := getattr(signal, name, None)) is not None
+    and signal.getsignal(number) is not signal.SIG_IGN  # by nohup
+]
+
+
+@pytest.mark.parametrize("number", ENDING)
 def test_a_signal_ends_a_camera_properly(number: int, camera, tmp_path: Path) -> None:
     """Before the third frame is there: its files are whole, and the usual handler is back."""
     before = signal.getsignal(number)
@@ -130,6 +138,18 @@ def test_a_second_signal_ends_all_at_once(numbers, error, camera, tmp_path: Path
         track(0, tmp_path / "t.mp4", options=FEW)
     assert [signal.getsignal(number) for number in numbers] == before
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
+def test_a_closed_terminal_does_not_end_what_ignores_it(camera, tmp_path: Path) -> None:
+    """As nohup has it."""
+    camera(signal.SIGHUP)
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert track(0, tmp_path / "t.mp4", options=FEW, max_frames=4).frames == 4
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_sigterm_that_the_caller_handles_is_left_to_it(camera, tmp_path: Path) -> None:

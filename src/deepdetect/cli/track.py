@@ -50,10 +50,10 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
     """Follow keypoints through a video file, a folder of frames, or the camera of this number.
 
     Writes a video with the points, their last positions and the frames per second of the work, and
-    beside it a table of all tracks (.csv): frame, track, x, y, score. Ctrl-C or SIGTERM on a
-    camera ends the recording, and both files are written. An image of a folder that cannot be read,
-    or has another size than the first one, does not stop the others: they are listed at the end,
-    with exit code 1.
+    beside it a table of all tracks (.csv): frame, track, x, y, score. Ctrl-C, SIGTERM or SIGHUP on
+    a camera ends the recording, and both files are written. An image of a folder that cannot be
+    read, or has another size than the first one, does not stop the others: they are listed at the
+    end, with exit code 1.
 
     \b
     deepdetect track drive.mp4 -o tracks.mp4

@@ -121,9 +121,9 @@ def track(
 ) -> TrackingReport:
     """Follow the points of a video, and write a video with the tracks, and their table.
 
-    Ctrl-C or SIGTERM on a camera ends the recording; both files are written. An image of a folder
-    that cannot be read, or has another size than the first one, does not stop the others: it is
-    named in the report.
+    Ctrl-C, SIGTERM or SIGHUP (of a terminal that is closed) on a camera ends the recording; both
+    files are written. An image of a folder that cannot be read, or has another size than the first
+    one, does not stop the others: it is named in the report.
 
     Args:
         source: a video file, a folder of images, or the number of a camera.
@@ -216,18 +216,20 @@ def output_files(output: str | Path) -> tuple[Path | None, Path]:
 
 @contextmanager
 def _ended_by_signals(live: bool) -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C or SIGTERM of a live source, so that its files are finished.
+    """Note the first Ctrl-C, SIGTERM or SIGHUP of a live source, so that its files are finished.
 
-    A second one ends all at once, and leaves no file. A SIGTERM that the caller handles is the
-    caller's.
+    A second one ends all at once, and leaves no file. A SIGTERM or SIGHUP that the caller handles
+    is the caller's, and one that is ignored, as nohup has it, is none.
     """
     noted: list[int] = []
     if not live or threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
     usual: dict[int, Any] = {signal.SIGINT: signal.getsignal(signal.SIGINT)}
-    if signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        usual[signal.SIGTERM] = _exit
+    for name in ("SIGTERM", "SIGHUP"):
+        ending = getattr(signal, name, None)  # Windows lacks some
+        if ending is not None and signal.getsignal(ending) is signal.SIG_DFL:
+            usual[ending] = _exit
 
     def note(number: int, _: Any) -> None:
         noted.append(number)
