@@ -98,6 +98,27 @@ def test_a_list_of_photographs_is_a_folder(run, fountain: Path) -> None:
     assert "made from" in fewer.stderr
 
 
+def test_results_within_the_folder_are_no_photographs(
+    run, fountain: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither the links to listed photographs, nor pictures of other commands."""
+    monkeypatch.chdir(fountain)
+    few = ("--workers", 1, "--max-keypoints", 1000, "--no-dense")
+    listed = run("reconstruct", "0004.jpg", "0005.jpg", "0006.jpg", *few, "-o", "listed")
+    assert listed.exit_code == 0, listed.output
+    whole = run("reconstruct", ".", *few, "--json")
+    assert whole.exit_code == 0, whole.output
+    values = json.loads(whole.stdout)
+    assert (values["photographs"], values["registered"]) == (4, 3)
+    drawn = run("detect", "0004.jpg", "-o", "drawn", "--max-keypoints", 100)
+    assert drawn.exit_code == 0, drawn.output
+    refused = run("reconstruct", ".", *few)
+    assert refused.exit_code == 2
+    assert one_sentence(refused.stderr)
+    words = " ".join(refused.stderr.split())
+    assert "drawn/0004_heatmap.jpg was made by an earlier run and is no photograph" in words
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -48,7 +48,7 @@ def reconstruct_folder(
     from ..sfm.options import MultiViewOptions
     from ..sfm.pipeline import check_output_folder, output_files, reconstruct_many
     from ..sfm.stages import check_photographs
-    from ._records import claim_outputs
+    from ._records import check_not_made, claim_outputs
 
     target = OUTPUT if output is None else output
     detector = given_only({name: values.pop(name) for name in DETECTOR.names})
@@ -58,11 +58,13 @@ def reconstruct_folder(
     selection = {name: values.pop(name) for name in fields if name in values}
     options = MultiViewOptions()
     chosen = dataclasses.replace(options.selection, **given_only(selection))
-    photographs = images[0] if len(images) == 1 else images
+    photographs: Path | Sequence[Path] = images[0] if len(images) == 1 else images
     # What is missing or wrong is said before anything is written.
     import_pycolmap()
     check_output_folder(target)
-    check_photographs(photographs)
+    found_images = check_photographs(photographs)
+    if isinstance(photographs, Path):
+        check_not_made(photographs, found_images.values())
     claim_outputs("reconstruct", sorted(images), output_files(target), overwrite, growing=True)
     found = reconstruct_many(
         photographs,

@@ -7,7 +7,7 @@ import hashlib
 import json
 import signal
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -278,6 +278,26 @@ def recorded_outputs(folder: Path) -> set[Path]:
     records = (_read(path) for path in folder.glob(f"{FOLDER}/*/*.json"))
     names = {name for record in records if record is not None for name in record["files"]}
     return {folder.resolve() / name for name in names}
+
+
+def check_not_made(folder: Path, images: Iterable[Path]) -> None:
+    """Refuse images below a folder that earlier runs of commands have made.
+
+    Raises:
+        OptionError: one of them is an output, or lies in a folder that is one.
+    """
+    made: dict[Path, set[Path]] = {}
+    for image in images:
+        parts = image.relative_to(folder).parts
+        for depth, name in enumerate(parts):
+            parent = folder.joinpath(*parts[:depth])
+            if parent not in made:
+                made[parent] = recorded_outputs(parent)
+            if parent.resolve() / name in made[parent]:
+                raise OptionError(
+                    f"{image} was made by an earlier run and is no photograph: move what was made "
+                    f"out of {folder}, or list the photographs"
+                )
 
 
 def file_digest(path: Path) -> str:

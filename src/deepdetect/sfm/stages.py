@@ -47,6 +47,10 @@ from .pair_selection import Pair, all_pairs, sequential_pairs, similar_pairs, vl
 WORK = "work"
 """Folder of what the stages made, within that of the results."""
 
+LINKS = ".images"
+"""Folder of links to listed photographs, within `WORK`. It is hidden, so that they are no further
+photographs of a folder that holds the results."""
+
 BYTES_PER_PIXEL = 700
 """That dense matching takes at its peak: it bounds the number of processes."""
 
@@ -111,7 +115,7 @@ class Stages:
                 raise OptionError(f"{folder} holds the photographs: give another folder with -o")
             return folder
         taken = check_photographs(images)
-        folder = self.work / "images"
+        folder = self.work / LINKS
         folder.mkdir(parents=True, exist_ok=True)
         for old in folder.iterdir():
             if old.name not in taken:
