@@ -4,7 +4,9 @@
 const MAX_ERROR_PX = 3;
 const ROUNDS = 3000;
 const MAX_LOG10_NFA = -3; // one such geometry among a thousand pairs that have none
-const MIN_AGREEING = 9; // several along one edge are no independent evidence (Brown and Lowe, 2007: over 8)
+// Several matches along one edge are no independent evidence: it is counted by places that lie apart.
+const MIN_PLACES = 9; // Brown and Lowe, 2007: over 8
+const PLACE_WIDTH = 0.02; // of the diagonal: by it, 7 to 9 wrong matches along edges were 4 or 5 places
 const PREFER_HOMOGRAPHY = 0.8; // of a fundamental matrix's inliers: it says less about each
 
 const MODELS = {
@@ -19,11 +21,17 @@ const MODELS = {
  * @property {Uint8Array} inliers 1 where a match agrees with it
  */
 
-/** @param {Float32Array} points0 @param {Float32Array} points1 @returns {Geometry} */
-export function estimateGeometry(points0, points1, width, height) {
+/**
+ * @param {Float32Array} points0
+ * @param {Float32Array} points1
+ * @param {[number, number][]} sizes width and height of both pictures
+ * @returns {Geometry}
+ */
+export function estimateGeometry(points0, points1, sizes) {
   const found = Object.keys(MODELS).map((name) => ransac(name, points0, points1));
   const likely = found.filter(({ model, inliers }) =>
-    sum(inliers) >= MIN_AGREEING && log10Nfa(model, inliers, width, height) < MAX_LOG10_NFA);
+    log10Nfa(model, inliers, ...sizes[1]) < MAX_LOG10_NFA
+    && countPlaces(points0, points1, inliers, sizes) >= MIN_PLACES);
   const none = { model: "none", matrix: null, inliers: new Uint8Array(points0.length / 2) };
   if (!likely.length) return none;
   const [first, second] = likely;
@@ -32,6 +40,18 @@ export function estimateGeometry(points0, points1, width, height) {
 }
 
 const sum = (values) => values.reduce((total, value) => total + value, 0);
+
+/** How many of the matches that agree lie apart in both pictures. */
+function countPlaces(points0, points1, inliers, sizes) {
+  const [apart0, apart1] = sizes.map((size) => PLACE_WIDTH * Math.hypot(...size));
+  const isNear = (points, j, k, apart) =>
+    Math.hypot(points[2 * j] - points[2 * k], points[2 * j + 1] - points[2 * k + 1]) < apart;
+  const places = [];
+  for (const k of rowsOf(inliers)) {
+    if (!places.some((j) => isNear(points0, j, k, apart0) || isNear(points1, j, k, apart1))) places.push(k);
+  }
+  return places.length;
+}
 
 /** The expected number of geometries that so many of wrong matches would agree with, log10. */
 export function log10Nfa(model, inliers, width, height) {

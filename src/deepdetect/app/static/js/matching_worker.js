@@ -22,8 +22,8 @@ answer({
     return { points0: take(pictures[0].xy, rows0), points1: take(pictures[1].xy, rows1), ratios };
   },
 
-  geometry({ points0, points1, width, height }) {
-    return estimateGeometry(points0, points1, width, height);
+  geometry({ points0, points1, sizes }) {
+    return estimateGeometry(points0, points1, sizes);
   },
 
   /** Draws the second picture in the frame of the first; transparent where it shows nothing. */

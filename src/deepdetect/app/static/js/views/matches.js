@@ -107,8 +107,8 @@ async function filter() {
                                              (_, k) => points[2 * rows[k >> 1] + (k & 1)]);
   const [points0, points1] = [take(found.points0), take(found.points1)];
   const [first, second, keypoints, mode] = key;
-  const geometry = await background.call("geometry", { points0, points1, width: second.width,
-                                                       height: second.height });
+  const sizes = [first, second].map(({ width, height }) => [width, height]);
+  const geometry = await background.call("geometry", { points0, points1, sizes });
   if (own !== filterings) return;
   const options = { mode, keypoints, ratio: largest, mutual: true };
   const ratios = Float32Array.from(rows, (k) => found.ratios[k]);
