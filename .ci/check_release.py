@@ -34,6 +34,8 @@ IN_THE_WHEEL = (
     "deepdetect/detector/weights/default.safetensors",
     "deepdetect/detector/weights/dense.onnx",
     "deepdetect/detector/weights/dense.safetensors",
+    "deepdetect/detector/weights/free.onnx",
+    "deepdetect/detector/weights/free.safetensors",
     "deepdetect/detector/points/ranker.npz",
     "deepdetect/io/viewer.html",
 )

@@ -244,10 +244,10 @@ def test_the_wheel_installs_and_detects(folder: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     weights = target / "deepdetect" / "detector" / "weights"
-    for name in ("default", "dense"):
+    for name in ("default", "dense", "free"):
         assert 0 < (weights / f"{name}.onnx").stat().st_size < 2_000_000
         assert 0 < (weights / f"{name}.safetensors").stat().st_size < 2_000_000
-    for name in ("MODEL_CARD.md", "DENSE_CARD.md"):
+    for name in ("MODEL_CARD.md", "DENSE_CARD.md", "FREE_CARD.md"):
         assert (weights / name).exists()
     code = (
         f"import sys; sys.path.insert(0, {str(target)!r}); import deepdetect;"

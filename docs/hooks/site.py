@@ -28,6 +28,7 @@ COPIED = {
     "SECURITY.md": "security.md",
     "src/deepdetect/detector/weights/MODEL_CARD.md": "cards/default.md",
     "src/deepdetect/detector/weights/DENSE_CARD.md": "cards/dense.md",
+    "src/deepdetect/detector/weights/FREE_CARD.md": "cards/free.md",
     "src/deepdetect/detector/points/MODEL_CARD.md": "cards/points.md",
 }
 """Files of the repository that are pages of the site, by their paths."""

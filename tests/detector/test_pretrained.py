@@ -34,6 +34,21 @@ def test_an_unknown_name_says_the_nearest() -> None:
         DeepDetect("densee")
 
 
+def photographs(name: str) -> str:
+    """Return the folder of the photographs that weights were trained on."""
+    return "photographs-free" if name == "free" else "photos"
+
+
+def test_free_weights_began_with_random_ones() -> None:
+    """No weights that have seen other photographs stand behind them."""
+    pytest.importorskip("torch", reason="needs torch, which is for training only")
+    from deepdetect.detector.network.weights import read_notes
+
+    notes = read_notes(pretrained_weights("free", ".safetensors"))
+    assert "parts" not in notes
+    assert " --init" not in notes["command"]
+
+
 @pytest.mark.parametrize("name", PRETRAINED)
 def test_weights_tell_where_they_come_from(name: str) -> None:
     pytest.importorskip("safetensors", reason="needs safetensors, which is for training only")
@@ -50,7 +65,7 @@ def test_weights_tell_where_they_come_from(name: str) -> None:
     for mean in means:
         assert mean["command"].startswith("deepdetect average ")
     for run in runs:
-        assert run["command"].startswith("deepdetect train photos/train ")
+        assert run["command"].startswith(f"deepdetect train {photographs(name)}/train ")
         for word in ("options", "photographs_digest", "versions", "machine", "start", "point"):
             assert run[word]
     for one in (*means, *runs):

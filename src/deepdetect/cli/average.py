@@ -20,7 +20,7 @@ def average(weights: tuple[str, ...], output: Path, overwrite: bool, as_json: bo
     """Average WEIGHTS (a model soup) into best.safetensors and deepdetect.onnx.
 
     The mean of runs that continue each other is often better than each of them; name one
-    twice to give it twice the weight. WEIGHTS are .safetensors files, or default or dense.
+    twice to give it twice the weight. WEIGHTS are .safetensors files, or default, dense or free.
     Files of another run are replaced with --overwrite only.
 
     \b

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     "--weights",
     multiple=True,
     metavar="NAME|FILE",
-    help="default or dense, the pretrained weights, or a file; may be repeated.",
+    help="default, dense or free, the pretrained weights, or a file; may be repeated.",
 )
 @click.option(
     "--label-settings",

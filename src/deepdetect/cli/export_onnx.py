@@ -55,10 +55,10 @@ def export_onnx(
 ) -> None:
     """Write WEIGHTS as an ONNX file, for ONNX Runtime, OpenVINO, OpenCV and others.
 
-    WEIGHTS are default, dense, an ONNX file that this package has written in fp32 for any size, or
-    a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs `probability`
-    and `logits` for each pixel, and `keypoints` with --max-keypoints. docs/onnx.md says which file
-    is for which runtime.
+    WEIGHTS are default, dense, free, an ONNX file that this package has written in fp32 for any
+    size, or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
+    `probability` and `logits` for each pixel, and `keypoints` with --max-keypoints. docs/onnx.md
+    says which file is for which runtime.
 
     \b
     deepdetect export onnx -o deepdetect.onnx

@@ -55,7 +55,7 @@ class DeepDetect:
     """The dense keypoint detector of the paper.
 
     Args:
-        weights: "default" or "dense", the weights inside the package; or an ONNX file, or
+        weights: "default", "dense" or "free", the weights inside the package; or an ONNX file, or
             a safetensors file where torch is installed.
         resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
             that), "native" (always as it is), or a number of pixels: the image is squashed to a

@@ -14,6 +14,7 @@ RANKER = Path(__file__).parent / "points" / "ranker.npz"
 PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
     "dense": "dense",  # two views of a scene in normal light, denser
+    "free": "free",  # as default, from photographs of free licences alone
 }
 """File names without ending, by the names that users choose them by."""
 
@@ -22,8 +23,9 @@ def pretrained_weights(name: str = "default", suffix: str = ".onnx") -> Path:
     """Return the path of weights inside the package.
 
     Args:
-        name: "default", for all purposes and in the dark, or "dense", for the geometry of
-            scenes in normal light.
+        name: "default", for all purposes and in the dark; "dense", for the geometry of
+            scenes in normal light; or "free", as "default" but trained on photographs of
+            free licences alone.
         suffix: ".onnx", or ".safetensors" for training.
 
     Raises:

@@ -36,7 +36,7 @@ class Benchmark:
     Attributes:
         name: by which users choose it.
         plan: plans the sections of its report; raises ImageError where its data are missing.
-        weights: which it runs, "default" or "dense" or both.
+        weights: which it runs: "default", "dense" or both.
     """
 
     name: str

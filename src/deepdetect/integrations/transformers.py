@@ -145,8 +145,8 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
         """Return the model with weights of DeepDetect, in evaluation mode.
 
         Args:
-            weights: "default" or "dense", the weights inside the package, or a safetensors file
-                that `deepdetect train` has written.
+            weights: "default", "dense" or "free", the weights inside the package, or a safetensors
+                file that `deepdetect train` has written.
             keypoint_threshold, max_keypoints, nms_radius: as of `DeepDetectConfig`.
 
         Raises:

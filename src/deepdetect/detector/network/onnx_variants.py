@@ -107,8 +107,8 @@ def write_onnx(
     """Write weights as an ONNX file for other programs, whole or not at all.
 
     Args:
-        weights: "default" or "dense"; an ONNX file that this package has written in fp32 for any
-            size; or a safetensors file, which needs torch.
+        weights: "default", "dense" or "free"; an ONNX file that this package has written in fp32
+            for any size; or a safetensors file, which needs torch.
         path: the file to be written, ending in .onnx.
         options: its size and precision, and whether it gives keypoints.
         calibration: photographs for int8, like those that it will be used on.
