@@ -186,7 +186,9 @@ def test_weights_that_are_gone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     (found,) = findings_of(checks.check_weights)
     assert found.status == "problem"
     assert found.details["absent"] == [
-        f"{name}{suffix}" for name in ("default", "dense") for suffix in (".onnx", ".safetensors")
+        f"{name}{suffix}"
+        for name in ("default", "dense", "free")
+        for suffix in (".onnx", ".safetensors")
     ]
 
 

@@ -33,7 +33,7 @@ def open_bundled(weights: str = "default") -> TiledNetwork:
     return network
 
 
-@pytest.mark.parametrize("weights", ["default", "dense"])
+@pytest.mark.parametrize("weights", ["default", "dense", "free"])
 @pytest.mark.parametrize("upright", [False, True])
 def test_tiles_give_the_logits_of_the_whole(weights: str, upright: bool, strip: np.ndarray) -> None:
     rgb = np.ascontiguousarray(strip.swapaxes(0, 1)) if upright else strip

@@ -136,7 +136,7 @@ def test_opencv_at_one_size(
         check_answers(*net.forward(["logits", "probability"]), expected_logits(network, images))
 
 
-@pytest.mark.parametrize("name", ["default", "dense"])
+@pytest.mark.parametrize("name", ["default", "dense", "free"])
 def test_the_shipped_files_are_those_of_the_safetensors(name: str, tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs torch, which is for training only")
     shipped = pretrained_weights(name)
