@@ -40,7 +40,7 @@ IN_THE_WHEEL = (
     "deepdetect/io/viewer.html",
 )
 IN_THE_ARCHIVE = ("README.md", "LICENSE", "CHANGELOG.md", "hatch_build.py", "mkdocs.yml", "tests")
-MAX_WHEEL_BYTES = 10_000_000
+MAX_WHEEL_BYTES = 12_000_000
 
 DRAW = """
 import numpy as np
