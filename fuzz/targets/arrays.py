@@ -12,7 +12,7 @@ from hypothesis import strategies
 from hypothesis.extra import numpy as arrays
 from hypothesis.strategies import SearchStrategy
 
-from deepdetect import DeepDetect, load_image, match_images
+from deepdetect import DeepDetect, Keypoints, load_image, match_images
 
 from ..case import Target, expect, prepared
 
@@ -100,8 +100,18 @@ def detected(generator: np.random.Generator, folder: Path) -> None:
     array = draw(any_array(), generator)
     budget = [None, 1, 50][int(generator.integers(3))]
     found = detector().detect(array, max_keypoints=budget)
-    expect(is_allowed(array), f"{array.dtype} of shape {array.shape} was taken")
-    height, width = array.shape[:2]
+    if array.ndim == 4:  # a batch
+        expect(len(found) == len(array), f"{len(found)} results for {array.shape}")
+        for image, keypoints in zip(array, found, strict=True):
+            check_keypoints(image, keypoints, budget)
+    else:
+        check_keypoints(array, found, budget)
+
+
+def check_keypoints(image: np.ndarray, found: Keypoints, budget: int | None) -> None:
+    """Check what was found in an image."""
+    expect(is_allowed(image), f"{image.dtype} of shape {image.shape} was taken")
+    height, width = image.shape[:2]
     expect(found.image_size == (width, height), f"of an image of {found.image_size}")
     expect(np.isfinite(found.xy).all() and np.isfinite(found.scores).all(), "not finite")
     inside = (found.xy > -0.51) & (found.xy < np.array([width, height]) - 0.49)
