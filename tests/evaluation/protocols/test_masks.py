@@ -88,7 +88,7 @@ def test_the_bundled_weights_hold_from_half_to_twice_the_size(
         (row,), (middle,) = rows[side], rows[480]
         assert row.visibility == middle.visibility == ("normal" if darkening is None else "low")
         dark = 0 if darkening is None else 1
-        assert row.score.iou > middle.score.iou - (0.04, 0.12)[dark]
+        assert row.score.iou > middle.score.iou - (0.03, 0.12)[dark]
         # Small images have more to mark: the loss of the paper's weights is 3 to 12 times as large.
         assert row.score.loss < 1.4 * middle.score.loss
         assert row.density == pytest.approx(row.label_density, rel=(0.1, 0.3)[dark])
