@@ -1,4 +1,4 @@
-"""What variants of the ONNX file cost and give: precisions, runtimes, keypoints, normalisation.
+"""What variants of the ONNX file cost and give: precisions, runtimes, keypoints.
 
     python benchmarks/onnx_variants.py SAMPLES [IMAGES] [--weights default] [--rounds 21]
 
@@ -20,8 +20,6 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import onnx
-from onnx import helper, numpy_helper
 
 from deepdetect import DeepDetect, MissingExtraError, OptionError
 from deepdetect.detector.backends.onnx_parts import cut_onnx
@@ -77,11 +75,7 @@ def main() -> None:
                 arguments.weights, files["int8"], OnnxOptions(precision="int8"), calibration=images
             )
         print(precision_table(files, samples, arguments.rounds).to_markdown() + "\n")
-        unfolded = folder / "multiply_add.onnx"
-        multiply_and_add(files["fp32"], unfolded)
         image = load_image(samples[0])
-        table = normalisation_table(files["fp32"], unfolded, image, arguments.rounds)
-        print(table.to_markdown() + "\n")
         print(parity_table(files["fp32"], folder, image).to_markdown() + "\n")
         print(keypoint_table(files["fp32"], folder, samples, arguments.rounds).to_markdown())
 
@@ -127,52 +121,6 @@ def precision_table(files: Mapping[str, Path], samples: list[Path], rounds: int)
 def one_thread(path: Path, backend: str, precision: Precision = "float32") -> DeepDetect:
     """Open a file for images as they are."""
     return DeepDetect(path, backend=backend, precision=precision, threads=1, resolution="native")
-
-
-def multiply_and_add(path: Path, made: Path) -> None:
-    """Write a file in which batch normalisation is a multiplication and an addition."""
-    model = onnx.load(str(path))
-    weights = {value.name: numpy_helper.to_array(value) for value in model.graph.initializer}
-    nodes = []
-    for node in model.graph.node:
-        if node.op_type != "BatchNormalization":
-            nodes.append(node)
-            continue
-        scale, bias, mean, variance = (weights[name].astype(float) for name in node.input[1:])
-        epsilon = next((a.f for a in node.attribute if a.name == "epsilon"), 1e-5)
-        factor = scale / np.sqrt(variance + epsilon)
-        output = node.output[0]
-        for kind, values in (("factor", factor), ("shift", bias - mean * factor)):
-            array = values.astype(np.float32).reshape(-1, 1, 1)
-            model.graph.initializer.append(numpy_helper.from_array(array, f"{output}_{kind}"))
-        product = f"{output}_product"
-        nodes.append(helper.make_node("Mul", [node.input[0], f"{output}_factor"], [product]))
-        nodes.append(helper.make_node("Add", [product, f"{output}_shift"], [output]))
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)
-    onnx.save(model, str(made))
-
-
-def normalisation_table(path: Path, unfolded: Path, image: np.ndarray, rounds: int) -> Table:
-    """Compare both ways to write batch normalisation in ONNX Runtime and in OpenCV 5."""
-    planes = planes_of(image, *TIMED_SIZE, 1)
-    makers: dict[str, Callable[[Path], Maps]] = {"ONNX Runtime": in_onnxruntime}
-    if cv2.__version__ >= "5":
-        makers[f"OpenCV {cv2.__version__}"] = lambda file: in_opencv(file, cv2.dnn.ENGINE_NEW)
-    rows: list[tuple[Cell, ...]] = []
-    for name, make in makers.items():
-        folded, other = make(path), make(unfolded)
-        before, after = folded(planes)[0], other(planes)[0]
-        crossing = float(np.mean((before > 0) != (after > 0)))
-        ratio = time_ratio(folded, other, planes, rounds)
-        rows.append((name, float(np.abs(after - before).max()), crossing, ratio))
-    columns = (
-        Column("multiplication and addition instead"),
-        Column("largest difference of logits", ".0e"),
-        Column("pixels that cross", ".4%"),
-        Column("time", ".2f"),
-    )
-    return Table("normalisation", "Batch normalisation", columns, tuple(rows))
 
 
 def parity_table(path: Path, folder: Path, image: np.ndarray) -> Table:

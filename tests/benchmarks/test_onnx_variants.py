@@ -55,22 +55,6 @@ def test_half_precision_beside_the_whole(
         assert 0.3 < overlap < 1
 
 
-def test_batch_normalisation_as_multiplication_and_addition(
-    script: ModuleType, photo: np.ndarray, tmp_path: Path
-) -> None:
-    made = tmp_path / "made.onnx"
-    script.multiply_and_add(pretrained_weights(), made)
-    kinds = [node.op_type for node in onnx.load(made).graph.node]
-    before = [node.op_type for node in onnx.load(pretrained_weights()).graph.node]
-    assert "BatchNormalization" not in kinds
-    assert kinds.count("Mul") - before.count("Mul") == before.count("BatchNormalization") > 0
-    planes = script.planes_of(photo, 64, 96, 1)
-    expected, found = (
-        script.in_onnxruntime(path)(planes)[0] for path in (pretrained_weights(), made)
-    )
-    assert 0 < np.abs(found - expected).max() < 1e-3
-
-
 def test_parity(
     script: ModuleType, photo: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,7 +14,7 @@ import onnxruntime  # noqa: E402
 
 from deepdetect import DeepDetect, OptionError, WeightsError  # noqa: E402
 from deepdetect.detector.backends.onnx_parts import cut_onnx  # noqa: E402
-from deepdetect.detector.network.onnx_graph import read_metadata  # noqa: E402
+from deepdetect.detector.network.onnx_graph import fold_normalisation, read_metadata  # noqa: E402
 from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 
@@ -149,6 +149,57 @@ def test_the_shipped_files_are_those_of_the_safetensors(name: str, tmp_path: Pat
         **metadata,
         "version": read_metadata(made)["version"],
     }
+
+
+@pytest.mark.parametrize("name", ["default", "dense", "free"])
+def test_batch_normalisation_is_folded(name: str) -> None:
+    graph = onnx.load(pretrained_weights(name)).graph
+    assert "BatchNormalization" not in {node.op_type for node in graph.node}
+
+
+def test_batch_normalisation_of_an_older_file_is_folded(tmp_path: Path, photo: np.ndarray) -> None:
+    """Behind a sum: (x + x) normalised per channel, beside NumPy."""
+    rng = np.random.default_rng(0)
+    weight, bias, mean, variance = rng.uniform(0.5, 2, (4, 3)).astype(np.float32)
+    graph = onnx.helper.make_graph(
+        [
+            onnx.helper.make_node("Add", ["image", "image"], ["sum"]),
+            onnx.helper.make_node("Identity", ["weight"], ["same"]),
+            onnx.helper.make_node(
+                "BatchNormalization",
+                ["sum", "same", "bias", "mean", "variance"],
+                ["logits"],
+                epsilon=0.25,
+            ),
+        ],
+        "older",
+        [onnx.helper.make_tensor_value_info("image", 1, ("b", 3, "h", "w"))],
+        [onnx.helper.make_tensor_value_info("logits", 1, ("b", 3, "h", "w"))],
+        [
+            onnx.numpy_helper.from_array(array, name)
+            for name, array in (
+                ("weight", weight),
+                ("bias", bias),
+                ("mean", mean),
+                ("variance", variance),
+            )
+        ],
+    )
+    fold_normalisation(graph)
+    assert [node.op_type for node in graph.node if node.op_type != "Identity"] == [
+        "Add",
+        "Mul",
+        "Add",
+    ]
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)])
+    model.ir_version = 8
+    images = images_of(photo, 5, 7, 2)
+    (found,) = session_of(model.SerializeToString()).run(None, {"image": images})
+    scale, offset, middle, spread = (
+        array[:, None, None] for array in (weight, bias, mean, variance)
+    )
+    expected = (2 * images - middle) / np.sqrt(spread + 0.25) * scale + offset
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_metadata(tmp_path: Path) -> None:

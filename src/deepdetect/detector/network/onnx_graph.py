@@ -45,7 +45,7 @@ def add_padding(model: ModelProto) -> None:
     """Let a network take any height and width, and give probabilities that are at most 1.
 
     The image is padded by repeating its last row and column to multiples of 8, and the maps are
-    cropped, as `compute_heatmap` does it. What follows a transposed convolution is folded into it.
+    cropped, as `compute_heatmap` does it. Batch normalisation is folded.
 
     Args:
         model: maps `image` to `logits` for multiples of 8; changed in place.
@@ -53,7 +53,7 @@ def add_padding(model: ModelProto) -> None:
     from onnx import helper
 
     graph = model.graph
-    _fold_transposed(graph)
+    fold_normalisation(graph)
     rest = split_nodes(graph)[1]
     for node in rest:
         rename(node, IMAGE, PADDED_IMAGE)
@@ -171,38 +171,49 @@ def _ending(graph: GraphProto, crop: bool = True) -> list[NodeProto]:
     ]
 
 
-def _fold_transposed(graph: GraphProto) -> None:
-    """Fold batch normalisation into the transposed convolution before it.
+def fold_normalisation(graph: GraphProto) -> None:
+    """Fold batch normalisation: into a transposed convolution, or into one factor and one offset.
 
-    PyTorch's exporter folds it into convolutions only. All others follow a sum or a concatenation,
-    and stay.
+    PyTorch's exporter folds those behind convolutions. Most of the others follow a sum or a
+    concatenation, and become a multiplication and an addition.
+
+    Args:
+        graph: of any network; changed in place. One without batch normalisation stays as it is.
     """
-    from onnx import numpy_helper
+    from onnx import helper, numpy_helper
 
     values = {one.name: one for one in graph.initializer}
     made = {name: node for node in graph.node for name in node.output}
     for node in graph.node:
-        if node.op_type == "Identity":  # equal weights are written once
+        if node.op_type == "Identity" and node.input[0] in values:  # equal weights, written once
             values[node.output[0]] = values[node.input[0]]
-    kept = []
+    folded: list[NodeProto] = []
     for node in graph.node:
-        before = made.get(node.input[0]) if node.op_type == "BatchNormalization" else None
-        if before is None or before.op_type != "ConvTranspose" or len(before.input) != 2:
-            kept.append(node)
+        if node.op_type != "BatchNormalization":
+            folded.append(node)
             continue
         weight, bias, mean, variance = (
             numpy_helper.to_array(values[name]).astype(np.float64) for name in node.input[1:]
         )
-        epsilon = next(one.f for one in node.attribute if one.name == "epsilon")
-        scale = weight / np.sqrt(variance + epsilon)
-        kernel = numpy_helper.to_array(values[before.input[1]]) * scale[:, None, None]
-        names = (f"{before.input[1]}.folded", f"{before.input[1]}.bias")
-        for name, array in zip(names, (kernel, bias - mean * scale), strict=True):
-            graph.initializer.append(numpy_helper.from_array(array.astype(np.float32), name))
-        before.input[1] = names[0]
-        before.input.append(names[1])
-        before.output[0] = node.output[0]
-    replace_nodes(graph, kept)
+        epsilon = next((one.f for one in node.attribute if one.name == "epsilon"), 1e-5)
+        factor = weight / np.sqrt(variance + epsilon)
+        offset = bias - mean * factor
+        source, target = node.input[0], node.output[0]
+        before = made.get(source)
+        if before is not None and before.op_type == "ConvTranspose" and len(before.input) == 2:
+            name = before.input[1]
+            kernel = numpy_helper.to_array(values[name]) * factor[:, None, None]
+            arrays = {f"{name}.folded": kernel, f"{name}.bias": offset}
+            before.input[:] = [before.input[0], *arrays]
+            before.output[0] = target
+        else:
+            both = {f"{target}.factor": factor, f"{target}.offset": offset}
+            arrays = {name: array[:, None, None] for name, array in both.items()}
+            product = f"{target}.product"
+            folded.append(helper.make_node("Mul", [source, f"{target}.factor"], [product]))
+            folded.append(helper.make_node("Add", [product, f"{target}.offset"], [target]))
+        add_constants(graph, arrays, np.float32)
+    replace_nodes(graph, folded)
 
 
 def replace_nodes(graph: GraphProto, nodes: Sequence[NodeProto]) -> None:

@@ -27,6 +27,7 @@ from .onnx_graph import (
     add_padding,
     check_graph,
     fix_size,
+    fold_normalisation,
     is_padded,
     read_metadata,
     write_metadata,
@@ -176,6 +177,7 @@ def _load(weights: str | Path) -> ModelProto:
         )
     if not is_padded(model):  # older files
         add_padding(model)
+    fold_normalisation(model.graph)  # those of version 0.1 have some left
     if "weights" not in found:
         write_metadata(model, {"weights": path.name})
     return model
