@@ -7,6 +7,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from deepdetect.io.image import luma
+from deepdetect.labels import fuse
+
 
 @pytest.fixture(scope="module")
 def script(load_script: Callable[[str], ModuleType]) -> ModuleType:
@@ -81,3 +84,12 @@ def test_photographs_without_masks_get_labels(script: ModuleType, photo_path: Pa
     assert image.shape == (64, 64, 3)
     assert label.shape == (64, 64)
     assert label.dtype == bool
+
+
+def test_labels_do_not_follow_shifts(script: ModuleType, photo: np.ndarray) -> None:
+    label = fuse(luma(photo)).mask
+    np.testing.assert_array_equal(script.label_logits(photo) > 0, label)
+    overlap, far, labels, density = script.shifts(script.label_logits, [(photo, label)])
+    assert 0.5 < overlap <= far < 0.999
+    assert labels == 1
+    assert density == label.mean()
