@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 
 from deepdetect import OptionError
 from deepdetect.cli._records import OutputRecords, claim_outputs, claimed_outputs
+from tests.cli.conftest import one_sentence
 
 
 @pytest.fixture
@@ -195,3 +197,28 @@ def test_an_output_belongs_to_the_command_that_wrote_it_last(tmp_path: Path) -> 
     claim_outputs("match", first, [output], overwrite=False)
     with pytest.raises(OptionError, match=r"made from .*a\.png"):
         claim_outputs("match", second, [output], overwrite=False)
+
+
+@pytest.mark.parametrize(
+    ("command", "package"),
+    [
+        (("extract", "photos", "-o", "out.h5"), "h5py"),
+        (("export", "colmap", "photos", "-o", "out"), "h5py"),
+        (("shards", "photos", "-o", "out"), "torch"),
+        (("train", "photos", "-o", "out"), "torch"),
+        (("train-points", "photos", "--validation", "photos", "-o", "out"), "torch"),
+    ],
+)
+def test_pictures_of_earlier_runs_are_no_photographs(
+    run, photos: Path, tmp_path: Path, command: tuple[str, ...], package: str
+) -> None:
+    pytest.importorskip(package, reason=f"needs {package}")
+    shutil.copytree(photos, tmp_path / "photos")
+    drawn = run("detect", "photos/cat.jpg", "-o", "photos/drawn", "--max-keypoints", 50)
+    assert drawn.exit_code == 0, drawn.output
+    refused = run(*command)
+    assert refused.exit_code == 2, refused.output
+    assert one_sentence(refused.stderr)
+    words = " ".join(refused.stderr.split())
+    assert "photos/drawn/cat_heatmap.jpg was made by an earlier run" in words
+    assert {path.name for path in tmp_path.iterdir()} == {"photos"}

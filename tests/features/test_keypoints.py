@@ -269,7 +269,7 @@ def test_the_text_of_keypoints_is_one_short_line() -> None:
     assert repr(Keypoints.empty((640, 480))) == "Keypoints(0 keypoints in 640x480 pixels)"
     described = Keypoints([[1, 2]], [0.25], (640, 480), descriptors=np.zeros((1, 128), np.uint8))
     assert repr(described) == (
-        "Keypoints(1 keypoints in 640x480 pixels, scores 0.25 to 0.25, 128-D uint8 descriptors)"
+        "Keypoints(1 keypoint in 640x480 pixels, scores 0.25 to 0.25, 128-D uint8 descriptors)"
     )
 
 

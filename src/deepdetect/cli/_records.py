@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from .._shared.atomic import atomic_path, clear_abandoned
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import DeepDetectError, ImageError, OptionError
 
 FOLDER = ".deepdetect"
 ADVICE = "choose another folder with -o, or replace it with --overwrite"
@@ -286,18 +286,36 @@ def check_not_made(folder: Path, images: Iterable[Path]) -> None:
     Raises:
         OptionError: one of them is an output, or lies in a folder that is one.
     """
-    made: dict[Path, set[Path]] = {}
+    made: dict[Path, set[str]] = {}
     for image in images:
         parts = image.relative_to(folder).parts
         for depth, name in enumerate(parts):
             parent = folder.joinpath(*parts[:depth])
             if parent not in made:
-                made[parent] = recorded_outputs(parent)
-            if parent.resolve() / name in made[parent]:
+                made[parent] = {path.name for path in recorded_outputs(parent)}
+            if name in made[parent]:
                 raise OptionError(
                     f"{image} was made by an earlier run and is no photograph: move what was made "
                     f"out of {folder}, or list the photographs"
                 )
+
+
+def check_none_made(folder: Path, output: Path) -> None:
+    """Refuse a folder of photographs that holds images which earlier runs of commands have made.
+
+    Those below the output are not looked at. Nothing is said of a folder without images, nor of
+    one that is missing: what reads it does.
+
+    Raises:
+        OptionError: one of them is an output, or lies in a folder that is one.
+    """
+    from ..io.image import find_images
+
+    try:
+        images = find_images(folder, [output])
+    except ImageError:
+        return
+    check_not_made(folder, images)
 
 
 def file_digest(path: Path) -> str:

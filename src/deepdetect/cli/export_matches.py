@@ -287,6 +287,7 @@ def _check_before_work(form: str, sources: tuple[Path, ...], camera: Mapping[str
     from ..geometry.camera import Camera
     from ..interchange.collection import check_names, check_upright
     from ..io.image import find_images
+    from ._records import check_not_made
 
     calibration, focal_px = camera.get("calibration"), camera.get("focal_px")
     if calibration is not None and focal_px is not None:
@@ -297,6 +298,7 @@ def _check_before_work(form: str, sources: tuple[Path, ...], camera: Mapping[str
         raise MissingFileError(f"there is no file {calibration}: check the path")
     if len(sources) == 1 and sources[0].is_dir():
         paths = find_images(sources[0])
+        check_not_made(sources[0], paths)
         check_names(form, (path.relative_to(sources[0]).as_posix() for path in paths))
         check_upright(form, paths)
 

@@ -66,7 +66,9 @@ def extract(
     """
     from ..batch.extraction import MAX_KEYPOINTS, extract_features
     from ..features.selection import SelectionOptions
+    from ._records import check_none_made
 
+    check_none_made(folder, output)
     detector = given_only({name: values.pop(name) for name in DETECTOR.names})
     given = given_only(values)
     if given.get("mode") != "dense":

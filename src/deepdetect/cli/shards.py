@@ -52,7 +52,9 @@ def shards(
     """
     from ..batch.engines import get_engine
     from ..training import Stage, write_shards
+    from ._records import check_none_made
 
+    check_none_made(images, output)
     # Shards are for any stages: one that fits every size stands for them.
     values["stages"] = (Stage(16, 1, 1),)
     chosen = given_only({name: values.pop(name) for name in WRITING.names})

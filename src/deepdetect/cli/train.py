@@ -83,7 +83,9 @@ def train(
     require_packages()
     from ..training import DeviceOptions, profile
     from ..training import train as train_network
+    from ._records import check_none_made
 
+    check_none_made(images, output)
     arguments = given_only({name: values.pop(name) for name in RUN.names})
     chosen = {name: values.pop(name) for name in DeviceOptions.__dataclass_fields__}
     arguments["device"] = DeviceOptions(**given_only(chosen))

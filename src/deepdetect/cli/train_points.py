@@ -67,7 +67,9 @@ def train_points(
     require_packages()
     from ..training.points.recipe import PointsTrainingOptions
     from ..training.points.trainer import BEST, PointsTrainer
+    from ._records import check_none_made
 
+    check_none_made(images, output)
     trainer = PointsTrainer(
         images,
         validation,

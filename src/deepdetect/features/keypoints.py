@@ -285,7 +285,7 @@ class Keypoints:
 
     def __repr__(self) -> str:
         width, height = self.image_size
-        text = f"{len(self)} keypoints in {width}x{height} pixels"
+        text = f"{len(self)} keypoint{'s' * (len(self) != 1)} in {width}x{height} pixels"
         if len(self):
             text += f", scores {self.scores.min():.3g} to {self.scores.max():.3g}"
         if self.descriptors is not None:

@@ -73,7 +73,7 @@ def load_keypoints(path: str | Path) -> Keypoints:
         >>> path = Path(tempfile.mkdtemp()) / "keypoints.npz"
         >>> save_keypoints(Keypoints([[3, 4]], [0.9], (20, 10)), path)
         >>> load_keypoints(path)
-        Keypoints(1 keypoints in 20x10 pixels, scores 0.9 to 0.9)
+        Keypoints(1 keypoint in 20x10 pixels, scores 0.9 to 0.9)
     """
     arrays = _load_npz(path, "keypoints")
     with _building(path, "keypoints"):
