@@ -9,8 +9,8 @@ import numpy as np
 from ..._shared.errors import OptionError
 from ..._shared.opencv import cv2
 
-BLOCK_SIZE = 32_000_000
-"""Numbers of four bytes that exact search holds at a time, to bound the memory (about 128 MB)."""
+BLOCK_SIZE = 4_000_000
+"""Numbers of four bytes that exact search holds at a time: 16 MB, most of which caches hold."""
 
 MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
 """Length of descriptors of bytes up to which single precision computes distances exactly."""
@@ -36,15 +36,17 @@ def exact_neighbours(
     whole = queries.dtype == base.dtype == np.uint8 and queries.shape[1] <= MAX_EXACT_BYTES
     precision: type[np.floating[Any]] = np.float32 if whole else np.float64
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
-    wide = base.astype(precision)
-    squared_norms = np.einsum("ij,ij->i", wide, wide)
-    step = max(1, BLOCK_SIZE // (2 * max(len(base), 2 * count * base.shape[1])))
+    # |q - b|^2 without the constant |q|^2, as one product: (-2 q, 1) (b, |b|^2).
+    length = base.shape[1]
+    wide = np.empty((length + 1, len(base)), precision)
+    wide[:length] = base.T
+    np.einsum("ij,ij->j", wide[:length], wide[:length], out=wide[length])
+    step = max(1, BLOCK_SIZE // max(len(base) * wide.itemsize // 4, 2 * count * length))
     for start in range(0, len(queries), step):
         block = queries[start : start + step]
-        # |q - b|^2 without the constant |q|^2.
-        partial = block.astype(precision) @ wide.T
-        partial *= -2
-        partial += squared_norms
+        factors = np.ones((len(block), length + 1), precision)
+        np.multiply(block, -2, out=factors[:, :length])
+        partial = factors @ wide
         found = np.empty((len(block), count), np.intp)
         every = np.arange(len(block))
         for rank in range(count):  # argmin takes the lower row of equals
