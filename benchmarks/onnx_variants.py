@@ -32,7 +32,7 @@ from deepdetect.detector.network.onnx_graph import (
     PROBABILITY,
     STRIDE,
 )
-from deepdetect.detector.network.onnx_keypoints import KEYPOINT_LOGITS, KEYPOINTS
+from deepdetect.detector.network.onnx_keypoints import KEYPOINT_LOGITS, KEYPOINTS, MAX_KEYPOINTS
 from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx
 from deepdetect.evaluation.protocols.masks import sample_images, score_samples
 from deepdetect.evaluation.report import Cell, Column, Table
@@ -48,7 +48,7 @@ Maps = Callable[[np.ndarray], Sequence[np.ndarray]]
 
 MAPS = (LOGITS, PROBABILITY)
 ALL_OUTPUTS = (*MAPS, KEYPOINTS, KEYPOINT_LOGITS)
-KEYPOINT_COUNTS = (100, 1000, 10_000)
+KEYPOINT_COUNTS = (100, MAX_KEYPOINTS, 10_000)
 
 SAME_PX = 1e-3
 """Of a keypoint from the package's, where they count as the same."""
@@ -66,14 +66,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         files = {"fp32": folder / "fp32.onnx", "fp16": folder / "fp16.onnx"}
-        write_onnx(arguments.weights, files["fp32"])
-        write_onnx(arguments.weights, files["fp16"], OnnxOptions(precision="fp16"))
+        write_onnx(arguments.weights, files["fp32"], OnnxOptions(max_keypoints=0))
+        write_onnx(arguments.weights, files["fp16"], OnnxOptions(precision="fp16", max_keypoints=0))
         if arguments.images is not None:
             files["int8"] = folder / "int8.onnx"
             images = find_images(arguments.images)
-            write_onnx(
-                arguments.weights, files["int8"], OnnxOptions(precision="int8"), calibration=images
-            )
+            options = OnnxOptions(precision="int8", max_keypoints=0)
+            write_onnx(arguments.weights, files["int8"], options, calibration=images)
         print(precision_table(files, samples, arguments.rounds).to_markdown() + "\n")
         image = load_image(samples[0])
         print(parity_table(files["fp32"], folder, image).to_markdown() + "\n")
@@ -190,7 +189,7 @@ def keypoint_table(path: Path, folder: Path, samples: list[Path], rounds: int) -
             same = np.concatenate([are_near(xy, keypoints) for xy, keypoints in pairs])
             ratio = time_ratio(make(path, MAPS), run, timed, rounds)
             rows.append((name, count, float(np.mean(same)), ratio))
-        if count == KEYPOINT_COUNTS[len(KEYPOINT_COUNTS) // 2]:
+        if count == MAX_KEYPOINTS:
             unread = time_ratio(in_onnxruntime(path), in_onnxruntime(file), timed, rounds)
             rows.append(("ONNX Runtime, asked for maps", count, float("nan"), unread))
     columns = (Column("runtime"), Column("keypoints", ","), Column("the package's", ".4%"))

@@ -52,7 +52,7 @@ def test_keypoints(run, tmp_path: Path) -> None:
         ("-o a.onnx --batch 2", "--batch needs --size"),
         ("-o a.onnx --size 480", "'480' is no height and width"),
         ("-o a.onnx --size 4x99999", "--size must lie in"),
-        ("-o a.onnx --max-keypoints 0", "--max-keypoints must lie in"),
+        ("-o a.onnx --max-keypoints -1", "--max-keypoints must lie in"),
         ("-o a.onnx --max-keypoints 100001", "--max-keypoints must lie in"),
         ("-o a.png", "ends in .onnx"),
         ("densse -o a.onnx", "did you mean 'dense'"),

@@ -12,7 +12,7 @@ from PIL import Image
 pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
 
 from deepdetect import DeepDetect
-from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx
+from deepdetect.detector.network.onnx_variants import write_onnx
 from tests.docs.test_pages import blocks
 
 
@@ -20,7 +20,7 @@ def test_keypoints_in_the_file(
     photo: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    write_onnx("default", "keypoints.onnx", OnnxOptions(max_keypoints=1000))
+    write_onnx("default", "deepdetect.onnx")
     Image.fromarray(photo[:123, :157]).save("photo.jpg", quality=100)
     (block,) = blocks("onnx.md", "python")
     found: dict[str, Any] = {}

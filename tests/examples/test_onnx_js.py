@@ -104,17 +104,21 @@ for (let k = 0; k < keypoint_logits.data.length; k++) {
     made = tmp_path / "made.onnx"
     write_onnx("default", made, OnnxOptions(max_keypoints=200))
     detector = DeepDetect(backend="onnxruntime")
-    for height, width in ((123, 157), (17, 23)):
+    for model, count, height, width in (
+        (pretrained_weights(), 2048, 123, 157),
+        (made, 200, 123, 157),
+        (made, 200, 17, 23),
+    ):
         rgb = photo[:height, :width]
         planes = np.ascontiguousarray(rgb.transpose(2, 0, 1) * np.float32(1 / 255))
         planes.tofile(tmp_path / "given.bin")
-        words = [made, tmp_path / "given.bin", height, width]
+        words = [model, tmp_path / "given.bin", height, width]
         command = ["node", "best.mjs", *map(str, words)]
         ended = subprocess.run(command, cwd=installed, capture_output=True, text=True, check=True)
         rows = [line.replace("Infinity", "inf").split() for line in ended.stdout.splitlines()]
         found = np.array(rows, float)
-        expected = detector.detect(rgb, max_keypoints=200, mode="dense")
-        assert found.shape == (200, 3)
+        expected = detector.detect(rgb, max_keypoints=count, mode="dense")
+        assert found.shape == (count, 3)
         assert np.isfinite(found[:, 2]).sum() == len(expected) > 5
         xy = found[: len(expected), :2]
         gaps = np.linalg.norm(xy[:, None] - expected.xy, axis=2)

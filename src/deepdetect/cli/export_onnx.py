@@ -57,14 +57,14 @@ def export_onnx(
 
     WEIGHTS are default, dense, free, an ONNX file that this package has written in fp32 for any
     size, or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
-    `probability` and `logits` for each pixel, and `keypoints` with --max-keypoints. docs/onnx.md
-    says which file is for which runtime.
+    `probability` and `logits` for each pixel, and the best `keypoints` with `keypoint_logits`.
+    docs/onnx.md says which file is for which runtime.
 
     \b
     deepdetect export onnx -o deepdetect.onnx
     deepdetect export onnx dense -o dense-480x640.onnx --size 480x640
     deepdetect export onnx run/best.safetensors -o half.onnx --precision fp16
-    deepdetect export onnx -o keypoints.onnx --max-keypoints 1000
+    deepdetect export onnx -o maps.onnx --max-keypoints 0
     deepdetect export onnx -o small.onnx --precision int8 --calibration photos/
     """
     from ..detector.network.onnx_variants import OnnxOptions, write_onnx

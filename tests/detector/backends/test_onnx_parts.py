@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect.detector.backends.onnx_parts import cut_onnx
+from deepdetect.detector.backends.onnx_parts import cut_onnx, leave_out_outputs
 from deepdetect.detector.pretrained import pretrained_weights
 
 MODEL = pretrained_weights().read_bytes()
@@ -22,7 +22,7 @@ def run(model: bytes, **given: np.ndarray) -> list[np.ndarray]:
 
 def test_the_parts_one_after_the_other_are_the_whole() -> None:
     image = np.random.default_rng(0).random((1, 3, 40, 64), np.float32)
-    _, expected = run(MODEL, image=image)
+    _, expected, *_ = run(MODEL, image=image)
     (half,) = run(cut_onnx(MODEL, ["image"], [HALF]), image=image)
     assert half.shape == (1, 19, 20, 32)
     (found,) = run(cut_onnx(MODEL, ["image", HALF], ["logits"]), image=image, half=half)
@@ -45,3 +45,40 @@ def test_a_part_is_a_valid_file_with_what_it_needs(tmp_path: Path) -> None:
 def test_tensors_that_are_missing(inputs: list[str], outputs: list[str]) -> None:
     with pytest.raises(KeyError):
         cut_onnx(MODEL, inputs, outputs)
+
+
+def test_outputs_are_left_out_with_what_computes_them_only() -> None:
+    onnx = pytest.importorskip("onnx")
+    image = np.random.default_rng(0).random((2, 3, 41, 50), np.float32)
+    part = leave_out_outputs(MODEL, {"keypoints", "keypoint_logits", "none"})
+    found, whole = onnx.load_from_string(part), onnx.load_from_string(MODEL)
+    onnx.checker.check_model(found, full_check=True)
+    assert list(found.graph.input) == list(whole.graph.input)
+    assert list(found.graph.output) == list(whole.graph.output)[:2]
+    assert {node.op_type for node in whole.graph.node} >= {"TopK", "MaxPool"}
+    assert {node.op_type for node in found.graph.node}.isdisjoint({"TopK", "MaxPool"})
+    assert list(found.metadata_props) == list(whole.metadata_props)
+    for one, other in zip(run(part, image=image), run(MODEL, image=image), strict=False):
+        np.testing.assert_allclose(one, other, atol=1e-4)
+
+
+def test_a_file_without_these_outputs_stays_as_it_is() -> None:
+    assert leave_out_outputs(MODEL, {"none"}) is MODEL
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"text, and no model" * 9, b"\xff" * 40, MODEL[5000:], MODEL[:9000], MODEL[:-100]],
+)
+def test_another_file_is_refused(content: bytes) -> None:
+    with pytest.raises(KeyError):
+        leave_out_outputs(content, {"logits"})
+
+
+def test_the_package_computes_maps_only() -> None:
+    from deepdetect.detector.backends.onnxruntime_backend import open_onnxruntime
+    from deepdetect.detector.backends.options import RuntimeOptions
+
+    network = open_onnxruntime(pretrained_weights(), RuntimeOptions())
+    names = [value.name for value in network._session.get_outputs()]
+    assert names == ["probability", "logits"]

@@ -14,8 +14,7 @@ import cv2  # noqa: E402
 import onnxruntime  # noqa: E402
 
 from deepdetect import DeepDetect, OptionError  # noqa: E402
-from deepdetect.detector.network.onnx_graph import read_metadata  # noqa: E402
-from deepdetect.detector.network.onnx_keypoints import add_keypoints  # noqa: E402
+from deepdetect.detector.network.onnx_keypoints import MAX_KEYPOINTS, add_keypoints  # noqa: E402
 from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 from deepdetect.features.keypoints import Keypoints  # noqa: E402
@@ -61,37 +60,50 @@ def best(rgb: np.ndarray, count: int = COUNT, weights: Any = "default") -> Keypo
     return detector.detect(rgb, max_keypoints=count, mode="dense")
 
 
+@pytest.fixture(scope="module", params=[MAX_KEYPOINTS, COUNT], ids=["shipped", "made"])
+def count(request: pytest.FixtureRequest) -> int:
+    """How many keypoints the file gives that is tested."""
+    return int(request.param)
+
+
 @pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file for any size that gives keypoints."""
-    made = tmp_path_factory.mktemp("keypoints") / "keypoints.onnx"
-    write_onnx("default", made, OnnxOptions(max_keypoints=COUNT))
+def path(count: int, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file for any size that gives keypoints: the shipped one, or another."""
+    made = pretrained_weights()
+    if count != MAX_KEYPOINTS:
+        made = tmp_path_factory.mktemp("keypoints") / "keypoints.onnx"
+        write_onnx("default", made, OnnxOptions(max_keypoints=count))
     onnx.checker.check_model(onnx.load(made), full_check=True)
     return made
 
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_they_are_what_detect_finds(height: int, width: int, path: Path, photo: np.ndarray) -> None:
+def test_they_are_what_detect_finds(
+    height: int, width: int, path: Path, count: int, tmp_path: Path, photo: np.ndarray
+) -> None:
     rgb = photo[:height, :width]
     names = ["probability", "logits", *OUTPUTS]
     probability, logits, xy, values = session_of(path).run(names, {"image": planes_of(rgb)})
-    expected = best(rgb)
-    assert (len(expected) < COUNT) == (width < 64)
-    check_keypoints(xy[0], values[0], expected, COUNT)
-    # The maps are those of the shipped file.
-    shipped = session_of(pretrained_weights()).run(names[:2], {"image": planes_of(rgb)})
-    np.testing.assert_allclose(probability, shipped[0], atol=1e-5)
-    np.testing.assert_allclose(logits, shipped[1], atol=1e-4)
+    expected = best(rgb, count)
+    assert count == MAX_KEYPOINTS or (len(expected) < count) == (width < 64)
+    check_keypoints(xy[0], values[0], expected, count)
+    # The maps are those of a file without keypoints.
+    write_onnx("default", tmp_path / "maps.onnx", OnnxOptions(max_keypoints=0))
+    maps = session_of(tmp_path / "maps.onnx")
+    assert [value.name for value in maps.get_outputs()] == names[:2]
+    alone = maps.run(names[:2], {"image": planes_of(rgb)})
+    np.testing.assert_allclose(probability, alone[0], atol=1e-5)
+    np.testing.assert_allclose(logits, alone[1], atol=1e-4)
 
 
-def test_a_batch_gives_those_of_each_image(path: Path, photo: np.ndarray) -> None:
+def test_a_batch_gives_those_of_each_image(path: Path, count: int, photo: np.ndarray) -> None:
     # The second one has fewer.
     images = [photo[:123, :157], photo[100:223, 60:217].copy()]
     images[1][:, 15:] = 128
     xy, values = session_of(path).run(OUTPUTS, {"image": planes_of(*images)})
     for k, rgb in enumerate(images):
-        check_keypoints(xy[k], values[k], best(rgb), COUNT)
-    assert np.isfinite(values).sum(1)[1] < COUNT
+        check_keypoints(xy[k], values[k], best(rgb, count), count)
+    assert np.isfinite(values).sum(1)[1] < count
 
 
 @pytest.mark.parametrize("precision", ["fp32", "fp16"])
@@ -179,7 +191,7 @@ def same_share(xy: np.ndarray, values: np.ndarray, expected: Keypoints) -> float
     return float(np.mean(gaps.min(0) < 0.01))
 
 
-def test_openvino(path: Path, photo: np.ndarray) -> None:
+def test_openvino(path: Path, count: int, photo: np.ndarray) -> None:
     openvino = pytest.importorskip("openvino", reason="needs OpenVINO")
     settings = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": 1}
     model = openvino.Core().compile_model(str(path), "CPU", settings)
@@ -187,19 +199,24 @@ def test_openvino(path: Path, photo: np.ndarray) -> None:
         images = [photo[:height, :width], photo[40 : 40 + height, 30 : 30 + width]]
         found = model([planes_of(*images)])
         for k, rgb in enumerate(images):
-            shares = same_share(found["keypoints"][k], found["keypoint_logits"][k], best(rgb))
+            expected = best(rgb, count)
+            shares = same_share(found["keypoints"][k], found["keypoint_logits"][k], expected)
             assert shares > 0.99
 
 
 @pytest.mark.skipif(cv2.__version__ < "5", reason="needs the new engine of OpenCV 5")
-def test_opencv_5(path: Path, photo: np.ndarray) -> None:
+def test_opencv_5(path: Path, count: int, photo: np.ndarray) -> None:
     network = cv2.dnn.readNetFromONNX(str(path), cv2.dnn.ENGINE_NEW)
     for height, width in SIZES:
         images = [photo[:height, :width], photo[40 : 40 + height, 30 : 30 + width]]
         network.setInput(planes_of(*images))
         *_, xy, values = network.forward(["probability", "logits", *OUTPUTS])
         for k, rgb in enumerate(images):
-            assert same_share(xy[k], values[k], best(rgb)) > 0.99
+            assert same_share(xy[k], values[k], best(rgb, count)) > 0.99
+        # A list of names must name all of them; one name alone may be any.
+        with pytest.raises(cv2.error):
+            network.forward(["probability", "logits"])
+        assert network.forward("logits").shape == (2, 1, height, width)
 
 
 @pytest.fixture(scope="module")
@@ -279,10 +296,34 @@ def test_the_classic_engine_refuses_them(tmp_path: Path) -> None:
         cv2.dnn.readNetFromONNX(str(tmp_path / "one.onnx"), cv2.dnn.ENGINE_CLASSIC)
 
 
-def test_metadata(path: Path) -> None:
+def test_metadata(path: Path, count: int) -> None:
     found = session_of(path).get_modelmeta().custom_metadata_map
-    assert found["max_keypoints"] == str(COUNT)
-    assert "max_keypoints" not in read_metadata(onnx.load(pretrained_weights()))
+    assert found["max_keypoints"] == str(count)
+
+
+@pytest.mark.parametrize("name", ["default", "dense", "free"])
+def test_all_shipped_files_give_them(name: str, photo: np.ndarray) -> None:
+    rgb = photo[:123, :157]
+    xy, values = session_of(pretrained_weights(name)).run(OUTPUTS, {"image": planes_of(rgb)})
+    check_keypoints(xy[0], values[0], best(rgb, MAX_KEYPOINTS, name), MAX_KEYPOINTS)
+
+
+@pytest.mark.parametrize(
+    ("options", "count"),
+    [
+        (OnnxOptions(), MAX_KEYPOINTS),
+        (OnnxOptions(precision="fp16"), MAX_KEYPOINTS),
+        (OnnxOptions(max_keypoints=0), 0),
+        (OnnxOptions((64, 96)), 0),  # OpenCV 4 refuses others
+        (OnnxOptions((64, 96), max_keypoints=7), 7),
+    ],
+)
+def test_how_many_a_file_gives(options: OnnxOptions, count: int, tmp_path: Path) -> None:
+    metadata = write_onnx("default", tmp_path / "made.onnx", options)
+    assert metadata.get("max_keypoints", "0") == str(count)
+    outputs = session_of(tmp_path / "made.onnx").get_outputs()
+    shapes = {value.name: value.shape[-1] for value in outputs if value.name in OUTPUTS}
+    assert shapes == ({"keypoints": 2, "keypoint_logits": count} if count else {})
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
@@ -310,15 +351,14 @@ def test_such_a_file_runs_in_tiles(path: Path, photo: np.ndarray) -> None:
 
 
 def test_a_file_is_made_of_such_a_file(path: Path, tmp_path: Path) -> None:
-    metadata = write_onnx(path, tmp_path / "maps.onnx")
-    assert "max_keypoints" not in metadata
-    assert onnx.load(tmp_path / "maps.onnx").graph == onnx.load(pretrained_weights()).graph
+    write_onnx(path, tmp_path / "again.onnx")
+    assert (tmp_path / "again.onnx").read_bytes() == pretrained_weights().read_bytes()
     write_onnx(path, tmp_path / "fewer.onnx", OnnxOptions(max_keypoints=7))
     write_onnx("default", tmp_path / "expected.onnx", OnnxOptions(max_keypoints=7))
     assert (tmp_path / "fewer.onnx").read_bytes() == (tmp_path / "expected.onnx").read_bytes()
 
 
-@pytest.mark.parametrize("count", [0, -3, 100_001, 1.5, "many", float("nan")])
+@pytest.mark.parametrize("count", [-3, 100_001, 0.5, 1.5, "many", float("nan")])
 def test_the_number_is_checked(count: Any) -> None:
     with pytest.raises(OptionError, match="`max_keypoints` must"):
         OnnxOptions(max_keypoints=count)

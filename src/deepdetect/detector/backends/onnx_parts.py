@@ -6,13 +6,17 @@ the format (onnx.proto3) are read: nodes and weights are copied as they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 MODEL_GRAPH = 7
 GRAPH_NODE, GRAPH_NAME, GRAPH_INITIALIZER, GRAPH_INPUT, GRAPH_OUTPUT = 1, 2, 5, 11, 12
 NODE_INPUT, NODE_OUTPUT = 1, 2
-INITIALIZER_NAME = 8
+INITIALIZER_NAME, VALUE_NAME = 8, 1
 FLOAT = 1
+
+Bytes = bytes | memoryview
+"""Parts of a file are views of it: copies would take several times its size."""
 
 
 def cut_onnx(model: bytes, inputs: Sequence[str], outputs: Sequence[str]) -> bytes:
@@ -29,49 +33,115 @@ def cut_onnx(model: bytes, inputs: Sequence[str], outputs: Sequence[str]) -> byt
     Raises:
         KeyError: a tensor is not there, or needs more than the inputs.
     """
-    rest, graph = [], b""
+    graph = _read(model)
+    nodes, weights = graph.needed(inputs, outputs)
+    return graph.written(
+        nodes,
+        weights,
+        [_message(GRAPH_INPUT, _tensor(name)) for name in inputs],
+        [_message(GRAPH_OUTPUT, _tensor(name)) for name in outputs],
+    )
+
+
+def leave_out_outputs(model: bytes, names: Collection[str]) -> bytes:
+    """Cut off an ONNX file what computes some of its outputs only.
+
+    ONNX Runtime computes all outputs of a file, asked for or not.
+
+    Args:
+        model: the file's content.
+        names: of the outputs.
+
+    Returns:
+        The content of a smaller file; the same where it has none of these outputs.
+
+    Raises:
+        KeyError: it is no ONNX file.
+    """
+    try:
+        graph = _read(model)
+        kept = [name for name in graph.outputs if name not in names]
+        if len(kept) == len(graph.outputs):
+            return model
+        nodes, weights = graph.needed(list(graph.inputs), kept)
+    except (IndexError, StopIteration, UnicodeDecodeError) as error:
+        raise KeyError(str(error)) from None
+    outputs = [graph.outputs[name] for name in kept]
+    return graph.written(nodes, weights, graph.inputs.values(), outputs)
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """What an ONNX file holds, each part as it is written there."""
+
+    model: list[Bytes]  # all but the graph
+    nodes: list[tuple[Bytes, list[str], list[str]]]  # with the tensors that are read and written
+    weights: dict[str, Bytes]
+    inputs: dict[str, Bytes]
+    outputs: dict[str, Bytes]
+
+    def needed(
+        self, inputs: Sequence[str], outputs: Sequence[str]
+    ) -> tuple[list[Bytes], list[Bytes]]:
+        """Return the nodes and the weights that compute some tensors from others."""
+        kept: list[Bytes] = []
+        wanted = set(outputs)
+        used = []
+        for raw, read, written in reversed(self.nodes):
+            if wanted.isdisjoint(written):
+                continue
+            kept.append(raw)
+            wanted -= set(written)
+            used += [name for name in read if name in self.weights]
+            wanted |= {name for name in read if name not in self.weights and name not in inputs}
+        if wanted:
+            raise KeyError(min(wanted))
+        return kept[::-1], [self.weights[name] for name in dict.fromkeys(used)]
+
+    def written(
+        self,
+        nodes: list[Bytes],
+        weights: list[Bytes],
+        inputs: Iterable[Bytes],
+        outputs: Iterable[Bytes],
+    ) -> bytes:
+        """Return the content of a file with these parts of a graph."""
+        part = [*nodes, _message(GRAPH_NAME, b"part"), *weights, *inputs, *outputs]
+        length = _number(sum(map(len, part)))
+        return b"".join([*self.model, _number(MODEL_GRAPH << 3 | 2), length, *part])
+
+
+def _read(model: bytes) -> _Graph:
+    """Take an ONNX file apart."""
+    rest: list[Bytes] = []
+    graph: Bytes = b""
     for number, payload, raw in _fields(model):
         if number == MODEL_GRAPH:
             graph = payload
         else:
             rest.append(raw)
-    nodes, weights = [], {}
+    parts = _Graph(rest, [], {}, {}, {})
+    named = {
+        GRAPH_INITIALIZER: (parts.weights, INITIALIZER_NAME),
+        GRAPH_INPUT: (parts.inputs, VALUE_NAME),
+        GRAPH_OUTPUT: (parts.outputs, VALUE_NAME),
+    }
     for number, payload, raw in _fields(graph):
         if number == GRAPH_NODE:
-            names = [(kind, name.decode()) for kind, name, _ in _fields(payload) if kind <= 2]
+            names = [(kind, str(name, "utf-8")) for kind, name, _ in _fields(payload) if kind <= 2]
             read = [name for kind, name in names if kind == NODE_INPUT and name]
             written = [name for kind, name in names if kind == NODE_OUTPUT]
-            nodes.append((raw, read, written))
-        elif number == GRAPH_INITIALIZER:
-            name = next(text for kind, text, _ in _fields(payload) if kind == INITIALIZER_NAME)
-            weights[name.decode()] = raw
-    kept: list[bytes] = []
-    wanted = set(outputs)
-    used = []
-    for raw, read, written in reversed(nodes):
-        if wanted.isdisjoint(written):
-            continue
-        kept.append(raw)
-        wanted -= set(written)
-        used += [name for name in read if name in weights]
-        wanted |= {name for name in read if name not in weights and name not in inputs}
-    if wanted:
-        raise KeyError(min(wanted))
-    part = b"".join(
-        [
-            *reversed(kept),
-            _message(GRAPH_NAME, b"part"),
-            *(weights[name] for name in dict.fromkeys(used)),
-            *(_message(GRAPH_INPUT, _tensor(name)) for name in inputs),
-            *(_message(GRAPH_OUTPUT, _tensor(name)) for name in outputs),
-        ]
-    )
-    return b"".join([*rest, _message(MODEL_GRAPH, part)])
+            parts.nodes.append((raw, read, written))
+        elif number in named:
+            into, field = named[number]
+            name = next(text for kind, text, _ in _fields(payload) if kind == field)
+            into[str(name, "utf-8")] = raw
+    return parts
 
 
-def _fields(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
+def _fields(data: Bytes) -> Iterator[tuple[int, memoryview, memoryview]]:
     """Yield number, payload and whole text of each field of a message in protobuf's format."""
-    place = 0
+    data, place = memoryview(data), 0
     while place < len(data):
         start = place
         tag, place = _varint(data, place)
@@ -85,10 +155,12 @@ def _fields(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
             place += 8 if kind == 1 else 4
         else:
             raise KeyError(f"field of kind {kind}")
+        if place > len(data):
+            raise KeyError("the end of the file")
         yield tag >> 3, data[first:place], data[start:place]
 
 
-def _varint(data: bytes, place: int) -> tuple[int, int]:
+def _varint(data: memoryview, place: int) -> tuple[int, int]:
     """Read a number; return it, and the place behind it."""
     value = shift = 0
     while True:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError, WeightsError, unknown_name
+from .onnx_parts import leave_out_outputs
 from .options import RuntimeOptions
 from .shapes import (
     KEYPOINT_OUTPUTS,
@@ -86,7 +87,7 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
     def start(chosen: list[str]) -> Any:
         # Falling back to the CPU after a failure, it would print blocks of text.
         return onnxruntime.InferenceSession(
-            str(path), settings, providers=chosen, enable_fallback=0
+            _maps_only(path), settings, providers=chosen, enable_fallback=0
         )
 
     try:
@@ -103,13 +104,14 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
         ) from None
     # It goes on with the CPU when a provider cannot start, and says so in a log only.
     session.disable_fallback()
+    session._model_bytes = None  # the content of the file, which it keeps for falling back
     if providers[0] not in session.get_providers():
         raise OptionError(
             f"the provider {providers[0]} could not start: check its driver and libraries, "
             "or leave it out"
         )
     inputs = session.get_inputs()
-    outputs = [value for value in session.get_outputs() if value.name not in KEYPOINT_OUTPUTS]
+    outputs = session.get_outputs()
     check_network(
         path,
         [value.shape for value in inputs],
@@ -122,6 +124,16 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
     )
     output = output_to_read([value.name for value in outputs])
     return OnnxRuntimeNetwork(session, inputs[0].name, output, path, options.threads)
+
+
+def _maps_only(path: Path) -> str | bytes:
+    """Return the content of a file that gives keypoints, too, without them; else its path."""
+    with contextlib.suppress(OSError, KeyError):  # ONNX Runtime says what is wrong
+        model = path.read_bytes()
+        without = leave_out_outputs(model, KEYPOINT_OUTPUTS)
+        if without is not model:
+            return without
+    return str(path)
 
 
 def _starts(start: Callable[[list[str]], Any]) -> bool:

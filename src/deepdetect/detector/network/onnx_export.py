@@ -1,4 +1,4 @@
-"""From torch to an ONNX file for any image size: `image` in, `probability` and `logits` out."""
+"""From torch to an ONNX file for any image size: `image` in; maps and the best keypoints out."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ..._shared.atomic import atomic_path
 from .onnx_graph import ANY_SIZE, add_padding, write_metadata
+from .onnx_keypoints import MAX_KEYPOINTS, add_keypoints
 
 OPSET = 17
 
@@ -39,7 +40,7 @@ def export_onnx(
             are multiples of 8.
         path: file ending in .onnx. Its input is `image` (batch, 3, height, width)
             float32 of any size, its outputs `probability` and `logits`, both
-            (batch, 1, height, width) float32.
+            (batch, 1, height, width) float32, and those of `add_keypoints`.
         metadata: what the file says beside what all say (`onnx_graph.METADATA`), as its licence.
     """
     import onnx
@@ -63,6 +64,8 @@ def export_onnx(
         )
     model = onnx.load_model_from_string(written.getvalue())
     add_padding(model)
-    write_metadata(model, {**ANY_SIZE, **(metadata or {})})
+    add_keypoints(model, MAX_KEYPOINTS)
+    of_keypoints = {"max_keypoints": str(MAX_KEYPOINTS)}
+    write_metadata(model, {**ANY_SIZE, **of_keypoints, **(metadata or {})})
     with atomic_path(path) as temporary:
         temporary.write_bytes(model.SerializeToString())

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 KEYPOINTS, KEYPOINT_LOGITS = "keypoints", "keypoint_logits"
 PREFIX = "keypoint"
 
+MAX_KEYPOINTS = 2048
+"""How many a file for any size gives, the shipped ones, too."""
+
 NO_POSITION, NO_LOGIT = -1.0, -np.inf
 """What the rows hold behind the last keypoint of an image that has fewer than the file gives."""
 

@@ -32,7 +32,7 @@ from .onnx_graph import (
     read_metadata,
     write_metadata,
 )
-from .onnx_keypoints import add_keypoints, remove_keypoints
+from .onnx_keypoints import MAX_KEYPOINTS, add_keypoints, remove_keypoints
 from .onnx_precision import to_float16, to_int8
 
 if TYPE_CHECKING:
@@ -54,8 +54,8 @@ class OnnxOptions:
             which it needs calibration images; it marks other pixels).
         max_calibration_images: at most this many images calibrate int8, evenly chosen.
         max_keypoints: the file gives this many dense keypoints, too, the best ones: what
-            `DeepDetect.detect` finds with the same `max_keypoints` and mode="dense". None: maps
-            only.
+            `DeepDetect.detect` finds with the same `max_keypoints` and mode="dense". 0: maps
+            only. None: 2048; with a size 0, as OpenCV 4 refuses files with keypoints.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -78,12 +78,20 @@ class OnnxOptions:
                 "size": (8, 16384),
                 "batch": (1, 1024),
                 "max_calibration_images": (1, 10_000),
-                "max_keypoints": (1, 100_000),
+                "max_keypoints": (0, 100_000),
             },
         )
-        check_max_keypoints(self.max_keypoints)
+        if self.max_keypoints:
+            check_max_keypoints(self.max_keypoints)
         if self.batch != 1 and self.size is None:
             raise OptionError("`batch` needs `size`: a file for any size takes any batch")
+
+    @property
+    def keypoints_in_file(self) -> int:
+        """How many keypoints the file gives: `max_keypoints`, or what is usual for its size."""
+        if self.max_keypoints is not None:
+            return int(self.max_keypoints)
+        return MAX_KEYPOINTS if self.size is None else 0
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -92,8 +100,8 @@ class OnnxOptions:
         if self.size is not None:
             height, width = self.size
             found |= {"size": f"{height}x{width}", "batch": str(self.batch)}
-        if self.max_keypoints is not None:
-            found["max_keypoints"] = str(self.max_keypoints)
+        if self.keypoints_in_file:
+            found["max_keypoints"] = str(self.keypoints_in_file)
         return found
 
 
@@ -141,8 +149,8 @@ def write_onnx(
         fix_size(model, *options.size, options.batch)
     if options.precision == "fp16":
         to_float16(model)
-    if options.max_keypoints is not None:
-        add_keypoints(model, int(options.max_keypoints))
+    if options.keypoints_in_file:
+        add_keypoints(model, options.keypoints_in_file)
     write_metadata(model, values)
     with atomic_path(path) as temporary:
         temporary.write_bytes(model.SerializeToString())
@@ -196,7 +204,9 @@ def _from_torch(path: Path) -> ModelProto:
     with tempfile.TemporaryDirectory() as folder:
         made = Path(folder) / "network.onnx"
         export_onnx(network, made, {"weights": path.name})
-        return onnx.load_model(str(made))
+        model = onnx.load_model(str(made))
+    remove_keypoints(model)
+    return model
 
 
 def _images(paths: Sequence[Path], at_most: int) -> Iterator[np.ndarray]:
