@@ -28,7 +28,7 @@ def test_every_public_name_can_be_imported() -> None:
     assert set(deepdetect.__all__) <= set(dir(deepdetect))
     for name in deepdetect.__all__:
         assert getattr(deepdetect, name).__name__ == name
-    assert deepdetect.__version__ == "0.1.0"
+    assert deepdetect.__version__ == "0.2.0"
 
 
 def test_the_stub_exports_what_it_imports() -> None:
