@@ -12,7 +12,6 @@ from PIL import Image
 onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
 
 from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
-from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 from deepdetect.io.image import luma  # noqa: E402
 from deepdetect.labels import fuse  # noqa: E402
 
@@ -33,19 +32,27 @@ def samples(tmp_path_factory: pytest.TempPathFactory, photo: np.ndarray) -> list
     return sorted(folder.glob("image_*.png"))
 
 
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file without keypoints."""
+    path = tmp_path_factory.mktemp("maps") / "maps.onnx"
+    write_onnx("default", path, OnnxOptions(max_keypoints=0))
+    return path
+
+
 def test_half_precision_beside_the_whole(
-    script: ModuleType, samples: list[Path], tmp_path: Path
+    script: ModuleType, maps: Path, samples: list[Path], tmp_path: Path
 ) -> None:
     half = tmp_path / "half.onnx"
-    write_onnx("default", half, OnnxOptions(precision="fp16"))
-    table = script.precision_table({"fp32": pretrained_weights(), "fp16": half}, samples, rounds=0)
+    write_onnx("default", half, OnnxOptions(precision="fp16", max_keypoints=0))
+    table = script.precision_table({"fp32": maps, "fp16": half}, samples, rounds=0)
     titles = [column.title for column in table.columns]
     assert titles[2:4] == ["normal: BCE / IoU", "low: BCE / IoU"]
     (name, size, *scores, crossing, ratio), (_, half_size, *_, half_crossing, no_ratio) = (
         table.rows[:2]
     )
     assert (name, crossing, ratio) == ("fp32", 0, 1)
-    assert size == pretrained_weights().stat().st_size / 1e6
+    assert size == maps.stat().st_size / 1e6
     assert half_size < 0.55 * size
     assert 0 <= half_crossing < 0.002
     assert np.isnan(no_ratio)
@@ -56,10 +63,14 @@ def test_half_precision_beside_the_whole(
 
 
 def test_parity(
-    script: ModuleType, photo: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    script: ModuleType,
+    maps: Path,
+    photo: np.ndarray,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(script, "PARITY_SIZES", ((40, 56, 1), (33, 41, 2)))
-    rows = script.parity_table(pretrained_weights(), tmp_path, photo).rows
+    rows = script.parity_table(maps, tmp_path, photo).rows
     assert rows[0][0] == "ONNX Runtime, any size"
     assert any("OpenCV" in name and "one size" in name for name, *_ in rows)
     for _, logits, probability in rows:
@@ -68,14 +79,18 @@ def test_parity(
 
 
 def test_keypoints(
-    script: ModuleType, samples: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    script: ModuleType,
+    maps: Path,
+    samples: list[Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(script, "KEYPOINT_COUNTS", (300,))
+    monkeypatch.setattr(script, "KEYPOINT_COUNTS", (2048,))
     monkeypatch.setattr(script, "TIMED_SIZE", (64, 96))
-    rows = script.keypoint_table(pretrained_weights(), tmp_path, samples, rounds=1).rows
+    rows = script.keypoint_table(maps, tmp_path, samples, rounds=1).rows
     names = [(name, count) for name, count, *_ in rows]
-    assert names[0] == ("ONNX Runtime", 300)
-    assert names[-1] == ("ONNX Runtime, asked for maps", 300)
+    assert names[0] == ("ONNX Runtime", 2048)
+    assert names[-1] == ("ONNX Runtime, asked for maps", 2048)
     for name, _, same, ratio in rows:
         assert ratio > 0
         assert "asked" in name or same > 0.99
