@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from ..._shared.errors import DeepDetectError, OptionError, WeightsError
 from .options import RuntimeOptions
 from .shapes import (
     KEYPOINT_OUTPUTS,
+    LOGITS,
     PADDED_IMAGE,
     as_logits,
     check_network,
@@ -133,11 +134,14 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         # Named, not guessed: guessing tries all formats and prints each one's complaint.
         reader = FrontEndManager().load_by_framework("onnx")
         graph = reader.convert(reader.load(str(path)))
-        _take_out_keypoints(graph)
+        _take_out(graph, KEYPOINT_OUTPUTS)
         return graph
 
     def compile_model(graph: Any = None) -> Any:
         graph = read() if graph is None else graph
+        names = {name for value in graph.outputs for name in value.get_names()}
+        if LOGITS in names:
+            _take_out(graph, names - {LOGITS})
         _take_out_padding(graph)
         # A new core: one that memory was short for crashes.
         return openvino.Core().compile_model(graph, "CPU", settings)
@@ -169,10 +173,10 @@ def computes_bfloat16() -> bool:
     return bool("BF16" in capabilities)
 
 
-def _take_out_keypoints(graph: Any) -> None:
-    """Compute maps only, of a file that gives keypoints, too."""
+def _take_out(graph: Any, names: Collection[str]) -> None:
+    """Do not compute the outputs of these names, which nobody reads."""
     for result in graph.get_results():
-        if not KEYPOINT_OUTPUTS.isdisjoint(result.output(0).get_names()):
+        if not result.output(0).get_names().isdisjoint(names):
             graph.remove_result(result)
 
 

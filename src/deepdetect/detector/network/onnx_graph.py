@@ -45,7 +45,8 @@ def add_padding(model: ModelProto) -> None:
     """Let a network take any height and width, and give probabilities that are at most 1.
 
     The image is padded by repeating its last row and column to multiples of 8, and the maps are
-    cropped, as `compute_heatmap` does it. Batch normalisation is folded.
+    cropped, as `compute_heatmap` does it. Batch normalisation is folded, and numbers for each
+    channel have four dimensions.
 
     Args:
         model: maps `image` to `logits` for multiples of 8; changed in place.
@@ -54,6 +55,7 @@ def add_padding(model: ModelProto) -> None:
 
     graph = model.graph
     fold_normalisation(graph)
+    give_four_dimensions(graph)
     rest = split_nodes(graph)[1]
     for node in rest:
         rename(node, IMAGE, PADDED_IMAGE)
@@ -214,6 +216,30 @@ def fold_normalisation(graph: GraphProto) -> None:
             folded.append(helper.make_node("Add", [product, f"{target}.offset"], [target]))
         add_constants(graph, arrays, np.float32)
     replace_nodes(graph, folded)
+
+
+def give_four_dimensions(graph: GraphProto) -> None:
+    """Write numbers for each channel as (1, C, 1, 1), not as (C, 1, 1), which means the same.
+
+    OpenVINO keeps the channels of a pixel together in convolutions, but not in a sum, product or
+    PReLU with an array of fewer dimensions than the image: it then turns the image around before
+    and after, which took a third of the time.
+
+    Args:
+        graph: of any network; changed in place.
+    """
+    from onnx import numpy_helper
+
+    used = {
+        name
+        for node in graph.node
+        if node.op_type in ("Add", "Mul", "PRelu")
+        for name in node.input
+    }
+    for one in graph.initializer:
+        if one.name in used and len(one.dims) == 3 and list(one.dims[1:]) == [1, 1]:
+            values = numpy_helper.to_array(one)
+            one.CopyFrom(numpy_helper.from_array(values[None], one.name))
 
 
 def replace_nodes(graph: GraphProto, nodes: Sequence[NodeProto]) -> None:

@@ -28,6 +28,7 @@ from .onnx_graph import (
     check_graph,
     fix_size,
     fold_normalisation,
+    give_four_dimensions,
     is_padded,
     read_metadata,
     write_metadata,
@@ -186,6 +187,7 @@ def _load(weights: str | Path) -> ModelProto:
     if not is_padded(model):  # older files
         add_padding(model)
     fold_normalisation(model.graph)  # those of version 0.1 have some left
+    give_four_dimensions(model.graph)  # those of version 0.2.0 have three
     if "weights" not in found:
         write_metadata(model, {"weights": path.name})
     return model
