@@ -165,15 +165,15 @@ def test_batch_normalisation_is_folded(name: str) -> None:
 def test_numbers_for_each_channel_have_four_dimensions(name: str) -> None:
     graph = onnx.load(pretrained_weights(name)).graph
     dimensions = {one.name: list(one.dims) for one in graph.initializer}
-    channels = [
+    shapes = [
         dimensions[each]
         for node in graph.node
         if node.op_type in ("Add", "Mul", "PRelu")
         for each in node.input
-        if each in dimensions and np.prod(dimensions[each]) > 1
+        if each in dimensions
     ]
-    assert channels
-    assert {(len(found), found[0], *found[2:]) for found in channels} == {(4, 1, 1, 1)}
+    assert not [each for each in shapes if len(each) == 3]
+    assert sum(len(each) == 4 and each[1] > 1 for each in shapes) > 20
 
 
 def test_a_file_of_version_0_2_gets_them(tmp_path: Path) -> None:
@@ -187,29 +187,6 @@ def test_a_file_of_version_0_2_gets_them(tmp_path: Path) -> None:
     shipped = onnx.load(pretrained_weights()).graph
     assert model.graph != shipped
     assert onnx.load(tmp_path / "again.onnx").graph == shipped
-
-
-def test_openvino_does_not_turn_the_image_around() -> None:
-    """Between its layers; a third of the time was lost to it."""
-    openvino = pytest.importorskip("openvino", reason="needs OpenVINO")
-    settings = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": 1}
-    turned = []
-    for three in (True, False):
-        model = onnx.load_model_from_string(
-            cut_onnx(pretrained_weights().read_bytes(), ["padded_image"], ["padded_logits"])
-        )
-        for one in model.graph.initializer:
-            if three and len(one.dims) == 4 and list(one.dims[:1] + one.dims[2:]) == [1, 1, 1]:
-                del one.dims[0]
-        core = openvino.Core()
-        read = core.read_model(model.SerializeToString())
-        compiled = core.compile_model(read, "CPU", settings)
-        layers = [
-            node.get_rt_info()["layerType"] for node in compiled.get_runtime_model().get_ops()
-        ]
-        assert layers.count("Convolution") > 20
-        turned.append(layers.count("Reorder"))
-    assert turned[1] < turned[0] / 2
 
 
 def test_batch_normalisation_of_an_older_file_is_folded(tmp_path: Path, photo: np.ndarray) -> None:
