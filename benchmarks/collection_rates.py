@@ -90,7 +90,7 @@ def cost_table(pair: Sequence[np.ndarray], sides_px: Sequence[int], rounds: int)
         Column("photograph, pixels"),
         *(Column(f"{budget:,} points") for budget in BUDGETS),
         Column("dense"),
-        *(Column(f"a pair of {budget:,}", ".2f") for budget in BUDGETS),
+        *(Column(f"a pair of {budget:,}", ".3f") for budget in BUDGETS),
     )
     return Table("costs", "CPU seconds", columns, tuple(rows))
 
