@@ -1,0 +1,73 @@
+"""Print the scores of weights on a training's validation photographs, and how calibrated they are.
+
+    python benchmarks/validation_photographs.py PHOTOS [--weights default] [--every 1]
+
+The views, the darkening and the labels are those of `deepdetect train --validation PHOTOS`: in
+normal light, and darkened, with the labels of low visibility. BCE and IoU are means over
+photographs; calibration error (Naeini et al., 2015) and densities are of all pixels together.
+"""
+
+from __future__ import annotations
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor
+from functools import cache, partial
+from pathlib import Path
+from statistics import fmean
+
+from deepdetect import DeepDetect
+from deepdetect._shared.parallel import processor_count
+from deepdetect.evaluation.metrics.calibration import Calibration, calibration_of, pooled
+from deepdetect.evaluation.metrics.masks import MaskScore, score_heatmap
+from deepdetect.io.image import load_image
+from deepdetect.training.labels import label_view
+from deepdetect.training.recipe import TrainingOptions
+from deepdetect.training.views import SourceImage, list_images, render
+
+OPTIONS = TrainingOptions()
+
+Scored = tuple[MaskScore, Calibration]
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("photographs", type=Path)
+    parser.add_argument("--weights", default="default", help="name or file")
+    parser.add_argument("--every", type=int, default=1, help="take every n-th (default 1: all)")
+    arguments = parser.parse_args()
+    images = list_images(arguments.photographs, OPTIONS, ())[:: arguments.every]
+    with ProcessPoolExecutor(processor_count()) as pool:
+        scored = list(pool.map(partial(score, weights=arguments.weights), images))
+    print(
+        "| light | photographs | BCE / IoU | calibration error | density | of the labels |\n"
+        "|---|--:|--:|--:|--:|--:|"
+    )
+    for light, rows in zip(("normal", "darkened"), zip(*scored, strict=True), strict=True):
+        loss, iou = fmean(one.loss for one, _ in rows), fmean(one.iou for one, _ in rows)
+        found = pooled(one for _, one in rows)
+        print(
+            f"| {light} | {len(rows)} | {loss:.4f} / {iou:.3f} | {found.expected_error:.4f} | "
+            f"{found.density:.4f} | {found.label_density:.4f} |"
+        )
+
+
+def score(image: SourceImage, weights: str) -> list[Scored]:
+    """Score the heat maps of a photograph in normal light and darkened, against their labels."""
+    rgb = load_image(image.path)
+    rows = []
+    for view in image.validation_views:
+        heatmap = detector(weights).heatmap(render(rgb, view))
+        label = label_view(rgb, view, OPTIONS.label_options)
+        rows.append((score_heatmap(heatmap, label), calibration_of(heatmap, label)))
+    return rows
+
+
+@cache
+def detector(weights: str) -> DeepDetect:
+    """Return a detector that sees images as they are."""
+    return DeepDetect(weights, resolution="native", threads=1)
+
+
+if __name__ == "__main__":
+    main()
