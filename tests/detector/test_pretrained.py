@@ -34,9 +34,9 @@ def test_an_unknown_name_says_the_nearest() -> None:
         DeepDetect("densee")
 
 
-def photographs(name: str) -> str:
-    """Return the folder of the photographs that weights were trained on."""
-    return "photographs-free" if name == "free" else "photos"
+def photographs(name: str) -> tuple[str, ...]:
+    """Return the folders of photographs that the runs behind weights were given."""
+    return ("photographs-free",) if name == "free" else ("photos", "photographs")
 
 
 def test_free_weights_began_with_random_ones() -> None:
@@ -65,7 +65,8 @@ def test_weights_tell_where_they_come_from(name: str) -> None:
     for mean in means:
         assert mean["command"].startswith("deepdetect average ")
     for run in runs:
-        assert run["command"].startswith(f"deepdetect train {photographs(name)}/train ")
+        folders = tuple(f"deepdetect train {folder}/train " for folder in photographs(name))
+        assert run["command"].startswith(folders)
         for word in ("options", "photographs_digest", "versions", "machine", "start", "point"):
             assert run[word]
     for one in (*means, *runs):
