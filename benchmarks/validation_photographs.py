@@ -1,6 +1,6 @@
 """Print the scores of weights on a training's validation photographs, and how calibrated they are.
 
-    python benchmarks/validation_photographs.py PHOTOS [--weights default] [--every 1]
+    python benchmarks/validation_photographs.py PHOTOS [--weights default] [--short-side 480]
 
 The views, the darkening and the labels are those of `deepdetect train --validation PHOTOS`: in
 normal light, and darkened, with the labels of low visibility. BCE and IoU are means over
@@ -20,11 +20,10 @@ from deepdetect._shared.parallel import processor_count
 from deepdetect.evaluation.metrics.calibration import Calibration, calibration_of, pooled
 from deepdetect.evaluation.metrics.masks import MaskScore, score_heatmap
 from deepdetect.io.image import load_image
+from deepdetect.labels import LabelOptions
 from deepdetect.training.labels import label_view
-from deepdetect.training.recipe import TrainingOptions
+from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.views import SourceImage, list_images, render
-
-OPTIONS = TrainingOptions()
 
 Scored = tuple[MaskScore, Calibration]
 
@@ -34,11 +33,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photographs", type=Path)
     parser.add_argument("--weights", default="default", help="name or file")
+    parser.add_argument("--short-side", type=int, default=480, help="in pixels (default 480)")
     parser.add_argument("--every", type=int, default=1, help="take every n-th (default 1: all)")
     arguments = parser.parse_args()
-    images = list_images(arguments.photographs, OPTIONS, ())[:: arguments.every]
+    options = options_of(arguments.short_side)
+    images = list_images(arguments.photographs, options, ())[:: arguments.every]
+    score_one = partial(score, weights=arguments.weights, labels=options.label_options)
     with ProcessPoolExecutor(processor_count()) as pool:
-        scored = list(pool.map(partial(score, weights=arguments.weights), images))
+        scored = list(pool.map(score_one, images))
     print(
         "| light | photographs | BCE / IoU | calibration error | density | of the labels |\n"
         "|---|--:|--:|--:|--:|--:|"
@@ -52,13 +54,18 @@ def main() -> None:
         )
 
 
-def score(image: SourceImage, weights: str) -> list[Scored]:
+def options_of(short_side_px: int) -> TrainingOptions:
+    """Return the options of a training that is validated at a size."""
+    return TrainingOptions(stages=(Stage(16, 1, 1),), short_sides=(short_side_px,))
+
+
+def score(image: SourceImage, weights: str, labels: LabelOptions) -> list[Scored]:
     """Score the heat maps of a photograph in normal light and darkened, against their labels."""
     rgb = load_image(image.path)
     rows = []
     for view in image.validation_views:
         heatmap = detector(weights).heatmap(render(rgb, view))
-        label = label_view(rgb, view, OPTIONS.label_options)
+        label = label_view(rgb, view, labels)
         rows.append((score_heatmap(heatmap, label), calibration_of(heatmap, label)))
     return rows
 

@@ -11,19 +11,23 @@ from deepdetect import DeepDetect
 from deepdetect.io.image import load_image, luma
 from deepdetect.labels import fuse
 from deepdetect.training.augmentation import darken
-from deepdetect.training.recipe import TrainingOptions
+from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.views import list_images, render
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "validation_photographs.py"
 
 
-def test_scores_both_lights_against_their_own_labels(photo_path: Path) -> None:
-    command = [sys.executable, str(BENCHMARK), str(photo_path.parent)]
+@pytest.mark.parametrize("side", [480, 320])
+def test_scores_both_lights_against_their_own_labels(photo_path: Path, side: int) -> None:
+    size = ["--short-side", str(side)] if side != 480 else []
+    command = [sys.executable, str(BENCHMARK), str(photo_path.parent), *size]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     rows = [line.strip("| ").split(" | ") for line in printed.splitlines()[2:]]
     assert [row[0] for row in rows] == ["normal", "darkened"]
-    normal, dark = list_images(photo_path.parent, TrainingOptions(), ())[0].validation_views
+    options = TrainingOptions(stages=(Stage(240, 1, 1),), short_sides=(side,))
+    normal, dark = list_images(photo_path.parent, options, ())[0].validation_views
     bright = render(load_image(photo_path), normal)
+    assert min(bright.shape[:2]) == side
     assert dark.darkening is not None
     views = bright, darken(bright, dark.darkening)
     for (_, count, scores, error, density, of_labels), view in zip(rows, views, strict=True):
