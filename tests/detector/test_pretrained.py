@@ -71,4 +71,5 @@ def test_weights_tell_where_they_come_from(name: str) -> None:
             assert run[word]
     for one in (*means, *runs):
         assert " /" not in one["command"], "no folder of one machine"
-        assert len(one["commit"].removesuffix("+")) == 40  # "+": with changes that were not committed
+        # "+" stands for changes that were not committed.
+        assert len(one["commit"].removesuffix("+")) == 40
