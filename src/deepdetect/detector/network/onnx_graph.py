@@ -173,11 +173,16 @@ def _ending(graph: GraphProto, crop: bool = True) -> list[NodeProto]:
     ]
 
 
-def fold_normalisation(graph: GraphProto) -> None:
-    """Fold batch normalisation: into a transposed convolution, or into one factor and one offset.
+_FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
+"""What a number for each output channel is multiplied with a kernel as."""
 
-    PyTorch's exporter folds those behind convolutions. Most of the others follow a sum or a
-    concatenation, and become a multiplication and an addition.
+
+def fold_normalisation(graph: GraphProto) -> None:
+    """Fold batch normalisation: into the convolution before it, or into one factor and one offset.
+
+    Computed in float64, so that the same weights give the same file everywhere: PyTorch's exporter,
+    which folds those behind convolutions in float32, rounds differently by processor. Those that
+    follow a sum or a concatenation become a multiplication and an addition.
 
     Args:
         graph: of any network; changed in place. One without batch normalisation stays as it is.
@@ -185,6 +190,7 @@ def fold_normalisation(graph: GraphProto) -> None:
     from onnx import helper, numpy_helper
 
     values = {one.name: one for one in graph.initializer}
+    outputs = {value.name for value in graph.output}
     made = {name: node for node in graph.node for name in node.output}
     for node in graph.node:
         if node.op_type == "Identity" and node.input[0] in values:  # equal weights, written once
@@ -202,12 +208,17 @@ def fold_normalisation(graph: GraphProto) -> None:
         offset = bias - mean * factor
         source, target = node.input[0], node.output[0]
         before = made.get(source)
-        if before is not None and before.op_type == "ConvTranspose" and len(before.input) == 2:
+        shape = _FACTOR_SHAPES.get(before.op_type) if before is not None else None
+        if before is not None and shape is not None and len(before.input) == 2:
             name = before.input[1]
-            kernel = numpy_helper.to_array(values[name]) * factor[:, None, None]
+            kernel = numpy_helper.to_array(values[name]) * factor.reshape(shape)
             arrays = {f"{name}.folded": kernel, f"{name}.bias": offset}
             before.input[:] = [before.input[0], *arrays]
-            before.output[0] = target
+            if target in outputs:
+                before.output[0] = target
+            else:  # tiling.py and other programs know the names that PyTorch's exporter leaves
+                for other in graph.node:
+                    rename(other, target, source)
         else:
             both = {f"{target}.factor": factor, f"{target}.offset": offset}
             arrays = {name: array[:, None, None] for name, array in both.items()}
