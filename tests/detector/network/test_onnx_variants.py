@@ -189,42 +189,137 @@ def test_a_file_of_version_0_2_gets_them(tmp_path: Path) -> None:
     assert onnx.load(tmp_path / "again.onnx").graph == shipped
 
 
-@pytest.mark.parametrize("kind", ["Conv", "ConvTranspose"])
-def test_batch_normalisation_is_folded_into_a_convolution(kind: str, photo: np.ndarray) -> None:
-    """In float64: the kernel is the exact one, rounded once."""
+def normalised_network(nodes: list[onnx.NodeProto], outputs: list[str]) -> onnx.ModelProto:
+    """A network of these nodes, which read `image`, `kernel`, `offset` and the statistics."""
     rng = np.random.default_rng(0)
-    kernel = rng.normal(size=(3, 3, 2, 2)).astype(np.float32)
-    numbers = rng.uniform(0.5, 2, (4, 3)).astype(np.float32)
-    names = ["weight", "bias", "mean", "variance"]
+    arrays = {"kernel": rng.normal(size=(3, 3, 2, 2)), "offset": rng.normal(size=3)}
+    arrays |= dict(zip(STATISTICS, rng.uniform(0.5, 2, (4, 3)), strict=True))
+    used = {name for node in nodes for name in node.input}
     graph = onnx.helper.make_graph(
-        [
-            onnx.helper.make_node(kind, ["image", "kernel"], ["made"], strides=[2, 2]),
-            onnx.helper.make_node("BatchNormalization", ["made", *names], ["logits"], epsilon=0.25),
-        ],
+        nodes,
         "one",
         [onnx.helper.make_tensor_value_info("image", 1, ("b", 3, "h", "w"))],
-        [onnx.helper.make_tensor_value_info("logits", 1, ("b", 3, "p", "q"))],
+        [onnx.helper.make_tensor_value_info(name, 1, ("b", 3, None, None)) for name in outputs],
         [
-            onnx.numpy_helper.from_array(array, name)
-            for name, array in zip(["kernel", *names], [kernel, *numbers], strict=True)
+            onnx.numpy_helper.from_array(array.astype(np.float32), name)
+            for name, array in arrays.items()
+            if name in used
         ],
     )
     model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)])
     model.ir_version = 8
-    images = images_of(photo, 6, 8, 2)
-    (expected,) = session_of(model.SerializeToString()).run(None, {"image": images})
+    return model
+
+
+STATISTICS = ["weight", "bias", "mean", "variance"]
+
+
+def convolution(made: str, *more: str, kind: str = "Conv") -> onnx.NodeProto:
+    return onnx.helper.make_node(kind, ["image", "kernel", *more], [made], strides=[2, 2])
+
+
+def normalisation(read: str, made: str) -> onnx.NodeProto:
+    return onnx.helper.make_node("BatchNormalization", [read, *STATISTICS], [made], epsilon=0.25)
+
+
+def node(kind: str, *names: str) -> onnx.NodeProto:
+    return onnx.helper.make_node(kind, list(names[:-1]), [names[-1]])
+
+
+def check_that_folding_changes_no_answer(model: onnx.ModelProto, photo: np.ndarray) -> None:
+    images = {"image": images_of(photo, 6, 8, 2)}
+    expected = session_of(model.SerializeToString()).run(None, images)
     fold_normalisation(model.graph)
-    assert [node.op_type for node in model.graph.node] == [kind]
-    (found,) = session_of(model.SerializeToString()).run(None, {"image": images})
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
-    weight, bias, mean, variance = numbers.astype(np.float64)
+    onnx.checker.check_model(model, full_check=True)
+    assert "BatchNormalization" not in {one.op_type for one in model.graph.node}
+    for array, other in zip(
+        session_of(model.SerializeToString()).run(None, images), expected, strict=True
+    ):
+        np.testing.assert_allclose(array, other, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("last", [True, False])
+@pytest.mark.parametrize("kind", ["Conv", "ConvTranspose"])
+def test_batch_normalisation_is_folded_into_a_convolution(
+    kind: str, last: bool, photo: np.ndarray
+) -> None:
+    """In float64: the kernel is the exact one, rounded once."""
+    behind = [] if last else [node("Neg", "normalised", "logits")]
+    nodes = [convolution("made", kind=kind), normalisation("made", "normalised"), *behind]
+    model = normalised_network(nodes, ["normalised" if last else "logits"])
+    before = {one.name: onnx.numpy_helper.to_array(one) for one in model.graph.initializer}
+    check_that_folding_changes_no_answer(model, photo)
+    found = list(model.graph.node)
+    assert [one.op_type for one in found] == [kind, *(one.op_type for one in behind)]
+    # Its output keeps its name, by which `tiling` knows it, unless the network ends there.
+    assert list(found[0].output) == ["normalised" if last else "made"]
+    weight, bias, mean, variance = (before[name].astype(np.float64) for name in STATISTICS)
     factor = weight / np.sqrt(variance + 0.25)
     folded = {one.name: onnx.numpy_helper.to_array(one) for one in model.graph.initializer}
     axes = (slice(None), *[None] * 3) if kind == "Conv" else (None, slice(None), None, None)
-    exact = kernel * factor[axes]
+    exact = before["kernel"] * factor[axes]
     np.testing.assert_array_equal(folded["kernel.folded"], exact.astype(np.float32))
     exact = bias - mean * factor
     np.testing.assert_array_equal(folded["kernel.bias"], exact.astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("nodes", "outputs"),
+    [
+        (
+            [
+                convolution("one"),
+                normalisation("one", "first"),
+                node("Neg", "image", "other"),
+                onnx.helper.make_node("Conv", ["other", "kernel"], ["two"], strides=[2, 2]),
+                normalisation("two", "second"),
+            ],
+            ["first", "second"],
+        ),
+        (
+            [
+                convolution("made"),
+                normalisation("made", "normalised"),
+                node("Add", "made", "normalised", "logits"),
+            ],
+            ["logits"],
+        ),
+        (
+            [
+                convolution("made"),
+                normalisation("made", "normalised"),
+                node("Neg", "made", "other"),
+                normalisation("other", "second"),
+            ],
+            ["normalised", "second"],
+        ),
+        (
+            [
+                convolution("made"),
+                normalisation("made", "first"),
+                normalisation("made", "second"),
+                node("Mul", "first", "second", "logits"),
+            ],
+            ["logits"],
+        ),
+        ([convolution("made"), normalisation("made", "normalised")], ["made", "normalised"]),
+        ([convolution("made", "offset"), normalisation("made", "normalised")], ["normalised"]),
+    ],
+    ids=[
+        "same kernel",
+        "read twice",
+        "read twice, apart",
+        "two of one",
+        "an output",
+        "with a bias",
+    ],
+)
+def test_batch_normalisation_that_does_not_fit_a_convolution(
+    nodes: list[onnx.NodeProto], outputs: list[str], photo: np.ndarray
+) -> None:
+    model = normalised_network(nodes, outputs)
+    check_that_folding_changes_no_answer(model, photo)
+    assert {"Conv", "Mul", "Add"} <= {one.op_type for one in model.graph.node}
 
 
 def test_batch_normalisation_of_an_older_file_is_folded(tmp_path: Path, photo: np.ndarray) -> None:

@@ -61,8 +61,8 @@ def export_onnx(
             dynamic_axes={"image": axes, "probability": axes, "logits": axes},
             opset_version=OPSET,
             dynamo=False,
-            # Of a network in evaluation mode that is the same, but `add_padding` is to fold batch
-            # normalisation, in float64.
+            # Keeps batch normalisation as nodes, for `add_padding` to fold in float64. The network
+            # is in evaluation mode already.
             training=torch.onnx.TrainingMode.PRESERVE,
         )
     model = onnx.load_model_from_string(written.getvalue())

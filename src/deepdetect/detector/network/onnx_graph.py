@@ -5,6 +5,7 @@ The package `onnx` is needed, torch is not: files are made from files.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -180,9 +181,11 @@ _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
 def fold_normalisation(graph: GraphProto) -> None:
     """Fold batch normalisation: into the convolution before it, or into one factor and one offset.
 
-    Computed in float64, so that the same weights give the same file everywhere: PyTorch's exporter,
-    which folds those behind convolutions in float32, rounds differently by processor. Those that
-    follow a sum or a concatenation become a multiplication and an addition.
+    Computed in float64, so that the same weights give the same numbers everywhere: PyTorch's
+    exporter, which folds those behind convolutions in float32, rounds differently by processor.
+    Into a convolution goes one that alone reads its output, and whose kernel no other node has;
+    the others become a multiplication and an addition: those behind a sum, a concatenation, or a
+    convolution that has a bias or several groups.
 
     Args:
         graph: of any network; changed in place. One without batch normalisation stays as it is.
@@ -191,6 +194,7 @@ def fold_normalisation(graph: GraphProto) -> None:
 
     values = {one.name: one for one in graph.initializer}
     outputs = {value.name for value in graph.output}
+    read = Counter([*outputs, *(name for node in graph.node for name in node.input)])
     made = {name: node for node in graph.node for name in node.output}
     for node in graph.node:
         if node.op_type == "Identity" and node.input[0] in values:  # equal weights, written once
@@ -208,9 +212,14 @@ def fold_normalisation(graph: GraphProto) -> None:
         offset = bias - mean * factor
         source, target = node.input[0], node.output[0]
         before = made.get(source)
-        shape = _FACTOR_SHAPES.get(before.op_type) if before is not None else None
-        if before is not None and shape is not None and len(before.input) == 2:
+        if (
+            before is not None
+            and before.op_type in _FACTOR_SHAPES
+            and [read[source], *(read[name] for name in before.input[1:])] == [1, 1]
+            and all(one.i == 1 for one in before.attribute if one.name == "group")
+        ):
             name = before.input[1]
+            shape = _FACTOR_SHAPES[before.op_type]
             kernel = numpy_helper.to_array(values[name]) * factor.reshape(shape)
             arrays = {f"{name}.folded": kernel, f"{name}.bias": offset}
             before.input[:] = [before.input[0], *arrays]
