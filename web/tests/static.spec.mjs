@@ -15,7 +15,17 @@ print(json.dumps({"xy": found.xy.tolist(), "scores": found.scores.tolist()}))
 `;
 
 /** Pixels as text: which ones, whatever their fractions. */
-const pixels = (rows) => rows.map(([x, y]) => `${Math.round(x)},${Math.round(y)}`);
+const pixel = ([x, y]) => `${Math.round(x)},${Math.round(y)}`;
+const pixels = (rows) => rows.map(pixel);
+
+/** Rows whose pixel is among those of others, and the rest. */
+function split(rows, others) {
+  const known = new Set(pixels(others));
+  return [rows.filter((row) => known.has(pixel(row))), rows.filter((row) => !known.has(pixel(row)))];
+}
+
+/** Probabilities are rounded in another way here: one at the threshold may fall on its other side. */
+const ROUNDING = 1e-4, MOST_ROUNDED = 2;
 
 async function chooseKeypoints(page, { kind = "dense", by = "threshold" }) {
   await choose(page, "kind", kind);
@@ -35,7 +45,7 @@ const CASES = [
 ];
 
 for (const file of ["coffee.jpg", "motorcycle-left.jpg", "motorcycle-right.jpg", "coffee-turned.jpg"]) {
-  test(`keypoints of ${file} are those of Python, to the pixel`, async ({ page }) => {
+  test(`keypoints of ${file} are those of Python`, async ({ page }) => {
     await page.goto("./");
     await openFile(page, join(examples, file));
     for (const { name, controls, slider, options } of CASES) {
@@ -43,14 +53,18 @@ for (const file of ["coffee.jpg", "motorcycle-left.jpg", "motorcycle-right.jpg",
       if (slider) await slide(page, ...slider);
       const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=csv]"));
       const found = table(content);
-      const expected = askPython(KEYPOINTS, join(examples, file), JSON.stringify(options));
+      const { xy, scores } = askPython(KEYPOINTS, join(examples, file), JSON.stringify(options));
+      const expected = xy.map(([x, y], k) => [x, y, scores[k]]);
       expect(found.length, name).toBeGreaterThan(1000);
-      expect(pixels(found), name).toEqual(pixels(expected.xy));
-      expected.scores.forEach((score, k) => {
-        const off = Math.max(Math.abs(found[k][2] - score), Math.abs(found[k][0] - expected.xy[k][0]),
-                             Math.abs(found[k][1] - expected.xy[k][1]));
-        if (off > 2e-3) throw new Error(`${name}: ${found[k]} instead of ${expected.xy[k]}, ${score}`);
+      const [here, only] = split(found, expected), [there, missing] = split(expected, found);
+      expect(pixels(here), name).toEqual(pixels(there));
+      there.forEach((row, k) => {
+        const off = Math.max(...row.map((value, j) => Math.abs(here[k][j] - value)));
+        if (off > 2e-3) throw new Error(`${name}: ${here[k]} instead of ${row}`);
       });
+      const rounded = [...only, ...missing], least = scores.reduce((a, b) => Math.min(a, b));
+      expect(rounded.length, `${name}: ${rounded}`).toBeLessThanOrEqual(MOST_ROUNDED);
+      for (const row of rounded) expect(Math.abs(row[2] - least), `${name}: ${row}`).toBeLessThan(ROUNDING);
       if (slider) await slide(page, slider[0], slider[0] === "threshold" ? 0.5 : slider[1]);
     }
   });
