@@ -280,13 +280,16 @@ def test_of_equal_ones_at_the_last_place_any_are_kept(keypoints_of: Any) -> None
 
 
 @pytest.mark.parametrize("grey", [0, 128, 255])
-def test_a_constant_image_has_weak_ones(grey: int, path: Path) -> None:
-    """The package gives none; the file gives what the network says."""
+def test_a_constant_image_has_weak_ones(grey: int, path: Path, photo: np.ndarray) -> None:
+    """The package gives none; the file gives what the network says, far below a photograph's."""
     rgb = np.full((100, 130, 3), grey, np.uint8)
     assert len(best(rgb)) == 0
-    (values,) = session_of(path).run(["keypoint_logits"], {"image": planes_of(rgb)})
+    session = session_of(path)
+    (values,) = session.run(["keypoint_logits"], {"image": planes_of(rgb)})
     assert np.isfinite(values).any()
     assert values.max() < 7
+    (others,) = session.run(["keypoint_logits"], {"image": planes_of(photo)})
+    assert others.max() > 20
 
 
 @pytest.mark.skipif(cv2.__version__ < "5", reason="its message is of OpenCV 5")
