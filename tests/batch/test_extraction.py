@@ -171,7 +171,7 @@ def test_what_the_network_is_fed_is_a_setting(
     collection: Callable[..., Path], tmp_path: Path
 ) -> None:
     folder = collection(1)
-    listed = {"providers": ["CPUExecutionProvider"], "backend": "onnxruntime"}
+    listed = {"device": "cpu", "backend": "onnxruntime"}
     for _ in range(2):
         extract_features(folder, tmp_path / "f.h5", selection=FEW, detector=listed, workers=1)
     other = {**listed, "network_channels": "bgr"}

@@ -52,7 +52,7 @@ CASES = {
     "other tensors": "detect {bad}/good.png --weights {bad}/weights.safetensors",
     "a pickle": "detect {bad}/good.png --weights {bad}/weights.pth",
     "backend": "detect {bad}/good.png --backend onnxruntim",
-    "provider": "detect {bad}/good.png --provider CUDA",
+    "device": "detect {bad}/good.png --device CUDA",
     "threshold": "detect {bad}/good.png --threshold 2",
     "density": "detect {bad}/good.png --density 0",
     "resolution": "detect {bad}/good.png --resolution 481",

@@ -352,7 +352,7 @@ def hide(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
 
 def test_the_automatic_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     assert DeepDetect().backend == ("openvino" if INSTALLED["openvino"] else "onnxruntime")
-    assert DeepDetect(providers=["CPUExecutionProvider"]).backend == "onnxruntime"
+    assert DeepDetect(device="CPUExecutionProvider").backend == "onnxruntime"
     hide(monkeypatch, "openvino")
     assert DeepDetect().backend == "onnxruntime"
 
@@ -413,12 +413,12 @@ def test_torch_without_safetensors(monkeypatch: pytest.MonkeyPatch, one_line: On
         ({"threads": 0}, "threads must be at least 1, not 0"),
         ({"threads": -2}, "threads must be at least 1, not -2"),
         (
-            {"providers": ("CUDAExecutionProvidr",)},
-            "unknown provider 'CUDAExecutionProvidr': did you mean 'CUDAExecutionProvider'?",
+            {"device": "CUDAExecutionProvidr"},
+            "unknown device 'CUDAExecutionProvidr': did you mean 'CUDAExecutionProvider'?",
         ),
         (
-            {"providers": ("CPUExecutionProvider",), "backend": "openvino"},
-            "providers belong to onnxruntime, not to openvino",
+            {"device": "cuda", "backend": "openvino"},
+            '`device="cuda"` needs the backend onnxruntime, not openvino',
         ),
         ({"precision": "float16"}, "unknown precision 'float16'"),
         (
@@ -430,13 +430,13 @@ def test_torch_without_safetensors(monkeypatch: pytest.MonkeyPatch, one_line: On
             "needs the backend openvino, not torch",
         ),
         (
-            {"precision": "bfloat16", "providers": ("CPUExecutionProvider",)},
-            '`precision="bfloat16"` needs openvino, and providers belong to onnxruntime',
+            {"precision": "bfloat16", "device": "cuda"},
+            '`precision="bfloat16"` needs openvino, and `device="cuda"` onnxruntime',
         ),
-        # Providers cannot be obeyed by torch, which alone reads these weights.
+        # Torch alone reads these weights.
         (
-            {"providers": ("CPUExecutionProvider",), "weights": TORCH_WEIGHTS},
-            "providers belong to onnxruntime",
+            {"device": "cuda", "weights": TORCH_WEIGHTS},
+            '`device="cuda"` needs the backend onnxruntime, not torch',
         ),
         ({"resolution": "nativ"}, "did you mean 'native'?"),
         ({"resolution": 100}, "multiple of 8"),
@@ -449,16 +449,18 @@ def test_wrong_options(arguments: dict[str, Any], words: str, one_line: OneLine)
     assert words in one_line(caught.value)
 
 
-def test_a_provider_that_is_not_in_this_build(one_line: OneLine) -> None:
+def test_a_device_that_is_not_in_this_build(
+    one_line: OneLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import onnxruntime
 
-    absent = set(onnxruntime.get_all_providers()) - set(onnxruntime.get_available_providers())
-    name = sorted(absent)[0]
-    with pytest.raises(OptionError) as caught:
-        DeepDetect(providers=(name,))
-    message = one_line(caught.value)
-    assert name in message
-    assert "CPUExecutionProvider" in message
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    for name, build in (("cuda", "onnxruntime-gpu"), ("TensorrtExecutionProvider", "the build")):
+        with pytest.raises(OptionError) as caught:
+            DeepDetect(device=name)
+        message = one_line(caught.value)
+        assert f"device {name}: install {build}" in message
+        assert message.endswith("use cpu")
 
 
 # Weights that are wrong.

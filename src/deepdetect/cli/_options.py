@@ -59,16 +59,15 @@ DETECTOR = FieldOptions(
         "weights",
         "resolution",
         "backend",
-        "providers",
+        "device",
         "threads",
         "precision",
         "tta",
         "tile_megapixels",
         "ranker",
     ),
-    flags={"providers": "--provider"},
     types={"resolution": Resolution(), "tile_megapixels": TileSize()},
-    metavars={"weights": "NAME|FILE", "providers": "NAME", "ranker": "FILE"},
+    metavars={"weights": "NAME|FILE", "device": "cpu|cuda|PROVIDER", "ranker": "FILE"},
     defaults={"threads": "the backend's choice"},
 )
 

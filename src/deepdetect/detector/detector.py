@@ -62,8 +62,8 @@ class DeepDetect:
             square of that side, as the paper does with 480.
         backend: "auto" (OpenVINO when it is installed, else ONNX Runtime; torch for
             safetensors), "onnxruntime", "openvino" or "torch".
-        providers: ONNX Runtime's execution providers by name, as "CUDAExecutionProvider", the
-            preferred one first.
+        device: "cpu"; or, with ONNX Runtime, "cuda", or the name of an execution provider, as
+            "TensorrtExecutionProvider".
         threads: number of threads. None: the backend's choice.
         precision: what the network computes with, "float32", or "bfloat16" with OpenVINO: faster on
             processors with instructions for it; a few keypoints are others, and there are no tiles.
@@ -104,7 +104,7 @@ class DeepDetect:
         *,
         resolution: Literal["auto", "native"] | int = "auto",
         backend: str = "auto",
-        providers: tuple[str, ...] = (),
+        device: str = "cpu",
         threads: int | None = None,
         precision: Literal["float32", "bfloat16"] = "float32",
         network_channels: Channels = "rgb",
@@ -119,7 +119,7 @@ class DeepDetect:
             from .points.ranker import load_ranker
 
             load_ranker(self.ranker)
-        self._runtime = RuntimeOptions(backend, providers, threads, precision)
+        self._runtime = RuntimeOptions(backend, device, threads, precision)
         self._network, self.backend = open_network(self.weights, self._runtime)
 
     @property

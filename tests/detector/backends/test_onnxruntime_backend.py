@@ -14,7 +14,7 @@ from deepdetect.detector.backends.onnxruntime_backend import open_onnxruntime
 from deepdetect.detector.backends.options import RuntimeOptions
 from deepdetect.detector.pretrained import pretrained_weights
 
-CUDA = RuntimeOptions("onnxruntime", ("CUDAExecutionProvider", "CPUExecutionProvider"))
+CUDA = RuntimeOptions("onnxruntime", "cuda")
 
 
 @pytest.fixture
@@ -32,12 +32,12 @@ def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnxruntime, "InferenceSession", start)
 
 
-def test_a_provider_that_cannot_start_is_no_damaged_file(broken_cuda: None) -> None:
+def test_a_device_that_cannot_start_is_no_damaged_file(broken_cuda: None) -> None:
     with pytest.raises(OptionError, match=r"could not start .CUDA failure 35: driver is insuff"):
         open_onnxruntime(pretrained_weights(), CUDA)
 
 
-def test_a_damaged_file_is_named_whatever_the_provider(broken_cuda: None, tmp_path: Path) -> None:
+def test_a_damaged_file_is_named_whatever_the_device(broken_cuda: None, tmp_path: Path) -> None:
     path = tmp_path / "damaged.onnx"
     path.write_bytes(pretrained_weights().read_bytes()[:1000])
     with pytest.raises(WeightsError, match=r"damaged\.onnx is not an ONNX file"):

@@ -24,6 +24,7 @@ from .shapes import (
 from .without_telemetry import import_onnxruntime
 
 CPU = "CPUExecutionProvider"
+PROVIDERS = {"cpu": CPU, "cuda": "CUDAExecutionProvider"}
 
 
 class OnnxRuntimeNetwork:
@@ -48,7 +49,7 @@ class OnnxRuntimeNetwork:
             if any(words in str(error) for words in ("allocate memory", "bad_alloc")):
                 raise lack_of_memory(image.shape) from None
             reason = str(error).splitlines()[0]
-            raise failed_run(image.shape, reason, "another provider") from None
+            raise failed_run(image.shape, reason, "another device") from None
         return as_logits(output, self._output_name, image.shape, self.onnx_path)
 
     def release_memory(self) -> None:
@@ -66,37 +67,38 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
 
     Raises:
         WeightsError: the file is damaged or is another network.
-        OptionError: an execution provider is unknown or not available.
+        OptionError: the device is unknown or not available.
     """
     onnxruntime = import_onnxruntime()
-    providers = list(options.providers) or [CPU]
-    for provider in providers:
-        if provider not in onnxruntime.get_all_providers():
-            raise unknown_name("provider", provider, onnxruntime.get_all_providers())
-        if provider not in onnxruntime.get_available_providers():
-            raise OptionError(
-                f"the provider {provider} is not in the installed onnxruntime: "
-                f"install the build that has it, or use one of "
-                f"{', '.join(onnxruntime.get_available_providers())}"
-            )
+    device = options.device
+    provider = PROVIDERS.get(device, device)
+    known, available = onnxruntime.get_all_providers(), onnxruntime.get_available_providers()
+    if provider not in known:
+        raise unknown_name("device", device, (*PROVIDERS, *known))
+    if provider not in available:
+        build = "onnxruntime-gpu in its place" if device == "cuda" else "the build that has it"
+        raise OptionError(
+            f"the installed onnxruntime does not have the device {device}: install {build}, or use "
+            f"{' or '.join(['cpu', *(name for name in available if name != CPU)])}"
+        )
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = 4  # what fails is said by the exception, and by us
     if options.threads is not None:
         settings.intra_op_num_threads = options.threads
 
-    def start(chosen: list[str]) -> Any:
+    def start(chosen: str) -> Any:
         # Falling back to the CPU after a failure, it would print blocks of text.
         return onnxruntime.InferenceSession(
-            _maps_only(path), settings, providers=chosen, enable_fallback=0
+            _maps_only(path), settings, providers=[chosen], enable_fallback=0
         )
 
     try:
-        session = start(providers)
+        session = start(provider)
     except Exception as error:  # its exceptions share no base class
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        if providers != [CPU] and _starts(start):
+        if provider != CPU and _starts(start):
             raise OptionError(
-                f"{' or '.join(providers)} could not start ({reason}): check its driver and "
+                f"the device {device} could not start ({reason}): check its driver and "
                 "libraries, or leave it out"
             ) from None
         raise WeightsError(
@@ -105,10 +107,9 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
     # It goes on with the CPU when a provider cannot start, and says so in a log only.
     session.disable_fallback()
     session._model_bytes = None  # the content of the file, which it keeps for falling back
-    if providers[0] not in session.get_providers():
+    if provider not in session.get_providers():
         raise OptionError(
-            f"the provider {providers[0]} could not start: check its driver and libraries, "
-            "or leave it out"
+            f"the device {device} could not start: check its driver and libraries, or leave it out"
         )
     inputs = session.get_inputs()
     outputs = session.get_outputs()
@@ -136,10 +137,10 @@ def _maps_only(path: Path) -> str | bytes:
     return str(path)
 
 
-def _starts(start: Callable[[list[str]], Any]) -> bool:
-    """Return whether the processor can read the file: then what failed is another provider."""
+def _starts(start: Callable[[str], Any]) -> bool:
+    """Return whether the processor can read the file: then what failed is another device."""
     try:
-        start([CPU])
+        start(CPU)
     except Exception:  # its exceptions share no base class
         return False
     return True

@@ -35,10 +35,10 @@ class RuntimeOptions:
 
     Attributes:
         backend: "auto", "onnxruntime", "openvino" or "torch". "auto" takes torch for
-            safetensors weights, else OpenVINO when it is installed and no provider is
-            named, else ONNX Runtime.
-        providers: names of ONNX Runtime's execution providers, the preferred one first,
-            as ("CUDAExecutionProvider",); empty means its CPU provider.
+            safetensors weights, else OpenVINO for the device "cpu" when it is installed, else
+            ONNX Runtime.
+        device: "cpu"; or, with ONNX Runtime, "cuda", or the name of an execution provider,
+            as "TensorrtExecutionProvider".
         threads: number of threads; None leaves the backend's choice.
         precision: what the network computes with, "float32" or "bfloat16": that is faster where
             the processor has instructions for it, needs OpenVINO, moves a few keypoints, and is not
@@ -49,23 +49,20 @@ class RuntimeOptions:
     """
 
     backend: str = "auto"
-    providers: tuple[str, ...] = ()
+    device: str = "cpu"
     threads: int | None = None
     precision: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
-        single = isinstance(self.providers, str)
-        providers = (self.providers,) if single else tuple(self.providers)
-        object.__setattr__(self, "providers", providers)
         if self.backend not in ("auto", *BACKENDS):
             raise unknown_name("backend", self.backend, ("auto", *BACKENDS))
         if self.threads is not None and self.threads < 1:
             raise OptionError(f"threads must be at least 1, not {self.threads}")
         if self.precision not in PRECISIONS:
             raise unknown_name("precision", self.precision, PRECISIONS)
-        if self.providers and self.precision != "float32":
+        if self.device != "cpu" and self.precision != "float32":
             raise OptionError(
-                f'`precision="{self.precision}"` needs openvino, and providers belong to '
+                f'`precision="{self.precision}"` needs openvino, and `device="{self.device}"` '
                 "onnxruntime: leave one of them out"
             )
         if self.backend != "auto":
@@ -78,7 +75,8 @@ class RuntimeOptions:
                 f'`precision="{self.precision}"` needs the backend openvino, not {backend}: leave '
                 "one of them out"
             )
-        if self.providers and backend != "onnxruntime":
+        if self.device != "cpu" and backend != "onnxruntime":
             raise OptionError(
-                f"providers belong to onnxruntime, not to {backend}: leave one of them out"
+                f'`device="{self.device}"` needs the backend onnxruntime, not {backend}: leave one '
+                "of them out"
             )
