@@ -1,0 +1,359 @@
+"""What was made from what: is it of the same input and options, is it whole, may it be replaced?
+
+`key` is a digest of values, arrays and files, to name what depends on them. A record beside each
+output, `.deepdetect/NAME.json` in its folder, says from what it was made. `lock` lets one process
+at a time write a file. All files appear whole or not at all (`atomic`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .atomic import atomic_path
+from .errors import DeepDetectError, MissingFileError, OptionError
+from .text_files import read_json
+
+FOLDER = ".deepdetect"
+"""Of the records, in the folder of the outputs."""
+
+ADVICE = "choose another place with -o, or replace it with --overwrite"
+
+MAX_RECORD_BYTES = 1 << 26
+"""Longer records are damaged: one of a thousand inputs has 100 kB."""
+
+NAMES = "names of the arrays"
+"""Key of the list of all others in a file of arrays: one that lost some is damaged."""
+
+Arrays = Mapping[str, np.ndarray]
+
+
+def key(*values: Any) -> str:
+    """Return a digest of values, the same in every process and on every machine.
+
+    Args:
+        values: None, booleans, numbers, text, bytes, arrays (by type, shape and content), paths
+            (by the content of their files), dataclasses (by name and fields), and lists, sets and
+            dictionaries of these. A tuple is a list.
+
+    Returns:
+        32 hexadecimal digits.
+
+    Raises:
+        MissingFileError: a file is missing.
+        TypeError: a value is of another type.
+
+    Example:
+        >>> key({"a": 1, "b": np.eye(2)}) == key({"b": np.eye(2), "a": 1})
+        True
+        >>> key(1) == key(1.0)
+        False
+    """
+    text = json.dumps(plain(values), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON gives it back; arrays and files become digests. See `key`.
+
+    Example:
+        >>> plain({"sizes": (1, np.float32(0.5)), "of": {"b", "a"}})
+        {'sizes': [1, 0.5], 'of': ['a', 'b']}
+    """
+    match value:
+        case None | bool() | int() | float() | str():
+            return value
+        case Path():
+            return file_digest(value)
+        case bytes():
+            return hashlib.sha256(value).hexdigest()
+        case np.generic():
+            return value.item()
+        case np.ndarray():
+            digest = hashlib.sha256(f"{value.dtype}{value.shape}".encode())
+            digest.update(np.ascontiguousarray(value).tobytes())
+            return digest.hexdigest()
+        case Mapping():
+            return {str(name): plain(each) for name, each in value.items()}
+        case set() | frozenset():
+            return sorted(plain(each) for each in value)
+        case list() | tuple():
+            return [plain(each) for each in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        names = [each.name for each in dataclasses.fields(value)]
+        return {"class": type(value).__name__} | {n: plain(getattr(value, n)) for n in names}
+    raise TypeError(f"there is no digest of {type(value).__name__}")
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file; it is read once in a process, and when it has changed.
+
+    Raises:
+        MissingFileError: it cannot be read.
+    """
+    try:
+        return _file_digest(path.resolve(), *file_state(path))
+    except OSError as error:
+        raise MissingFileError(f"{path} cannot be read ({error.strerror})") from None
+
+
+@lru_cache(maxsize=4096)
+def _file_digest(path: Path, size: int, changed: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def file_state(path: Path) -> tuple[int, int]:
+    """Return a file's size in bytes and the time of its last change in ns; zeros without it."""
+    try:
+        status = path.stat()
+    except OSError:
+        return (0, 0)
+    return (status.st_size, status.st_mtime_ns)
+
+
+def check_same(place: Path, before: object, now: Mapping[str, Any], advice: str = ADVICE) -> None:
+    """Refuse what was made with other settings.
+
+    Args:
+        place: what was made.
+        before: the settings that are noted in it, None where there are none.
+        now: those of this run, as `plain` returns them; others that were noted do not matter.
+        advice: what to do.
+
+    Raises:
+        OptionError: they differ; the names of those that do are in the message.
+    """
+    if not isinstance(before, Mapping):
+        raise OptionError(f"{place} exists, written by something else: {advice}")
+    names = sorted(n for n in now if n not in before or before[n] != now[n])
+    if names:
+        other = ", ".join(f"`{name}`" for name in names)
+        raise OptionError(f"{place} exists, made with other settings ({other}): {advice}")
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """The outputs of one piece of work, and the record beside each of what it was made from.
+
+    Attributes:
+        paths: files or folders that are made.
+        inputs: files or folders that they are made from.
+        settings: what else they depend on, as for `key`; outputs of others are not replaced. The
+            name of the command is one of them where commands may write files of one name.
+        overwrite: replace whatever there is.
+        growing: outputs of a part of the inputs are replaced, too.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> outputs = Outputs([folder / "points.txt"], [folder / "image.png"], {"count": 2})
+        >>> with outputs.writing() as values:
+        ...     _ = outputs.paths[0].write_text("1 2")
+        ...     values["seconds"] = 0.5
+        >>> outputs.find()
+        {'seconds': 0.5}
+    """
+
+    paths: Sequence[Path]
+    inputs: Sequence[Path]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    overwrite: bool = False
+    growing: bool = False
+
+    def check(self) -> None:
+        """Refuse to replace what was made otherwise; call it before long work.
+
+        Raises:
+            OptionError: an output was made from other files, with other settings, or by something
+                else.
+        """
+        names = [str(path.resolve()) for path in self.inputs]
+        for path in () if self.overwrite else self.paths:
+            if not path.exists():
+                continue
+            record = _read(path)
+            if record is None:
+                origin = " and ".join(names)
+                raise OptionError(f"{path} exists, and is not known to be of {origin}: {ADVICE}")
+            before = record["inputs"]
+            if before != names and not (self.growing and {*before} <= {*names}):
+                raise OptionError(f"{path} exists, made from {' and '.join(before)}: {ADVICE}")
+            check_same(path, record["settings"], plain(self.settings))
+
+    def find(self) -> dict[str, Any] | None:
+        """Return the values noted with outputs that are done, None where work is left.
+
+        Raises:
+            OptionError: as `check`, or an output has been changed since it was made.
+        """
+        if self.overwrite:
+            return None
+        self.check()
+        records = [_read(path) if path.exists() else None for path in self.paths]
+        for path, record in zip(self.paths, records, strict=True):
+            if record and record["digest"] and not _is_unchanged(path, record):
+                raise OptionError(f"{path} exists, and has been changed: {ADVICE}")
+        states = [list(file_state(path)) for path in self.inputs]
+        done = all(record and record["whole"] and record["states"] == states for record in records)
+        return records[0]["values"] if done and records[0] else None
+
+    @contextmanager
+    def writing(self) -> Iterator[dict[str, Any]]:
+        """Note what the outputs are made from, before the work and, with their digests, after it.
+
+        Work that fails leaves no trace: what it has not replaced is known as what it was before.
+        What work that is killed has written is known as its own.
+
+        Yields:
+            An empty dictionary of values to note, which `find` gives back.
+
+        Raises:
+            OptionError: as `check`.
+            DeepDetectError: the folder cannot be written.
+        """
+        self.check()
+        records = [_record(path) for path in self.paths]
+        missing = {each for path in records for each in path.parents if not each.exists()}
+        before = [
+            (file_state(path), record.read_bytes() if record.is_file() else None)
+            for path, record in zip(self.paths, records, strict=True)
+        ]
+        values: dict[str, Any] = {}
+        try:
+            for path in self.paths:
+                self._note(path, False, values)
+            yield values
+            for path in self.paths:
+                self._note(path, path.exists(), values)
+        except BaseException:
+            for path, record, (state, content) in zip(self.paths, records, before, strict=True):
+                if file_state(path) == state:
+                    _restore(record, content)
+            for folder in sorted(missing, key=lambda path: -len(path.parts)):
+                with contextlib.suppress(OSError):  # it is not empty
+                    folder.rmdir()
+            raise
+
+    def _note(self, path: Path, whole: bool, values: Mapping[str, Any]) -> None:
+        note = {
+            "inputs": [str(each.resolve()) for each in self.inputs],
+            "states": [file_state(each) for each in self.inputs],
+            "settings": plain(self.settings),
+            "whole": whole,
+            "state": file_state(path),
+            "digest": file_digest(path) if whole and path.is_file() else None,
+            "values": plain(values),
+        }
+        with atomic_path(_record(path)) as temporary:
+            temporary.write_text(json.dumps(note), encoding="utf-8")
+
+
+def _record(output: Path) -> Path:
+    return output.parent / FOLDER / f"{output.name}.json"
+
+
+def _read(output: Path) -> dict[str, Any] | None:
+    """Read the record of an output, None where there is none or it is damaged."""
+    try:
+        record = read_json(_record(output), MAX_RECORD_BYTES)
+    except (OSError, ValueError):
+        return None
+    fields = {"inputs", "states", "settings", "whole", "state", "digest", "values"}
+    return record if isinstance(record, dict) and fields <= {*record} else None
+
+
+def _restore(record: Path, content: bytes | None) -> None:
+    with contextlib.suppress(OSError, DeepDetectError):
+        if content is None:
+            record.unlink()
+        else:
+            with atomic_path(record) as temporary:
+                temporary.write_bytes(content)
+
+
+def _is_unchanged(path: Path, record: Mapping[str, Any]) -> bool:
+    # A copy of the folder has other times.
+    return list(file_state(path)) == record["state"] or file_digest(path) == record["digest"]
+
+
+def outputs_in(folder: Path) -> set[str]:
+    """Return the names of what was made in a folder, or was about to be."""
+    return {path.name.removesuffix(".json") for path in (folder / FOLDER).glob("*.json")}
+
+
+def check_not_made(folder: Path, images: Iterable[Path]) -> None:
+    """Refuse images below a folder that earlier runs have made.
+
+    Raises:
+        OptionError: one of them is an output, or lies in a folder that is one.
+    """
+    made = lru_cache(maxsize=None)(outputs_in)
+    for image in images:
+        parts = image.relative_to(folder).parts
+        if any(name in made(folder.joinpath(*parts[:depth])) for depth, name in enumerate(parts)):
+            raise OptionError(
+                f"{image} was made by an earlier run and is no input: move what was made out of "
+                f"{folder}, or list the images"
+            )
+
+
+def save_arrays(path: Path, arrays: Arrays, *, compress: bool = True) -> None:
+    """Write arrays by name to an NPZ file, whole or not at all.
+
+    Raises:
+        DeepDetectError: it cannot be written.
+    """
+    contents: dict[str, Any] = {**arrays, NAMES: np.array(sorted(arrays))}
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        (np.savez_compressed if compress else np.savez)(file, **contents)
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
+    """Read the arrays of `save_arrays`; None where there is no file or it is damaged."""
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            arrays = dict(file)
+        names = arrays.pop(NAMES).tolist()
+    except Exception:  # damage shows as any of a dozen errors of zip, zlib and numpy
+        return None
+    return arrays if sorted(arrays) == names else None
+
+
+@contextmanager
+def lock(path: Path, final: Path) -> Iterator[None]:
+    """Let one process at a time write a file; the system unlocks it when that ends.
+
+    Args:
+        path: a file for the lock, in a folder that exists. On Windows nothing is locked.
+        final: what is written, for the message.
+
+    Raises:
+        OptionError: another process holds the lock.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OptionError(
+                f"{final} is being written by another process: wait for it, or choose another "
+                "place with -o"
+            ) from None
+        except OSError:  # a network folder without locks
+            pass
+        yield
