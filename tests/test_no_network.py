@@ -123,5 +123,5 @@ def test_only_downloads_and_the_page_import_what_connects() -> None:
             if FOR_THE_NETWORK & {name.partition(".")[0] for name in names}:
                 found.add(path.relative_to(ROOT).as_posix())
     # The page's server listens, on the loopback address only; its command can open a browser.
-    page = {"app/guarded_http.py", "app/server.py", "cli/app.py"}
+    page = {"app/server.py", "cli/app.py"}
     assert found == {"datasets/download.py", *page}

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from email.message import Message
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ class Answer:
     """What came back."""
 
     status: int
-    headers: dict[str, str]
+    headers: Message
     content: bytes
 
     @property
@@ -38,7 +39,7 @@ class Client:
 
     def __init__(self, server: AppServer) -> None:
         self.server = server
-        self.host = f"127.0.0.1:{server.server_port}"
+        self.host = f"127.0.0.1:{server.port}"
 
     def ask(
         self,
@@ -52,7 +53,7 @@ class Client:
             "Authorization": f"Bearer {self.server.key}",
             **(headers or {}),
         }
-        connection = http.client.HTTPConnection("127.0.0.1", self.server.server_port, timeout=60)
+        connection = http.client.HTTPConnection("127.0.0.1", self.server.port, timeout=60)
         connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
         if body is not None and "Content-Length" not in given:
             given["Content-Length"] = str(len(body))
@@ -61,7 +62,7 @@ class Client:
                 connection.putheader(name, value)
         connection.endheaders(body)
         response = connection.getresponse()
-        answer = Answer(response.status, dict(response.getheaders()), response.read())
+        answer = Answer(response.status, response.headers, response.read())
         connection.close()
         return answer
 
@@ -100,14 +101,16 @@ def serve(
         folder.mkdir()
         monkeypatch.setattr(tempfile, "tempdir", str(folder))
         server = AppServer(AppOptions(port=0, **options))
-        threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
-        started.append((server, folder))
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        started.append((server, thread, folder))
         return Client(server), folder
 
     yield start
-    for server, folder in started:
-        server.shutdown()
-        server.server_close()
+    for server, thread, folder in started:
+        with server:
+            server.stop()
+            thread.join(timeout=60)
         assert list(folder.iterdir()) == []
 
 

@@ -42,7 +42,7 @@ def folders(temporary: Path) -> list[Path]:
 
 def test_it_is_bound_to_the_loopback_address(serve: Any) -> None:
     client, _ = serve()
-    assert client.server.server_address[0] == "127.0.0.1"
+    assert client.server._socket.getsockname()[0] == "127.0.0.1"
     assert client.server.address.startswith(f"http://{client.host}/#key=")
 
 
@@ -75,9 +75,11 @@ def test_the_policy_of_the_file_is_that_of_the_server(serve: Any) -> None:
 def test_another_host_is_refused(host: str | None, serve: Any) -> None:
     """What DNS rebinding would send."""
     client, _ = serve()
-    given = None if host is None else host.format(port=client.server.server_port)
+    given = None if host is None else host.format(port=client.server.port)
     for path in ("/", "/config.json", "/api/jobs/x"):
-        assert client.ask("GET", path, headers={"Host": given}).status == 421
+        # That HTTP demands one is uvicorn's to say.
+        status = 400 if given is None else 421
+        assert client.ask("GET", path, headers={"Host": given}).status == status
 
 
 @pytest.mark.parametrize(
@@ -128,15 +130,16 @@ def test_only_the_files_of_the_page_are_served(path: str, serve: Any) -> None:
 def test_what_is_no_address_is_refused(serve: Any, capfd: pytest.CaptureFixture[str]) -> None:
     client, _ = serve()
     for path in ("http://[x", "http://[::1"):
-        assert client.ask("GET", path).status == 400
+        assert client.ask("GET", path).status == 404
     assert capfd.readouterr().err == ""
 
 
 def test_port_80_is_left_out_by_browsers(serve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     client, _ = serve()
     assert client.ask("GET", "/", headers={"Host": "127.0.0.1"}).status == 421
-    monkeypatch.setattr(client.server, "server_port", 80)
-    connection = socket.create_connection(client.server.server_address)
+    port = client.server.port
+    monkeypatch.setattr(client.server, "port", 80)
+    connection = socket.create_connection(("127.0.0.1", port))
     connection.sendall(b"GET /config.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
     assert connection.recv(12) == b"HTTP/1.1 200"
     connection.close()
@@ -144,11 +147,13 @@ def test_port_80_is_left_out_by_browsers(serve: Any, monkeypatch: pytest.MonkeyP
 
 def test_a_body_that_nobody_reads_is_no_request(serve: Any) -> None:
     client, _ = serve()
+    port = client.server.port
     inner = f"GET /icon.svg HTTP/1.1\r\nHost: {client.host}\r\n\r\n"
     outer = (
-        f"GET /config.json HTTP/1.1\r\nHost: {client.host}\r\nContent-Length: {len(inner)}\r\n\r\n"
+        f"GET /config.json HTTP/1.1\r\nHost: {client.host}\r\nConnection: close\r\n"
+        f"Content-Length: {len(inner)}\r\n\r\n"
     )
-    with socket.create_connection(client.server.server_address) as connection:
+    with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.settimeout(30)
         connection.sendall((outer + inner).encode())
         answer = b""
@@ -187,17 +192,11 @@ def test_a_wrong_heat_map_is_refused(query: str, length: int, status: int, serve
 
 def test_a_body_without_length_is_refused(serve: Any) -> None:
     client, _ = serve()
-    for headers in (
-        {"Content-Length": None, "Transfer-Encoding": "chunked"},
-        {"Content-Length": "-1"},
-        {"Content-Length": "1e3"},
-        {"Content-Length": "٣"},
-    ):
-        try:
-            answer = client.ask("POST", "/api/jobs?kind=match", b"", headers)
-        except UnicodeEncodeError:
-            continue  # http.client does not send it
-        assert answer.status == 411
+    chunked = {"Content-Length": None, "Transfer-Encoding": "chunked"}
+    assert client.ask("POST", "/api/jobs?kind=match", b"0\r\n\r\n", chunked).status == 411
+    for length in ("-1", "1e3"):
+        headers = {"Content-Length": length}
+        assert client.ask("POST", "/api/jobs?kind=match", b"", headers).status == 400
 
 
 def test_sizes_are_limited(serve: Any, photo: np.ndarray) -> None:
@@ -205,7 +204,7 @@ def test_sizes_are_limited(serve: Any, photo: np.ndarray) -> None:
     pixel = ("a.png", b"x")
     for files, said in (
         ([("big.png", bytes(10_001))] * 2, "big.png is over 0.01 MB"),
-        ([pixel] * 4, "there are 4 photographs, over 3"),
+        ([pixel] * 4, "there are 4 images, over 3"),
         ([("a.png", bytes(9_000))] * 60, "this is over"),
     ):
         answer = client.start("stitch", files)
@@ -260,14 +259,14 @@ def test_a_damaged_task_is_refused(body: bytes, serve: Any) -> None:
     ("kind", "count", "options", "said"),
     [
         ("mach", 2, {}, "did you mean 'match'"),
-        ("match", 3, {}, "takes 2 photographs, not 3"),
-        ("stitch", 1, {}, "takes at least 2 photographs, not 1"),
+        ("match", 3, {}, "takes 2 images, not 3"),
+        ("stitch", 1, {}, "takes at least 2 images, not 1"),
         ("match", 2, {"focal_px": 3}, "does not take 'focal_px'"),
         ("reconstruct", 2, {"focal_px": "3"}, "does not take 'focal_px' as '3'"),
         ("reconstruct", 2, {"focal_px": -3}, "does not take 'focal_px' as -3"),
         ("reconstruct", 2, {"focal_px": True}, "does not take 'focal_px' as True"),
         ("reconstruct", 2, {"focal_px": 10**400}, "does not take 'focal_px' as 1000"),
-        ("folder-keypoints", 0, {}, "takes at least 1 photograph, not 0"),
+        ("folder-keypoints", 0, {}, "takes at least 1 image, not 0"),
     ],
 )
 def test_a_task_that_does_not_fit_is_refused(
@@ -288,7 +287,7 @@ def test_a_task_is_done_and_forgotten(serve: Any, photo: np.ndarray) -> None:
     job = client.start("folder-keypoints", files).values["job"]
     state = client.wait(job)
     assert state["state"] == "done", state
-    assert state["numbers"]["Photographs"] == "1 of 2"
+    assert state["numbers"]["Images"] == "1 of 2"
     address = f"/api/jobs/{job}/files/keypoints.zip"
     assert client.ask("GET", address, headers={"Authorization": None}).status == 401
     answer = client.ask("GET", address)
@@ -305,7 +304,7 @@ def test_a_task_is_done_and_forgotten(serve: Any, photo: np.ndarray) -> None:
     assert client.ask("GET", address).status == 404
 
 
-def test_photographs_can_be_read_by_their_owner_only(serve: Any, photo: np.ndarray) -> None:
+def test_images_can_be_read_by_their_owner_only(serve: Any, photo: np.ndarray) -> None:
     client, temporary = serve()
     client.start("folder-keypoints", [("a.png", encoded(photo))])
     for folder in [*temporary.iterdir(), *folders(temporary)]:
@@ -313,7 +312,7 @@ def test_photographs_can_be_read_by_their_owner_only(serve: Any, photo: np.ndarr
 
 
 def noise(count: int) -> list[tuple[str, bytes]]:
-    """Return photographs that take seconds each."""
+    """Return images that take seconds each."""
     rgb = np.random.default_rng(0).integers(0, 256, (600, 600, 3)).astype(np.uint8)
     content = encoded(rgb)
     return [(f"{number}.png", content) for number in range(count)]
@@ -327,7 +326,7 @@ def long_task(client: Client) -> str:
 def test_a_task_is_cancelled(serve: Any) -> None:
     client, temporary = serve(max_tasks=1)
     job = long_task(client)
-    process = client.server.jobs.find(job)._process
+    process = client.server.jobs.find(job).process
     refused = client.start("folder-keypoints", [("a.png", b"x")])
     assert "as many tasks as are allowed (1) are at work" in refused.values["error"]
     assert client.ask("DELETE", f"/api/jobs/{job}").status == 200
@@ -355,7 +354,7 @@ def test_a_task_that_nobody_asks_for_is_forgotten(serve: Any) -> None:
 def test_a_process_that_dies_is_said_in_one_sentence(serve: Any) -> None:
     client, _ = serve()
     job = long_task(client)
-    client.server.jobs.find(job)._process.kill()
+    client.server.jobs.find(job).process.kill()
     state = client.wait(job)
     assert state["state"] == "failed"
     assert "ended without a result" in state["error"]
@@ -363,14 +362,14 @@ def test_a_process_that_dies_is_said_in_one_sentence(serve: Any) -> None:
 
 def test_a_worker_ends_with_the_server(serve: Any) -> None:
     client, _ = serve()
-    process = client.server.jobs.find(long_task(client))._process
+    process = client.server.jobs.find(long_task(client)).process
     process.stdin.close()  # as when the server is killed
     assert process.wait(timeout=60) != 0
 
 
 def test_a_request_that_stands_still_is_ended(serve: Any) -> None:
     client, _ = serve(max_request_s=0.3)
-    with socket.create_connection(("127.0.0.1", client.server.server_port)) as connection:
+    with socket.create_connection(("127.0.0.1", client.server.port)) as connection:
         connection.settimeout(30)
         connection.sendall(b"GET / HTTP/1.1\r\nHost: ")
         assert connection.recv(100) == b""
@@ -382,7 +381,7 @@ def test_a_body_that_trickles_is_ended(serve: Any) -> None:
         f"POST /api/heatmap?width=1000&height=1000 HTTP/1.1\r\nHost: {client.host}\r\n"
         f"Authorization: Bearer {client.server.key}\r\nContent-Length: 3000000\r\n\r\n"
     )
-    with socket.create_connection(("127.0.0.1", client.server.server_port)) as connection:
+    with socket.create_connection(("127.0.0.1", client.server.port)) as connection:
         connection.sendall(head.encode())
 
         def trickle() -> None:
@@ -394,7 +393,7 @@ def test_a_body_that_trickles_is_ended(serve: Any) -> None:
             trickle()
 
 
-def test_photographs_that_cannot_be_written_are_said(
+def test_images_that_cannot_be_written_are_said(
     serve: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
     client, temporary = serve()
@@ -420,7 +419,7 @@ def test_the_last_place_is_taken_once(serve: Any, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_full_disk_is_said_by_the_task(tmp_path: Path) -> None:
-    task = {"kind": "match", "photographs": [], "options": {}, "max_megapixels": 1}
+    task = {"kind": "match", "images": [], "options": {}, "max_megapixels": 1}
     (tmp_path / "task.json").write_text(json.dumps(task))
     code = (
         "import errno, pathlib, sys, types\n"
@@ -440,13 +439,13 @@ def test_a_full_disk_is_said_by_the_task(tmp_path: Path) -> None:
 def test_a_port_that_is_taken_is_said_in_one_sentence(serve: Any) -> None:
     client, _ = serve()
     with pytest.raises(OptionError, match="cannot be used"):
-        AppServer(AppOptions(port=client.server.server_port))
+        AppServer(AppOptions(port=client.server.port))
 
 
 def test_what_is_not_installed_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     import importlib.util
 
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert TASKS["match"].missing == 'pip install "deepdetect[standard]"'
+    assert TASKS["folder-model"].missing == "pip install pycolmap h5py"
     with pytest.raises(OptionError, match="needs another package"):
-        TASKS["match"].check(2, {})
+        TASKS["folder-model"].check(3, {})

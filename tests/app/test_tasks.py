@@ -14,7 +14,7 @@ from PIL import Image
 import deepdetect
 from deepdetect import load_image, load_matches, register
 from deepdetect._shared.errors import DeepDetectError
-from deepdetect.app.tasks import TASKS, Photograph, TaskResult
+from deepdetect.app.tasks import TASKS, SentImage, TaskResult
 
 EXAMPLES = Path(deepdetect.__path__[0]) / "app/static/examples"
 
@@ -24,8 +24,8 @@ def run(
 ) -> tuple[TaskResult, list[tuple[str, int, int]]]:
     """Run a task on examples of the page; return its result and its progress."""
     told: list[tuple[str, int, int]] = []
-    photographs = [Photograph(EXAMPLES / name, name) for name in names]
-    result = TASKS[kind].run(photographs, options, folder, lambda *stage: told.append(stage))
+    images = [SentImage(EXAMPLES / name, name) for name in names]
+    result = TASKS[kind].run(images, options, folder, lambda *stage: told.append(stage))
     for name in {result.shown, *result.files}:
         assert (folder / name).stat().st_size > 0
     assert all(isinstance(text, str) for text in result.numbers.values())
@@ -59,7 +59,7 @@ def test_a_panorama_names_what_is_left_out(tmp_path: Path) -> None:
     pytest.importorskip("numba")
     names = ["coffee.jpg", "motorcycle-left.jpg", "coffee-turned.jpg"]
     result, _ = run("stitch", names, tmp_path)
-    assert result.numbers["Photographs"] == "2 of 3"
+    assert result.numbers["Images"] == "2 of 3"
     assert result.numbers["Left out"] == "motorcycle-left.jpg"
     assert load_image(tmp_path / "panorama.jpg").shape[1] >= 600
 
@@ -100,5 +100,5 @@ def test_a_model_of_a_folder(serve: Any, shared: Path) -> None:
         files.append((f"fountain/{number:04d}.jpg", file.getvalue()))
     state = client.wait(client.start("folder-model", files).values["job"], 600)
     assert state["state"] == "done", state
-    assert state["numbers"]["Photographs"] == "4 of 4"
+    assert state["numbers"]["Images"] == "4 of 4"
     assert state["shown"] == "model.html"

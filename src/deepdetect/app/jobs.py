@@ -25,83 +25,81 @@ from .options import AppOptions
 FOLDER_PREFIX = "deepdetect-app-"
 """Of the folder of a server, in the folder for temporary files."""
 
-CHECK_EVERY_S = 1.0
-"""How often it is looked for tasks that last too long or are forgotten."""
+NO_RESULT = "the task ended without a result: there may be too little memory for it"
 
 
 class Job:
     """A task, the process that does it, and the folder of its files.
 
     Args:
-        folder: its own, with the photographs in it; removed by `remove`.
+        folder: its own, with the images in it; removed by `remove`.
         kind: of the task.
-        photographs: pairs of a file's name in the folder and the name that the user knows it by.
+        images: pairs of a file's name in the folder and the name that the user knows it by.
         options: of the task.
-        limits: of the server.
+        max_megapixels: larger images are refused.
+
+    Attributes:
+        name: secret, known to the page alone.
+        state: what the page is told.
+        started, asked: when it began, and when the page has last asked for it.
+        process: that does it.
     """
 
     def __init__(
         self,
         folder: Path,
         kind: str,
-        photographs: Sequence[tuple[str, str]],
+        images: Sequence[tuple[str, str]],
         options: Mapping[str, float],
-        limits: AppOptions,
+        max_megapixels: float,
     ) -> None:
         self.name = secrets.token_urlsafe(24)
         self.folder = folder
         self.started = self.asked = time.monotonic()
-        self._lock = threading.Lock()
-        self._state: dict[str, Any] = {"state": "running", "stage": "starting"}
+        self.state: dict[str, Any] = {"state": "running", "stage": "starting"}
+        self._reason = NO_RESULT
         task = {
             "kind": kind,
-            "photographs": [{"file": file, "name": name} for file, name in photographs],
-            "options": dict(options),
-            "max_megapixels": limits.max_megapixels,
+            "images": images,
+            "options": options,
+            "max_megapixels": max_megapixels,
         }
         (folder / "task.json").write_text(json.dumps(task), encoding="utf-8")
-        self._process = subprocess.Popen(
+        root = str(Path(__file__).parents[2])  # where the worker finds the package
+        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+        self.process = subprocess.Popen(
             # -P: no module is taken from the folder it is started in.
             [sys.executable, "-P", "-m", f"{__package__}.worker", str(folder)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             cwd=folder,
-            env=_environment(),
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
             start_new_session=True,  # so that all it starts can be ended
         )
-        threading.Thread(target=self._listen, daemon=True).start()
-
-    def state(self) -> dict[str, Any]:
-        """Return what the page is told, and note that it has asked."""
-        self.asked = time.monotonic()
-        with self._lock:
-            return dict(self._state)
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
 
     @property
     def running(self) -> bool:
         """Whether the process is at work."""
-        return self._process.poll() is None
+        return self.process.poll() is None
 
     def file(self, name: str) -> Path | None:
         """Return one of the files that the task has named; None for any other name."""
-        with self._lock:
-            files = [*self._state.get("files", ()), self._state.get("shown")]
-        self.asked = time.monotonic()
+        files = [*self.state.get("files", ()), self.state.get("shown")]
         return self.folder / "results" / name if name in files else None
 
     def stop(self, reason: str) -> None:
         """End the process with all that it has started."""
-        with self._lock:
-            if self._state["state"] == "running":
-                self._state = {"state": "failed", "error": reason}
+        self._reason = reason
         if self.running:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 if hasattr(os, "killpg"):
-                    os.killpg(self._process.pid, signal.SIGKILL)
+                    os.killpg(self.process.pid, signal.SIGKILL)
                 else:
-                    self._process.kill()
-        self._end()
+                    self.process.kill()
+        self._listener.join()
 
     def remove(self) -> None:
         """End the process, and remove all files."""
@@ -109,44 +107,23 @@ class Job:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _listen(self) -> None:
-        assert self._process.stdout is not None
-        with self._process.stdout as lines:
-            for line in lines:
-                with contextlib.suppress(ValueError):
-                    self._note(json.loads(line))
-        self._end()
-        with self._lock:
-            if self._state["state"] == "running":
-                reason = "the task ended without a result: there may be too little memory for it"
-                self._state = {"state": "failed", "error": reason}
-
-    def _end(self) -> None:
-        """Wait for the process, and close what it was held by."""
-        self._process.wait()
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-
-    def _note(self, told: dict[str, Any]) -> None:
-        with self._lock:
-            if self._state["state"] != "running":
-                return
-            if "result" in told:
-                self._state = {"state": "done", **told["result"]}
-            elif "error" in told:
-                self._state = {"state": "failed", "error": told["error"]}
-            else:
-                self._state = {"state": "running", **told}
-
-
-def _environment() -> dict[str, str]:
-    """Return this process's variables, so that the worker finds the package where this one is."""
-    root = str(Path(__file__).parents[2])
-    given = os.environ.get("PYTHONPATH")
-    return {**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{given}" if given else root}
+        with self.process:  # closes what it was held by, and waits for it
+            for line in self.process.stdout or ():
+                if not line.endswith(b"\n"):
+                    break  # it was ended while it wrote
+                told = json.loads(line)
+                if "result" in told:
+                    self.state = {"state": "done", **told["result"]}
+                elif "error" in told:
+                    self.state = {"state": "failed", "error": told["error"]}
+                else:
+                    self.state = {"state": "running", **told}
+        if self.state["state"] == "running":
+            self.state = {"state": "failed", "error": self._reason}
 
 
 class Jobs:
-    """All tasks of a server.
+    """All tasks of a server. They are started by one thread, that of the server.
 
     Args:
         limits: of the server.
@@ -155,44 +132,32 @@ class Jobs:
     def __init__(self, limits: AppOptions) -> None:
         self.limits = limits
         self._jobs: dict[str, Job] = {}
-        self._lock = threading.Lock()
         self._folder = private_folder(FOLDER_PREFIX)
-        self._closed = threading.Event()
-        threading.Thread(target=self._watch, daemon=True).start()
 
     @contextmanager
     def new_folder(self) -> Iterator[Path]:
-        """Make a folder for the photographs of a task, which nobody else can read.
+        """Make a folder for the images of a task, which nobody else can read.
 
         It is removed where the task cannot be started.
 
         Raises:
             DeepDetectError: files cannot be written, or the process cannot be started.
         """
-        folder = None
-        try:
-            folder = Path(tempfile.mkdtemp(dir=self._folder))
-            yield folder
-        except BaseException as error:
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)
-            if isinstance(error, DeepDetectError | ConnectionError | TimeoutError):
-                raise  # the browser has ended the request, or is too slow
-            if isinstance(error, OSError):
+        with contextlib.ExitStack() as made:
+            try:
+                folder = Path(tempfile.mkdtemp(dir=self._folder))
+                made.callback(shutil.rmtree, folder, ignore_errors=True)
+                yield folder
+            except OSError as error:
                 raise DeepDetectError(
                     f"the task cannot be started ({error.strerror or error}): free some space and "
                     "memory, or start deepdetect app again"
                 ) from error
-            raise
+            made.pop_all()
 
     def check_room(self) -> None:
         """Raise an OptionError where too many tasks are at work."""
-        with self._lock:
-            self._check_room()
-
-    def _check_room(self) -> None:
-        at_work = sum(job.running for job in self._jobs.values())
-        if at_work >= self.limits.max_tasks:
+        if sum(job.running for job in self._jobs.values()) >= self.limits.max_tasks:
             raise OptionError(
                 f"as many tasks as are allowed ({self.limits.max_tasks}) are at work: wait for one "
                 "of them, or cancel it"
@@ -202,55 +167,44 @@ class Jobs:
         self,
         folder: Path,
         kind: str,
-        photographs: Sequence[tuple[str, str]],
+        images: Sequence[tuple[str, str]],
         options: Mapping[str, float],
     ) -> Job:
-        """Start a task with the photographs of a folder.
+        """Start a task with the images of a folder.
 
         Raises:
-            DeepDetectError: the server ends, or too many tasks are at work.
+            OptionError: too many tasks are at work.
         """
-        with self._lock:  # two requests at once must not both take the last place
-            self._check_room()
-            job = Job(folder, kind, photographs, options, self.limits)
-            self._jobs[job.name] = job
-        if self._closed.is_set():
-            self.close()
-            raise DeepDetectError("deepdetect app is ending: start it again")
+        self.check_room()
+        job = Job(folder, kind, images, options, self.limits.max_megapixels)
+        self._jobs[job.name] = job
         return job
 
     def find(self, name: str) -> Job | None:
-        """Return a task by its name."""
-        with self._lock:
-            return self._jobs.get(name)
+        """Return a task by its name, and note that the page has asked for it."""
+        job = self._jobs.get(name)
+        if job is not None:
+            job.asked = time.monotonic()
+        return job
 
-    def remove(self, name: str) -> bool:
-        """End a task, and remove its files; return whether there was one."""
-        with self._lock:
-            job = self._jobs.pop(name, None)
+    def remove(self, name: str) -> None:
+        """End a task, if there is one of this name, and remove its files."""
+        job = self._jobs.pop(name, None)
         if job is not None:
             job.remove()
-        return job is not None
+
+    def end_overdue(self) -> None:
+        """End the tasks that last too long, and forget those that the page has forgotten."""
+        now = time.monotonic()
+        for job in list(self._jobs.values()):
+            if now - job.asked > self.limits.abandoned_s:
+                self.remove(job.name)
+            elif job.running and now - job.started > self.limits.max_task_s:
+                minutes = self.limits.max_task_s / 60
+                job.stop(f"it took over {minutes:.3g} minutes: use fewer or smaller images")
 
     def close(self) -> None:
         """End all tasks, and remove all files."""
-        self._closed.set()
-        with self._lock:
-            names = list(self._jobs)
-        for name in names:
+        for name in list(self._jobs):
             self.remove(name)
         shutil.rmtree(self._folder, ignore_errors=True)
-
-    def _watch(self) -> None:
-        while not self._closed.wait(min(CHECK_EVERY_S, self.limits.abandoned_s / 4)):
-            now = time.monotonic()
-            with self._lock:
-                jobs = list(self._jobs.values())
-            for job in jobs:
-                if now - job.asked > self.limits.abandoned_s:
-                    self.remove(job.name)
-                elif job.running and now - job.started > self.limits.max_task_s:
-                    minutes = self.limits.max_task_s / 60
-                    job.stop(
-                        f"it took over {minutes:.3g} minutes: use fewer or smaller photographs"
-                    )

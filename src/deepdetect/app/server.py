@@ -1,43 +1,92 @@
-"""The server of the page: what it is asked for and answers, for one user, keeping nothing."""
+"""The server of the page: for one user, on the loopback address only, keeping nothing.
+
+Starlette and uvicorn speak HTTP. It answers only requests that name this computer and come from
+its own page with the key of this start, and that are neither too large nor too slow.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import hmac
 import json
+import mimetypes
+import secrets
+import signal
+import socket
 import threading
+from collections.abc import AsyncIterator
 from functools import cached_property
-from http import HTTPStatus
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
+from .._shared.signals import handle_signals
 from ..detector.pretrained import RANKER
-from .guarded_http import (
-    HOST,
-    PAGE_POLICY,
-    VIEWER_POLICY,
-    GuardedHandler,
-    GuardedServer,
-    Refused,
-)
 from .jobs import Jobs
 from .options import AppOptions
 from .tasks import TASKS
 
+HOST = "127.0.0.1"
+NAMES = (HOST, "localhost")
+HTTP_PORT = 80
 STATIC = Path(__file__).parent / "static"
 
+SLOWEST = 10
+"""A request may last so many times as long in all as it may stand still."""
+
+DRAINED_BYTES = 16 << 20
+"""Of a refused request that are read before it is answered: browsers look for the answer only when
+they have sent everything."""
+
+SHUTDOWN_S = 1
+"""How long the end waits for requests that are being answered."""
+
+CHECK_EVERY_S = 1.0
+"""How often it is looked for tasks that last too long or are forgotten."""
+
 MAX_HEATMAP_PIXELS = 2_100_000
-"""The page reduces photographs to two megapixels, with sides that are multiples of 8."""
+"""The page reduces images to two megapixels, with sides that are multiples of 8."""
 
 MIN_SIDE = 16
 MAX_DESCRIPTION_BYTES = 1 << 18
-"""Of the names and sizes of photographs, and of the options of a task."""
+"""Of the names and sizes of images, and of the options of a task."""
 
 MAX_NAME_LENGTH = 200
 
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; "
+        "style-src 'self'; img-src 'self' blob:; connect-src 'self'; frame-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+VIEWER_POLICY = (
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+    "frame-ancestors 'self'; sandbox allow-scripts"
+)
+"""The viewer of a model is one file with its script in it, and cannot reach the page around it."""
 
-class AppServer(GuardedServer):
+
+class AppServer:
     """Serves the page until it is closed.
 
     Args:
@@ -45,6 +94,7 @@ class AppServer(GuardedServer):
 
     Attributes:
         key: the secret of this start, which every request but those for the page must have.
+        port: the one that it listens at.
         address: of the page, with the key.
 
     Raises:
@@ -59,39 +109,95 @@ class AppServer(GuardedServer):
 
     def __init__(self, options: AppOptions = AppOptions()) -> None:
         self.options = options
-        self.network = threading.Lock()  # one photograph at a time: it takes all processors
-        super().__init__(options.port, Handler, options.max_request_s)
+        self.key = secrets.token_urlsafe(24)
+        self._network = threading.Lock()  # one image at a time: it takes all processors
+        self.jobs = Jobs(options)
         try:
-            self.jobs = Jobs(options)
-        except DeepDetectError:
-            self.server_close()
-            raise
-        self.pages = {
-            f"/{path.relative_to(STATIC).as_posix()}": path
-            for path in STATIC.rglob("*")
-            if path.is_file()
-        }
-        self.pages["/model/ranker.npz"] = RANKER  # where a build for other servers has it, too
+            self._socket = socket.create_server((HOST, options.port))
+        except OSError as error:
+            self.jobs.close()
+            raise OptionError(
+                f"port {options.port} cannot be used ({error.strerror}): give another `port`, or 0 "
+                "for any that is free"
+            ) from None
+        self.port = self._socket.getsockname()[1]
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                _Guard(self, self._routes()),
+                http=_protocol(options.max_request_s),
+                ws="none",
+                log_config=None,
+                log_level="error",
+                access_log=False,
+                server_header=False,
+                proxy_headers=False,
+                timeout_graceful_shutdown=SHUTDOWN_S,
+            )
+        )
+
+    def __enter__(self) -> AppServer:
+        # A signal to end is Ctrl+C, so that tasks are ended and their files removed.
+        self._signals = contextlib.ExitStack()
+        self._signals.enter_context(handle_signals(signal.default_int_handler, ["SIGTERM"]))
+        self._signals.enter_context(
+            handle_signals(lambda *_: signal.raise_signal(signal.SIGTERM), ["SIGHUP"])
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+        self.jobs.close()
+        self._signals.close()
 
     @property
     def address(self) -> str:
         """The address of the page."""
-        return f"http://{HOST}:{self.server_port}/#key={self.key}"
+        return f"http://{HOST}:{self.port}/#key={self.key}"
 
-    @cached_property
-    def detector(self) -> Any:
-        """The network, opened when it is first needed."""
-        from ..detector.detector import DeepDetect
+    def serve_forever(self) -> None:
+        """Answer requests until `stop`, or until Ctrl+C or a signal to end: KeyboardInterrupt."""
+        self._server.run(sockets=[self._socket])
 
-        return DeepDetect(resolution="native")
+    def stop(self) -> None:
+        """End `serve_forever`, which runs in another thread."""
+        self._server.should_exit = True
 
-    def server_close(self) -> None:
-        """End all tasks, and remove their files."""
-        super().server_close()
-        if hasattr(self, "jobs"):
-            self.jobs.close()
+    def _routes(self) -> Starlette:
+        # Of the system's table, which programs of Windows change.
+        mimetypes.add_type("text/javascript", ".js")
+        return Starlette(
+            routes=[
+                Route("/config.json", lambda _: JSONResponse(self._description())),
+                # Where a build for other servers has it, too.
+                Route("/model/ranker.npz", lambda _: FileResponse(RANKER)),
+                Route("/api/heatmap", self._heatmap, methods=["POST"]),
+                Route("/api/jobs", self._new_job, methods=["POST"]),
+                Route("/api/jobs/{name}", self._job_state, methods=["GET"]),
+                Route("/api/jobs/{name}", self._remove_job, methods=["DELETE"]),
+                Route("/api/jobs/{name}/files/{file}", self._job_file),
+                Mount("/", StaticFiles(directory=STATIC, html=True)),
+            ],
+            exception_handlers={
+                HTTPException: lambda _, error: _refusal(error.status_code, error.detail),
+                DeepDetectError: lambda _, error: _refusal(400, str(error)),
+            },
+            lifespan=self._watched,
+        )
 
-    def description(self) -> dict[str, Any]:
+    @contextlib.asynccontextmanager
+    async def _watched(self, _: Starlette) -> AsyncIterator[None]:
+        """Look for tasks that have to be ended, while the server runs."""
+
+        async def watch() -> None:
+            while True:
+                await asyncio.sleep(min(CHECK_EVERY_S, self.options.abandoned_s / 4))
+                await run_in_threadpool(self.jobs.end_overdue)
+
+        watching = asyncio.create_task(watch())
+        yield
+        watching.cancel()
+
+    def _description(self) -> dict[str, Any]:
         """Return what the page is told of this server."""
         options = self.options
         tasks = [
@@ -113,122 +219,217 @@ class AppServer(GuardedServer):
         }
         return {"engine": "python", "version": __version__, "tasks": tasks, "limits": limits}
 
+    def _check_key(self, request: Request) -> None:
+        """Refuse requests without the key of this start, and of other sites."""
+        given = request.headers.get("Authorization", "").removeprefix("Bearer ")
+        if not hmac.compare_digest(given.encode(), self.key.encode()):
+            raise HTTPException(
+                401,
+                "the key of this page is not that of deepdetect app: open the address that it has "
+                "printed",
+            )
+        if request.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
+            raise HTTPException(403, "only the page of deepdetect app may ask this")
 
-class Handler(GuardedHandler):
-    """Answers one connection."""
+    @cached_property
+    def _detector(self) -> Any:
+        """The network, opened when it is first needed."""
+        from ..detector.detector import DeepDetect
 
-    server: AppServer
+        return DeepDetect(resolution="native")
 
-    def do_GET(self) -> None:
-        self.answer(self._get)
-
-    def do_POST(self) -> None:
-        self.answer(self._post)
-
-    def do_DELETE(self) -> None:
-        self.answer(self._delete)
-
-    def _get(self, url: Any) -> None:
-        if url.path == "/config.json":
-            self.send_json(self.server.description())
-            return
-        page = self.server.pages.get("/index.html" if url.path == "/" else url.path)
-        if page is not None:
-            self.send_file(page, PAGE_POLICY)
-            return
-        job, rest = self._job(url.path)
-        name = rest.removeprefix("files/")
-        if not rest:
-            self.check_key()
-            self.send_json(job.state())
-            return
-        path = job.file(name) if rest.startswith("files/") else None
-        if path is None:
-            raise Refused(HTTPStatus.NOT_FOUND, "there is no such file")
-        if path.suffix == ".html":  # a frame cannot send the key: the task's name is one, too
-            self.send_file(path, VIEWER_POLICY)
-            return
-        self.check_key()
-        self.send_file(path, PAGE_POLICY)
-
-    def _post(self, url: Any) -> None:
-        self.check_key()
-        query = {name: values[-1] for name, values in parse_qs(url.query).items()}
-        if url.path == "/api/heatmap":
-            self._heatmap(query)
-        elif url.path == "/api/jobs":
-            self._new_job(query.get("kind", ""))
-        else:
-            raise Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
-
-    def _delete(self, url: Any) -> None:
-        self.check_key()
-        job, _ = self._job(url.path)
-        self.server.jobs.remove(job.name)
-        self.send_json({})
-
-    def _job(self, path: str) -> Any:
-        """Return the task that a path names, and the rest of the path."""
-        name, _, rest = path.removeprefix("/api/jobs/").partition("/")
-        job = self.server.jobs.find(name) if path.startswith("/api/jobs/") else None
-        if job is None:
-            raise Refused(HTTPStatus.NOT_FOUND, "there is no such task: it may have been forgotten")
-        return job, rest
-
-    def _heatmap(self, query: dict[str, str]) -> None:
-        """Answer the pixels of a photograph, (H, W, 3) uint8, with its logits, (H, W) float32."""
+    async def _heatmap(self, request: Request) -> Response:
+        """Answer the pixels of an image, (H, W, 3) uint8, with its logits, (H, W) float32."""
         import numpy as np
 
+        self._check_key(request)
         try:
-            width, height = int(query["width"]), int(query["height"])
+            width, height = (int(request.query_params[name]) for name in ("width", "height"))
         except (KeyError, ValueError):
-            raise Refused(HTTPStatus.BAD_REQUEST, "the size of the picture is missing") from None
+            raise HTTPException(400, "the size of the image is missing") from None
         if min(width, height) < MIN_SIDE or width * height > MAX_HEATMAP_PIXELS:
-            raise Refused(HTTPStatus.BAD_REQUEST, f"a picture cannot be {width}x{height} here")
-        length = self.body_length(3 * width * height)
-        if length != 3 * width * height:
-            raise Refused(HTTPStatus.BAD_REQUEST, "these are not the pixels of such a picture")
-        pixels = b"".join(self.pieces(length))
-        rgb = np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
-        with self.server.network:
-            logits = self.server.detector.heatmap_and_logits(rgb)[1]
-        self.send(np.ascontiguousarray(logits, "<f4").tobytes(), "application/octet-stream")
+            raise HTTPException(400, f"an image cannot be {width}x{height} here")
+        if _body_length(request, 3 * width * height) != 3 * width * height:
+            raise HTTPException(400, "these are not the pixels of such an image")
+        rgb = np.frombuffer(await request.body(), np.uint8).reshape(height, width, 3)
 
-    def _new_job(self, kind: str) -> None:
-        """Start a task: a length, a description in JSON of that length, and the photographs."""
-        options, jobs = self.server.options, self.server.jobs
+        def logits() -> bytes:
+            with self._network:
+                return self._detector.heatmap_and_logits(rgb)[1].astype("<f4").tobytes()
+
+        return Response(await run_in_threadpool(logits), media_type="application/octet-stream")
+
+    async def _new_job(self, request: Request) -> Response:
+        """Start a task: a length, a description in JSON of that length, and the images."""
+        self._check_key(request)
+        kind, options = request.query_params.get("kind", ""), self.options
         if kind not in TASKS:
             raise unknown_name("task", kind[:MAX_NAME_LENGTH], TASKS)
-        left = self.body_length(int(options.max_task_mb * 1e6) + MAX_DESCRIPTION_BYTES)
-        jobs.check_room()
-        size = int.from_bytes(b"".join(self.pieces(min(4, left))))
+        left = _body_length(request, int(options.max_task_mb * 1e6) + MAX_DESCRIPTION_BYTES)
+        self.jobs.check_room()
+        body = _Body(request)
+        size = int.from_bytes(await body.read(min(4, left)))
         if not 0 < size <= min(MAX_DESCRIPTION_BYTES, left - 4):
-            raise Refused(HTTPStatus.BAD_REQUEST, "the description of the task is missing")
-        names, sizes, given = _described(b"".join(self.pieces(size)))
+            raise HTTPException(400, "the description of the task is missing")
+        names, sizes, given = _described(await body.read(size))
         if len(names) > options.max_files:
             raise OptionError(
-                f"there are {len(names)} photographs, over {options.max_files}: give fewer, or "
+                f"there are {len(names)} images, over {options.max_files}: give fewer, or "
                 "allow more by --max-files"
             )
         for name, bytes_ in zip(names, sizes, strict=True):
             if bytes_ > options.max_file_mb * 1e6:
                 raise OptionError(f"{name} is over {options.max_file_mb:g} MB: make it smaller")
         if sum(sizes) != left - 4 - size:
-            raise Refused(HTTPStatus.BAD_REQUEST, "the photographs are not as long as is said")
+            raise HTTPException(400, "the images are not as long as is said")
         numbers = TASKS[kind].check(len(names), given)
-        with jobs.new_folder() as folder:
-            files = []
-            for number, bytes_ in enumerate(sizes):
-                files.append(f"{number:04d}{_suffix(names[number])}")
-                with (folder / files[-1]).open("xb") as file:
-                    for piece in self.pieces(bytes_):
-                        file.write(piece)
-            job = jobs.start(folder, kind, list(zip(files, names, strict=True)), numbers)
-        self.send_json({"job": job.name})
+        with self.jobs.new_folder() as folder:
+            files = [f"{number:04d}{_suffix(name)}" for number, name in enumerate(names)]
+            for file, bytes_ in zip(files, sizes, strict=True):
+                with (folder / file).open("xb") as opened:
+                    async for piece in body.pieces(bytes_):
+                        opened.write(piece)
+            job = self.jobs.start(folder, kind, list(zip(files, names, strict=True)), numbers)
+        return JSONResponse({"job": job.name})
+
+    def _job(self, request: Request) -> Any:
+        job = self.jobs.find(request.path_params["name"])
+        if job is None:
+            raise HTTPException(404, "there is no such task: it may have been forgotten")
+        return job
+
+    def _job_state(self, request: Request) -> Response:
+        self._check_key(request)
+        return JSONResponse(self._job(request).state)
+
+    def _job_file(self, request: Request) -> Response:
+        path = self._job(request).file(request.path_params["file"])
+        if path is None:
+            raise HTTPException(404, "there is no such file")
+        if path.suffix == ".html":  # a frame cannot send the key: the task's name is one, too
+            return FileResponse(path, headers={"Content-Security-Policy": VIEWER_POLICY})
+        self._check_key(request)
+        return FileResponse(path)
+
+    def _remove_job(self, request: Request) -> Response:
+        self._check_key(request)
+        self.jobs.remove(self._job(request).name)
+        return JSONResponse({})
+
+
+class _Guard:
+    """Refuses requests for other computers (DNS rebinding), of other pages, and too slow ones."""
+
+    def __init__(self, server: AppServer, app: ASGIApp) -> None:
+        self.server, self.app = server, app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":  # the server's start and end
+            await self.app(scope, receive, send)
+            return
+        clock, still_s = asyncio.get_running_loop().time, self.server.options.max_request_s
+        deadline = clock() + SLOWEST * still_s
+        whole = False
+
+        async def receive_in_time() -> Message:
+            nonlocal whole
+            if whole:  # it is waited for the end of the connection
+                return await receive()
+            try:
+                async with asyncio.timeout_at(min(deadline, clock() + still_s)):
+                    message = await receive()
+            except TimeoutError:
+                raise HTTPException(408, "the request takes too long") from None
+            whole = not message.get("more_body")
+            return message
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                left = DRAINED_BYTES
+                with contextlib.suppress(HTTPException):
+                    while not whole and left > 0:
+                        left -= len((await receive_in_time()).get("body", b""))
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+                if not whole:  # the rest would be taken for the next request
+                    headers["Connection"] = "close"
+            await send(message)
+
+        refusal = self._refusal(Headers(scope=scope))
+        with contextlib.suppress(ClientDisconnect):
+            await (refusal or self.app)(scope, receive_in_time, send_guarded)
+
+    def _refusal(self, headers: Headers) -> Response | None:
+        host, port = headers.get("Host"), self.server.port
+        allowed = [f"{name}:{port}" for name in NAMES]
+        if port == HTTP_PORT:  # browsers leave it out
+            allowed += NAMES
+        if host not in allowed:
+            return _refusal(421, "this address is not served here")
+        if headers.get("Origin", f"http://{host}") != f"http://{host}":
+            return _refusal(403, "only the page of deepdetect app may ask this")
+        return None
+
+
+def _protocol(still_s: float) -> type[H11Protocol]:
+    """Return uvicorn's protocol, which also ends connections on which a request stands still."""
+
+    class Protocol(H11Protocol):
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            self._end_when_still()
+
+        def data_received(self, data: bytes) -> None:
+            super().data_received(data)
+            self._end_when_still()
+
+        def _end_when_still(self) -> None:
+            if self.cycle is None or self.cycle.response_complete:
+                self._unset_keepalive_if_required()
+                self.timeout_keep_alive_task = self.loop.call_later(
+                    still_s, self.timeout_keep_alive_handler
+                )
+
+    return Protocol
+
+
+class _Body:
+    """The body of a request, read in parts of known lengths."""
+
+    def __init__(self, request: Request) -> None:
+        self._chunks, self._read = request.stream(), b""
+
+    async def pieces(self, length: int) -> AsyncIterator[bytes]:
+        while length:
+            if not self._read:
+                self._read = await anext(self._chunks)
+            piece, self._read = self._read[:length], self._read[length:]
+            length -= len(piece)
+            yield piece
+
+    async def read(self, length: int) -> bytes:
+        return b"".join([piece async for piece in self.pieces(length)])
+
+
+def _refusal(status: int, sentence: str) -> Response:
+    return JSONResponse({"error": sentence}, status)
+
+
+def _body_length(request: Request, largest: int) -> int:
+    """Return the length of the request's body, which must be given and not too large."""
+    text = request.headers.get("Content-Length")
+    if text is None:
+        raise HTTPException(411, "the length of the request is missing")
+    if int(text) > largest:
+        raise HTTPException(
+            413, f"this is over {largest / 1e6:.3g} MB: give fewer or smaller images"
+        )
+    return int(text)
 
 
 def _described(text: bytes) -> tuple[list[str], list[int], dict[str, object]]:
-    """Return the names and sizes of photographs, and the options, of a description in JSON."""
+    """Return the names and sizes of images, and the options, of a description in JSON."""
     try:
         values = json.loads(text)
         names = [_clean(str(one["name"])) for one in values["files"]]
@@ -238,13 +439,13 @@ def _described(text: bytes) -> tuple[list[str], list[int], dict[str, object]]:
     except (ValueError, TypeError, KeyError, RecursionError):
         whole = False
     if not whole:
-        raise Refused(HTTPStatus.BAD_REQUEST, "the description of the task is damaged")
+        raise HTTPException(400, "the description of the task is damaged")
     return names, sizes, options
 
 
 def _clean(name: str) -> str:
     """Return a name that can be shown: not too long, and of one line."""
-    return "".join(c if c.isprintable() else "_" for c in name[-MAX_NAME_LENGTH:]) or "photograph"
+    return "".join(c if c.isprintable() else "_" for c in name[-MAX_NAME_LENGTH:]) or "image"
 
 
 def _suffix(name: str) -> str:

@@ -1,6 +1,6 @@
 """What the page can ask Python for: one function and one line of `TASKS` each.
 
-A task reads photographs, tells its progress, writes files into a folder, and returns what the page
+A task reads images, tells its progress, writes files into a folder, and returns what the page
 shows beside them.
 """
 
@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import DeepDetectError, OptionError, install_command
 
 if TYPE_CHECKING:
     from ..reconstruction.result import Reconstruction
 
 FOLDER_KEYPOINTS = 2048
-"""Best keypoints of each photograph of a folder."""
+"""Best keypoints of each image of a folder."""
 
 MODEL_STAGES = 9
 """Of a 3D model at most, with its files."""
@@ -30,8 +30,8 @@ Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
-class Photograph:
-    """A photograph that the page has sent.
+class SentImage:
+    """An image that the page has sent.
 
     Attributes:
         path: of the file.
@@ -63,41 +63,39 @@ class Task:
 
     Attributes:
         title, note: for the page.
-        run: does it, with the photographs, the options, the folder, and what is told the progress.
-        files: least and largest number of photographs; None for as many as are allowed.
-        modules: packages that it needs.
-        extra: of DeepDetect that brings them.
+        run: does it, with the images, the options, the folder, and what is told the progress.
+        files: least and largest number of images; None for as many as are allowed.
+        packages: that it needs beside those that DeepDetect brings.
         options: names of the numbers that it takes, and what the page calls them.
         folder: whether it is for whole folders.
     """
 
     title: str
     note: str
-    run: Callable[[Sequence[Photograph], Mapping[str, float], Path, Report], TaskResult]
+    run: Callable[[Sequence[SentImage], Mapping[str, float], Path, Report], TaskResult]
     files: tuple[int, int | None]
-    modules: tuple[str, ...] = ()
-    extra: str = ""
+    packages: tuple[str, ...] = ()
     options: Mapping[str, str] = field(default_factory=dict)
     folder: bool = False
 
     @property
     def missing(self) -> str:
         """What has to be installed first; empty where nothing has."""
-        absent = [name for name in self.modules if importlib.util.find_spec(name) is None]
-        return f'pip install "deepdetect[{self.extra}]"' if absent else ""
+        absent = [name for name in self.packages if importlib.util.find_spec(name) is None]
+        return install_command(*absent) if absent else ""
 
     def check(self, count: int, options: Mapping[str, object]) -> dict[str, float]:
         """Return the options as numbers.
 
         Raises:
-            OptionError: the number of photographs or an option does not fit, or a package is
+            OptionError: the number of images or an option does not fit, or a package is
                 missing.
         """
         least, most = self.files
         if count < least or (most is not None and count > most):
             number = f"{least}" if most == least else f"at least {least}"
             plural = "" if least == 1 else "s"
-            raise OptionError(f"{self.title} takes {number} photograph{plural}, not {count}")
+            raise OptionError(f"{self.title} takes {number} image{plural}, not {count}")
         if self.missing:
             raise OptionError(f"{self.title} needs another package: {self.missing}")
         for name, value in options.items():
@@ -108,9 +106,9 @@ class Task:
 
 
 def run_match(
-    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
 ) -> TaskResult:
-    """Match two photographs, guided by a geometry."""
+    """Match two images, guided by a geometry."""
     from ..io.image import load_image
     from ..io.tables import save_matches
     from ..matching.pipeline import match_images
@@ -119,11 +117,11 @@ def run_match(
     stages = _stages(
         ("initial geometry", "keypoints", "guided matching", "geometry", "files"), report
     )
-    first, second = (load_image(one.path) for one in photographs)
+    first, second = (load_image(one.path) for one in images)
     matches = match_images(first, second, progress=stages)
     if matches.lost:
         raise DeepDetectError(
-            "no geometry between these photographs can be trusted: they must show the same scene"
+            "no geometry between these images can be trusted: they must show the same scene"
         )
     save_matches(matches, folder / "matches.csv")
     save_matches(matches, folder / "matches.npz")
@@ -141,9 +139,9 @@ def run_match(
 
 
 def run_register(
-    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
 ) -> TaskResult:
-    """Warp the second photograph into the frame of the first."""
+    """Warp the second image into the frame of the first."""
     import numpy as np
 
     from ..matching.registration import register
@@ -152,7 +150,7 @@ def run_register(
     stages = _stages(
         ("initial geometry", "keypoints", "guided matching", "geometry", "files"), report
     )
-    found = register(photographs[0].path, photographs[1].path, progress=stages)
+    found = register(images[0].path, images[1].path, progress=stages)
     pictures = {
         "checkerboard.png": found.checkerboard(),
         "registered.png": found.warped,
@@ -170,31 +168,31 @@ def run_register(
 
 
 def run_stitch(
-    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
 ) -> TaskResult:
     """Make a panorama."""
     from ..matching.stitching import STAGES, stitch
     from ..viz.draw import save_picture
 
     stages = _stages((*STAGES, "files"), report)
-    panorama = stitch([one.path for one in photographs], progress=stages)
+    panorama = stitch([one.path for one in images], progress=stages)
     save_picture(panorama.image, folder / "panorama.jpg")
     height, width = panorama.image.shape[:2]
-    used = len(photographs) - len(panorama.left_out)
+    used = len(images) - len(panorama.left_out)
     numbers = {
-        "Photographs": f"{used} of {len(photographs)}",
+        "Images": f"{used} of {len(images)}",
         "Size": f"{width}×{height}, {panorama.valid.mean():.0%} covered",
     }
-    left_out = [photographs[number].name for number in panorama.left_out]
+    left_out = [images[number].name for number in panorama.left_out]
     if left_out:
         numbers["Left out"] = ", ".join(left_out)
     return TaskResult(numbers, "panorama.jpg", ("panorama.jpg",))
 
 
 def run_reconstruct(
-    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
 ) -> TaskResult:
-    """Make a 3D model of two photographs."""
+    """Make a 3D model of two images."""
     from ..detector.detector import DeepDetect
     from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
     from ..reconstruction.pipeline import reconstruct
@@ -208,12 +206,12 @@ def run_reconstruct(
         report(f"after {name}", done, MODEL_STAGES)
 
     report("starting", 0, MODEL_STAGES)
-    left, right = (one.path for one in photographs)
+    left, right = (one.path for one in images)
     found = reconstruct(
         left, right, DeepDetect("dense"), focal_px=options.get("focal_px"), progress=stage
     )
     report("files", MODEL_STAGES - 1, MODEL_STAGES)
-    title = " and ".join(one.name for one in photographs)
+    title = " and ".join(one.name for one in images)
     names = [f"model{ending}" for ending in POINT_CLOUD_WRITERS]
     for name in names:
         save_point_cloud(found.cloud, folder / name, {"title": title})
@@ -235,28 +233,28 @@ def _model_numbers(found: Reconstruction) -> dict[str, str]:
 
 
 def run_reconstruct_many(
-    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
 ) -> TaskResult:
-    """Make cameras and a dense model of many photographs."""
+    """Make cameras and a dense model of many images."""
     from ..sfm.pipeline import reconstruct_many
 
-    report("cameras and points of all photographs", 0, 0)
+    report("cameras and points of all images", 0, 0)
     work = folder / "work"
-    found = reconstruct_many([one.path for one in photographs], work)
+    found = reconstruct_many([one.path for one in images], work)
     names = ["model.html", "model.ply", "model.glb", "model.json"]
     for name in names:
         (work / name).rename(folder / name)
     numbers = {
-        "Photographs": f"{len(photographs) - len(found.left_out)} of {len(photographs)}",
+        "Images": f"{len(images) - len(found.left_out)} of {len(images)}",
         "Left out": f"{len(found.left_out)}",
     }
     return TaskResult(numbers, "model.html", names)
 
 
 def run_folder_keypoints(
-    photographs: Sequence[Photograph], options: Mapping[str, float], folder: Path, report: Report
+    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
 ) -> TaskResult:
-    """Write the best keypoints of each photograph, as one CSV file each, into one ZIP file."""
+    """Write the best keypoints of each image, as one CSV file each, into one ZIP file."""
     from ..detector.detector import DeepDetect
     from ..io.image import load_image
     from ..io.tables import save_keypoints
@@ -266,9 +264,9 @@ def run_folder_keypoints(
     count = int(options.get("max_keypoints", FOLDER_KEYPOINTS))
     shown, total = "", 0
     with zipfile.ZipFile(folder / "keypoints.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        names = _entry_names(photographs)
-        for number, (one, name) in enumerate(zip(photographs, names, strict=True)):
-            report(one.name, number, len(photographs))
+        names = _entry_names(images)
+        for number, (one, name) in enumerate(zip(images, names, strict=True)):
+            report(one.name, number, len(images))
             try:
                 rgb = load_image(one.path)
             except DeepDetectError as error:
@@ -285,23 +283,23 @@ def run_folder_keypoints(
             archive.writestr("failures.txt", "\n".join(failures) + "\n")
     table.unlink(missing_ok=True)
     if not shown:
-        raise DeepDetectError(f"no photograph can be read: {failures[0]}")
+        raise DeepDetectError(f"no image can be read: {failures[0]}")
     numbers = {
-        "Photographs": f"{len(photographs) - len(failures)} of {len(photographs)}",
+        "Images": f"{len(images) - len(failures)} of {len(images)}",
         "Keypoints": f"{total:,}",
     }
     return TaskResult(numbers, shown, ("keypoints.zip",))
 
 
-def _entry_names(photographs: Sequence[Photograph]) -> list[str]:
-    """Return a name in the archive for each photograph, all different, none with a folder.
+def _entry_names(images: Sequence[SentImage]) -> list[str]:
+    """Return a name in the archive for each image, all different, none with a folder.
 
     Example:
-        >>> _entry_names([Photograph(Path("0"), name) for name in ("a/b.jpg", "b.png", "../c")])
+        >>> _entry_names([SentImage(Path("0"), name) for name in ("a/b.jpg", "b.png", "../c")])
         ['b.csv', 'b_2.csv', 'c.csv']
     """
     names: list[str] = []
-    for one in photographs:
+    for one in images:
         stem = Path(one.name.replace("\\", "/")).name.rpartition(".")[0] or one.name
         stem = "".join(c if c.isalnum() or c in "-_ " else "_" for c in Path(stem).name) or "photo"
         name, number = f"{stem}.csv", 2
@@ -330,41 +328,31 @@ TASKS: dict[str, Task] = {
         "all matches that agree with one geometry",
         run_match,
         (2, 2),
-        ("cv2", "numba"),
-        "standard",
     ),
     "register": Task(
         "Registration",
         "the second picture in the frame of the first",
         run_register,
         (2, 2),
-        ("cv2", "numba"),
-        "standard",
     ),
     "stitch": Task(
         "Panorama",
         "of pictures that overlap",
         run_stitch,
         (2, None),
-        ("cv2", "numba"),
-        "standard",
     ),
     "reconstruct": Task(
         "3D model",
         "coloured points, and a depth map",
         run_reconstruct,
         (2, 2),
-        ("cv2", "numba"),
-        "standard",
-        {"focal_px": "Focal length in pixels, where the pictures do not say it"},
+        options={"focal_px": "Focal length in pixels, where the pictures do not say it"},
     ),
     "folder-keypoints": Task(
         "Keypoints",
         "of each picture, as CSV files",
         run_folder_keypoints,
         (1, None),
-        ("cv2",),
-        "standard",
         folder=True,
     ),
     "folder-stitch": Task(
@@ -372,8 +360,6 @@ TASKS: dict[str, Task] = {
         "of all pictures",
         run_stitch,
         (2, None),
-        ("cv2", "numba"),
-        "standard",
         folder=True,
     ),
     "folder-model": Task(
@@ -381,8 +367,7 @@ TASKS: dict[str, Task] = {
         "of three or more pictures",
         run_reconstruct_many,
         (3, None),
-        ("cv2", "numba", "pycolmap", "h5py"),
-        "standard,sfm",
+        ("pycolmap", "h5py"),
         folder=True,
     ),
 }

@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from .._shared.errors import DeepDetectError
-from .tasks import TASKS, Photograph
+from .tasks import TASKS, SentImage
 
 
 def main(folder: Path) -> None:
     """Do the task of a folder."""
+    from ..io.image_file import limit_megapixels
+
     # What libraries print must not come between the lines of JSON.
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
@@ -30,38 +32,31 @@ def main(folder: Path) -> None:
         out.flush()
 
     task = json.loads((folder / "task.json").read_text(encoding="utf-8"))
-    photographs = [Photograph(folder / one["file"], one["name"]) for one in task["photographs"]]
+    images = [SentImage(folder / file, name) for file, name in task["images"]]
     results = folder / "results"
     results.mkdir()
     try:
-        from ..io.image_file import limit_megapixels
-
         with limit_megapixels(task["max_megapixels"]):
-            found = TASKS[task["kind"]].run(
-                photographs,
+            result = TASKS[task["kind"]].run(
+                images,
                 task["options"],
                 results,
                 lambda stage, done, total: tell(stage=stage, done=done, total=total),
             )
-        tell(
-            result={
-                "numbers": dict(found.numbers),
-                "shown": found.shown,
-                "files": list(found.files),
-            }
-        )
+        tell(result=vars(result))
     except DeepDetectError as error:
-        tell(error=_for_the_page(str(error), photographs, folder))
+        tell(error=_for_the_page(str(error), images, folder))
     except MemoryError:
-        tell(error="there is not enough memory for this: use smaller photographs")
+        tell(error="there is not enough memory for this: use smaller images")
     except OSError as error:
         tell(error=f"the files cannot be written ({error.strerror or error}): free some space")
 
 
-def _for_the_page(message: str, photographs: list[Photograph], folder: Path) -> str:
-    """Name photographs and files as the user does, and options as `deepdetect app` does."""
-    for number, one in enumerate(photographs):
-        message = message.replace(str(one.path), one.name).replace(f"images[{number}]", one.name)
+def _for_the_page(message: str, images: list[SentImage], folder: Path) -> str:
+    """Name images and files as the user does, and options as `deepdetect app` does."""
+    for number, image in enumerate(images):
+        message = message.replace(str(image.path), image.name)
+        message = message.replace(f"images[{number}]", image.name)
     for path in (folder / "results", folder):
         message = message.replace(f"{path}{os.sep}", "")
     return message.replace("`max_megapixels`", "--max-megapixels")

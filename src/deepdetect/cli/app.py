@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from .._shared.errors import MissingExtraError, install_command
 from ._generated import FieldOptions, generated_command, given_only
 
 LIMITS = FieldOptions("app.options:AppOptions")
@@ -16,27 +17,25 @@ LIMITS = FieldOptions("app.options:AppOptions")
 def app(open_browser: bool, **values: Any) -> None:
     """Serve a page at 127.0.0.1: keypoints, matches, registration, panoramas and 3D models.
 
-    It prints the address to open, which ends in a key that is new at each start. Photographs stay
+    It prints the address to open, which ends in a key that is new at each start. Images stay
     on this computer, and are removed after each task. Ctrl+C ends it.
 
     \b
     deepdetect app
     deepdetect app --port 0 --open
     """
-    import signal
-    import threading
     import webbrowser
 
     from ..app.options import AppOptions
-    from ..app.server import AppServer
+
+    try:
+        from ..app.server import AppServer
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"deepdetect app needs {error.name}: {install_command('starlette', 'uvicorn')}"
+        ) from None
 
     with AppServer(AppOptions(**given_only(values))) as server:
-        if threading.current_thread() is threading.main_thread():
-            # As Ctrl+C, so that tasks are ended and their files removed.
-            signal.signal(signal.SIGTERM, signal.default_int_handler)
-            hangup = getattr(signal, "SIGHUP", None)  # of a terminal that is closed
-            if hangup is not None and signal.getsignal(hangup) != signal.SIG_IGN:  # by nohup
-                signal.signal(hangup, signal.default_int_handler)
         try:
             click.echo(f"DeepDetect is at {server.address}")
             click.echo("Ctrl+C ends it.", err=True)
