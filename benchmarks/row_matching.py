@@ -5,7 +5,7 @@
 DATA holds the Middlebury scenes, as SCENE/left.png, right.png, disparity.png and calib.json. The
 rows of each scene:
 
-- keypoints: `match_rectified` at the keypoints of the `dense` weights;
+- keypoints: the disparity map at the keypoints of the `dense` weights;
 - every: at every pixel, as it is by default;
 - edges: at every pixel, also near disparity discontinuities;
 - parabola: the same before `refine_disparity`: a parabola through the costs of three whole
@@ -41,7 +41,7 @@ from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.protocols.stereo import ground_truths
 from deepdetect.evaluation.protocols.stereo_pipelines import sgbm_disparity
 from deepdetect.io.image import load_image, luma
-from deepdetect.matching.stereo import DENSE, DisparityOptions, match_rectified
+from deepdetect.matching.stereo import DENSE, DisparityOptions
 from deepdetect.matching.stereo.sgm import semi_global_matching
 
 TOLERANCES = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -114,7 +114,7 @@ def ours(
     filled: bool = True,
 ) -> np.ndarray:
     """Return a map of the matches' disparities, NaN where there is none."""
-    found = match_rectified(left, right, xy, options)
+    found = disparity_map(left, right, options).at(xy)
     kept = found.matched | filled
     out = np.full(left.shape[:2], np.nan, np.float32)
     column, row = xy[found.indices[kept]].astype(int).T

@@ -13,7 +13,7 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
-from deepdetect.matching.stereo import DENSE, DisparityOptions, match_rectified
+from deepdetect.matching.stereo import DENSE, DisparityOptions, disparity_map
 from deepdetect.reconstruction.rectified_checks import (
     RectifiedCheckOptions,
     check_cameras,
@@ -185,7 +185,7 @@ def test_a_photograph_of_a_rotated_camera(
         (other, Calibration(camera, camera)),
         (level.right, level.calibration),
     ):
-        found = match_rectified(luma(level.left), luma(right), pixels, options)
+        found = disparity_map(luma(level.left), luma(right), options).at(pixels)
         matches = pixels[found.indices][found.matched], found.disparity[found.matched]
         check_disparities(matches[1])
         if right is level.right:

@@ -32,14 +32,3 @@ def rectified_pair() -> Callable[[np.ndarray], Pair]:
         return read(column - disparity), read(column.astype(float))
 
     return make
-
-
-@pytest.fixture(scope="session")
-def every_pixel() -> Callable[[tuple[int, ...]], np.ndarray]:
-    """Return (N, 2) the pixels of an image of a shape, row by row."""
-
-    def make(shape: tuple[int, ...]) -> np.ndarray:
-        row, column = np.indices(shape[:2])
-        return np.column_stack([column.ravel(), row.ravel()])
-
-    return make

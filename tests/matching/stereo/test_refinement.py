@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect import OptionError
-from deepdetect.matching.stereo.refinement import DisparityRefinementOptions, refine_disparity
+from deepdetect.matching.stereo import refinement
+from deepdetect.matching.stereo.refinement import refine_disparity
 
 SHAPE = (60, 120)
 ROW, COLUMN = np.indices(SHAPE)
@@ -55,23 +55,14 @@ def test_unknown_pixels_stay_and_do_not_count(rectified_pair) -> None:
     assert np.median(np.abs(refined - truth)[known]) < 0.02
 
 
-def test_more_iterations_come_nearer(rectified_pair) -> None:
+def test_more_iterations_come_nearer(rectified_pair, monkeypatch: pytest.MonkeyPatch) -> None:
     truth = np.full(SHAPE, 6.4, np.float32)
     left, right = rectified_pair(truth)
     start, known = np.full(SHAPE, 6.0, np.float32), np.ones(SHAPE, bool)
     errors = []
     for iterations in (0, 1, 2):
-        options = DisparityRefinementOptions(iterations=iterations)
-        refined = refine_disparity(left, right, start, known, options)
+        monkeypatch.setattr(refinement, "ITERATIONS", iterations)
+        refined = refine_disparity(left, right, start, known)
         errors.append(np.median(np.abs(refined - truth)[INNER]))
     assert errors[0] == pytest.approx(0.4, abs=1e-5)
     assert errors[0] > 2 * errors[1] > 4 * errors[2]
-
-
-@pytest.mark.parametrize(
-    "values", [{"window_radius_px": 0}, {"iterations": -1}, {"min_gain": 0}, {"noise_levels": -1}]
-)
-def test_options_out_of_range_are_refused(values: dict, one_line) -> None:
-    with pytest.raises(OptionError) as error:
-        DisparityRefinementOptions(**values)
-    one_line(error.value)

@@ -273,9 +273,7 @@ def sgbm(scene: CalibratedStereoPair) -> StereoPoints:
     with StageProfiler() as profiler:
         gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
         search = find_disparity_range(*gray)
-        smallest, largest = (
-            (0, 64) if search is None else (min(search.min_disparity, 0), search.max_disparity)
-        )
+        smallest, largest = (0, 64) if search is None else (min(search[0], 0), search[1])
         count = max(16, -(-(largest - smallest + 1) // 16) * 16)
         borders = max(smallest + count, 0), -smallest
         disparity = sgbm_disparity(scene.left, scene.right, count, borders, smallest)

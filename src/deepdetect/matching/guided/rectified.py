@@ -146,7 +146,7 @@ def _is_range_too_wide(view: RectifiedView, options: RectifiedMatchingOptions) -
     if view.scale == 1 or searched is None:
         return False
     low, high = range_with_margin(view.disparities.disparity[view.disparities.matched], options)
-    width = searched.max_disparity - searched.min_disparity
+    width = searched[1] - searched[0]
     return width > options.max_range_excess * (high - low)
 
 

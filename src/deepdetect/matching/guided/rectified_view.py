@@ -81,9 +81,9 @@ def rectified_view(
     # About an epipole everything grows, or everything shrinks: what small copies of the two views
     # agree on in the other direction is wrong.
     polar = isinstance(frame, PolarFrame)
-    seen = None if polar else find_disparity_range(first, second, options.disparity)
+    seen = None if polar else find_disparity_range(first, second)
     if seen is not None:
-        low, high = min(low, seen.min_disparity), max(high, seen.max_disparity)
+        low, high = min(low, seen[0]), max(high, seen[1])
         # What both views agree on may be far off where much of a frame shows nothing.
         limit = int(options.max_volume / float(np.prod(frame.size)))
         if high - low > limit:

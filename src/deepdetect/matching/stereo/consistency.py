@@ -13,20 +13,18 @@ SUBDIVISIONS = 4
 """Parts of a pixel in which OpenCV's speckle filter counts."""
 
 
-def filter_speckles(
-    disparity: np.ndarray,
-    known: np.ndarray,
-    max_area_px: int,
-    max_difference_px: float = MAX_DIFFERENCE_PX,
-) -> np.ndarray:
+OCCLUSION_SLACK_PX = 8
+"""By which a gap may be wider than the step of disparity explains: the windows on both sides."""
+
+
+def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) -> np.ndarray:
     """Remove small patches whose disparity differs from all around them: most are wrong.
 
     Args:
         disparity: (H, W) float32 in pixels.
         known: (H, W) bool.
-        max_area_px: patches of at most this many pixels are removed.
-        max_difference_px: of disparities on one surface; a patch is connected by steps of at most
-            twice that.
+        max_area_px: patches of at most this many pixels are removed; a patch is connected by steps
+            of at most twice `MAX_DIFFERENCE_PX`.
 
     Returns:
         (H, W) bool, the known pixels without the patches.
@@ -39,16 +37,11 @@ def filter_speckles(
     """
     invalid = np.iinfo(np.int16).min
     steps = np.where(known, np.rint(disparity * SUBDIVISIONS), invalid).astype(np.int16)
-    cv2.filterSpeckles(steps, invalid, max_area_px, round(2 * max_difference_px * SUBDIVISIONS))
+    cv2.filterSpeckles(steps, invalid, max_area_px, round(2 * MAX_DIFFERENCE_PX * SUBDIVISIONS))
     return known & (steps != invalid)
 
 
-def near_discontinuity(
-    disparity: np.ndarray,
-    known: np.ndarray,
-    distance_px: int,
-    max_difference_px: float = MAX_DIFFERENCE_PX,
-) -> np.ndarray:
+def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
     """Find the pixels near a disparity discontinuity.
 
     The window of a match there sees both surfaces, and gives a pixel beside the nearer one its
@@ -58,7 +51,6 @@ def near_discontinuity(
         disparity: (H, W) float32 in pixels.
         known: (H, W) bool.
         distance_px: along rows, columns or both.
-        max_difference_px: of neighbouring disparities on one surface.
 
     Returns:
         (H, W) bool.
@@ -71,8 +63,8 @@ def near_discontinuity(
     """
     filled = fill_occlusions(disparity, known)[0]
     near = np.zeros(disparity.shape, np.uint8)
-    across = np.abs(np.diff(filled, axis=1)) > max_difference_px
-    along = np.abs(np.diff(filled, axis=0)) > max_difference_px
+    across = np.abs(np.diff(filled, axis=1)) > MAX_DIFFERENCE_PX
+    along = np.abs(np.diff(filled, axis=0)) > MAX_DIFFERENCE_PX
     near[:, 1:] |= across
     near[:, :-1] |= across
     near[1:] |= along
@@ -81,12 +73,7 @@ def near_discontinuity(
     return cv2.dilate(near, np.ones((side, side), np.uint8)) > 0
 
 
-def on_occluding_edge(
-    disparity: np.ndarray,
-    known: np.ndarray,
-    distance_px: int,
-    max_difference_px: float = MAX_DIFFERENCE_PX,
-) -> np.ndarray:
+def on_occluding_edge(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
     """Find the outermost pixels of surfaces in front of others.
 
     The windows of the match give the nearer disparity also to what lies just beside it, so these
@@ -97,7 +84,6 @@ def on_occluding_edge(
         disparity: (H, W) float32 in pixels.
         known: (H, W) bool.
         distance_px: along rows, columns or both.
-        max_difference_px: of neighbouring disparities on one surface.
 
     Returns:
         (H, W) bool, a part of the known pixels.
@@ -111,12 +97,10 @@ def on_occluding_edge(
     filled = fill_occlusions(disparity, known)[0]
     side = 2 * distance_px + 1
     farthest = cv2.erode(filled, np.ones((side, side), np.uint8))
-    return known & (filled - farthest > max_difference_px)
+    return known & (filled - farthest > MAX_DIFFERENCE_PX)
 
 
-def fill_occlusions(
-    disparity: np.ndarray, known: np.ndarray, slack_px: float = 8
-) -> tuple[np.ndarray, np.ndarray]:
+def fill_occlusions(disparity: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fill unknown pixels with the farther of the nearest known ones on both sides of their row.
 
     What the right view does not see lies behind what occludes it.
@@ -124,8 +108,6 @@ def fill_occlusions(
     Args:
         disparity: (H, W) float32 in pixels.
         known: (H, W) bool.
-        slack_px: by which a gap may be wider than the occlusion explains: the matching windows on
-            both sides extend this far.
 
     Returns:
         (H, W) float32 disparity, 0 in rows where nothing is known; and (H, W) bool, true where
@@ -141,6 +123,6 @@ def fill_occlusions(
     has_left, has_right = left >= 0, right < width
     farther = np.where(has_left, at_left, at_right)
     farther = np.where(has_left & has_right, np.minimum(at_left, at_right), farther)
-    occluded = right - left - 1 <= np.abs(at_left - at_right) + slack_px
+    occluded = right - left - 1 <= np.abs(at_left - at_right) + OCCLUSION_SLACK_PX
     filled = np.where(has_left | has_right, farther, np.float32(0))
     return filled, has_left & has_right & occluded

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,53 +15,27 @@ from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
 from ...io.image import load_image, luma
-from .consistency import (
-    MAX_DIFFERENCE_PX,
-    fill_occlusions,
-    filter_speckles,
-    near_discontinuity,
-    on_occluding_edge,
-)
-from .continuation import continue_surfaces
-from .refinement import DisparityRefinementOptions, refine_disparity
-from .sgm import DisparityRange, SGMOptions, is_textured, semi_global_matching
+from .consistency import fill_occlusions, filter_speckles, near_discontinuity, on_occluding_edge
+from .extrapolation import extrapolate_disparity
+from .refinement import refine_disparity
+from .sgm import DisparityRange, is_textured, semi_global_matching
 
+MAX_SPECKLE_AREA_PX = 100
+"""Patches of one surface up to this size are not kept."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class RangeSearchOptions:
-    """How the range of disparities is found, on a small copy of the pair.
+# The search for the range of disparities, on a small copy of the pair: the range holds all of the
+# Motorcycle pair and of the Middlebury scenes of the benchmark, without being much wider.
+SEARCH_WIDTH_PX = 160
+SEARCH_UNIQUENESS_RATIO = 1.3
+"""Least ratio of the cost of any other place on the row: what has no match is rarely so clear."""
 
-    The defaults were chosen so that the range holds all of the Motorcycle pair and of the
-    Middlebury scenes of the benchmark, without being much wider.
+SEARCH_MAX_SPECKLE_AREA_PX = 50
+SEARCH_TAIL_FRACTION = 0.01
+"""Of the disparities at each end, which may be wrong."""
 
-    Attributes:
-        width_px: of the small copy.
-        uniqueness_ratio: least ratio of the cost of any other place on the row: what has no match
-            is rarely so clear.
-        max_speckle_area_px: patches of the small copy up to this size do not count.
-        tail_fraction: of the disparities at each end, which may be wrong.
-        margin_px: of the small copy, added at both ends of the range.
-        margin_fraction: of the range, added at both ends, too, for what is too small to be seen.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    width_px: int = 160
-    uniqueness_ratio: float = 1.3
-    max_speckle_area_px: int = 50
-    tail_fraction: float = 0.01
-    margin_px: float = 1.5
-    margin_fraction: float = 0.2
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("width_px",),
-            not_negative=("max_speckle_area_px", "margin_px", "margin_fraction"),
-            between={"uniqueness_ratio": (1, math.inf), "tail_fraction": (0, 0.5)},
-        )
+SEARCH_MARGIN_PX = 1.5
+SEARCH_MARGIN_FRACTION = 0.2
+"""Of the small copy, and of the range, added at both ends for what is too small to be seen."""
 
 
 @suggest_keywords
@@ -71,7 +45,7 @@ class DisparityOptions:
 
     Attributes:
         disparity_range: smallest and largest disparity in whole pixels; None: found on a small
-            copy of the pair, by `range_search`.
+            copy of the pair.
         uniqueness_ratio: the cost of any other place on the row, over that of the match, is at
             least this.
         discontinuity_margin_px: pixels this near to a disparity discontinuity are left out: the
@@ -79,21 +53,13 @@ class DisparityOptions:
             disparity. Objects up to twice as wide vanish. 0 keeps them.
         fill_occlusions: give what the right image does not show the disparity of the surface
             beside it: between two surfaces that of the farther one; where the counterpart lies
-            outside the right image that of the first surface in sight, continued along a line as
-            far as this predicts the surface itself, unless the surfaces above and below suggest
+            outside the right image that of the first surface in sight, extrapolated along a line
+            as far as this predicts the surface itself, unless the surfaces above and below suggest
             another. Such pixels have no match: `DisparityMap.matched`.
         occluding_edge_px: so many of the outermost pixels of a nearer surface, and of the columns
             at both ends of the right image, have no match, but are filled as what is hidden there,
             or keep their disparity where that is not known: the windows give them the nearer
             disparity too often. 0 takes them as matched.
-        max_speckle_area_px: patches of one surface up to this size are left out.
-        max_difference_px: of neighbouring disparities on one surface.
-        occlusion_slack_px: by which an occlusion may be wider than the step of disparity that
-            causes it.
-        min_support_px: fewest pixels that a line is fitted to, to continue a surface.
-        sgm: penalties of semi-global matching.
-        refinement: to sub-pixel accuracy.
-        range_search: used without a `disparity_range`.
 
     Raises:
         OptionError: a value is out of its range.
@@ -104,27 +70,22 @@ class DisparityOptions:
     discontinuity_margin_px: int = 4
     fill_occlusions: bool = False
     occluding_edge_px: int = 0
-    max_speckle_area_px: int = 100
-    max_difference_px: float = MAX_DIFFERENCE_PX
-    occlusion_slack_px: float = 8
-    min_support_px: int = 5
-    sgm: SGMOptions = field(default_factory=SGMOptions)
-    refinement: DisparityRefinementOptions = field(default_factory=DisparityRefinementOptions)
-    range_search: RangeSearchOptions = field(default_factory=RangeSearchOptions)
 
     def __post_init__(self) -> None:
         if self.disparity_range is not None:
             if len(self.disparity_range) != 2 or any(int(d) != d for d in self.disparity_range):
                 raise OptionError("disparity_range takes two whole disparities, as (0, 63)")
-            DisparityRange(*self.disparity_range)
+            low, high = self.disparity_range
+            if low > high:
+                raise OptionError(
+                    f"the smallest disparity, {low}, is above the largest, {high}: exchange them"
+                )
         check_ranges(
             self,
-            not_negative=("max_speckle_area_px", "max_difference_px", "occlusion_slack_px"),
             between={
                 "uniqueness_ratio": (1, math.inf),
                 "discontinuity_margin_px": (0, 100),
                 "occluding_edge_px": (0, 100),
-                "min_support_px": (2, math.inf),
             },
         )
 
@@ -166,7 +127,8 @@ class DisparityMap:
         matched: (H, W) bool: seen in both views, so that (x - disparity, y) lies in the right one;
             False where the disparity is NaN or filled in from the surface beside: hidden in the
             right view, outside of it, or on the edge of what hides.
-        disparity_range: the disparities that were tried; None where the views agree on nothing.
+        disparity_range: smallest and largest disparity that were tried; None where the views agree
+            on nothing.
     """
 
     disparity: np.ndarray
@@ -236,22 +198,6 @@ def disparity_map(
     return compute_disparity(grays[0], grays[1], options)
 
 
-def match_rectified(
-    left: Any,
-    right: Any,
-    keypoints: Keypoints | np.ndarray,
-    options: DisparityOptions = DisparityOptions(),
-    *,
-    channels: Channels = "rgb",
-) -> RectifiedMatches:
-    """Find the disparities of keypoints of the left view: `disparity_map`, sampled at them.
-
-    Raises:
-        ImageError, OptionError: as of `disparity_map` and `DisparityMap.at`.
-    """
-    return disparity_map(left, right, options, channels=channels).at(keypoints)
-
-
 def compute_disparity(
     left: np.ndarray, right: np.ndarray, options: DisparityOptions = DisparityOptions()
 ) -> DisparityMap:
@@ -264,43 +210,29 @@ def compute_disparity(
     if disparities is None:
         nowhere = np.zeros(left.shape, bool)
         return DisparityMap(np.full(left.shape, np.nan, np.float32), nowhere, None)
-    found = semi_global_matching(left, right, disparities, options.sgm)
+    found = semi_global_matching(left, right, disparities)
     clear = found.uniqueness_ratio >= options.uniqueness_ratio
-    known = filter_speckles(
-        found.disparity,
-        found.consistent & clear & is_textured(left),
-        options.max_speckle_area_px,
-        options.max_difference_px,
-    )
-    disparity = refine_disparity(
-        left, right, found.disparity, known, options.refinement, options.max_difference_px
-    )
+    trusted = found.consistent & clear & is_textured(left)
+    known = filter_speckles(found.disparity, trusted, MAX_SPECKLE_AREA_PX)
+    disparity = refine_disparity(left, right, found.disparity, known)
     known &= _leads_inside(disparity)
     sure = known
     if options.occluding_edge_px:
         sure = _leads_inside(disparity, options.occluding_edge_px) & ~on_occluding_edge(
-            disparity, known, options.occluding_edge_px, options.max_difference_px
+            disparity, known, options.occluding_edge_px
         )
         sure &= known
     kept = known
     if options.discontinuity_margin_px:
-        kept = known & ~near_discontinuity(
-            disparity, known, options.discontinuity_margin_px, options.max_difference_px
-        )
+        kept = known & ~near_discontinuity(disparity, known, options.discontinuity_margin_px)
     matched = kept & sure
     if options.fill_occlusions:
-        behind, occluded = fill_occlusions(disparity, sure, options.occlusion_slack_px)
-        beyond = continue_surfaces(
-            disparity,
-            sure,
-            found.disparity,
-            options.min_support_px,
-            options.max_difference_px,
-        )
+        behind, occluded = fill_occlusions(disparity, sure)
+        beyond = extrapolate_disparity(disparity, sure, found.disparity)
         occluded &= ~sure
-        continued = ~known & np.isfinite(beyond)
-        disparity = np.where(occluded, behind, np.where(continued, beyond, disparity))
-        kept = kept | (occluded & ~known) | continued
+        extrapolated = ~known & np.isfinite(beyond)
+        disparity = np.where(occluded, behind, np.where(extrapolated, beyond, disparity))
+        kept = kept | (occluded & ~known) | extrapolated
     return DisparityMap(np.where(kept, disparity, np.float32(np.nan)), matched, disparities)
 
 
@@ -311,27 +243,24 @@ def _leads_inside(disparity: np.ndarray, margin_px: int = 0) -> np.ndarray:
     return (place >= margin_px - 0.5) & (place <= width - 0.5 - margin_px)
 
 
-def find_disparity_range(
-    left: np.ndarray, right: np.ndarray, options: DisparityOptions = DisparityOptions()
-) -> DisparityRange | None:
+def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange | None:
     """Find the disparities of a rectified pair, of both signs and up to half its width.
 
     A small copy of the pair is matched over all of them. What both views agree on, in patches of
     some size, gives the range.
 
     Returns:
-        The range, or None where the views agree on nothing.
+        Smallest and largest, or None where the views agree on nothing.
 
     Example:
         >>> scene = np.random.default_rng(0).integers(0, 256, (30, 80), np.uint8)
         >>> scene = cv2.resize(scene, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
-        >>> found = find_disparity_range(scene[:, 40:300], scene[:, :260])
-        >>> found.min_disparity <= -40 <= found.max_disparity < 0
+        >>> low, high = find_disparity_range(scene[:, 40:300], scene[:, :260])
+        >>> low <= -40 <= high < 0
         True
     """
-    search = options.range_search
     height, width = left.shape
-    scale = max(width / search.width_px, 1.0)
+    scale = max(width / SEARCH_WIDTH_PX, 1.0)
     if scale > 1:
         size = (round(width / scale), max(round(height / scale), 1))
         left, right = (
@@ -339,18 +268,18 @@ def find_disparity_range(
         )
         scale = width / size[0]
     half = left.shape[1] // 2
-    found = semi_global_matching(left, right, DisparityRange(-half, half), options.sgm)
-    clear = found.consistent & (found.uniqueness_ratio >= search.uniqueness_ratio)
-    known = filter_speckles(found.disparity, clear, search.max_speckle_area_px)
+    found = semi_global_matching(left, right, (-half, half))
+    clear = found.consistent & (found.uniqueness_ratio >= SEARCH_UNIQUENESS_RATIO)
+    known = filter_speckles(found.disparity, clear, SEARCH_MAX_SPECKLE_AREA_PX)
     if not known.any():
         return None
     low, high = np.quantile(
-        found.disparity[known], [search.tail_fraction, 1 - search.tail_fraction]
+        found.disparity[known], [SEARCH_TAIL_FRACTION, 1 - SEARCH_TAIL_FRACTION]
     )
-    margin = search.margin_px + search.margin_fraction * (high - low)
+    margin = SEARCH_MARGIN_PX + SEARCH_MARGIN_FRACTION * (high - low)
     smallest = int(np.floor((low - margin) * scale))
     largest = int(np.ceil((high + margin) * scale))
-    return DisparityRange(max(smallest, 1 - width), min(largest, width - 1))
+    return max(smallest, 1 - width), min(largest, width - 1)
 
 
 def _disparity_range(
@@ -358,15 +287,15 @@ def _disparity_range(
 ) -> DisparityRange | None:
     """Return the range that is given, or the one that is found."""
     if options.disparity_range is None:
-        return find_disparity_range(left, right, options)
-    given = DisparityRange(*(int(disparity) for disparity in options.disparity_range))
+        return find_disparity_range(left, right)
+    low, high = (int(disparity) for disparity in options.disparity_range)
     width = left.shape[1]
-    if max(abs(given.min_disparity), abs(given.max_disparity)) >= width:
+    if max(abs(low), abs(high)) >= width:
         raise OptionError(
-            f"disparities from {given.min_disparity} to {given.max_disparity} do not fit images "
-            f"{width} pixels wide: narrow disparity_range"
+            f"disparities from {low} to {high} do not fit images {width} pixels wide: narrow "
+            "disparity_range"
         )
-    return given
+    return low, high
 
 
 def _whole_pixels(

@@ -6,67 +6,41 @@ surface that makes terraces. Here it only starts a least-squares fit of the grey
 light free in each window. Each pixel of a window is mapped to the right image by its own smoothed
 disparity, so that slanted surfaces fit as well as those that face the camera, and pixels on the
 other side of a disparity discontinuity do not count. Measured on the Motorcycle pair, on which the
-defaults were chosen (`benchmarks/row_matching.py`): 82 % of the disparities within 0.25 px of the
+constants were chosen (`benchmarks/row_matching.py`): 82 % of the disparities within 0.25 px of the
 truth instead of the parabola's 73 %, and fractions as often near whole pixels as between them (each
 tenth of a pixel 0.97 to 1.03 times as often as in the truth; with the parabola 0.45 to 2.00 times).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ..._shared.opencv import cv2
-from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 from .consistency import MAX_DIFFERENCE_PX
 
+WINDOW_RADIUS_PX = 2
+"""The fitted windows have 5 pixels a side."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class DisparityRefinementOptions:
-    """How disparities are refined to sub-pixel accuracy.
+SMOOTHING_RADIUS_PX = 4
+"""Of the mean of the same surface before each iteration: it undoes most of the parabola's pull."""
 
-    Attributes:
-        window_radius_px: the fitted windows have 2 radius + 1 pixels a side.
-        smoothing_radius_px: of the mean of the same surface taken before each iteration, which
-            undoes most of the parabola's pull.
-        final_smoothing_radius_px: of the mean taken at the end.
-        iterations: of the fit.
-        noise_levels: grey levels; where the image has no stronger gradients the smoothed surface
-            stays.
-        min_gain: contrast of the right view over that of the left; below it the right view shows
-            something else, and the disparity stays.
+FINAL_SMOOTHING_RADIUS_PX = 2
+"""Of the mean taken at the end."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+ITERATIONS = 2
+"""Of the fit."""
 
-    window_radius_px: int = 2
-    smoothing_radius_px: int = 4
-    final_smoothing_radius_px: int = 2
-    iterations: int = 2
-    noise_levels: float = 2.0
-    min_gain: float = 0.2
+NOISE_LEVELS = 2.0
+"""Grey levels; where the image has no stronger gradients the smoothed surface stays."""
 
-    def __post_init__(self) -> None:
-        radii = "window_radius_px", "smoothing_radius_px", "final_smoothing_radius_px"
-        check_ranges(
-            self,
-            positive=("noise_levels", "min_gain"),
-            not_negative=("iterations",),
-            between=dict.fromkeys(radii, (1, 31)),
-        )
+MIN_GAIN = 0.2
+"""Least contrast of the right view over the left: below, it shows something else, and the disparity
+stays."""
 
 
 def refine_disparity(
-    left: np.ndarray,
-    right: np.ndarray,
-    disparity: np.ndarray,
-    known: np.ndarray,
-    options: DisparityRefinementOptions = DisparityRefinementOptions(),
-    max_difference_px: float = MAX_DIFFERENCE_PX,
+    left: np.ndarray, right: np.ndarray, disparity: np.ndarray, known: np.ndarray
 ) -> np.ndarray:
     """Refine disparities to sub-pixel accuracy.
 
@@ -74,8 +48,6 @@ def refine_disparity(
         left, right: (H, W) uint8 luma of a rectified pair.
         disparity: (H, W) float32 in pixels, accurate to a pixel.
         known: (H, W) bool, where it is to be refined.
-        options: of the fit.
-        max_difference_px: of disparities on one surface.
 
     Returns:
         (H, W) float32 disparity; unchanged where not known.
@@ -94,35 +66,32 @@ def refine_disparity(
     from . import refinement_kernel as kernel
 
     gray, target = left.astype(np.float32), right.astype(np.float32)
-    radius = options.window_radius_px
-    padded = _padded(gray, radius)
-    limits = np.array([max_difference_px, options.noise_levels, options.min_gain], np.float32)
+    padded = _padded(gray, WINDOW_RADIUS_PX)
+    limits = np.array([MAX_DIFFERENCE_PX, NOISE_LEVELS, MIN_GAIN], np.float32)
     refined = disparity
-    for _ in range(options.iterations):
-        start = _smoothed(refined, known, options.smoothing_radius_px, max_difference_px)
+    for _ in range(ITERATIONS):
+        start = _smoothed(refined, known, SMOOTHING_RADIUS_PX)
         values, gradient = np.empty_like(gray), np.empty_like(gray)
         parallel_for(len(gray), kernel.sample_rows, target, start, values, gradient)
         images = (
             padded,
-            _padded(values, radius),
-            _padded(gradient, radius),
-            _padded(start, radius, known),
+            _padded(values, WINDOW_RADIUS_PX),
+            _padded(gradient, WINDOW_RADIUS_PX),
+            _padded(start, WINDOW_RADIUS_PX, known),
         )
         refined = np.empty_like(gray)
-        parallel_for(len(gray), kernel.step_rows, *images, radius, *limits, refined)
-    final = _smoothed(refined, known, options.final_smoothing_radius_px, max_difference_px)
+        parallel_for(len(gray), kernel.step_rows, *images, WINDOW_RADIUS_PX, *limits, refined)
+    final = _smoothed(refined, known, FINAL_SMOOTHING_RADIUS_PX)
     return np.where(known, final, disparity)
 
 
-def _smoothed(
-    disparity: np.ndarray, known: np.ndarray, radius: int, max_difference_px: float
-) -> np.ndarray:
+def _smoothed(disparity: np.ndarray, known: np.ndarray, radius: int) -> np.ndarray:
     """Return the mean disparity of the same surface around each known pixel, 0 elsewhere."""
     from . import refinement_kernel as kernel
 
     out = np.empty_like(disparity)
     padded = _padded(disparity, radius, known)
-    limit = np.float32(max_difference_px)
+    limit = np.float32(MAX_DIFFERENCE_PX)
     parallel_for(len(out), kernel.smooth_rows, padded, radius, limit, out)
     return np.where(known, out, np.float32(0))
 

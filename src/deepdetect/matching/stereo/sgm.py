@@ -9,14 +9,11 @@ disparity that changes by one pixel, P2 for a larger change, less where the grey
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..._shared.errors import OptionError
 from ..._shared.opencv import cv2
-from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 
 CENSUS_RADIUS_X = 4
@@ -31,9 +28,6 @@ WRONG_PLACE_BITS = CENSUS_BITS // 2
 COST_PER_BIT = 9 / 4
 """Costs are sums over 3 x 3 pixels, divided by four to fit a byte."""
 
-MAX_PENALTY = 3000
-"""Eight paths of this penalty, in `COST_PER_BIT`, still fit 16 bits."""
-
 LANES = 16
 """The number of disparities is rounded up to a multiple of this, for vector registers."""
 
@@ -47,79 +41,30 @@ BAND_OVERLAP_PX = 32
 """Rows above and below a band from which paths enter it."""
 
 
-@suggest_keywords
-@dataclass(frozen=True)
-class SGMOptions:
-    """Penalties of semi-global matching.
+# The penalties are the best of a few tried on the Motorcycle pair; noisy images of full size would
+# take larger ones.
+P1_BITS = 20
+"""Penalty of a disparity that changes by one pixel along a path, in census bits per pixel."""
 
-    The defaults are the best of a few tried on the Motorcycle pair; noisy photographs of full size
-    would take larger ones.
+P2_BITS = 100
+"""Penalty of a larger change, where the grey level does not change."""
 
-    Attributes:
-        p1: penalty of a disparity that changes by one pixel along a path, in census bits per pixel.
-        p2: penalty of a larger change, where the grey level does not change; in the same unit.
-        p2_half_gradient_levels: change of the grey level that halves `p2`.
-        min_p2_to_p1: `p2` never falls below this many times `p1`.
-        outside_cost: of a place outside the right image, of which nothing is known: 0 is that of
-            the pair's matches (their median), 1 that of a wrong place. Between them a surface that
-            leaves the image is carried on by its neighbours, and takes no wrong place inside. With
-            less, more of what is seen at the border is lost where views are noisy.
+P2_HALF_GRADIENT_LEVELS = 8
+"""Change of the grey level that halves P2."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+MIN_P2_BITS = 1.25 * P1_BITS
 
-    p1: float = 20
-    p2: float = 100
-    p2_half_gradient_levels: float = 8
-    min_p2_to_p1: float = 1.25
-    outside_cost: float = 0.6
+OUTSIDE_COST = 0.6
+"""Cost of a place outside the right image, of which nothing is known.
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.p1 <= self.p2:
-            raise OptionError(f"p1 must lie between 0 and p2, {self.p2:g}, not {self.p1:g}")
-        check_ranges(
-            self,
-            positive=("p2_half_gradient_levels",),
-            between={"min_p2_to_p1": (1, math.inf), "outside_cost": (0, 1)},
-        )
-        if max(self.p2, self.min_p2_to_p1 * self.p1) > MAX_PENALTY:
-            raise OptionError(
-                f"p2 and min_p2_to_p1 * p1 must be at most {MAX_PENALTY}: costs are kept in 16 bits"
-            )
+0 is that of the pair's matches (their median), 1 that of a wrong place. Between them a surface that
+leaves the image is carried on by its neighbours, and takes no wrong place inside. With less, more
+of what is seen at the border is lost where views are noisy.
+"""
 
-
-@suggest_keywords
-@dataclass(frozen=True)
-class DisparityRange:
-    """The disparities that are tried.
-
-    Attributes:
-        min_disparity, max_disparity: in whole pixels; the match of a left (x, y) is searched from
-            the right x - max_disparity to x - min_disparity.
-
-    Raises:
-        OptionError: the minimum is above the maximum.
-
-    Example:
-        >>> DisparityRange(-4, 11).count
-        16
-    """
-
-    min_disparity: int
-    max_disparity: int
-
-    def __post_init__(self) -> None:
-        if self.min_disparity > self.max_disparity:
-            raise OptionError(
-                f"the smallest disparity, {self.min_disparity}, is above the largest, "
-                f"{self.max_disparity}: exchange them"
-            )
-
-    @property
-    def count(self) -> int:
-        """Number of disparities."""
-        return self.max_disparity - self.min_disparity + 1
+DisparityRange = tuple[int, int]
+"""The smallest and the largest disparity tried, in whole pixels: the match of a left (x, y) is
+searched from the right x - largest to x - smallest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,32 +85,28 @@ class SGMResult:
 
 
 def semi_global_matching(
-    left: np.ndarray,
-    right: np.ndarray,
-    disparities: DisparityRange,
-    options: SGMOptions = SGMOptions(),
+    left: np.ndarray, right: np.ndarray, disparities: DisparityRange
 ) -> SGMResult:
     """Match every pixel of the left view along its row.
 
     Args:
         left, right: (H, W) uint8 luma of a rectified pair.
         disparities: those to try.
-        options: the penalties.
 
     Returns:
         The disparities, to sub-pixel by a parabola; these still cluster around whole pixels.
 
     Example:
         >>> scene = np.random.default_rng(0).integers(0, 256, (40, 80), np.uint8)
-        >>> found = semi_global_matching(scene[:, :60], scene[:, 5:65], DisparityRange(0, 15))
+        >>> found = semi_global_matching(scene[:, :60], scene[:, 5:65], (0, 15))
         >>> float(np.median(found.disparity[found.consistent]).round())
         5.0
     """
     height, width = left.shape
-    count = -(-disparities.count // LANES) * LANES
+    count = -(-(disparities[1] - disparities[0] + 1) // LANES) * LANES
     censuses = census(left), census(right)
     match = _match_distance(*censuses, disparities)
-    outside = round(match + options.outside_cost * (WRONG_PLACE_BITS - match))
+    outside = round(match + OUTSIDE_COST * (WRONG_PLACE_BITS - match))
     found = SGMResult(
         disparity=np.zeros((height, width), np.float32),
         consistent=np.zeros((height, width), bool),
@@ -178,15 +119,8 @@ def semi_global_matching(
         bottom = min(top + rows, height)
         first, last = max(top - BAND_OVERLAP_PX, 0), min(bottom + BAND_OVERLAP_PX, height)
         band = slice(first, last)
-        total = _aggregate(
-            left[band],
-            censuses[0][band],
-            censuses[1][band],
-            disparities.min_disparity,
-            count,
-            options,
-            outside,
-        )
+        bands = left[band], censuses[0][band], censuses[1][band]
+        total = _aggregate(*bands, disparities[0], count, outside)
         inside = total[top - first : bottom - first]
         _select(inside, disparities, slice(top, bottom), found)
     return found
@@ -271,7 +205,7 @@ def _match_distance(left: np.ndarray, right: np.ndarray, disparities: DisparityR
     centres = np.arange(min(SAMPLED_ROW_STEP // 2, height // 2), height, SAMPLED_ROW_STEP)
     # Costs are sums over three rows. Places outside are the most distant.
     rows = np.clip(centres[:, None] + [-1, 0, 1], 0, height - 1).ravel()
-    tried = disparities.min_disparity, disparities.count
+    tried = disparities[0], disparities[1] - disparities[0] + 1
     cost = matching_cost(left[rows], right[rows], *tried, CENSUS_BITS)[1::3]
     disparity, ratio = np.empty((2, len(centres), width), np.float32)
     agreed = np.empty(ratio.shape, bool)
@@ -290,7 +224,6 @@ def _aggregate(
     right: np.ndarray,
     min_disparity: int,
     count: int,
-    options: SGMOptions,
     outside: int = WRONG_PLACE_BITS,
 ) -> np.ndarray:
     """Return the (H, W, D) uint16 costs of a pair's censuses, summed over the eight paths."""
@@ -299,9 +232,9 @@ def _aggregate(
     height, width = gray.shape
     cost = matching_cost(left, right, min_disparity, count, outside)
     total = np.zeros(cost.shape, np.uint16)
-    p1 = np.uint16(options.p1 * COST_PER_BIT)
-    p2 = options.p2 / (1 + np.arange(256) / options.p2_half_gradient_levels)
-    p2 = np.maximum(p2, options.min_p2_to_p1 * options.p1)
+    p1 = np.uint16(P1_BITS * COST_PER_BIT)
+    p2 = P2_BITS / (1 + np.arange(256) / P2_HALF_GRADIENT_LEVELS)
+    p2 = np.maximum(p2, MIN_P2_BITS)
     penalties = (p1, (p2 * COST_PER_BIT).astype(np.uint16))
     volumes = (gray, cost, total)
     for direction in (1, -1):
@@ -316,5 +249,5 @@ def _select(total: np.ndarray, disparities: DisparityRange, rows: slice, found: 
     from . import sgm_kernel as kernel
 
     outputs = (found.disparity[rows], found.consistent[rows], found.uniqueness_ratio[rows])
-    tried = disparities.min_disparity, disparities.count
+    tried = disparities[0], disparities[1] - disparities[0] + 1
     parallel_for(len(total), kernel.best_of_rows, total, *tried, *outputs)

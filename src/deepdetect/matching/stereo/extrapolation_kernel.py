@@ -1,4 +1,4 @@
-"""The compiled part of `continuation`. Importing it takes numba; the first call compiles."""
+"""The compiled part of `extrapolation`. Importing it takes numba; the first call compiles."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def _line_at(sums, first, last, x):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True)
-def continue_rows(  # type: ignore[no-untyped-def]
+def extrapolate_rows(  # type: ignore[no-untyped-def]
     first, last, disparity, known, carried, sign, min_support, max_difference, out
 ):
-    """Continue the first known surface of some rows to the left, where it is not seen.
+    """Extrapolate the first known surface of some rows to the left, where it is not seen.
 
     Args:
         first, last: the rows.
@@ -35,7 +35,7 @@ def continue_rows(  # type: ignore[no-untyped-def]
         sign: the other view shows x at x - sign * disparity: -1 in mirrored views.
         min_support: fewest known pixels that a line is fitted to.
         max_difference: of disparities on one surface.
-        out: (H, W) float32, written where the surface is continued.
+        out: (H, W) float32, written where the surface is extrapolated.
     """
     width = disparity.shape[1]
     sums = np.zeros((4, width + 1), np.float64)
@@ -43,7 +43,7 @@ def continue_rows(  # type: ignore[no-untyped-def]
         start = 0
         while start < width and not known[y, start]:
             start += 1
-        # Of the surface no more is used than twice the distance that it is continued.
+        # Of the surface no more is used than twice the distance that it is extrapolated.
         wanted = 2 * max(start, min_support)
         support = 0
         before = np.float32(0)
