@@ -38,7 +38,7 @@ def main() -> None:
     arguments = parser.parse_args()
     options = options_of(arguments.short_side)
     images = list_images(arguments.photographs, options, ())[:: arguments.every]
-    score_one = partial(score, weights=arguments.weights, labels=options.label_options)
+    score_one = partial(score, weights=arguments.weights, labels=options.labels)
     with ProcessPoolExecutor(processor_count()) as pool:
         scored = list(pool.map(score_one, images))
     print(

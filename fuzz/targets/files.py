@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import json
 import tempfile
@@ -48,9 +47,7 @@ CALIBRATIONS = strategies.dictionaries(
     max_size=6,
 ).map(lambda values: {"focal_px": 500.0, **values})
 
-SETTINGS = {
-    entry.name: [field.name for field in dataclasses.fields(entry.normal)] for entry in DETECTORS
-}
+SETTINGS = {name: list(detector.defaults) for name, detector in DETECTORS.items()}
 EXTREMES = (0, -1, 1, 2, 3, 10**6, 2**31, 2**63, 1e30, -1e30, 1e-30, 0.5, "nan", "inf", '"a"', "[]")
 
 

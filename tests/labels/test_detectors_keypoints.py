@@ -10,13 +10,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from deepdetect.labels.detectors import (
-    AgastSettings,
-    BriskSettings,
-    FastSettings,
-    HarrisSettings,
-    OrbSettings,
-    ShiTomasiSettings,
-    SiftSettings,
     agast_mask,
     brisk_mask,
     fast_mask,
@@ -35,7 +28,7 @@ def sift_blob(x: float, y: float, sigma: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("x", "y", "sigma"), [(40, 22, 4), (31, 40, 3), (61, 33, 5)])
 def test_sift_a_blob_is_marked_at_its_centre(x: int, y: int, sigma: float) -> None:
-    mask = sift_mask(sift_blob(x, y, sigma), SiftSettings())
+    mask = sift_mask(sift_blob(x, y, sigma))
     assert mask[y, x]
 
 
@@ -44,7 +37,7 @@ def test_sift_equals_opencv_with_the_published_settings(
 ) -> None:
     # Arguments by position: features, octave layers, contrast, edge threshold, sigma.
     expected = naive_mask(gray, cv2.SIFT_create(0, 3, 0.04, 1000, 1.6))
-    mask = sift_mask(gray, SiftSettings())
+    mask = sift_mask(gray)
     assert mask.dtype == bool
     assert expected.sum() > 100
     np.testing.assert_array_equal(mask, expected)
@@ -52,7 +45,7 @@ def test_sift_equals_opencv_with_the_published_settings(
 
 def test_sift_the_edge_test_is_all_but_off(gray: np.ndarray) -> None:
     # OpenCV's own default of 10 drops points on edges.
-    assert sift_mask(gray, SiftSettings()).sum() > sift_mask(gray, SiftSettings(0.04, 10.0)).sum()
+    assert sift_mask(gray).sum() > sift_mask(gray, edge_threshold=10.0).sum()
 
 
 def test_sift_agrees_with_scikit_image(gray: np.ndarray) -> None:
@@ -62,14 +55,14 @@ def test_sift_agrees_with_scikit_image(gray: np.ndarray) -> None:
     theirs = np.zeros(gray.shape, np.uint8)
     for row, column in np.rint(detector.positions).astype(int):
         theirs[row, column] = 1
-    ours = sift_mask(gray, SiftSettings())
+    ours = sift_mask(gray)
     near = cv2.dilate(theirs, np.ones((5, 5), np.uint8)).astype(bool)
     assert near[ours].mean() > 0.7
     assert near.mean() < 0.3  # by chance alone it would be this
 
 
 def test_orb_the_corners_of_a_square(square: np.ndarray) -> None:
-    row, column = np.nonzero(orb_mask(square, OrbSettings()))
+    row, column = np.nonzero(orb_mask(square))
     corners = [(24, 20), (47, 20), (24, 43), (47, 43)]
     distance = np.array(
         [
@@ -90,18 +83,18 @@ def test_orb_equals_opencv_with_the_published_settings(
     detector.setEdgeThreshold(13)
     detector.setFastThreshold(13)
     expected = naive_mask(gray, detector)
-    mask = orb_mask(gray, OrbSettings())
+    mask = orb_mask(gray)
     assert mask.dtype == bool
     np.testing.assert_array_equal(mask, expected)
 
 
 def test_orb_nothing_is_cut_off(gray: np.ndarray) -> None:
-    mask, capped = (orb_mask(gray, OrbSettings(features=n)) for n in (1_000_000, 300))
+    mask, capped = (orb_mask(gray, features=n) for n in (1_000_000, 300))
     assert mask.sum() > 2 * capped.sum()
 
 
 def test_orb_nothing_near_the_border(gray: np.ndarray) -> None:
-    mask = orb_mask(gray, OrbSettings(levels=1))
+    mask = orb_mask(gray, levels=1)
     inner = mask[13:-13, 13:-13]
     assert inner.sum() == mask.sum() > 100
     assert inner[0].any() | inner[-1].any() | inner[:, 0].any() | inner[:, -1].any()
@@ -117,7 +110,7 @@ def test_brisk_equals_opencv_with_the_published_settings(
     image: str, naive_mask: Callable, request: pytest.FixtureRequest
 ) -> None:
     gray = request.getfixturevalue(image)
-    mask = brisk_mask(gray, BriskSettings())
+    mask = brisk_mask(gray)
     assert mask.dtype == bool
     assert mask.any()
     np.testing.assert_array_equal(mask, naive_mask(gray, brisk_create(11, 3)))
@@ -125,7 +118,7 @@ def test_brisk_equals_opencv_with_the_published_settings(
 
 def test_brisk_marks_lie_at_the_corners_of_a_square(square: np.ndarray) -> None:
     corners = np.array([(24, 20), (47, 20), (24, 43), (47, 43)])
-    marked = np.argwhere(brisk_mask(square, BriskSettings()))[:, ::-1]
+    marked = np.argwhere(brisk_mask(square))[:, ::-1]
     assert len(marked) > 0
     for point in marked:
         assert np.abs(corners - point).max(1).min() <= 2
@@ -135,13 +128,13 @@ def test_brisk_settings_are_kept_apart(gray: np.ndarray, naive_mask: Callable) -
     # The detectors are made once and kept, which must not mix their settings up.
     for threshold, octaves in [(11, 3), (60, 3), (11, 0), (11, 3)]:
         np.testing.assert_array_equal(
-            brisk_mask(gray, BriskSettings(threshold, octaves)),
+            brisk_mask(gray, threshold, octaves),
             naive_mask(gray, brisk_create(threshold, octaves)),
         )
 
 
 def test_fast_the_corners_of_a_square(square: np.ndarray) -> None:
-    mask = fast_mask(square, FastSettings())
+    mask = fast_mask(square)
     row, column = np.nonzero(mask)
     for y in (20, 43):
         for x in (24, 47):
@@ -154,7 +147,7 @@ def test_fast_the_corners_of_a_square(square: np.ndarray) -> None:
 def test_fast_a_straight_edge_is_no_corner(shape: tuple[int, int]) -> None:
     gray = np.zeros(shape, np.uint8)
     gray[:, 20:] = 200
-    assert not fast_mask(gray, FastSettings()).any()
+    assert not fast_mask(gray).any()
 
 
 @pytest.mark.parametrize(
@@ -165,7 +158,7 @@ def test_fast_one_bright_pixel_must_exceed_the_threshold(
 ) -> None:
     gray = np.full((30, 40), 100, np.uint8)
     gray[11, 17] += contrast
-    mask = fast_mask(gray, FastSettings(threshold=threshold))
+    mask = fast_mask(gray, threshold=threshold)
     assert mask[11, 17] == marked
     assert mask.sum() == marked
 
@@ -174,19 +167,19 @@ def test_fast_one_bright_pixel_must_exceed_the_threshold(
 def test_fast_equals_scikit_image(gray: np.ndarray, threshold: int) -> None:
     feature = pytest.importorskip("skimage.feature")
     expected = feature.corner_fast(gray.astype(np.float64), n=9, threshold=threshold) > 0
-    mask = fast_mask(gray, FastSettings(threshold=threshold))
+    mask = fast_mask(gray, threshold=threshold)
     assert expected.sum() > 100
     np.testing.assert_array_equal(mask, expected)
 
 
 def test_fast_the_low_setting_marks_more(dark: np.ndarray) -> None:
-    normal, low = (fast_mask(dark, FastSettings(threshold=t)) for t in (13, 1))
+    normal, low = (fast_mask(dark, threshold=t) for t in (13, 1))
     assert low.sum() > 5 * normal.sum()
     assert (low | normal).sum() == low.sum()
 
 
 def test_fast_suppression_keeps_a_part(gray: np.ndarray) -> None:
-    every, best = (fast_mask(gray, FastSettings(suppression=s)) for s in (False, True))
+    every, best = (fast_mask(gray, suppression=s) for s in (False, True))
     assert 0 < best.sum() < every.sum()
     assert (every | best).sum() == every.sum()
 
@@ -195,9 +188,9 @@ def test_fast_suppression_keeps_a_part(gray: np.ndarray) -> None:
 @pytest.mark.parametrize("image", ["gray", "dark", "square"])
 def test_agast_equals_fast(image: str, threshold: int, request: pytest.FixtureRequest) -> None:
     gray = request.getfixturevalue(image)
-    mask = agast_mask(gray, AgastSettings(threshold=threshold))
+    mask = agast_mask(gray, threshold=threshold)
     assert mask.dtype == bool
-    np.testing.assert_array_equal(mask, fast_mask(gray, FastSettings(threshold=threshold)))
+    np.testing.assert_array_equal(mask, fast_mask(gray, threshold=threshold))
 
 
 @given(
@@ -206,18 +199,20 @@ def test_agast_equals_fast(image: str, threshold: int, request: pytest.FixtureRe
 )
 def test_agast_equals_fast_on_any_image(gray: np.ndarray, threshold: int) -> None:
     np.testing.assert_array_equal(
-        agast_mask(gray, AgastSettings(threshold=threshold)),
-        fast_mask(gray, FastSettings(threshold=threshold)),
+        agast_mask(gray, threshold=threshold),
+        fast_mask(gray, threshold=threshold),
     )
 
 
 def test_agast_the_corners_of_a_square(square: np.ndarray) -> None:
-    mask = agast_mask(square, AgastSettings())
+    mask = agast_mask(square)
     assert all(mask[y, x] for y in (20, 43) for x in (24, 47))
     assert not mask[25:39].any()
 
 
-def harris_reference(gray: np.ndarray, settings: HarrisSettings) -> tuple[np.ndarray, np.ndarray]:
+def harris_reference(
+    gray: np.ndarray, k: float, share: float, dilate: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """The mask, and where it hangs on rounding, by SciPy's filters in float64."""
     ndimage = pytest.importorskip("scipy.ndimage")
     derivative, smooth = [-1, -2, 0, 2, 1], [1, 4, 6, 4, 1]  # Sobel of width 5
@@ -228,32 +223,27 @@ def harris_reference(gray: np.ndarray, settings: HarrisSettings) -> tuple[np.nda
         return ndimage.correlate1d(filtered, smooth, 1 - axis, mode="mirror")
 
     def window(product: np.ndarray) -> np.ndarray:
-        return ndimage.uniform_filter(product, settings.block_size, mode="mirror")
+        return ndimage.uniform_filter(product, 3, mode="mirror")
 
     dx, dy = gradient(1), gradient(0)
     a, b, c = window(dx * dx), window(dx * dy), window(dy * dy)
-    response = a * c - b * b - settings.k * (a + c) ** 2
-    if settings.dilate:
+    response = a * c - b * b - k * (a + c) ** 2
+    if dilate:
         response = ndimage.maximum_filter(response, 3, mode="nearest")
-    limit = settings.relative_threshold * response.max()
+    limit = share * response.max()
     return response > limit, abs(response - limit) < 1e-3 * limit
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [
-        HarrisSettings(),
-        HarrisSettings(dilate=False),
-        HarrisSettings(k=0.04, relative_threshold=0.04),
-    ],
+    ("k", "share", "dilate"), [(0.001, 0.001, True), (0.001, 0.001, False), (0.04, 0.04, True)]
 )
 @pytest.mark.parametrize("image", ["gray", "dark", "square"])
 def test_harris_equals_scipy(
-    image: str, settings: HarrisSettings, request: pytest.FixtureRequest
+    image: str, k: float, share: float, dilate: bool, request: pytest.FixtureRequest
 ) -> None:
     gray = request.getfixturevalue(image)
-    expected, unsure = harris_reference(gray, settings)
-    mask = harris_mask(gray, settings)
+    expected, unsure = harris_reference(gray, k, share, dilate)
+    mask = harris_mask(gray, k=k, relative_threshold=share, dilate=dilate)
     assert mask.dtype == bool
     assert 0.005 < mask.mean() < 0.9
     assert unsure.mean() < 0.01
@@ -261,7 +251,7 @@ def test_harris_equals_scipy(
 
 
 def test_harris_the_corners_of_a_square(square: np.ndarray) -> None:
-    mask = harris_mask(square, HarrisSettings())
+    mask = harris_mask(square)
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     assert count == 5  # the background and four blobs
     # A corner lies between the pixels; each blob is centred there and up to 8 pixels wide.
@@ -275,16 +265,16 @@ def test_harris_the_corners_of_a_square(square: np.ndarray) -> None:
 def test_harris_the_middle_of_a_straight_edge_is_no_corner() -> None:
     gray = np.zeros((40, 60), np.uint8)
     gray[:, 30:] = 200
-    assert not harris_mask(gray, HarrisSettings()).any()
+    assert not harris_mask(gray).any()
 
 
 def test_harris_the_mask_turns_with_the_image(gray: np.ndarray) -> None:
-    turned = harris_mask(np.ascontiguousarray(gray.T), HarrisSettings())
-    assert (turned != harris_mask(gray, HarrisSettings()).T).mean() < 1e-3
+    turned = harris_mask(np.ascontiguousarray(gray.T))
+    assert (turned != harris_mask(gray).T).mean() < 1e-3
 
 
 def test_shi_tomasi_the_corners_of_a_square(square: np.ndarray) -> None:
-    mask = shi_tomasi_mask(square, ShiTomasiSettings())
+    mask = shi_tomasi_mask(square)
     found = sorted(np.argwhere(mask)[:, ::-1].tolist())
     # A window of 2 pixels reaches to the left and above, so that its corners lie at its end.
     assert found == [[25, 21], [25, 43], [47, 21], [47, 43]]
@@ -293,34 +283,30 @@ def test_shi_tomasi_the_corners_of_a_square(square: np.ndarray) -> None:
 def test_shi_tomasi_a_straight_edge_is_no_corner() -> None:
     gray = np.zeros((40, 60), np.uint8)
     gray[:, 30:] = 200
-    assert not shi_tomasi_mask(gray, ShiTomasiSettings()).any()
+    assert not shi_tomasi_mask(gray).any()
 
 
 @pytest.mark.parametrize("image", ["gray", "dark"])
 def test_shi_tomasi_agrees_with_scipy(image: str, request: pytest.FixtureRequest) -> None:
     ndimage = pytest.importorskip("scipy.ndimage")
     gray = request.getfixturevalue(image)
-    settings = ShiTomasiSettings()
     values = gray.astype(np.float64)
     dx, dy = (ndimage.sobel(values, axis, mode="mirror") for axis in (1, 0))
     a, b, c = (
-        ndimage.uniform_filter(product, settings.block_size, mode="mirror")
-        for product in (dx * dx, dx * dy, dy * dy)
+        ndimage.uniform_filter(product, 2, mode="mirror") for product in (dx * dx, dx * dy, dy * dy)
     )
     smaller = (a + c) / 2 - np.sqrt(((a - c) / 2) ** 2 + b * b)
     largest_near = ndimage.maximum_filter(smaller, 3, mode="nearest")
-    expected = (smaller > settings.quality_level * smaller.max()) & (
-        smaller >= largest_near * (1 - 1e-6)
-    )
+    expected = (smaller > 0.01 * smaller.max()) & (smaller >= largest_near * (1 - 1e-6))
     expected[[0, -1]] = expected[:, [0, -1]] = False  # OpenCV takes none on the border
-    mask = shi_tomasi_mask(gray, settings)
+    mask = shi_tomasi_mask(gray)
     assert mask.dtype == bool
     assert mask.sum() > 200
     assert (mask & expected).sum() > 0.99 * max(mask.sum(), expected.sum())
 
 
 def test_shi_tomasi_a_limit_keeps_the_strongest(gray: np.ndarray) -> None:
-    every, some = (shi_tomasi_mask(gray, ShiTomasiSettings(corners=n)) for n in (0, 50))
+    every, some = (shi_tomasi_mask(gray, corners=n) for n in (0, 50))
     assert some.sum() == 50
     assert every.sum() > 200
     assert not (some & ~every).any()

@@ -19,9 +19,9 @@ from deepdetect.viz.draw import CAPTION_HEIGHT
 def single(gray: np.ndarray) -> dict[tuple[str, str], np.ndarray]:
     """What each detector marks by itself, in each of its settings."""
     masks = {}
-    for detector in DETECTORS:
-        masks[detector.name, "normal"] = detector.mask(gray, detector.normal)
-        masks[detector.name, "low"] = detector.mask(gray, detector.low_visibility)
+    for name, detector in DETECTORS.items():
+        masks[name, "normal"] = detector.mask(gray)
+        masks[name, "low"] = detector.mask(gray, **detector.low_visibility)
     return masks
 
 
@@ -41,11 +41,11 @@ def test_the_or_of_all_parts(visibility: str, gray: np.ndarray, single: dict) ->
     assert 0 < label.density < 1
 
 
-@pytest.mark.parametrize("detector", DETECTORS, ids=DETECTOR_NAMES)
-def test_one_detector_by_itself(detector: object, gray: np.ndarray, single: dict) -> None:
-    label = fuse(gray, LabelOptions((detector.name,), "normal"))
-    np.testing.assert_array_equal(label.mask, single[detector.name, "normal"])
-    empty = label.edges if detector.kind == "keypoint" else label.keypoints
+@pytest.mark.parametrize("name", DETECTOR_NAMES)
+def test_one_detector_by_itself(name: str, gray: np.ndarray, single: dict) -> None:
+    label = fuse(gray, LabelOptions((name,), "normal"))
+    np.testing.assert_array_equal(label.mask, single[name, "normal"])
+    empty = label.edges if DETECTORS[name].kind == "keypoint" else label.keypoints
     assert not empty.any()
 
 

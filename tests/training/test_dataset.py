@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader  # noqa: E402
 from deepdetect import ImageError  # noqa: E402
 from deepdetect._shared.options import replace_options  # noqa: E402
 from deepdetect.io.image import luma  # noqa: E402
-from deepdetect.labels import visibility_of  # noqa: E402
+from deepdetect.labels import LabelOptions, visibility_of  # noqa: E402
 from deepdetect.training.dataset import (  # noqa: E402
     CropDataset,
     FolderSource,
@@ -37,14 +37,14 @@ OPTIONS = TrainingOptions(
     flips=True,
     color_jitter=0.0,
     augmentations=1,
-    detectors=("fast", "harris", "sobel"),
+    labels=LabelOptions(("fast", "harris", "sobel")),
 )
 Batch = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
 def source(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> FolderSource:
-    cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.label_options)
+    cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.labels)
     images = list_images(photographs, OPTIONS)
     cache.make([(image, image.normal + image.dark) for image in images], workers=1)
     return FolderSource(images, cache, 2**30)
@@ -247,7 +247,7 @@ def test_worker_processes_give_the_same_batches(source: FolderSource) -> None:
 def test_an_error_of_a_worker_is_one_sentence(
     source: FolderSource, tmp_path: Path, workers: int, one_line
 ) -> None:
-    lost = FolderSource(source.images, LabelCache(tmp_path, OPTIONS.label_options))
+    lost = FolderSource(source.images, LabelCache(tmp_path, OPTIONS.labels))
     with pytest.raises(ImageError) as caught, loading(loader(lost, workers=workers)) as made:
         next(made)
     assert one_line(caught.value).startswith("there is no file")
@@ -258,7 +258,7 @@ def test_a_label_of_another_size_is_refused(photographs: Path, tmp_path: Path) -
     from deepdetect.io.masks import save_mask
 
     image = list_images(photographs, OPTIONS)[0]
-    cache = LabelCache(tmp_path, OPTIONS.label_options)
+    cache = LabelCache(tmp_path, OPTIONS.labels)
     save_mask(np.zeros((8, 8), bool), cache.path(image, image.normal[0]))
     with pytest.raises(ImageError, match="another size"):
         FolderSource([image], cache).load(0, image.normal[0])
@@ -283,7 +283,10 @@ def test_preparation_makes_only_the_labels_that_are_needed(
     photographs: Path, tmp_path: Path
 ) -> None:
     options = TrainingOptions(
-        stages=(Stage(64, 2, 1),), short_sides=(64, 96), detectors=("fast",), val_fraction=0.3
+        stages=(Stage(64, 2, 1),),
+        short_sides=(64, 96),
+        labels=LabelOptions(("fast",)),
+        val_fraction=0.3,
     )
     data = prepare_data(photographs, options, tmp_path, workers=1)
     names = [path.name for path in (tmp_path / "labels").rglob("*.png")]

@@ -13,13 +13,16 @@ from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.views import digest_images, list_images, render
 
 OPTIONS = TrainingOptions(
-    stages=(Stage(64, 2, 1),), short_sides=(64,), augmentations=1, detectors=("fast", "sobel")
+    stages=(Stage(64, 2, 1),),
+    short_sides=(64,),
+    augmentations=1,
+    labels=LabelOptions(("fast", "sobel")),
 )
 
 
 @pytest.fixture(scope="module")
 def cache(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> LabelCache:
-    made = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.label_options)
+    made = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.labels)
     wanted = [(image, image.normal + image.dark) for image in list_images(photographs, OPTIONS)]
     assert made.make(wanted[:3], workers=1) == 3 * 4
     assert made.make(wanted[:4], workers=1) == 4, "labels are made once"
@@ -31,7 +34,7 @@ def test_labels_are_those_of_the_views(cache: LabelCache, photographs: Path) -> 
     for view in image.normal + image.dark:
         rgb = render(image.path, view)
         visibility = "normal" if view.darkening is None else "low"
-        expected = fuse(luma(rgb), LabelOptions(OPTIONS.detectors, visibility)).mask
+        expected = fuse(luma(rgb), LabelOptions(OPTIONS.labels.detectors, visibility)).mask
         np.testing.assert_array_equal(cache.load(image, view), expected)
 
 
@@ -40,7 +43,7 @@ def test_a_view_of_an_array_has_the_same_label(cache: LabelCache, photographs: P
 
     image = list_images(photographs, OPTIONS)[1]
     for view in image.normal + image.dark:
-        made = label_view(load_image(image.path), view, OPTIONS.label_options)
+        made = label_view(load_image(image.path), view, OPTIONS.labels)
         np.testing.assert_array_equal(made, cache.load(image, view))
 
 
@@ -55,7 +58,7 @@ def test_an_image_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path
         (tmp_path / name).write_bytes((photographs / "photo00.png").read_bytes())
     (tmp_path / "broken.png").write_bytes(b"no image")
     images = list_images(tmp_path, OPTIONS)
-    cache = LabelCache(tmp_path / "labels", OPTIONS.label_options)
+    cache = LabelCache(tmp_path / "labels", OPTIONS.labels)
     with pytest.raises(DeepDetectError, match=r"1 of 3 images cannot be read.*broken\.png"):
         cache.make([(image, image.normal) for image in images], workers=1)
     assert len(list(cache.folder.glob("*.png"))) == 2 * 2, "the others are kept"

@@ -8,7 +8,7 @@ import pytest
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.options import replace_options
 from deepdetect.cli._options import chosen_recipe
-from deepdetect.labels import find_label_settings
+from deepdetect.labels import LabelOptions, find_label_settings
 from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions, training_preset
 from deepdetect.training.sampler import Schedule
 
@@ -74,20 +74,20 @@ def test_the_recipe_for_geometry() -> None:
     """Normal light only, and the labels of the name."""
     geometry = training_preset("dense")
     assert geometry.dark_fraction == 0
-    assert geometry.label_changes == find_label_settings("dense").changes
+    assert geometry.labels == find_label_settings("dense")
     assert Schedule(geometry, 2_705).steps > 1_000
 
 
 def test_a_preset_keeps_its_label_settings_unless_others_are_given(tmp_path: Path) -> None:
-    changes = training_preset("dense").label_changes
-    assert chosen_recipe("dense", None, None, {}).label_changes == changes
-    assert chosen_recipe("dense", "sobel,fast", None, {}).label_changes == changes
-    assert chosen_recipe("dense", "fast", None, {}).label_changes == ()
-    assert chosen_recipe("dense", None, "paper", {}).label_changes == ()
-    assert chosen_recipe("paper", None, "dense", {}).label_changes == changes
+    dense = find_label_settings("dense")
+    assert chosen_recipe("dense", None, None, {}).labels == dense
+    assert chosen_recipe("dense", "sobel,fast", None, {}).labels.settings == dense.settings
+    assert chosen_recipe("dense", "fast", None, {}).labels == LabelOptions(("fast",))
+    assert chosen_recipe("dense", None, "paper", {}).labels == LabelOptions()
+    assert chosen_recipe("paper", None, "dense", {}).labels == dense
     (tmp_path / "mine.toml").write_text("[fast]\nnormal = { threshold = 20 }\n")
-    (change,) = chosen_recipe("dense", None, str(tmp_path / "mine.toml"), {}).label_changes
-    assert change.detector == "fast"
+    chosen = chosen_recipe("dense", None, str(tmp_path / "mine.toml"), {}).labels
+    assert list(chosen.settings) == ["fast"]
 
 
 def test_the_default_is_that_of_the_options() -> None:

@@ -9,6 +9,7 @@ pytest.importorskip("torch", reason="needs torch, which is for training only")
 import importlib.util
 
 from deepdetect import MissingExtraError, TrainingOptions, train
+from deepdetect.labels import LabelOptions
 from deepdetect.training import DeviceOptions, Stage, profile
 
 
@@ -19,7 +20,7 @@ def test_a_profile_times_each_stage_and_writes_no_weights(
     options = TrainingOptions(
         stages=(Stage(64, 4, 4), Stage(96, 2, 1)),
         short_sides=(96,),
-        detectors=("fast",),
+        labels=LabelOptions(("fast",)),
         interleave=True,
     )
     device = DeviceOptions("cpu", "float32", compile=False, threads=1)

@@ -23,7 +23,7 @@ OPTIONS = TrainingOptions(
     stages=(Stage(64, 2, 3), Stage(96, 2, 2)),
     short_sides=(96, 64),
     augmentations=1,
-    detectors=("fast", "harris", "sobel"),
+    labels=LabelOptions(("fast", "harris", "sobel")),
     val_fraction=0.2,
 )
 
@@ -76,7 +76,7 @@ def test_views_and_labels_are_those_of_the_images(photographs: Path, source: Sha
             image, mask = source.load(index, view)
             np.testing.assert_array_equal(image, render(path, view))
             visibility = "normal" if view.darkening is None else "low"
-            expected = fuse(luma(image), LabelOptions(OPTIONS.detectors, visibility)).mask
+            expected = fuse(luma(image), LabelOptions(OPTIONS.labels.detectors, visibility)).mask
             np.testing.assert_array_equal(mask, expected)
 
 
@@ -103,7 +103,9 @@ def test_a_broken_off_call_goes_on(photographs: Path, tmp_path: Path) -> None:
 
 
 def test_other_options_are_refused(photographs: Path, shards: Shards) -> None:
-    other = TrainingOptions(stages=OPTIONS.stages, short_sides=(96,), detectors=("fast",))
+    other = TrainingOptions(
+        stages=OPTIONS.stages, short_sides=(96,), labels=LabelOptions(("fast",))
+    )
     with pytest.raises(
         OptionError, match="`short_sides`, `val_fraction`, `augmentations`, `labels`"
     ):

@@ -28,6 +28,7 @@ from deepdetect.detector.network.weights import (  # noqa: E402
     weights_digest,
 )
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
+from deepdetect.labels import LabelOptions  # noqa: E402
 from deepdetect.training.checkpoint import read_checkpoint  # noqa: E402
 from deepdetect.training.learner import Learner  # noqa: E402
 from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions  # noqa: E402
@@ -38,7 +39,7 @@ PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1, checkpoint_int
 OPTIONS = TrainingOptions(
     stages=(Stage(64, 4, 3), Stage(96, 2, 1)),
     short_sides=(96, 64),
-    detectors=("fast", "sobel"),
+    labels=LabelOptions(("fast", "sobel")),
     val_count=3,
 )
 TINY = dataclasses.replace(OPTIONS, stages=(Stage(64, 4, 1),), short_sides=(64,), val_count=1)

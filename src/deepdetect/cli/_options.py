@@ -15,7 +15,7 @@ from ._generated import FieldOptions, given_only
 
 if TYPE_CHECKING:
     from ..detector.detector import DeepDetect
-    from ..labels import LabelSettings
+    from ..labels import LabelOptions
     from ..training import TrainingOptions
 
 PATH = click.Path(path_type=Path)
@@ -143,11 +143,11 @@ label_settings_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 
 
-def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelSettings:
+def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelOptions:
     """Find settings by name or TOML file; detectors (with commas between) replace theirs."""
-    from ..labels import LabelSettings, find_label_settings
+    from ..labels import find_label_settings
 
-    settings = LabelSettings() if chosen is None else find_label_settings(chosen)
+    settings = find_label_settings("paper" if chosen is None else chosen)
     if detectors is None:
         return settings
     names = tuple(name.strip() for name in detectors.split(",") if name.strip())
@@ -156,7 +156,7 @@ def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelSet
 
 RECIPE = FieldOptions(
     "training.recipe:TrainingOptions",
-    skip=("darkening", "augmentation_ranges", "detectors", "label_changes"),
+    skip=("darkening", "augmentation_ranges", "labels"),
     flags={
         "stages": "--stage",
         "short_sides": "--short-side",
@@ -207,12 +207,11 @@ def chosen_recipe(
             Stage.parse(stage) if isinstance(stage, str) else stage for stage in given["stages"]
         )
     recipe = training_preset(preset)
-    if detectors is not None or label_settings is not None:
-        settings = chosen_label_settings(detectors, label_settings)
-        given["detectors"], given["label_changes"] = settings.detectors, settings.changes
-    if label_settings is None:  # the preset's, for the detectors that are used
-        chosen = given.get("detectors", recipe.detectors)
-        given["label_changes"] = tuple(c for c in recipe.label_changes if c.detector in chosen)
+    if label_settings is not None:
+        given["labels"] = chosen_label_settings(detectors, label_settings)
+    elif detectors is not None:  # the preset's settings, for the detectors that are used
+        chosen = chosen_label_settings(detectors, None).detectors
+        given["labels"] = recipe.labels.with_detectors(chosen)
     return dataclasses.replace(recipe, **given)
 
 

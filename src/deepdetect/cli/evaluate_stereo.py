@@ -54,7 +54,7 @@ def evaluate_stereo(
     from ..detector.pretrained import PRETRAINED
     from ..evaluation.protocols.masks import LabelDetector
     from ..evaluation.protocols.stereo_matches import score_stereo_matches
-    from ..labels import LabelOptions, find_label_settings
+    from ..labels import find_label_settings
 
     pairs, failures = [], []
     for scene in scenes:
@@ -66,9 +66,7 @@ def evaluate_stereo(
         report_failures(failures, len(scenes), "scenes")
     sources: dict[str, HeatmapDetector] = {}
     for name in labels:
-        chosen = find_label_settings(name)
-        options = LabelOptions(chosen.detectors, changes=chosen.changes)
-        sources[f"labels {name}"] = LabelDetector(options)
+        sources[f"labels {name}"] = LabelDetector(find_label_settings(name))
     for name in weights if weights or labels else tuple(PRETRAINED):
         sources[f"weights {name}"] = DeepDetect(name)
     rows = score_stereo_matches(sources, pairs, quiet=as_json)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,7 +74,6 @@ def label(
     """
     from .._shared.progress import progress
     from ..batch.engines import get_engine
-    from ..labels import LabelOptions
     from ..labels.batch import (
         LabelTarget,
         LabelTask,
@@ -83,8 +83,7 @@ def label(
     )
 
     map_tasks = get_engine(engine)
-    settings = chosen_label_settings(detectors, label_settings)
-    options = LabelOptions(settings.detectors, visibility, settings.changes)
+    options = replace(chosen_label_settings(detectors, label_settings), visibility=visibility)
     tasks = []
     for image in expand_images(images, output):
         figure = output / f"{image.stem}_labels.png" if visualize else None

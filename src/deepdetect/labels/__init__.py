@@ -1,11 +1,10 @@
 """Labels for training: classical detectors, and their fusion into one binary mask."""
 
 from .detectors import DETECTOR_NAMES, DETECTORS, LabelDetector
-from .fusion import Label, LabelOptions, draw_label, fuse
+from .fusion import Label, draw_label, fuse
 from .settings import (
     LABEL_SETTINGS,
-    LabelSettings,
-    SettingChange,
+    LabelOptions,
     find_label_settings,
     read_label_settings,
 )
@@ -19,8 +18,6 @@ __all__ = [
     "Label",
     "LabelDetector",
     "LabelOptions",
-    "LabelSettings",
-    "SettingChange",
     "draw_label",
     "find_label_settings",
     "fuse",

@@ -17,7 +17,8 @@ from .._shared.parallel import TaskMap, map_in_processes
 from ..io.image import load_image, luma
 from ..io.masks import load_mask_settings, save_mask
 from ..viz.draw import save_picture
-from .fusion import LabelOptions, draw_label, fuse
+from .fusion import draw_label, fuse
+from .settings import LabelOptions
 
 
 @dataclass(frozen=True)

@@ -1,39 +1,41 @@
-"""The nine label detectors: for each its settings and its mask, and the table of all of them.
+"""The nine label detectors: a function for each, and the table of all of them.
 
-To add a detector, write a frozen dataclass of settings and a function from a grey image and these
-settings to a boolean mask, and add a line to `DETECTORS`. All images are (H, W) uint8 luma, all
-masks (H, W) bool.
+To add a detector, write a function from a grey image and keyword parameters to a boolean mask, and
+add a line to `DETECTORS`. All images are (H, W) uint8 luma, all masks (H, W) bool. The defaults of
+the parameters are the paper's settings of normal images.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.opencv import cv2, opencv_factory
-from .._shared.options import check_ranges
 
-Limits = dict[str, tuple[float, float]]
+Value = bool | int | float
+Range = tuple[float, float] | range
+"""Smallest and largest value, or all values."""
 
 AGAST_OAST_9_16 = 3
 """`AgastFeatureDetector::OAST_9_16`; not every OpenCV exports it to Python."""
 
-# Beyond the ranges of the settings OpenCV ends the process, runs for minutes, takes another number
-# (modulo 256), or raises an error.
+# Beyond these ranges OpenCV ends the process, runs for minutes, takes another number (modulo 256),
+# or raises an error.
 GRAY_LEVELS = (0, 255)
 """Range of differences of grey levels."""
 
 BLOCK_SIZES = (1, 255)
 """Range of the widths of windows, in pixels."""
 
-KERNEL_SIZES = (1, 31)
-"""Range of the widths of Sobel filters, in pixels."""
+KERNEL_SIZES = range(1, 32, 2)
+"""Widths of Sobel filters, in pixels."""
 
 MAX_CANNY_THRESHOLD = 2040
 """Largest sum of both gradients of the 3x3 Sobel filter, in grey levels."""
@@ -66,298 +68,255 @@ def keypoints_mask(gray: np.ndarray, keypoints: Sequence[cv2.KeyPoint]) -> np.nd
     return pixels_mask(gray.shape, xy)
 
 
-@dataclass(frozen=True)
-class SiftSettings:
-    """Settings of `cv2.SIFT_create`; the edge test is practically switched off."""
+def sift_mask(
+    gray: np.ndarray,
+    contrast_threshold: float = 0.04,
+    edge_threshold: float = 1000.0,
+    sigma: float = 1.6,
+    octave_layers: int = 3,
+) -> np.ndarray:
+    """Mark SIFT keypoints: extrema of the difference-of-Gaussians scale space (Lowe, 2004).
 
-    contrast_threshold: float = 0.04
-    edge_threshold: float = 1000.0
-    sigma: float = 1.6
-    octave_layers: int = 3
-
-    def __post_init__(self) -> None:
-        limits: Limits = {"contrast_threshold": (0, 1), "edge_threshold": (1, 1e6)}
-        limits |= {"sigma": (0.1, 20), "octave_layers": (1, 20)}
-        check_ranges(self, between=limits)
-
-
-def sift_mask(gray: np.ndarray, settings: SiftSettings) -> np.ndarray:
-    """Mark SIFT keypoints: extrema of the difference-of-Gaussians scale space (Lowe, 2004)."""
+    The edge test is practically switched off.
+    """
     detector = cv2.SIFT_create(
-        nOctaveLayers=settings.octave_layers,
-        contrastThreshold=settings.contrast_threshold,
-        edgeThreshold=settings.edge_threshold,
-        sigma=settings.sigma,
+        nOctaveLayers=octave_layers,
+        contrastThreshold=contrast_threshold,
+        edgeThreshold=edge_threshold,
+        sigma=sigma,
     )
     return keypoints_mask(gray, detector.detect(gray, None))
 
 
-@dataclass(frozen=True)
-class OrbSettings:
-    """Settings of `cv2.ORB_create`; `features` is so large that nothing is cut off."""
+def orb_mask(
+    gray: np.ndarray,
+    features: int = 1_000_000,
+    scale_factor: float = 1.2,
+    levels: int = 7,
+    edge_threshold: int = 13,
+    fast_threshold: int = 13,
+) -> np.ndarray:
+    """Mark ORB keypoints: FAST corners on an image pyramid (Rublee et al., 2011).
 
-    features: int = 1_000_000
-    scale_factor: float = 1.2
-    levels: int = 7
-    edge_threshold: int = 13
-    fast_threshold: int = 13
-
-    def __post_init__(self) -> None:
-        limits: Limits = {"features": (1, 1e7), "scale_factor": (1.01, 10), "levels": (1, 32)}
-        limits |= {"edge_threshold": (0, 1000), "fast_threshold": GRAY_LEVELS}
-        check_ranges(self, between=limits)
-
-
-def orb_mask(gray: np.ndarray, settings: OrbSettings) -> np.ndarray:
-    """Mark ORB keypoints: FAST corners on an image pyramid (Rublee et al., 2011)."""
+    `features` is so large that nothing is cut off.
+    """
     # OpenCV refuses levels of less than a pixel.
-    most = 1 + int(math.log(min(gray.shape)) / math.log(settings.scale_factor))
+    most = 1 + int(math.log(min(gray.shape)) / math.log(scale_factor))
     detector = cv2.ORB_create(
-        nfeatures=settings.features,
-        scaleFactor=settings.scale_factor,
-        nlevels=min(settings.levels, most),
-        edgeThreshold=settings.edge_threshold,
-        fastThreshold=settings.fast_threshold,
+        nfeatures=features,
+        scaleFactor=scale_factor,
+        nlevels=min(levels, most),
+        edgeThreshold=edge_threshold,
+        fastThreshold=fast_threshold,
     )
     return keypoints_mask(gray, detector.detect(gray, None))
-
-
-@dataclass(frozen=True)
-class BriskSettings:
-    """Settings of `cv2.BRISK_create`."""
-
-    threshold: int = 11
-    octaves: int = 3
-
-    def __post_init__(self) -> None:
-        check_ranges(self, between={"threshold": GRAY_LEVELS, "octaves": (0, 16)})
 
 
 @lru_cache(maxsize=8)
-def _brisk(settings: BriskSettings) -> cv2.Feature2D:
+def _brisk(threshold: int, octaves: int) -> cv2.Feature2D:
     """Make a BRISK detector once: its sampling pattern costs as much as a dark image."""
-    return opencv_factory("BRISK_create")(thresh=settings.threshold, octaves=settings.octaves)
+    return opencv_factory("BRISK_create")(thresh=threshold, octaves=octaves)
 
 
-def brisk_mask(gray: np.ndarray, settings: BriskSettings) -> np.ndarray:
+def brisk_mask(gray: np.ndarray, threshold: int = 11, octaves: int = 3) -> np.ndarray:
     """Mark BRISK keypoints: AGAST corners in a scale space (Leutenegger et al., 2011)."""
     # OpenCV refuses octaves of less than a pixel; in each, a layer has 2/3 of the size.
     most = (2 * min(gray.shape) // 3).bit_length()
-    settings = replace(settings, octaves=min(settings.octaves, most))
-    return keypoints_mask(gray, _brisk(settings).detect(gray, None))
+    return keypoints_mask(gray, _brisk(threshold, min(octaves, most)).detect(gray, None))
 
 
-@dataclass(frozen=True)
-class FastSettings:
-    """Settings of `cv2.FastFeatureDetector_create`, type 9-16."""
-
-    threshold: int = 13
-    suppression: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, between={"threshold": GRAY_LEVELS})
-
-
-def fast_mask(gray: np.ndarray, settings: FastSettings) -> np.ndarray:
+def fast_mask(gray: np.ndarray, threshold: int = 13, suppression: bool = False) -> np.ndarray:
     """Mark FAST corners: the segment test on a circle of 16 pixels (Rosten and Drummond, 2006)."""
     detector = cv2.FastFeatureDetector_create(
-        settings.threshold, settings.suppression, cv2.FAST_FEATURE_DETECTOR_TYPE_9_16
+        threshold, suppression, cv2.FAST_FEATURE_DETECTOR_TYPE_9_16
     )
     return keypoints_mask(gray, detector.detect(gray, None))
 
 
-@dataclass(frozen=True)
-class AgastSettings:
-    """Settings of `cv2.AgastFeatureDetector_create`, type OAST 9-16."""
-
-    threshold: int = 13
-    suppression: bool = False
-
-    def __post_init__(self) -> None:
-        check_ranges(self, between={"threshold": GRAY_LEVELS})
-
-
-def agast_mask(gray: np.ndarray, settings: AgastSettings) -> np.ndarray:
+def agast_mask(gray: np.ndarray, threshold: int = 13, suppression: bool = False) -> np.ndarray:
     """Mark AGAST corners: the segment test with an adaptive decision tree (Mair et al., 2010).
 
     With equal settings the mask is that of FAST: both test the same circle and differ only in
     the order of the comparisons.
     """
     create = opencv_factory("AgastFeatureDetector_create")
-    detector = create(settings.threshold, settings.suppression, AGAST_OAST_9_16)
+    detector = create(threshold, suppression, AGAST_OAST_9_16)
     return keypoints_mask(gray, detector.detect(gray, None))
 
 
-@dataclass(frozen=True)
-class HarrisSettings:
-    """Settings of `cv2.cornerHarris`; the threshold is relative to the largest response."""
-
-    block_size: int = 3
-    aperture: int = 5
-    k: float = 0.001
-    relative_threshold: float = 0.001
-    dilate: bool = True
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            fractions=("k", "relative_threshold"),
-            odd=("aperture",),
-            between={"block_size": BLOCK_SIZES, "aperture": KERNEL_SIZES},
-        )
-
-
-def harris_mask(gray: np.ndarray, settings: HarrisSettings) -> np.ndarray:
+def harris_mask(
+    gray: np.ndarray,
+    block_size: int = 3,
+    aperture: int = 5,
+    k: float = 0.001,
+    relative_threshold: float = 0.001,
+    dilate: bool = True,
+) -> np.ndarray:
     """Mark corners of the gradient covariance (Harris and Stephens, 1988).
 
-    The response is dilated by 3x3 before it is thresholded, which makes blobs.
+    The response is dilated by 3x3, which makes blobs, before it is compared with a threshold
+    relative to the largest response.
     """
-    response = cv2.cornerHarris(gray, settings.block_size, settings.aperture, settings.k)
-    if settings.dilate:
+    response = cv2.cornerHarris(gray, block_size, aperture, k)
+    if dilate:
         response = cv2.dilate(response, None)
-    return response > settings.relative_threshold * max(float(response.max()), 0.0)
+    return response > relative_threshold * max(float(response.max()), 0.0)
 
 
-@dataclass(frozen=True)
-class ShiTomasiSettings:
-    """Settings of `cv2.goodFeaturesToTrack`; `corners` 0 means all of them."""
+def shi_tomasi_mask(
+    gray: np.ndarray,
+    corners: int = 0,
+    quality_level: float = 0.01,
+    minimum_distance: float = 1.0,
+    block_size: int = 2,
+) -> np.ndarray:
+    """Mark corners by the smaller eigenvalue of the gradient covariance (Shi and Tomasi, 1994).
 
-    corners: int = 0
-    quality_level: float = 0.01
-    minimum_distance: float = 1.0
-    block_size: int = 2
-
-    def __post_init__(self) -> None:
-        limits: Limits = {"corners": (0, 1e7), "quality_level": (1e-6, 1)}
-        limits |= {"minimum_distance": (0, 1000), "block_size": BLOCK_SIZES}
-        check_ranges(self, between=limits)
-
-
-def shi_tomasi_mask(gray: np.ndarray, settings: ShiTomasiSettings) -> np.ndarray:
-    """Mark corners by the smaller eigenvalue of the gradient covariance (Shi and Tomasi, 1994)."""
-    corners = cv2.goodFeaturesToTrack(
+    0 `corners` are all of them.
+    """
+    found = cv2.goodFeaturesToTrack(
         gray,
-        maxCorners=settings.corners,
-        qualityLevel=settings.quality_level,
-        minDistance=settings.minimum_distance,
-        blockSize=settings.block_size,
+        maxCorners=corners,
+        qualityLevel=quality_level,
+        minDistance=minimum_distance,
+        blockSize=block_size,
     )
-    return pixels_mask(gray.shape, np.empty((0, 2)) if corners is None else corners)
+    return pixels_mask(gray.shape, np.empty((0, 2)) if found is None else found)
 
 
-@dataclass(frozen=True)
-class CannySettings:
-    """The two thresholds of `cv2.Canny`; the image is not blurred first."""
-
-    low_threshold: float = 150.0
-    high_threshold: float = 250.0
-
-    def __post_init__(self) -> None:
-        limits = dict.fromkeys(("low_threshold", "high_threshold"), (0, MAX_CANNY_THRESHOLD))
-        check_ranges(self, between=limits)
+def canny_mask(
+    gray: np.ndarray, low_threshold: float = 150.0, high_threshold: float = 250.0
+) -> np.ndarray:
+    """Mark thin edges: gradient maxima with hysteresis (Canny, 1986), without a blur before."""
+    return cv2.Canny(gray, low_threshold, high_threshold) > 0
 
 
-def canny_mask(gray: np.ndarray, settings: CannySettings) -> np.ndarray:
-    """Mark thin edges: gradient maxima with hysteresis (Canny, 1986)."""
-    return cv2.Canny(gray, settings.low_threshold, settings.high_threshold) > 0
-
-
-@dataclass(frozen=True)
-class SobelSettings:
-    """Width of the derivative filter; the threshold is relative to the largest gradient."""
-
-    kernel_size: int = 11
-    relative_threshold: float = 0.1
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            fractions=("relative_threshold",),
-            odd=("kernel_size",),
-            between={"kernel_size": KERNEL_SIZES},
-        )
-
-
-def sobel_mask(gray: np.ndarray, settings: SobelSettings) -> np.ndarray:
-    """Mark thick edges: a large gradient by a wide derivative filter."""
-    dx = cv2.Sobel(gray, cv2.CV_64F, 1, 0, ksize=settings.kernel_size)
-    dy = cv2.Sobel(gray, cv2.CV_64F, 0, 1, ksize=settings.kernel_size)
+def sobel_mask(
+    gray: np.ndarray, kernel_size: int = 11, relative_threshold: float = 0.1
+) -> np.ndarray:
+    """Mark thick edges: a gradient by a wide filter, large relative to the largest one."""
+    dx = cv2.Sobel(gray, cv2.CV_64F, 1, 0, ksize=kernel_size)
+    dy = cv2.Sobel(gray, cv2.CV_64F, 0, 1, ksize=kernel_size)
     magnitude = cv2.magnitude(dx, dy)
-    return magnitude > settings.relative_threshold * float(magnitude.max())
+    return magnitude > relative_threshold * float(magnitude.max())
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LabelDetector:
-    """A classical detector, with its settings for normal and for low-visibility images.
+    """A classical detector.
 
     Attributes:
-        name: the name users choose it by.
         kind: whether it marks keypoints or edges (the two halves of the paper's Figure 4).
-        mask: function from a (H, W) uint8 grey image and settings to a (H, W) bool mask.
-        normal: settings for a normal image.
-        low_visibility: settings for an image with few grey levels.
+        mask: function from a (H, W) uint8 grey image and keyword parameters to a (H, W) bool mask.
+        limits: ranges of the parameters that are numbers.
+        low_visibility: parameters of an image with few grey levels that differ from the defaults.
     """
 
-    name: str
     kind: Literal["keypoint", "edge"]
-    mask: Callable[[np.ndarray, Any], np.ndarray]
-    normal: Any
-    low_visibility: Any
+    mask: Callable[..., np.ndarray]
+    limits: Mapping[str, Range]
+    low_visibility: Mapping[str, Value] = field(default_factory=dict)
+
+    @property
+    def defaults(self) -> dict[str, Value]:
+        """The parameters of a normal image."""
+        parameters = list(inspect.signature(self.mask).parameters.values())[1:]
+        return {parameter.name: parameter.default for parameter in parameters}
 
 
-DETECTORS: tuple[LabelDetector, ...] = (
-    LabelDetector("sift", "keypoint", sift_mask, SiftSettings(), SiftSettings()),
-    LabelDetector("orb", "keypoint", orb_mask, OrbSettings(), OrbSettings()),
-    LabelDetector("brisk", "keypoint", brisk_mask, BriskSettings(), BriskSettings()),
-    LabelDetector("fast", "keypoint", fast_mask, FastSettings(), FastSettings(threshold=1)),
-    LabelDetector("agast", "keypoint", agast_mask, AgastSettings(), AgastSettings(threshold=1)),
-    LabelDetector("harris", "keypoint", harris_mask, HarrisSettings(), HarrisSettings()),
-    LabelDetector(
-        "shi-tomasi", "keypoint", shi_tomasi_mask, ShiTomasiSettings(), ShiTomasiSettings()
+DETECTORS: dict[str, LabelDetector] = {
+    "sift": LabelDetector(
+        "keypoint",
+        sift_mask,
+        {
+            "contrast_threshold": (0, 1),
+            "edge_threshold": (1, 1e6),
+            "sigma": (0.1, 20),
+            "octave_layers": (1, 20),
+        },
     ),
-    LabelDetector("canny", "edge", canny_mask, CannySettings(), CannySettings()),
-    LabelDetector(
-        "sobel", "edge", sobel_mask, SobelSettings(), SobelSettings(relative_threshold=0.5)
+    "orb": LabelDetector(
+        "keypoint",
+        orb_mask,
+        {
+            "features": (1, 1e7),
+            "scale_factor": (1.01, 10),
+            "levels": (1, 32),
+            "edge_threshold": (0, 1000),
+            "fast_threshold": GRAY_LEVELS,
+        },
     ),
-)
+    "brisk": LabelDetector("keypoint", brisk_mask, {"threshold": GRAY_LEVELS, "octaves": (0, 16)}),
+    "fast": LabelDetector("keypoint", fast_mask, {"threshold": GRAY_LEVELS}, {"threshold": 1}),
+    "agast": LabelDetector("keypoint", agast_mask, {"threshold": GRAY_LEVELS}, {"threshold": 1}),
+    "harris": LabelDetector(
+        "keypoint",
+        harris_mask,
+        {
+            "block_size": BLOCK_SIZES,
+            "aperture": KERNEL_SIZES,
+            "k": (0, 1),
+            "relative_threshold": (0, 1),
+        },
+    ),
+    "shi-tomasi": LabelDetector(
+        "keypoint",
+        shi_tomasi_mask,
+        {
+            "corners": (0, 1e7),
+            "quality_level": (1e-6, 1),
+            "minimum_distance": (0, 1000),
+            "block_size": BLOCK_SIZES,
+        },
+    ),
+    "canny": LabelDetector(
+        "edge",
+        canny_mask,
+        dict.fromkeys(("low_threshold", "high_threshold"), (0, MAX_CANNY_THRESHOLD)),
+    ),
+    "sobel": LabelDetector(
+        "edge",
+        sobel_mask,
+        {"kernel_size": KERNEL_SIZES, "relative_threshold": (0, 1)},
+        {"relative_threshold": 0.5},
+    ),
+}
+
+DETECTOR_NAMES: tuple[str, ...] = tuple(DETECTORS)
 
 
-def run_detector(detector: LabelDetector, gray: np.ndarray, settings: Any) -> np.ndarray:
+def run_detector(name: str, gray: np.ndarray, settings: Mapping[str, Value]) -> np.ndarray:
     """Return what a detector marks in a (H, W) uint8 grey image, (H, W) bool.
 
     Raises:
         OptionError: OpenCV refuses the settings for this image.
     """
     try:
-        return detector.mask(gray, settings)
+        return DETECTORS[name].mask(gray, **settings)
     except (cv2.error, ValueError, OverflowError) as error:
         reason = (str(error).strip().splitlines() or ["no reason given"])[-1]
         size = f"{gray.shape[1]}x{gray.shape[0]}"
+        values = ", ".join(f"{key}={value}" for key, value in settings.items())
         raise OptionError(
-            f"OpenCV refuses {settings} for an image of {size} pixels ({reason}): change them"
+            f"OpenCV refuses {name}({values}) for an image of {size} pixels ({reason}): change them"
         ) from None
 
 
-DETECTOR_NAMES: tuple[str, ...] = tuple(detector.name for detector in DETECTORS)
-
-
-def select_detectors(names: Iterable[str]) -> tuple[LabelDetector, ...]:
-    """Look up detectors by name, in the order of `DETECTORS`, each once.
+def select_detectors(names: Iterable[str]) -> tuple[str, ...]:
+    """Check names of detectors; return them in the order of `DETECTORS`, each once.
 
     Raises:
         OptionError: a name is unknown (the nearest right one is named), or there is none.
 
     Example:
-        >>> [d.name for d in select_detectors(["sobel", "fast"])]
-        ['fast', 'sobel']
+        >>> select_detectors(["sobel", "fast"])
+        ('fast', 'sobel')
     """
-    wanted = set()
-    for name in names:
-        if name not in DETECTOR_NAMES:
-            raise unknown_name("label detector", name, DETECTOR_NAMES)
-        wanted.add(name)
+    wanted = set(names)
+    for name in sorted(wanted - DETECTORS.keys()):
+        raise unknown_name("label detector", name, DETECTOR_NAMES)
     if not wanted:
         raise OptionError(
             f"no label detector was chosen: name at least one of {', '.join(DETECTOR_NAMES)}"
         )
-    return tuple(detector for detector in DETECTORS if detector.name in wanted)
+    return tuple(name for name in DETECTOR_NAMES if name in wanted)

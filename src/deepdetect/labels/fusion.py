@@ -11,34 +11,9 @@ from .._shared.image_array import Channels, check_channels
 from .._shared.options import suggest_keywords
 from ..io.image import load_image, luma
 from ..viz.draw import draw_masks
-from .detectors import DETECTOR_NAMES, run_detector, select_detectors
-from .settings import SettingChange, settings_for
-from .visibility import Visibility, VisibilityChoice, check_visibility, visibility_of
-
-
-@suggest_keywords
-@dataclass(frozen=True)
-class LabelOptions:
-    """How a label is made.
-
-    Attributes:
-        detectors: names of the detectors to fuse (default: all nine).
-        visibility: "auto" decides by `visibility_of`; "normal" and "low" override it.
-        changes: settings of detectors that differ from the paper's.
-
-    Raises:
-        OptionError: a name is unknown.
-    """
-
-    detectors: tuple[str, ...] = DETECTOR_NAMES
-    visibility: VisibilityChoice = "auto"
-    changes: tuple[SettingChange, ...] = ()
-
-    def __post_init__(self) -> None:
-        names = (self.detectors,) if isinstance(self.detectors, str) else self.detectors
-        chosen = select_detectors(names)
-        object.__setattr__(self, "detectors", tuple(detector.name for detector in chosen))
-        check_visibility(self.visibility)
+from .detectors import DETECTORS, run_detector
+from .settings import LabelOptions
+from .visibility import Visibility, visibility_of
 
 
 @suggest_keywords
@@ -99,9 +74,9 @@ def fuse(
     gray = _luma(image, channels)
     visibility = visibility_of(gray, options.visibility)
     marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
-    for detector in select_detectors(options.detectors):
-        settings = settings_for(detector, visibility, options.changes)
-        marked[detector.kind] |= run_detector(detector, gray, settings)
+    for name in options.detectors:
+        settings = options.parameters(name, visibility)
+        marked[DETECTORS[name].kind] |= run_detector(name, gray, settings)
     return Label(marked["keypoint"], marked["edge"], visibility)
 
 

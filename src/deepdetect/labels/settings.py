@@ -1,142 +1,128 @@
-"""Settings of the label detectors: by name, from a TOML file, or changed one by one."""
+"""Which detectors make a label, with which settings: by name, from a TOML file, or one by one."""
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.options import suggest_keywords
 from .._shared.registry import resolve_name_or_path
 from .._shared.text_files import read_toml
-from .detectors import (
-    DETECTOR_NAMES,
-    DETECTORS,
-    LabelDetector,
-    run_detector,
-    select_detectors,
-)
-from .visibility import Visibility
+from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
+from .visibility import Visibility, VisibilityChoice, check_visibility
 
-SECTIONS: dict[str, Visibility] = {"normal": "normal", "low_visibility": "low"}
+Settings = Mapping[str, Mapping[str, Mapping[str, Value]]]
+"""Changed settings by detector, section and parameter, as a settings file holds them."""
+
+SECTIONS: dict[Visibility, str] = {"normal": "normal", "low": "low_visibility"}
 
 MAX_FILE_BYTES = 16_000
 """Longer settings files are refused: all settings of all detectors take 2,000 bytes, and the time
 to read some files of TOML grows with the square of their length."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
-class SettingChange:
-    """A changed setting of a label detector.
+class LabelOptions:
+    """How a label is made.
 
     Attributes:
-        detector: the detector's name, such as "fast".
-        visibility: which of its two sets of settings is changed, "normal" or "low".
-        name: the setting's name, such as "threshold".
-        value: its new value.
+        detectors: names of the detectors to fuse (default: all nine).
+        visibility: "auto" decides by `visibility_of`; "normal" and "low" override it.
+        settings: settings of detectors that differ from the paper's, for normal images and for
+            those of low visibility.
 
     Raises:
-        OptionError: a name is unknown, or the value has another type than the default or is out
-            of its range.
+        OptionError: a name is unknown (the nearest right one is named), or a value has another
+            type than the default or is out of its range.
 
     Example:
-        >>> SettingChange("fast", "normal", "threshold", 20).value
-        20
-        >>> SettingChange("fast", "normal", "treshold", 20)
+        >>> LabelOptions(settings={"fast": {"normal": {"threshold": 20}}}).visibility
+        'auto'
+        >>> LabelOptions(settings={"fast": {"normal": {"treshold": 20}}})
         Traceback (most recent call last):
         ...
         deepdetect.OptionError: unknown setting of fast 'treshold': did you mean \
 'threshold'? (known: threshold, suppression)
     """
 
-    detector: str
-    visibility: Visibility
-    name: str
-    value: bool | int | float
-
-    def __post_init__(self) -> None:
-        if self.detector not in DETECTOR_NAMES:
-            raise unknown_name("label detector", self.detector, DETECTOR_NAMES)
-        if self.visibility not in SECTIONS.values():
-            raise unknown_name("visibility", self.visibility, SECTIONS.values())
-        default = next(entry for entry in DETECTORS if entry.name == self.detector).normal
-        known = [field.name for field in dataclasses.fields(default)]
-        if self.name not in known:
-            raise unknown_name(f"setting of {self.detector}", self.name, known)
-        if not _is_finite(self.value):
-            raise OptionError(f"the setting {self.name} of {self.detector} must be finite")
-        kind = type(getattr(default, self.name))
-        fits = type(self.value) is kind or (kind is float and type(self.value) is int)
-        if not fits:
-            raise OptionError(
-                f"the setting {self.name} of {self.detector} must be of type {kind.__name__}, "
-                f"not {self.value!r}"
-            )
-        object.__setattr__(self, "value", kind(self.value))
-        try:
-            dataclasses.replace(default, **{self.name: self.value})
-        except OptionError as error:
-            raise OptionError(f"settings of {self.detector}: {error}") from None
-
-
-def _is_finite(value: object) -> bool:
-    """Whether a value is no number, or one that a float can hold."""
-    try:
-        return not isinstance(value, (int, float)) or math.isfinite(value)
-    except OverflowError:
-        return False
-
-
-def settings_for(
-    detector: LabelDetector, visibility: Visibility, changes: Iterable[SettingChange]
-) -> Any:
-    """Return a detector's settings for a visibility, with the changes that apply."""
-    settings = detector.normal if visibility == "normal" else detector.low_visibility
-    values = {
-        change.name: change.value
-        for change in changes
-        if (change.detector, change.visibility) == (detector.name, visibility)
-    }
-    return dataclasses.replace(settings, **values)
-
-
-@dataclass(frozen=True)
-class LabelSettings:
-    """The label detectors and their settings, as a settings file holds them.
-
-    Attributes:
-        detectors: names of the detectors to fuse.
-        changes: changed settings.
-    """
-
     detectors: tuple[str, ...] = DETECTOR_NAMES
-    changes: tuple[SettingChange, ...] = ()
+    visibility: VisibilityChoice = "auto"
+    settings: Settings = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        chosen = {detector.name for detector in select_detectors(self.detectors)}
-        idle = sorted({change.detector for change in self.changes} - chosen)
-        if idle:
+        names = (self.detectors,) if isinstance(self.detectors, str) else self.detectors
+        object.__setattr__(self, "detectors", select_detectors(names))
+        check_visibility(self.visibility)
+        checked = {name: _checked(name, self.settings[name]) for name in self.settings}
+        object.__setattr__(self, "settings", checked)
+        if idle := sorted(checked.keys() - set(self.detectors)):
             raise OptionError(
                 f"settings of {idle[0]} are given, but it is not among the detectors: "
                 "add it to them, or remove its settings"
             )
 
+    def with_detectors(self, names: tuple[str, ...]) -> LabelOptions:
+        """Return the options with other detectors, without the settings of those left out."""
+        kept = {name: self.settings[name] for name in self.settings if name in names}
+        return replace(self, detectors=names, settings=kept)
 
-LABEL_SETTINGS: dict[str, LabelSettings] = {
-    "paper": LabelSettings(),
+    def parameters(self, detector: str, visibility: Visibility) -> dict[str, Value]:
+        """Return all parameters of a detector for images of a visibility."""
+        entry = DETECTORS[detector]
+        low = entry.low_visibility if visibility == "low" else {}
+        changed = self.settings.get(detector, {}).get(SECTIONS[visibility], {})
+        return {**entry.defaults, **low, **changed}
+
+
+def _checked(detector: str, sections: Any) -> dict[str, dict[str, Value]]:
+    if detector not in DETECTORS:
+        raise unknown_name("label detector", detector, ("detectors", *DETECTOR_NAMES))
+    if not isinstance(sections, Mapping):
+        raise OptionError(f"{detector} must be a table, as [{detector}]")
+    for section, values in sections.items():
+        if section not in SECTIONS.values():
+            raise unknown_name(f"part of {detector}", section, SECTIONS.values())
+        if not isinstance(values, Mapping):
+            raise OptionError(f"{section} of {detector} must be a table, as {{ threshold = 20 }}")
+    return {
+        section: {name: _checked_value(detector, name, value) for name, value in values.items()}
+        for section, values in sections.items()
+    }
+
+
+def _checked_value(detector: str, name: str, value: Any) -> Value:
+    defaults = DETECTORS[detector].defaults
+    if name not in defaults:
+        raise unknown_name(f"setting of {detector}", name, defaults)
+    kind = type(defaults[name])
+    if type(value) is not kind and not (kind is float and type(value) is int):
+        raise OptionError(
+            f"the setting {name} of {detector} must be of type {kind.__name__}, not {value!r}"
+        )
+    if kind is bool:
+        return bool(value)
+    limits = DETECTORS[detector].limits[name]
+    low, high = limits[0], limits[-1]
+    if not low <= value <= high:  # nor NaN
+        raise OptionError(f"the setting {name} of {detector} must lie in [{low:.12g}, {high:.12g}]")
+    if isinstance(limits, range) and value not in limits:
+        raise OptionError(f"the setting {name} of {detector} must be odd, not {value}")
+    return kind(value)
+
+
+LABEL_SETTINGS: dict[str, LabelOptions] = {
+    "paper": LabelOptions(),
     # Denser, for geometry: chosen by true stereo matches (docs/labels.md).
-    "dense": LabelSettings(changes=(SettingChange("sobel", "normal", "relative_threshold", 0.02),)),
+    "dense": LabelOptions(settings={"sobel": {"normal": {"relative_threshold": 0.02}}}),
 }
 
 
 @suggest_keywords
-def find_label_settings(settings: str | Path) -> LabelSettings:
+def find_label_settings(settings: str | Path) -> LabelOptions:
     """Look settings up by name, or read them from a file.
 
     Args:
@@ -146,15 +132,15 @@ def find_label_settings(settings: str | Path) -> LabelSettings:
         OptionError: the name is unknown, or the file cannot be read or is wrong.
 
     Example:
-        >>> find_label_settings("paper").changes
-        ()
+        >>> find_label_settings("dense").settings
+        {'sobel': {'normal': {'relative_threshold': 0.02}}}
     """
     found = resolve_name_or_path("label settings", settings, LABEL_SETTINGS)
     return read_label_settings(found) if isinstance(found, Path) else found
 
 
 @suggest_keywords
-def read_label_settings(path: str | Path) -> LabelSettings:
+def read_label_settings(path: str | Path) -> LabelOptions:
     """Read detectors and their settings from a TOML file.
 
     The file may name the detectors, and change some of their settings::
@@ -174,47 +160,10 @@ def read_label_settings(path: str | Path) -> LabelSettings:
         raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
     except ValueError as error:
         raise OptionError(f"{path} is no valid TOML file ({error})") from None
+    detectors = content.pop("detectors", list(DETECTOR_NAMES))
     try:
-        return _parsed(content)
+        if not isinstance(detectors, list) or not all(isinstance(name, str) for name in detectors):
+            raise OptionError('detectors must be a list of names, as ["fast", "sobel"]')
+        return LabelOptions(tuple(detectors), settings=content)
     except OptionError as error:
         raise OptionError(f"{path}: {error}") from None
-
-
-def _parsed(content: dict[str, Any]) -> LabelSettings:
-    detectors = content.pop("detectors", list(DETECTOR_NAMES))
-    if not isinstance(detectors, list) or not all(isinstance(name, str) for name in detectors):
-        raise OptionError('detectors must be a list of names, as ["fast", "sobel"]')
-    changes = []
-    for detector, sections in content.items():
-        changes += _changes(detector, sections)
-    # The order in the file has no meaning: the same settings must give equal options.
-    changes.sort(key=lambda change: (change.detector, change.visibility, change.name))
-    for entry in DETECTORS:
-        if any(change.detector == entry.name for change in changes):
-            for visibility in SECTIONS.values():
-                _try(entry, visibility, changes)
-    return LabelSettings(tuple(detectors), tuple(changes))
-
-
-def _try(detector: LabelDetector, visibility: Visibility, changes: list[SettingChange]) -> None:
-    """Run a detector once, so that values which OpenCV refuses are reported at once."""
-    pattern = (np.indices((64, 64)).sum(0) // 8 % 2 * 200).astype(np.uint8)
-    run_detector(detector, pattern, settings_for(detector, visibility, changes))
-
-
-def _changes(detector: str, sections: Any) -> list[SettingChange]:
-    if detector not in DETECTOR_NAMES:
-        raise unknown_name("label detector", detector, ("detectors", *DETECTOR_NAMES))
-    if not isinstance(sections, dict):
-        raise OptionError(f"{detector} must be a table, as [{detector}]")
-    found = []
-    for section, values in sections.items():
-        if section not in SECTIONS:
-            raise unknown_name(f"part of {detector}", section, SECTIONS)
-        if not isinstance(values, dict):
-            raise OptionError(f"{section} of {detector} must be a table, as {{ threshold = 20 }}")
-        found += [
-            SettingChange(detector, SECTIONS[section], name, value)
-            for name, value in values.items()
-        ]
-    return found

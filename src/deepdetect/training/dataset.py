@@ -185,7 +185,7 @@ def prepare_data(
         context.local_slice(stage.batch)  # an uneven one is reported before the labels are made
     images, output = Path(images), Path(output)
     label_folder = output / "labels" if labels is None else Path(labels)
-    cache = LabelCache(label_folder, options.label_options)
+    cache = LabelCache(label_folder, options.labels)
     exclude = (output, label_folder)
     shards = Shards.open(images, options) if has_shards(images) else None
     listed = [] if shards else list_images(images, options, exclude, options.max_images)

@@ -16,8 +16,6 @@ from ..io.image import luma
 from ..io.masks import load_mask
 from ..labels import LabelOptions, fuse
 from ..labels.batch import LabelTarget, LabelTask, label_files
-from ..labels.detectors import select_detectors
-from ..labels.settings import settings_for
 from ..labels.visibility import Visibility
 from .views import SourceImage, View, render
 
@@ -96,7 +94,7 @@ def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray
 def settings_digest(options: LabelOptions) -> str:
     """Return a digest of everything a label depends on besides the image and the view."""
     used = [
-        (detector.name, *(repr(settings_for(detector, v, options.changes)) for v in VISIBILITIES))
-        for detector in select_detectors(options.detectors)
+        (name, *(options.parameters(name, visibility) for visibility in VISIBILITIES))
+        for name in options.detectors
     ]
     return hashlib.sha256(repr(used).encode()).hexdigest()[:12]

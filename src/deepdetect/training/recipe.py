@@ -14,7 +14,7 @@ from .._shared.errors import OptionError, unknown_name
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import processor_count
 from .._shared.registry import look_up
-from ..labels import DETECTOR_NAMES, LABEL_SETTINGS, LabelOptions, SettingChange
+from ..labels import LABEL_SETTINGS, LabelOptions
 from .augmentation import AugmentationRanges, DarkeningRange
 
 OPTIMIZERS = ("adam", "soap")
@@ -120,8 +120,7 @@ class TrainingOptions:
         freeze_encoder: train the decoder only. The encoder has nearly all of the weights: a
             step takes about half of the time, and what the initial weights know is kept. For few
             images, or to change only how many pixels are marked.
-        detectors: label detectors to fuse.
-        label_changes: settings of label detectors that differ from the paper's.
+        labels: the label detectors and their settings.
         val_count: how many times the validation loss is computed.
         seed: of the initial weights, the order of the images, the crops and their augmentation.
 
@@ -154,13 +153,11 @@ class TrainingOptions:
     low_light_pos_weight: float | None = None
     pos_weight_uncertain: bool = False
     freeze_encoder: bool = False
-    detectors: tuple[str, ...] = DETECTOR_NAMES
-    label_changes: tuple[SettingChange, ...] = ()
+    labels: LabelOptions = field(default_factory=LabelOptions)
     val_count: int = 12
     seed: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "detectors", LabelOptions(self.detectors).detectors)
         if self.optimizer not in OPTIMIZERS:
             raise unknown_name("optimizer", self.optimizer, OPTIMIZERS)
         self._check_sizes()
@@ -202,11 +199,6 @@ class TrainingOptions:
                 f"a crop of {largest} pixels does not fit into images of "
                 f"{max(self.short_sides)}: make `short_sides` larger or the crops smaller"
             )
-
-    @property
-    def label_options(self) -> LabelOptions:
-        """How labels are made."""
-        return LabelOptions(self.detectors, changes=self.label_changes)
 
     def to_json(self) -> str:
         """Return the options as JSON text, which is stored with the weights."""
@@ -296,7 +288,7 @@ PRESETS: dict[str, TrainingOptions] = {
         interleave=True,
         short_sides=(480, 240, 720),
         dark_fraction=0.0,
-        label_changes=LABEL_SETTINGS["dense"].changes,
+        labels=LABEL_SETTINGS["dense"],
         optimizer="soap",
         learning_rate=1.5e-3,
         warm_up=100,

@@ -180,9 +180,7 @@ def write_shards(
     for kind, part in zip(files, train_val_split(listed, options.val_fraction), strict=True):
         for number, chosen in enumerate(_deal(part, images, shard_size)):
             if chosen:
-                task = _ShardTask(
-                    images, tuple(chosen), kind == "validation", options.label_options
-                )
+                task = _ShardTask(images, tuple(chosen), kind == "validation", options.labels)
                 path = output / f"{kind}-{number:06d}-{task.digest}.tar"
                 files[kind].append((path, len(chosen)))
                 if not path.exists():
@@ -329,7 +327,7 @@ def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
     fixed = {name: getattr(options, name) for name in (*names, "augmentations")}
     for name in ("darkening", "augmentation_ranges"):
         fixed[name] = dataclasses.asdict(getattr(options, name))
-    fixed["labels"] = settings_digest(options.label_options)
+    fixed["labels"] = settings_digest(options.labels)
     return dict(json.loads(json.dumps(fixed)))
 
 
