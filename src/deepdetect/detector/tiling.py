@@ -29,7 +29,7 @@ STRIDE = 8
 REACH_PX = 1744
 """How far the whole network sees, rounded up: seven pyramids of 64 pixels, ten of 128, and kernels.
 
-`benchmarks/receptive_field.py` measures it.
+`4679d01:benchmarks/receptive_field.py` measures it.
 """
 
 BLOCKS = 9
