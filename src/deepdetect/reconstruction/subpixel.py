@@ -4,8 +4,8 @@ Inverse compositional alignment (Baker and Matthews, "Lucas-Kanade 20 years on",
 and offset of the light taken out. The patch is rotated and sheared as its surroundings are: first
 as all matches together (a similarity), then as the refined matches around it (an affinity).
 
-Chosen by measurement (4679d01:benchmarks/two_view.py) against a parabola through the correlation of the
-same patches, rotated likewise, at the nearest whole pixels. Fraction of the matches of the
+Chosen by measurement (4679d01:benchmarks/two_view.py) against a parabola through the correlation
+of the same patches, rotated likewise, at the nearest whole pixels. Fraction of the matches of the
 Motorcycle pair within 0.25 / 0.5 px of the truth, of those that converge (88 %): 65 / 83 %
 (parabola 49 / 74 %; before, of all matches, 36 / 63 %); with its views rotated against each other
 by 14 degrees (84 %) 62 / 79 % (parabola 31 / 59 %; before 9 / 29 %).
