@@ -28,8 +28,9 @@ from deepdetect import (
 )
 from deepdetect.datasets import load_stereo_pair
 from deepdetect.datasets.degradation import DEGRADATIONS, degrade
+from deepdetect.features.display import draw_circle
 from deepdetect.geometry import disparity_errors
-from deepdetect.viz.draw import _circle, _dimmed, draw_heatmap
+from deepdetect.viz.draw import _dimmed, draw_heatmap
 from deepdetect.viz.render import orbit_camera, render
 
 OUTPUT = Path(__file__).parents[1] / "images" / "day-dark-blurred.jpg"
@@ -106,8 +107,8 @@ def draw_points(rgb: np.ndarray, points: Keypoints) -> np.ndarray:
     colors = draw_heatmap(1 - 0.75 * rank[None] / len(points))[0].tolist()
     for k in np.argsort(-rank):
         radius = max(points.sizes[k] / 2, 3)
-        _circle(canvas, points.xy[k], radius, (0, 0, 0), 4)
-        _circle(canvas, points.xy[k], radius, colors[k], 2)
+        draw_circle(canvas, points.xy[k], radius, (0, 0, 0), 4)
+        draw_circle(canvas, points.xy[k], radius, colors[k], 2)
     return canvas
 
 

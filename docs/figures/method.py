@@ -16,8 +16,9 @@ from layout import caption, write_jpeg
 
 from deepdetect import DeepDetect, LabelOptions, Matches, fuse, match_images
 from deepdetect.datasets import StereoPair, load_stereo_pair
+from deepdetect.features.display import draw_matches
 from deepdetect.geometry import disparity_errors
-from deepdetect.viz.draw import draw_heatmap, draw_keypoints, draw_matches
+from deepdetect.viz.draw import draw_heatmap
 
 FOLDER = Path(__file__).parents[1] / "images"
 DETECTORS = {"sift": "SIFT", "fast": "FAST", "harris": "Harris", "canny": "Canny", "sobel": "Sobel"}
@@ -60,7 +61,7 @@ def draw_kinds(rgb: np.ndarray) -> np.ndarray:
     dense = detector.detect(rgb)
     points = detector.detect(rgb, max_keypoints=POINTS, spread="grid")
     cells = [
-        caption(draw_keypoints(rgb, dense), f"dense: {len(dense):,} keypoints", KIND_CELL),
+        caption(dense.draw(rgb), f"dense: {len(dense):,} keypoints", KIND_CELL),
         caption(draw_points(rgb, points), f"{len(points)} points, the best in yellow", KIND_CELL),
     ]
     return np.concatenate(cells, axis=1)

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import base64
-import builtins
-import dataclasses
 import re
 from typing import Any
 
@@ -11,107 +9,112 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import ImageError, Keypoints, Matches, MissingExtraError
+from deepdetect import ImageError, Keypoints, Matches
+from deepdetect.features.display import GREEN, PICTURE_SIDE_PX, RED
 
 
 def keypoints(count: int, size: tuple[int, int] = (256, 256), **columns: Any) -> Keypoints:
     rng = np.random.default_rng(0)
-    return Keypoints(rng.uniform(0, 1, (count, 2)) * size - 0.5, np.ones(count), size, **columns)
+    xy = rng.uniform(0, 1, (count, 2)) * np.subtract(size, 1)
+    return Keypoints(xy, np.ones(count), size, **columns)
 
 
-def matches(count: int, size: tuple[int, int] = (256, 256)) -> Matches:
-    points = keypoints(count, size)
-    inliers = np.arange(count) % 4 > 0
-    return Matches(points.xy, points.xy, points.scores, inliers, "none", None, points, points)
+def matches(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    inliers: list[bool],
+    sizes: tuple[tuple[int, int], tuple[int, int]] = ((60, 50), (60, 50)),
+) -> Matches:
+    scores = np.ones(len(points0))
+    ends = [Keypoints(xy, scores, size) for xy, size in zip((points0, points1), sizes, strict=True)]
+    points = ends[0].xy, ends[1].xy
+    return Matches(*points, scores, np.array(inliers, bool), "none", None, *ends)
 
 
-@pytest.fixture
-def axes() -> Any:
-    """Axes that need no display."""
-    figures = pytest.importorskip("matplotlib.figure", reason="needs matplotlib")
-    return figures.Figure().subplots()
+def test_dense_keypoints_colour_their_own_pixels_only() -> None:
+    rgb = np.full((100, 120, 3), 100, np.uint8)
+    row, column = np.divmod(np.arange(6000), 120)
+    picture = Keypoints(np.stack([column, row], 1), np.ones(6000), (120, 100)).draw(rgb)
+    greener = picture[..., 1] > picture[..., 0]
+    assert greener[:50].all()
+    assert not greener[50:].any()
 
 
-@pytest.mark.parametrize("count", [0, 3, 6000])
-@pytest.mark.parametrize("sized", [False, True])
-def test_keypoints_are_plotted_where_they_are(axes: Any, count: int, sized: bool) -> None:
-    points = keypoints(count, sizes=np.arange(count)) if sized else keypoints(count)
-    assert points.plot(axes=axes) is axes
-    if sized and count <= 5000:
-        (drawn,) = axes.collections
-        np.testing.assert_allclose(drawn.get_offsets().reshape(-1, 2), points.xy)
-        np.testing.assert_allclose(drawn._widths * 2, np.arange(count))
-    else:
-        (line,) = axes.lines
-        np.testing.assert_array_equal(line.get_xydata(), points.xy)
-    axes.figure.canvas.draw()
+@pytest.mark.parametrize(("sizes", "diameter"), [(None, 6), ([24], 24), ([1], 4)])
+def test_few_keypoints_are_circles_of_their_size(sizes: Any, diameter: int) -> None:
+    rgb = np.zeros((80, 90, 3), np.uint8)
+    rows, columns = np.nonzero(Keypoints([[40, 30]], [1], (90, 80), sizes=sizes).draw(rgb).any(2))
+    assert abs(columns.mean() - 40) + abs(rows.mean() - 30) < 1
+    assert abs(np.ptp(columns) - diameter) <= 2
+    assert not rgb.any()
 
 
-def test_images_of_any_kind_lie_below(axes: Any, photo: np.ndarray) -> None:
-    points = keypoints(5)
+def test_images_of_any_kind_lie_below(photo: np.ndarray) -> None:
+    points = keypoints(0)
     for image, channels in (
         (photo, "rgb"),
         (photo[..., ::-1], "bgr"),
         (photo.transpose(2, 0, 1), "rgb"),
         (Image.fromarray(photo), "bgr"),
     ):
-        points.plot(image, axes=axes, channels=channels)
-        np.testing.assert_array_equal(axes.images[-1].get_array(), photo)
+        np.testing.assert_array_equal(points.draw(image, channels=channels), photo // 2)
     with pytest.raises(ImageError, match="100x256 pixels, the keypoints are of one of 256x256"):
-        points.plot(photo[:, :100], axes=axes)
+        points.draw(photo[:, :100])
     with pytest.raises(ImageError, match=r"give load_image\(path\)"):
-        points.plot("photo.png", axes=axes)
+        points.draw("photo.png")
 
 
-def test_matches_are_lines_between_the_images(axes: Any, photo: np.ndarray) -> None:
-    found = matches(200)
-    assert found.plot(photo, photo, axes=axes, lines=40) is axes
-    (shown,) = axes.images
-    assert shown.get_array().shape == (256, 512, 3)
-    lines = axes.collections[0]
-    segments = np.array(lines.get_segments())
-    assert segments.shape == (40, 2, 2)
-    np.testing.assert_allclose(segments[:, 0] + (256, 0), segments[:, 1], rtol=1e-6)
-    ends = {tuple(xy) for xy in found.points0.tolist()}
-    assert all(tuple(np.float32(xy).tolist()) in ends for xy in segments[:, 0])
-    green = (lines.get_colors()[:, 1] == 1).sum()
-    assert green == sum(
-        bool(found.inliers[(found.points0 == np.float32(xy)).all(axis=1)][0])
-        for xy in segments[:, 0]
+def test_match_lines_join_the_right_pixels() -> None:
+    black = np.zeros((50, 60, 3), np.uint8)
+    ends = np.array([[10, 5], [10, 40]]), np.array([[20, 5], [50, 40]])
+    picture = matches(*ends, [True, False]).draw(black, black)
+    assert picture.shape == (50, 120, 3)
+    assert tuple(picture[5, 10]) == tuple(picture[5, 60 + 20]) == GREEN
+    assert tuple(picture[40, 10]) == tuple(picture[40, 60 + 50]) == RED
+    assert not picture[20:30].any()
+
+
+def test_the_lower_image_is_enlarged_with_its_matches() -> None:
+    """A white pixel of either image lies under its end of the line, and nothing is left black."""
+    first, second = np.full((60, 40, 3), 90, np.uint8), np.full((30, 50, 3), 90, np.uint8)
+    ends = np.array([[10, 20]]), np.array([[30, 10]])
+    picture = matches(*ends, [True], ((40, 60), (50, 30))).draw(first, second)
+    assert picture.shape == (60, 40 + 100, 3)
+    assert tuple(picture[20, 10]) == GREEN
+    assert tuple(picture[20, 40 + 60]) == GREEN  # (30, 10) is at (60.5, 20.5) in twice the size
+    assert picture.any(axis=2).all()
+
+
+def test_large_images_are_reduced() -> None:
+    rgb = np.zeros((1500, 2000, 3), np.uint8)
+    none = np.empty((0, 2))
+    picture = matches(none, none, [], ((2000, 1500),) * 2).draw(rgb, rgb)
+    assert picture.shape == (750, PICTURE_SIDE_PX, 3)
+
+
+def test_matches_have_the_colour_of_their_position() -> None:
+    black = np.zeros((60, 80, 3), np.uint8)
+    points0, points1 = (
+        np.array([[10, 10], [70, 50], [40, 30]]),
+        np.array([[12, 20], [60, 5], [1, 55]]),
     )
-    axes.figure.canvas.draw()
-
-
-def test_a_figure_is_made_where_there_are_no_axes() -> None:
-    matplotlib = pytest.importorskip("matplotlib", reason="needs matplotlib")
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    axes = matches(3).plot()
-    assert axes.figure in map(pyplot.figure, pyplot.get_fignums())
-    pyplot.close(axes.figure)
-
-
-def test_without_matplotlib_it_is_one_sentence(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
-    real = builtins.__import__
-
-    def missing(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("matplotlib"):
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
-    for thing in (keypoints(3), matches(3)):
-        with pytest.raises(MissingExtraError, match="pip install matplotlib") as caught:
-            thing.plot()
-        one_line(caught.value)
+    found = matches(points0, points1, [True, True, False], ((80, 60), (80, 60)))
+    picture = found.draw(black, black, by_position=True)
+    colors = [picture[y, x] for x, y in points0]
+    np.testing.assert_array_equal(colors, [picture[y, x + 80] for x, y in points1])
+    assert np.abs(colors[0].astype(int) - colors[1]).max() > 100
+    assert tuple(colors[2]) == RED
 
 
 @pytest.mark.parametrize("size", [(640, 480), (6000, 4000), (20, 3000)])
 @pytest.mark.parametrize("count", [0, 1, 200_000])
 def test_what_a_notebook_shows_is_small(size: tuple[int, int], count: int) -> None:
-    crossed = dataclasses.replace(matches(count, size), points1=matches(count, size).points0[::-1])
-    for thing, pictures in ((keypoints(count, size), 1), (crossed, 2)):
+    points = keypoints(count, size)
+    good = np.arange(count) % 4 > 0
+    crossed = Matches(
+        points.xy, points.xy[::-1], points.scores, good, "none", None, points, points[::-1]
+    )
+    for thing, pictures in ((points, 1), (crossed, 2)):
         text = thing._repr_html_()
         assert len(text) < 20_000
         assert f"{count:,} " in text

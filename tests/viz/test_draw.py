@@ -9,12 +9,10 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError, Keypoints, OptionError
+from deepdetect.features.display import PICTURE_SIDE_PX, draw_matches
 from deepdetect.viz import draw
 from deepdetect.viz.draw import (
     CAPTION_HEIGHT,
-    GREEN,
-    PICTURE_SIDE_PX,
-    RED,
     SHOWN_KEYPOINTS,
     add_caption,
     add_scale,
@@ -22,9 +20,7 @@ from deepdetect.viz.draw import (
     draw_dense_keypoints,
     draw_depth,
     draw_heatmap,
-    draw_keypoints,
     draw_logits,
-    draw_matches,
     fit_picture,
     save_picture,
     vstack,
@@ -37,43 +33,6 @@ def test_heat_map_colours_are_viridis() -> None:
     levels = np.linspace(0, 1, 256, dtype=np.float32)[None].repeat(16, 0)
     expected = colormaps["viridis"](levels)[..., :3] * 255
     assert np.abs(draw_heatmap(levels).astype(float) - expected).max() <= 2
-
-
-def test_dense_keypoints_colour_their_own_pixels_only() -> None:
-    rgb = np.full((100, 120, 3), 100, np.uint8)
-    row, column = np.divmod(np.arange(6000), 120)
-    picture = draw_keypoints(rgb, Keypoints(np.stack([column, row], 1), np.ones(6000), (120, 100)))
-    greener = picture[..., 1] > picture[..., 0]
-    assert greener[:50].all()
-    assert not greener[50:].any()
-
-
-def test_sparse_keypoints_are_circles_around_them() -> None:
-    rgb = np.zeros((40, 60, 3), np.uint8)
-    picture = draw_keypoints(rgb, Keypoints([[30, 20]], [1], (60, 40)))
-    rows, columns = np.nonzero(picture.any(2))
-    assert (columns.mean(), rows.mean()) == (30, 20)
-
-
-def test_match_lines_join_the_right_pixels() -> None:
-    black = np.zeros((50, 60, 3), np.uint8)
-    picture = draw_matches(
-        black, black, np.array([[10, 5], [10, 40]]), np.array([[20, 5], [50, 40]]), [True, False]
-    )
-    assert picture.shape == (50, 120, 3)
-    assert tuple(picture[5, 10]) == tuple(picture[5, 60 + 20]) == GREEN
-    assert tuple(picture[40, 10]) == tuple(picture[40, 60 + 50]) == RED
-    assert not picture[20:30].any()
-
-
-def test_the_lower_image_is_enlarged_with_its_matches() -> None:
-    """A white pixel of either image lies under its end of the line, and nothing is left black."""
-    first, second = np.full((60, 40, 3), 90, np.uint8), np.full((30, 50, 3), 90, np.uint8)
-    picture = draw_matches(first, second, np.array([[10, 20]]), np.array([[30, 10]]), [True])
-    assert picture.shape == (60, 40 + 100, 3)
-    assert tuple(picture[20, 10]) == GREEN
-    assert tuple(picture[20, 40 + 60]) == GREEN  # (30, 10) is at (60.5, 20.5) in twice the size
-    assert picture.any(axis=2).all()
 
 
 def test_pictures_are_saved_as_they_are(tmp_path: Path) -> None:
@@ -124,19 +83,6 @@ def test_a_picture_too_large_for_its_format_is_refused(
     save_picture(wide, tmp_path / "p.png")
     with Image.open(tmp_path / "p.png") as picture:
         assert picture.size == (65_501, 2)
-
-
-def test_a_picture_that_opencv_does_not_encode_leaves_no_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*given: object) -> None:
-        raise cv2.error("no memory")
-
-    for encode in (lambda *given: (False, ()), fail):
-        monkeypatch.setattr(cv2, "imencode", encode)
-        with pytest.raises(DeepDetectError, match="cannot hold a picture of 30x20 pixels: make"):
-            save_picture(np.zeros((20, 30, 3), np.uint8), tmp_path / "p.png")
-    assert not list(tmp_path.iterdir())
 
 
 def large_photo(photo: np.ndarray) -> np.ndarray:
@@ -299,20 +245,6 @@ def test_the_caption_counts_the_keypoints(
     keypoints = Keypoints(xy, np.ones(count), (900, 900), values if logits else None)
     draw_best_keypoints(np.zeros((900, 900, 3), np.uint8), keypoints)
     assert expected in captions
-
-
-def test_matches_have_the_colour_of_their_position() -> None:
-    black = np.zeros((60, 80, 3), np.uint8)
-    points0, points1 = (
-        np.array([[10, 10], [70, 50], [40, 30]]),
-        np.array([[12, 20], [60, 5], [1, 55]]),
-    )
-    good = np.array([True, True, False])
-    picture = draw_matches(black, black, points0, points1, good, by_position=True)
-    colors = [picture[y, x] for x, y in points0]
-    np.testing.assert_array_equal(colors, [picture[y, x + 80] for x, y in points1])
-    assert np.abs(colors[0].astype(int) - colors[1]).max() > 100
-    assert tuple(colors[2]) == RED
 
 
 def test_small_pictures_keep_their_size() -> None:

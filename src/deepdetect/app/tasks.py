@@ -112,7 +112,7 @@ def run_match(
     from ..io.image import load_image
     from ..io.tables import save_matches
     from ..matching.pipeline import match_images
-    from ..viz.draw import add_caption, draw_matches, save_picture
+    from ..viz.draw import add_caption, save_picture
 
     stages = _stages(
         ("initial geometry", "keypoints", "guided matching", "geometry", "files"), report
@@ -125,8 +125,7 @@ def run_match(
         )
     save_matches(matches, folder / "matches.csv")
     save_matches(matches, folder / "matches.npz")
-    points = matches.points0, matches.points1
-    picture = draw_matches(first, second, *points, matches.inliers, by_position=True)
+    picture = matches.draw(first, second, by_position=True)
     inliers = int(matches.inliers.sum())
     caption = f"{len(matches):,} matches, of equal colour where they belong together"
     save_picture(add_caption(picture, caption), folder / "matches.jpg")
@@ -258,7 +257,7 @@ def run_folder_keypoints(
     from ..detector.detector import DeepDetect
     from ..io.image import load_image
     from ..io.tables import save_keypoints
-    from ..viz.draw import draw_keypoints, save_picture
+    from ..viz.draw import save_picture
 
     detector, table, failures = DeepDetect(), folder / "table.csv", []
     count = int(options.get("max_keypoints", FOLDER_KEYPOINTS))
@@ -278,7 +277,7 @@ def run_folder_keypoints(
             total += len(keypoints)
             if not shown:
                 shown = "keypoints.jpg"
-                save_picture(draw_keypoints(rgb, keypoints), folder / shown)
+                save_picture(keypoints.draw(rgb), folder / shown)
         if failures:
             archive.writestr("failures.txt", "\n".join(failures) + "\n")
     table.unlink(missing_ok=True)

@@ -141,17 +141,12 @@ def _draw(
     import numpy as np
 
     from ..evaluation.metrics.stereo import TOLERANCE_PX, score_errors
-    from ..viz.draw import (
-        add_caption,
-        draw_heatmap,
-        draw_keypoints,
-        draw_matches,
-        save_picture,
-    )
+    from ..features.display import draw_matches
+    from ..viz.draw import add_caption, draw_heatmap, save_picture
 
     def keypoint_picture(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
         caption = f"{len(keypoints):,} keypoints, density {keypoints.density:.3f}"
-        return add_caption(draw_keypoints(rgb, keypoints), caption)
+        return add_caption(keypoints.draw(rgb), caption)
 
     known = np.isfinite(errors)
     points = matches.points0[known], matches.points1[known]

@@ -198,10 +198,9 @@ def _guide_numbers(matches: Any) -> dict[str, Any] | None:
 
 
 def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
-    from ..viz.draw import add_caption, draw_matches, save_picture
+    from ..viz.draw import add_caption, save_picture
 
-    points = matches.points0, matches.points1
-    picture = draw_matches(rgb0, rgb1, *points, matches.inliers, by_position=True)
+    picture = matches.draw(rgb0, rgb1, by_position=True)
     others = len(matches) - int(matches.inliers.sum())
     caption = (
         f"{len(matches):,} matches ({matches.model}), of equal colour where they belong together"

@@ -1,4 +1,4 @@
-"""Keypoints and matches in notebooks: plots with matplotlib, and small tables in HTML."""
+"""Keypoints and matches drawn on their images, and small tables in HTML for notebooks."""
 
 from __future__ import annotations
 
@@ -9,12 +9,24 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import ImageError, MissingExtraError
+from .._shared.errors import ImageError
 from .._shared.image_array import Channels, array_to_rgb
 from .._shared.opencv import cv2
 
 MAX_CIRCLES = 5000
-"""More keypoints than this are plotted as single pixels."""
+"""More keypoints than this are drawn as single pixels."""
+
+LEAST_RADIUS_PX = 2.0
+"""Of the circle of a keypoint that has a size; without one it is a pixel more."""
+
+PICTURE_SIDE_PX = 2000
+"""Longer side of a picture of matches: as JPEG it takes less than two megabytes."""
+
+READABLE_WIDTH_PX = 800
+"""Captions, lines and points grow with pictures that are wider than this."""
+
+LINES, DOTS = 60, 1500
+"""Of matches that have the colour of their position."""
 
 MAX_SIDE_PX = 240
 """Of the picture of one image in a table."""
@@ -22,64 +34,132 @@ MAX_SIDE_PX = 240
 MAX_LINES = 60
 """Of matches in that picture."""
 
+GREEN, RED = (60, 255, 60), (255, 60, 60)
+
 Points = tuple[np.ndarray, tuple[int, int]]
 
 
-def plot_keypoints(
-    xy: np.ndarray,
-    size: tuple[int, int],
-    diameters: np.ndarray | None,
-    image: Any,
-    axes: Any,
-    channels: Channels,
-    color: str,
-) -> Any:
-    """Plot keypoints over their image; arguments as of `Keypoints.plot`. Return the axes."""
-    axes = _prepared_axes(axes, [(image, size)], channels)
-    if diameters is None or len(xy) > MAX_CIRCLES:
-        # Circles of 3 px when they are few, else pixels.
-        marker = "," if len(xy) > MAX_CIRCLES else "o"
-        style = {"markersize": 4, "markerfacecolor": "none", "markeredgecolor": color}
-        axes.plot(*xy.T, marker, color=color, **(style if marker == "o" else {}))
-        return axes
-    from matplotlib.collections import EllipseCollection
-
-    circles = EllipseCollection(
-        diameters,
-        diameters,
-        np.zeros(len(xy)),
-        units="xy",
-        offsets=xy,
-        offset_transform=axes.transData,
-        facecolors="none",
-        edgecolors=color,
-    )
-    axes.add_collection(circles)
-    return axes
+def draw_keypoints(rgb: np.ndarray, xy: np.ndarray, sizes: np.ndarray | None) -> np.ndarray:
+    """Draw keypoints on a (H, W, 3) uint8 RGB image, which is dimmed; as `Keypoints.draw`."""
+    canvas, unit = rgb // 2, line_scale(rgb)
+    if len(xy) > MAX_CIRCLES:
+        # Half transparent, so that the image shows through the dense points.
+        columns, rows = np.rint(xy).astype(int).T
+        canvas[rows, columns] = canvas[rows, columns] // 2 + np.array(GREEN, np.uint8) // 2
+        return canvas
+    least = LEAST_RADIUS_PX * unit
+    radii = np.full(len(xy), least + unit) if sizes is None else np.maximum(sizes / 2, least)
+    for centre, radius in zip(xy, radii, strict=True):
+        draw_circle(canvas, centre, radius, GREEN, round(unit))
+    return canvas
 
 
-def plot_matches(
+def draw_matches(
+    rgb0: np.ndarray,
+    rgb1: np.ndarray,
     points0: np.ndarray,
     points1: np.ndarray,
-    inliers: np.ndarray,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
-    images: tuple[Any, Any],
-    axes: Any,
-    channels: Channels,
-    lines: int,
-) -> Any:
-    """Plot matches between two images side by side; arguments as of `Matches.plot`."""
-    axes = _prepared_axes(axes, list(zip(images, sizes, strict=True)), channels)
-    from matplotlib.collections import LineCollection
+    good: np.ndarray,
+    lines: int = 150,
+    *,
+    by_position: bool = False,
+) -> np.ndarray:
+    """Draw the two images side by side, with lines between a sample of the matches.
 
-    chosen = _sample(len(points0), lines)
-    chosen = chosen[np.argsort(inliers[chosen], kind="stable")]  # the inliers on top
-    ends = np.stack([points0[chosen], points1[chosen] + (sizes[0][0], 0)], axis=1)
-    colors = ["lime" if good else "red" for good in inliers[chosen]]
-    axes.add_collection(LineCollection(list(ends), colors=colors, linewidths=0.8))
-    for end in (0, 1):
-        axes.scatter(*ends[:, end].T, s=6, c=colors, linewidths=0)
-    return axes
+    The lower image is enlarged to the height of the other, and both are scaled down where the
+    picture would be wider or higher than `PICTURE_SIDE_PX`.
+
+    Args:
+        rgb0, rgb1: the images, (H, W, 3) uint8 RGB.
+        points0, points1: (M, 2) matched positions.
+        good: (M,) bool: green lines, the others red.
+        lines: number of lines; the sample is random with a fixed seed, so green and red
+            have the proportions of all matches.
+        by_position: colour good matches by where they are in the first image, and draw more of
+            them as dots than as lines, so that one sees what was found where.
+
+    Returns:
+        (H, W, 3) uint8 RGB, H that of the taller image, W that of both at this height.
+    """
+    height = max(rgb0.shape[0], rgb1.shape[0])
+    width = sum(rgb.shape[1] * height / len(rgb) for rgb in (rgb0, rgb1))
+    height = max(1, round(height * min(1.0, PICTURE_SIDE_PX / max(width, height))))
+    shown = [_of_height(rgb, height) for rgb in (rgb0, rgb1)]
+    canvas = cv2.convertScaleAbs(np.concatenate(shown, axis=1), alpha=0.7)
+    points0, points1 = (
+        (np.asarray(points, np.float64) + 0.5) * (view.shape[1] / rgb.shape[1], height / len(rgb))
+        - 0.5
+        for points, view, rgb in zip((points0, points1), shown, (rgb0, rgb1), strict=True)
+    )
+    good = np.asarray(good, bool)
+    order = np.random.default_rng(0).permutation(len(points0))[: DOTS if by_position else lines]
+    colors = np.where(good[order, None], GREEN, RED)
+    if by_position:
+        where = points0[order] / (shown[0].shape[1], height)
+        colors[good[order]] = _colors_of_positions(where[good[order]])
+    with_line = np.arange(len(order)) < (LINES if by_position else lines)
+    unit = line_scale(canvas)
+    for k in np.argsort(good[order], kind="stable"):  # the good ones on top
+        row, color = order[k], tuple(int(v) for v in colors[k])
+        start = tuple(int(v) for v in np.rint(points0[row]))
+        end = tuple(int(v) for v in np.rint(points1[row] + [shown[0].shape[1], 0]))
+        if with_line[k]:
+            cv2.line(canvas, start, end, color, round(unit), cv2.LINE_AA)
+        for place in (start, end):
+            cv2.circle(canvas, place, round(2 * unit), color, -1, cv2.LINE_AA)
+    return canvas
+
+
+def _colors_of_positions(where: np.ndarray) -> np.ndarray:
+    """Return (N, 3) RGB colours of positions in [0, 1]: hue from left to right, dark downwards.
+
+    None is red, which matches that are not good have.
+    """
+    x, y = np.clip(where, 0, 1).T
+    hsv = np.stack([20 + 120 * x, np.full(len(x), 230), 255 - 110 * y], 1)  # of 180, 255, 255
+    hsv = np.rint(hsv).astype(np.uint8)[None]
+    return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if len(x) else np.empty((0, 3), np.uint8)
+
+
+def _of_height(rgb: np.ndarray, height: int) -> np.ndarray:
+    """Scale an image to a height."""
+    if len(rgb) == height:
+        return rgb
+    width = max(1, round(rgb.shape[1] * height / len(rgb)))
+    how = cv2.INTER_LINEAR if height > len(rgb) else cv2.INTER_AREA
+    return cv2.resize(rgb, (width, height), interpolation=how)
+
+
+def line_scale(picture: np.ndarray) -> float:
+    """Return by how much captions, lines and points are enlarged."""
+    return max(1.0, picture.shape[1] / READABLE_WIDTH_PX)
+
+
+def draw_circle(
+    canvas: np.ndarray, centre: np.ndarray, radius: float, color: Sequence[int], width: int
+) -> None:
+    """Draw a circle with sub-pixel position and radius."""
+    x, y = np.rint(centre * 16).astype(int).tolist()
+    cv2.circle(canvas, (x, y), round(radius * 16), tuple(color), width, cv2.LINE_AA, 4)
+
+
+def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.ndarray:
+    """Return the image of keypoints, of any kind, as (H, W, 3) uint8 RGB.
+
+    Raises:
+        ImageError: it is a path, or has another (width, height) than `size`.
+    """
+    if isinstance(image, (str, bytes)) or hasattr(image, "__fspath__"):
+        raise ImageError("a picture needs the image itself, not a path: give load_image(path)")
+    if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
+        image, channels = np.asarray(image.convert("RGB")), "rgb"
+    rgb = array_to_rgb(image, channels)
+    if rgb.shape[1::-1] != size:
+        raise ImageError(
+            f"the image has {rgb.shape[1]}x{rgb.shape[0]} pixels, the keypoints are of "
+            f"one of {size[0]}x{size[1]}: give the image that they were found in"
+        )
+    return rgb
 
 
 def html_summary(
@@ -128,43 +208,6 @@ def _position_picture(points: Sequence[Points], lines: np.ndarray | None) -> np.
         for x0, y0, x1, y1 in lines[_sample(len(lines), MAX_LINES)] * scale:
             start, end = (round(x0), round(y0)), (round(x1) + panels[0].shape[1], round(y1))
             cv2.line(picture, start, end, (90, 220, 255))  # smooth ones take five times the bytes
-    return picture
-
-
-def _prepared_axes(
-    axes: Any, images: Sequence[tuple[Any, tuple[int, int]]], channels: Channels
-) -> Any:
-    """Return axes that show images side by side, black ones where there are none."""
-    pictures = [_picture(image, size, channels) for image, size in images]
-    try:
-        from matplotlib import pyplot
-    except ImportError:
-        raise MissingExtraError(
-            "plots need the package matplotlib, which is not installed: run pip install matplotlib"
-        ) from None
-    height = max(len(picture) for picture in pictures)
-    canvas = np.hstack([np.pad(p, ((0, height - len(p)), (0, 0), (0, 0))) for p in pictures])
-    if axes is None:
-        axes = pyplot.subplots(figsize=(6.0 * len(pictures), 4.5), layout="constrained")[1]
-    axes.imshow(canvas)
-    axes.set_axis_off()
-    return axes
-
-
-def _picture(image: Any, size: tuple[int, int], channels: Channels) -> np.ndarray:
-    """Return an image as (H, W, 3) uint8 RGB."""
-    if image is None:
-        return np.zeros((size[1], size[0], 3), np.uint8)
-    if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
-        image, channels = np.asarray(image.convert("RGB")), "rgb"
-    if isinstance(image, (str, bytes)) or hasattr(image, "__fspath__"):
-        raise ImageError("a plot needs the image itself, not a path: give load_image(path)")
-    picture = array_to_rgb(image, channels)
-    if picture.shape[1::-1] != size:
-        raise ImageError(
-            f"the image has {picture.shape[1]}x{picture.shape[0]} pixels, the keypoints are of "
-            f"one of {size[0]}x{size[1]}: give the image that they were found in"
-        )
     return picture
 
 

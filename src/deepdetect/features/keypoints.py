@@ -205,32 +205,25 @@ class Keypoints:
         return {name: torch.tensor(a, dtype=torch.float32)[None] for name, a in arrays.items()}
 
     @suggest_keywords
-    def plot(
-        self,
-        image: Any = None,
-        *,
-        axes: Any = None,
-        channels: Channels = "rgb",
-        color: str = "lime",
-    ) -> Any:
-        """Plot the keypoints with matplotlib: as circles of their sizes when they are few.
+    def draw(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray:
+        """Draw the keypoints on their image, which is dimmed.
+
+        They are circles of their sizes, of three pixels where they have none, and single pixels
+        where they are more than 5,000.
 
         Args:
-            image: their image as an array, a PyTorch tensor or a PIL image, drawn below them.
-            axes: matplotlib axes to draw on. None: those of a new figure.
+            image: an array, a PyTorch tensor or a PIL image.
             channels: order of the colours in an array or a tensor.
-            color: any that matplotlib knows.
 
         Returns:
-            The axes.
+            (H, W, 3) uint8 RGB.
 
         Raises:
             ImageError: the image has another size than the keypoints'.
-            MissingExtraError: matplotlib is not installed.
         """
-        from .display import plot_keypoints
+        from .display import checked_image, draw_keypoints
 
-        return plot_keypoints(self.xy, self.image_size, self.sizes, image, axes, channels, color)
+        return draw_keypoints(checked_image(image, self.image_size, channels), self.xy, self.sizes)
 
     @property
     def density(self) -> float:

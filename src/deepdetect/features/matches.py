@@ -236,35 +236,36 @@ class Matches:
         return self[kept]
 
     @suggest_keywords
-    def plot(
+    def draw(
         self,
-        image0: Any = None,
-        image1: Any = None,
+        image0: Any,
+        image1: Any,
         *,
-        axes: Any = None,
         channels: Channels = "rgb",
         lines: int = 150,
-    ) -> Any:
-        """Plot matches with matplotlib, on both images side by side: inliers green, others red.
+        by_position: bool = False,
+    ) -> np.ndarray:
+        """Draw matches on both images side by side: lines, green for inliers and red for others.
 
         Args:
-            image0, image1: arrays, PyTorch tensors or PIL images, drawn below the matches.
-            axes: matplotlib axes to draw on. None: those of a new figure.
+            image0, image1: arrays, PyTorch tensors or PIL images.
             channels: order of the colours in arrays and tensors.
             lines: at most this many are drawn: a random sample, the same each time.
+            by_position: colour inliers by where they are in the first image, and draw more of them
+                as dots than as lines, so that one sees what was matched where.
 
         Returns:
-            The axes.
+            (H, W, 3) uint8 RGB, its longer side at most 2,000 pixels.
 
         Raises:
             ImageError: an image has another size than its keypoints'.
-            MissingExtraError: matplotlib is not installed.
         """
-        from .display import plot_matches
+        from .display import checked_image, draw_matches
 
-        sizes = self.keypoints0.image_size, self.keypoints1.image_size
+        rgb0 = checked_image(image0, self.keypoints0.image_size, channels)
+        rgb1 = checked_image(image1, self.keypoints1.image_size, channels)
         ends = self.points0, self.points1, self.inliers
-        return plot_matches(*ends, sizes, (image0, image1), axes, channels, lines)
+        return draw_matches(rgb0, rgb1, *ends, lines, by_position=by_position)
 
     def __len__(self) -> int:
         return len(self.points0)

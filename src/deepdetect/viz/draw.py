@@ -11,21 +11,13 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError
 from .._shared.opencv import cv2
+from ..features.display import PICTURE_SIDE_PX, draw_circle, line_scale
 from ..features.keypoints import Keypoints
 from ..features.sift_detector import spread_over_grid
-
-MAX_CIRCLES = 5000
-"""More keypoints than this are drawn as single pixels."""
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_JPEG_SIDE_PX = 65_500
 """The largest width and height that libjpeg writes."""
-
-PICTURE_SIDE_PX = 2000
-"""Longer side of what `fit_picture` returns: as JPEG it takes less than two megabytes."""
-
-READABLE_WIDTH_PX = 800
-"""Captions, lines and points grow with pictures that are wider than this."""
 
 JPEG_QUALITY = 85
 SHOWN_KEYPOINTS = 1000
@@ -38,8 +30,6 @@ SHOWN_PERCENTILE = 99.0
 LEAST_LEVEL, LEAST_DEPTH_LEVEL = 0.35, 0.2
 """Darker colours of the scale are not seen on a photograph, or look like unknown depth."""
 
-LINES, DOTS = 60, 1500
-
 CAPTION_HEIGHT = 28
 """Of pictures that are not wider than `READABLE_WIDTH_PX`."""
 
@@ -49,7 +39,7 @@ CAPTION_MARGIN = 6
 CAPTION_SCALE = 0.5
 """Of OpenCV's font."""
 
-GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
+WHITE = (255, 255, 255)
 
 
 def save_picture(rgb: np.ndarray, path: str | Path) -> None:
@@ -167,7 +157,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     canvas = _dimmed(shown)
     values = keypoints.scores if keypoints.logits is None else keypoints.logits
     name = "score" if keypoints.logits is None else "logit"
-    unit = _unit(canvas)
+    unit = line_scale(canvas)
     room = int(canvas.shape[0] * canvas.shape[1] / (AREA_OF_KEYPOINT_PX * unit**2))
     most = max(1, min(SHOWN_KEYPOINTS, room, len(keypoints)))
     # No more cells than keypoints, or the dimmest parts would be left out.
@@ -188,15 +178,15 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     centres = _placed(keypoints.xy[rows], factor)
     # The best on top, and a dark rim, so that each is seen before any colour.
     for k in np.argsort(values[rows]):
-        _circle(canvas, centres[k], radii[k], (0, 0, 0), max(2, round(2.5 * unit)))
-        _circle(canvas, centres[k], radii[k], colors[k], max(1, round(1.25 * unit)))
+        draw_circle(canvas, centres[k], radii[k], (0, 0, 0), max(2, round(2.5 * unit)))
+        draw_circle(canvas, centres[k], radii[k], colors[k], max(1, round(1.25 * unit)))
     return add_scale(canvas, f"{counted}, coloured by {name}", low, high, LEAST_LEVEL)
 
 
 def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw all keypoints as pixels, with a caption that counts them, as `fit_picture` sizes it."""
+    """Draw all keypoints, with a caption that counts them, as `fit_picture` sizes it."""
     caption = f"{_counted(keypoints)}, {keypoints.density:.1%} of the pixels"
-    return add_caption(fit_picture(_draw_pixels(rgb, keypoints)), caption)
+    return add_caption(fit_picture(keypoints.draw(rgb)), caption)
 
 
 def _counted(keypoints: Keypoints) -> str:
@@ -213,106 +203,6 @@ def fit_picture(picture: np.ndarray) -> np.ndarray:
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
 
 
-def draw_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw keypoints over a dimmed RGB image: as circles when they are few, else as pixels."""
-    if len(keypoints) > MAX_CIRCLES:
-        return _draw_pixels(rgb, keypoints)
-    canvas, unit = rgb // 2, _unit(rgb)
-    for x, y in np.rint(keypoints.xy).astype(int).tolist():
-        cv2.circle(canvas, (x, y), round(3 * unit), GREEN, round(unit), cv2.LINE_AA)
-    return canvas
-
-
-def _draw_pixels(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    canvas = rgb // 2
-    pixels = np.rint(keypoints.xy).astype(int)
-    # Half transparent, so that the image shows through the dense points.
-    columns, rows = pixels.T
-    canvas[rows, columns] = canvas[rows, columns] // 2 + np.array(GREEN, np.uint8) // 2
-    return canvas
-
-
-def draw_matches(
-    rgb0: np.ndarray,
-    rgb1: np.ndarray,
-    points0: np.ndarray,
-    points1: np.ndarray,
-    good: np.ndarray,
-    lines: int = 150,
-    *,
-    by_position: bool = False,
-) -> np.ndarray:
-    """Draw the two images side by side, with lines between a sample of the matches.
-
-    The lower image is enlarged to the height of the other, and both are scaled down where the
-    picture would be wider or higher than `PICTURE_SIDE_PX`.
-
-    Args:
-        rgb0, rgb1: the images, (H, W, 3) uint8 RGB.
-        points0, points1: (M, 2) matched positions.
-        good: (M,) bool: green lines, the others red.
-        lines: number of lines; the sample is random with a fixed seed, so green and red
-            have the proportions of all matches.
-        by_position: colour good matches by where they are in the first image, and draw more of
-            them as dots than as lines, so that one sees what was found where.
-
-    Returns:
-        (H, W, 3) uint8 RGB, H that of the taller image, W that of both at this height.
-    """
-    height = max(rgb0.shape[0], rgb1.shape[0])
-    width = sum(rgb.shape[1] * height / len(rgb) for rgb in (rgb0, rgb1))
-    height = max(1, round(height * min(1.0, PICTURE_SIDE_PX / max(width, height))))
-    shown = [_of_height(rgb, height) for rgb in (rgb0, rgb1)]
-    canvas = cv2.convertScaleAbs(np.concatenate(shown, axis=1), alpha=0.7)
-    points0, points1 = (
-        (np.asarray(points, np.float64) + 0.5) * (view.shape[1] / rgb.shape[1], height / len(rgb))
-        - 0.5
-        for points, view, rgb in zip((points0, points1), shown, (rgb0, rgb1), strict=True)
-    )
-    good = np.asarray(good, bool)
-    order = np.random.default_rng(0).permutation(len(points0))[: DOTS if by_position else lines]
-    colors = np.where(good[order, None], GREEN, RED)
-    if by_position:
-        where = points0[order] / (shown[0].shape[1], height)
-        colors[good[order]] = _colors_of_positions(where[good[order]])
-    with_line = np.arange(len(order)) < (LINES if by_position else lines)
-    unit = _unit(canvas)
-    for k in np.argsort(good[order], kind="stable"):  # the good ones on top
-        row, color = order[k], tuple(int(v) for v in colors[k])
-        start = tuple(int(v) for v in np.rint(points0[row]))
-        end = tuple(int(v) for v in np.rint(points1[row] + [shown[0].shape[1], 0]))
-        if with_line[k]:
-            cv2.line(canvas, start, end, color, round(unit), cv2.LINE_AA)
-        for place in (start, end):
-            cv2.circle(canvas, place, round(2 * unit), color, -1, cv2.LINE_AA)
-    return canvas
-
-
-def _colors_of_positions(where: np.ndarray) -> np.ndarray:
-    """Return (N, 3) RGB colours of positions in [0, 1]: hue from left to right, dark downwards.
-
-    None is red, which matches that are not good have.
-    """
-    x, y = np.clip(where, 0, 1).T
-    hsv = np.stack([20 + 120 * x, np.full(len(x), 230), 255 - 110 * y], 1)  # of 180, 255, 255
-    hsv = np.rint(hsv).astype(np.uint8)[None]
-    return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if len(x) else np.empty((0, 3), np.uint8)
-
-
-def _of_height(rgb: np.ndarray, height: int) -> np.ndarray:
-    """Scale an image to a height."""
-    if len(rgb) == height:
-        return rgb
-    width = max(1, round(rgb.shape[1] * height / len(rgb)))
-    how = cv2.INTER_LINEAR if height > len(rgb) else cv2.INTER_AREA
-    return cv2.resize(rgb, (width, height), interpolation=how)
-
-
-def _unit(picture: np.ndarray) -> float:
-    """Return by how much captions, lines and points are enlarged."""
-    return max(1.0, picture.shape[1] / READABLE_WIDTH_PX)
-
-
 def _dimmed(rgb: np.ndarray) -> np.ndarray:
     """Return a grey, darker copy, on which colours are seen."""
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
@@ -322,14 +212,6 @@ def _dimmed(rgb: np.ndarray) -> np.ndarray:
 def _placed(xy: np.ndarray, factor: float) -> np.ndarray:
     """Return where positions of an image are in a picture that is so many times as large."""
     return (np.asarray(xy, np.float64) + 0.5) * factor - 0.5
-
-
-def _circle(
-    canvas: np.ndarray, centre: np.ndarray, radius: float, color: Sequence[int], width: int
-) -> None:
-    """Draw a circle with sub-pixel position and radius."""
-    x, y = np.rint(centre * 16).astype(int).tolist()
-    cv2.circle(canvas, (x, y), round(radius * 16), tuple(color), width, cv2.LINE_AA, 4)
 
 
 def _viridis(levels: np.ndarray) -> np.ndarray:
@@ -358,7 +240,7 @@ def draw_masks(rgb: np.ndarray, masks: Mapping[str, np.ndarray], title: str) -> 
 
 def add_caption(rgb: np.ndarray, text: str) -> np.ndarray:
     """Add a line of text below a picture, scaled to be legible and to fit its width."""
-    return np.concatenate([rgb, _caption(text, rgb.shape[1], _unit(rgb))])
+    return np.concatenate([rgb, _caption(text, rgb.shape[1], line_scale(rgb))])
 
 
 def add_scale(
@@ -369,7 +251,7 @@ def add_scale(
     The colours are those of `draw_heatmap` from `least_level` to 1. The values are at their ends,
     with two digits, or so many that they tell apart what is a hundredth of the scale.
     """
-    width, unit = rgb.shape[1], _unit(rgb)
+    width, unit = rgb.shape[1], line_scale(rgb)
     bar = max(1, width // 5)
     values = _rounded(low, high)
     margins = round(2 * CAPTION_MARGIN * unit)

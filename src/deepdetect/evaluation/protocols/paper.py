@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from ...datasets.types import PlanarPair, PlanarScene
+from ...features.display import draw_matches
 from ...features.keypoints import Keypoints
 from ...geometry.residuals import transfer_errors
 from ...io.image import load_image, luma
 from ...labels import draw_label, fuse
-from ...viz.draw import add_caption, draw_keypoints, draw_matches, hstack
+from ...viz.draw import add_caption, hstack
 from ..baselines.method import LocalFeature
 from ..cache import matrix_digest
 from ..charts import picture
@@ -208,7 +209,7 @@ def keypoint_figure(
     for feature in features:
         found = context.keypoints(feature, image).features
         inside = np.clip(np.rint(found.xy), 0, np.array(found.image_size) - 1)
-        drawn = draw_keypoints(rgb, Keypoints(inside, found.scores, found.image_size))
+        drawn = Keypoints(inside, found.scores, found.image_size).draw(rgb)
         panels.append(add_caption(drawn, f"{feature.title}: {len(found):,}"))
         counts.append(f"{feature.title} {len(found):,}")
     title = f"Figure 2: keypoints of {scene.name}: {'; '.join(counts)}{note}"
