@@ -48,7 +48,7 @@ test-all: $(VENV)/.test test-opencv4 test-ray test-integrations onnxruntime
 	$(VENV)/bin/python $(PYTEST) --runslow
 	$(VENV)/bin/python -m fuzz --seconds 540 --kills 8
 
-# All wrong input and all kills of docs/reliability.md: a quarter of an hour on two cores.
+# All wrong input and all kills of docs/limits.md: a quarter of an hour on two cores.
 fuzz: $(VENV)/.test
 	$(VENV)/bin/python -m fuzz
 

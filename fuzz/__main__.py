@@ -1,4 +1,4 @@
-"""Try wrong input and kills, and print the table of `docs/reliability.md`.
+"""Try wrong input and kills, and print the table of `docs/limits.md`.
 
     python -m fuzz                       # everything: about a quarter of an hour on two cores
     python -m fuzz --seconds 600         # what can be done in ten minutes, of all targets

@@ -69,14 +69,14 @@ _PAGES = (
     ApiPage(
         "api/registration.md",
         "Registration and panoramas",
-        "Photographs of a plane, or from one place: [how](../matching.md#panoramas).",
+        "Photographs of a plane, or from one place: [how](../matching.md#registration-and-panoramas).",
         ("register", "Registration", "stitch", "Panorama", "StitchingOptions"),
     ),
     ApiPage(
         "api/reconstruction.md",
         "3D reconstruction",
         "From [two photographs](../reconstruction.md), or from "
-        "[three and more](../many-photographs.md).",
+        "[three and more](../reconstruction.md#many-images).",
         (
             "reconstruct",
             "Reconstruction",
@@ -113,14 +113,14 @@ _PAGES = (
     ApiPage(
         "api/training.md",
         "Labels, training, evaluation",
-        "The masks that the network learns ([labels](../labels.md)), and how it does "
+        "The masks that the network learns ([labels](../training.md#labels)), and how it does "
         "([training](../training.md)).",
         ("fuse", "Label", "LabelOptions", "train", "TrainingOptions", "evaluate", "Evaluation"),
     ),
     ApiPage(
         "api/integrations.md",
         "Drop-ins for other programs",
-        "With snippets that run: [DeepDetect in other programs](../integrations.md).",
+        "With snippets that run: [DeepDetect in other programs](../other-programs.md).",
         (
             "integrations.opencv",
             "integrations.kornia",

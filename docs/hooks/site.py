@@ -33,9 +33,6 @@ COPIED = {
 }
 """Files of the repository that are pages of the site, by their paths."""
 
-OPTIONAL = frozenset({"app.md", "interchange.md", "tracking.md"})
-"""Pages of the navigation that are left out where they are not there."""
-
 APP = ROOT / "web" / "dist"
 """The page that detects and matches in the browser, once it is built."""
 
@@ -53,30 +50,26 @@ ORIGINS: dict[str, str] = {site: repository for repository, site in COPIED.items
 
 
 def on_config(config: Any) -> Any:
-    """Complete what mkdocs.yml says: the address, anchors, and the navigation.
-
-    Pages that are not there are left out of it, and those of the API are put in.
-    """
+    """Complete what mkdocs.yml says: the address, anchors, and the pages of the API."""
     from pymdownx.slugs import slugify
 
     config.site_url = os.environ.get("SITE_URL", "")
     # Anchors as GitHub makes them, where the same pages are read.
     config.mdx_configs["toc"]["slugify"] = slugify(case="lower")
-    config.nav = _navigation(config.nav, Path(config.docs_dir))
+    config.nav = _navigation(config.nav)
     return config
 
 
-def _navigation(entries: list[Any], folder: Path) -> list[Any]:
-    kept = []
+def _navigation(entries: list[Any]) -> list[Any]:
+    pages = []
     for entry in entries:
         ((title, target),) = entry.items()
-        if isinstance(target, list):
-            kept.append({title: _navigation(target, folder)})
-        elif target == "api/":
-            kept.append({title: [{page.title: page.uri} for page in api_pages.PAGES]})
-        elif target not in OPTIONAL or (folder / target).is_file():
-            kept.append(entry)
-    return kept
+        if target == "api/":
+            target = [{page.title: page.uri} for page in api_pages.PAGES]
+        elif isinstance(target, list):
+            target = _navigation(target)
+        pages.append({title: target})
+    return pages
 
 
 def on_files(files: Any, config: Any) -> Any:

@@ -23,8 +23,8 @@ GITHUB = "https://github.com/deepdetect/deepdetect/blob/main/"
         ("docs/index.md", "index.md", "matching.md#limits", "matching.md#limits"),
         ("docs/index.md", "index.md", "#here", "#here"),
         ("docs/index.md", "index.md", "https://arxiv.org/abs/1", "https://arxiv.org/abs/1"),
-        ("docs/onnx.md", "onnx.md", "../examples/onnx_cpp", f"{GITHUB}examples/onnx_cpp"),
-        ("README.md", "readme.md", "docs/scale.md", "scale.md"),
+        ("docs/other-programs.md", "onnx.md", "../examples/onnx_cpp", f"{GITHUB}examples/onnx_cpp"),
+        ("README.md", "readme.md", "docs/many-images.md", "scale.md"),
         ("README.md", "readme.md", "docs/images/demo.jpg", "images/demo.jpg"),
         ("README.md", "readme.md", "LICENSE", f"{GITHUB}LICENSE"),
         (
@@ -82,24 +82,12 @@ def test_notebooks_have_no_scripts(hooks: ModuleType) -> None:
     assert hooks.on_page_content(html, notebook) == "<p>a</p><p>b</p>"
 
 
-def test_optional_pages_leave_the_navigation(hooks: ModuleType, tmp_path: Path) -> None:
-    (tmp_path / "tracking.md").write_text("# Tracking")
-    entries = [
-        {"Use": [{"Tracking": "tracking.md"}, {"Files": "interchange.md"}]},
-        {"Typo": "nowhere.md"},
-    ]
-    assert hooks._navigation(entries, tmp_path) == [
-        {"Use": [{"Tracking": "tracking.md"}]},
-        {"Typo": "nowhere.md"},  # an error of the strict build
-    ]
-
-
 def test_every_page_is_in_the_navigation(hooks: ModuleType) -> None:
     listed = set(re.findall(r": ([\w/-]+\.(?:md|ipynb))$", navigation(), re.M))
     docs = ROOT / "docs"
     pages = {path.name for path in docs.glob("*.md")} | set(hooks.COPIED.values()) | {"cli.md"}
     pages |= {f"notebooks/{path.name}" for path in docs.glob("notebooks/*.ipynb")}
-    assert listed - hooks.OPTIONAL == pages - hooks.OPTIONAL
+    assert listed == pages - {"history.md", "benchmark-report.md"}
 
 
 def navigation() -> str:
@@ -114,12 +102,12 @@ def test_every_exported_name_is_on_one_page_of_the_interface(hooks: ModuleType) 
     drop_ins = {
         path.stem
         for path in (ROOT / "src/deepdetect/integrations").glob("*.py")
-        if re.search(rf"^## {path.stem}$", INTEGRATIONS, re.M | re.I)
+        if re.search(rf"^### {path.stem}$", INTEGRATIONS, re.M | re.I)
     } | {"skimage"}
     assert {name.partition(".")[2] for name in names if "." in name} == drop_ins
 
 
-INTEGRATIONS = (ROOT / "docs/integrations.md").read_text("utf-8")
+INTEGRATIONS = (ROOT / "docs/other-programs.md").read_text("utf-8")
 
 
 def commands(group: click.Group, name: str = "deepdetect") -> list[tuple[str, click.Command]]:

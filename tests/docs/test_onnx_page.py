@@ -1,4 +1,4 @@
-"""The Python of docs/onnx.md runs, and finds what the page says."""
+"""The Python of docs/other-programs.md on ONNX runs, and finds what the page says."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def test_keypoints_in_the_file(
     monkeypatch.chdir(tmp_path)
     write_onnx("default", "deepdetect.onnx")
     Image.fromarray(photo[:123, :157]).save("photo.jpg", quality=100)
-    (block,) = blocks("onnx.md", "python")
+    block = blocks("other-programs.md", "python")[-1]
     found: dict[str, Any] = {}
-    exec(compile(block, "onnx.md", "exec"), found)
+    exec(compile(block, "other-programs.md", "exec"), found)
     expected = DeepDetect(backend="onnxruntime").detect(
-        "photo.jpg", max_keypoints=1000, mode="dense"
+        "photo.jpg", max_keypoints=1000, nms_radius=1, subpixel=True
     )
     order = np.argsort(-expected.logits, kind="stable")
     assert 100 < len(expected) < 1000

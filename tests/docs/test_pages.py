@@ -76,16 +76,16 @@ def test_first_steps(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_dense_or_points(folder: Path) -> None:
+def test_points(folder: Path) -> None:
     from skimage import data
 
-    Image.fromarray(data.stereo_motorcycle()[0]).save("left.png")
-    (block,) = blocks("dense-or-points.md", "python")
+    for name, view in zip(("left", "right"), data.stereo_motorcycle(), strict=False):
+        Image.fromarray(view).save(f"{name}.png")
+    (block,) = blocks("points.md", "python")
     found: dict[str, object] = {}
-    exec(compile(block, "dense-or-points.md", "exec"), found)
-    assert len(found["surer"]) < len(found["detector"].detect("left.png"))
+    exec(compile(block, "points.md", "exec"), found)
+    assert len(found["surer"]) < len(found["dense"])
     assert len(found["thinner"]) == pytest.approx(0.05 * 741 * 500, rel=0.02)
     assert found["spaced"].sizes is None
-    assert len(found["spread"]) == 1000
+    assert len(found["points"]) == len(found["spread"]) == 1000
     assert found["spread"].sizes is not None
-    assert 0 <= found["spread"].scores.min() <= found["spread"].scores.max() <= 1

@@ -1,4 +1,4 @@
-"""The snippets of docs/integrations.md run, each where its program is installed."""
+"""The snippets of docs/other-programs.md run, each where its program is installed."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from PIL import Image
 
 from .conftest import Views
 
-PAGE = Path(__file__).parents[2] / "docs/integrations.md"
-SECTIONS = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", PAGE.read_text("utf-8"), re.S | re.M))
+PAGE = Path(__file__).parents[2] / "docs/other-programs.md"
+SECTIONS = dict(re.findall(r"^### (\S+)\n(.*?)(?=^##|\Z)", PAGE.read_text("utf-8"), re.S | re.M))
 SNIPPETS = {
     name: "\n".join(re.findall(r"^```python\n(.*?)^```", text, re.S | re.M))
     for name, text in SECTIONS.items()

@@ -1,4 +1,4 @@
-"""The commands and snippets of docs/interchange.md run, in their order."""
+"""The commands and snippets of docs/other-programs.md, "Files", run in their order."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from click.testing import CliRunner
 
 from deepdetect.cli import main
 
-PAGE = (Path(__file__).parents[2] / "docs/interchange.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs/other-programs.md").read_text(encoding="utf-8")
+PAGE = PAGE.partition("\n## Files\n")[2].partition("\n## ")[0]
 BLOCKS = re.findall(r"^( *)```(sh|python)\n(.*?)^ *```", PAGE, re.S | re.M)
 
 

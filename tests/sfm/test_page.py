@@ -1,4 +1,4 @@
-"""The commands and the snippet of docs/many-photographs.md run, in their order."""
+"""The commands and snippets of docs/reconstruction.md, "Many images", run in their order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from click.testing import CliRunner
 
 from deepdetect.cli import main
 
-PAGE = (Path(__file__).parents[2] / "docs/many-photographs.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs/reconstruction.md").read_text(encoding="utf-8")
+PAGE = PAGE.partition("\n## Many images\n")[2].partition("\n## ")[0]
 BLOCKS = re.findall(r"^```(sh|python)\n(.*?)^```", PAGE, re.S | re.M)
 
 

@@ -1,4 +1,4 @@
-"""The commands and snippets of docs/tracking.md run, in their order."""
+"""The commands and snippets of docs/many-images.md, "Videos", run in their order."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from click.testing import CliRunner
 
 from deepdetect.cli import main
 
-PAGE = (Path(__file__).parents[2] / "docs/tracking.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs/many-images.md").read_text(encoding="utf-8")
+PAGE = PAGE.partition("\n## Videos\n")[2].partition("\n## ")[0]
 BLOCKS = re.findall(r"^```(sh|python)\n(.*?)^```", PAGE, re.S | re.M)
 
 

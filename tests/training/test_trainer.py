@@ -402,7 +402,7 @@ def test_a_killed_run_ends_with_the_same_weights(
 def test_own_images_and_settings_from_the_pretrained_weights(
     photographs: Path, tmp_path: Path
 ) -> None:
-    """The command of docs/fine-tuning.md, on few images."""
+    """The command of docs/training.md, on few images."""
     settings = tmp_path / "labels.toml"
     settings.write_text('detectors = ["fast", "sobel"]\n[fast]\nnormal = { threshold = 30 }\n')
     arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]

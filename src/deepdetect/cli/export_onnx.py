@@ -58,7 +58,7 @@ def export_onnx(
     WEIGHTS are default, dense, free, an ONNX file that this package has written in fp32 for any
     size, or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
     `probability` and `logits` for each pixel, and the best `keypoints` with `keypoint_logits`.
-    docs/onnx.md says which file is for which runtime.
+    docs/other-programs.md says which file is for which runtime.
 
     \b
     deepdetect export onnx -o deepdetect.onnx

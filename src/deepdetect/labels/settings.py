@@ -116,7 +116,7 @@ def _checked_value(detector: str, name: str, value: Any) -> Value:
 
 LABEL_SETTINGS: dict[str, LabelOptions] = {
     "paper": LabelOptions(),
-    # Denser, for geometry: chosen by true stereo matches (docs/labels.md).
+    # Denser, for geometry: chosen by true stereo matches (docs/training.md).
     "dense": LabelOptions(settings={"sobel": {"normal": {"relative_threshold": 0.02}}}),
 }
 

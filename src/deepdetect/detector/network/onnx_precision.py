@@ -31,7 +31,7 @@ QUANTIZED = "/network/encoder/level3"
 """Beginning of the names of the convolutions that int8 changes: those at an eighth of the size.
 
 Three quarters of all weights are there. Before and behind them rounding to 255 steps costs more
-marks than it saves time (docs/onnx.md).
+marks than it saves time (docs/other-programs.md#onnx).
 """
 
 
