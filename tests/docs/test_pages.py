@@ -8,6 +8,7 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
@@ -36,6 +37,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 def test_first_steps(folder: Path) -> None:
+    from skimage import data
+
     fetch, use = blocks("first-steps.md", "python")
     exec(compile(fetch, "first-steps.md", "exec"), {})
     commands = [
@@ -63,6 +66,10 @@ def test_first_steps(folder: Path) -> None:
             numbers(re.search(row, text, re.M)[0]) for text in (matched, printed["match"])
         )
         assert promised == pytest.approx(found, rel=0.01)
+    disparity = data.stereo_motorcycle()[2]
+    true = 994.978 * 193.001 / (disparity + 31.086)  # of Middlebury 2014, in mm
+    ratio = (np.load("deepdetect-output/model_depth.npz")["depth"] / true)[np.isfinite(disparity)]
+    np.testing.assert_allclose(np.nanpercentile(ratio, [5, 50, 95]), 1, atol=0.02)
     page = (DOCS / "first-steps.md").read_text("utf-8")
     for name in re.findall(r"^\| `(left\S+)` \|", page, re.M):
         assert (folder / "deepdetect-output" / name).is_file()
@@ -77,8 +84,6 @@ def test_first_steps(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_points(folder: Path) -> None:
-    from skimage import data
-
     for name, view in zip(("left", "right"), data.stereo_motorcycle(), strict=False):
         Image.fromarray(view).save(f"{name}.png")
     (block,) = blocks("points.md", "python")
