@@ -84,6 +84,8 @@ def test_first_steps(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_points(folder: Path) -> None:
+    from skimage import data
+
     for name, view in zip(("left", "right"), data.stereo_motorcycle(), strict=False):
         Image.fromarray(view).save(f"{name}.png")
     (block,) = blocks("points.md", "python")
