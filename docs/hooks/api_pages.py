@@ -69,7 +69,7 @@ _PAGES = (
     ApiPage(
         "api/registration.md",
         "Registration and panoramas",
-        "Photographs of a plane, or from one place: [how](../matching.md#registration-and-panoramas).",
+        "Images of a plane, or from one place: [how](../matching.md#registration-and-panoramas).",
         ("register", "Registration", "stitch", "Panorama", "StitchingOptions"),
     ),
     ApiPage(

@@ -23,12 +23,7 @@ GITHUB = "https://github.com/deepdetect/deepdetect/blob/main/"
         ("docs/index.md", "index.md", "matching.md#limits", "matching.md#limits"),
         ("docs/index.md", "index.md", "#here", "#here"),
         ("docs/index.md", "index.md", "https://arxiv.org/abs/1", "https://arxiv.org/abs/1"),
-        (
-            "docs/other-programs.md",
-            "other-programs.md",
-            "../examples/onnx_cpp",
-            f"{GITHUB}examples/onnx_cpp",
-        ),
+        ("docs/index.md", "index.md", "../examples/onnx_cpp", f"{GITHUB}examples/onnx_cpp"),
         ("README.md", "readme.md", "docs/many-images.md", "many-images.md"),
         ("README.md", "readme.md", "docs/images/demo.jpg", "images/demo.jpg"),
         ("README.md", "readme.md", "LICENSE", f"{GITHUB}LICENSE"),
