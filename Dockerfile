@@ -15,7 +15,7 @@ RUN pip install --no-cache-dir "build>=1.2" \
 
 FROM python:${PYTHON}-slim
 # openvino runs the network about 1.5 times as fast on CPUs.
-ARG EXTRAS=standard,openvino
+ARG EXTRAS=openvino
 ENV NUMBA_CACHE_DIR=/opt/deepdetect/numba \
     PYTHONDONTWRITEBYTECODE=1
 COPY --from=build /wheels /wheels

@@ -25,7 +25,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 DIST = ROOT / "dist"
 PYTHONS = tuple(f"python3.{minor}" for minor in range(11, 15))
-EXTRA = "standard"
 
 IN_THE_WHEEL = (
     "deepdetect/py.typed",
@@ -157,11 +156,11 @@ def check_installs(python: str, wheel: Path, version: str) -> None:
         folder = Path(name)
         fetched = folder / "fetched"
         own = make_environment(python, folder / "first")
-        wanted = f"{wheel}[{EXTRA}]"
+        wanted = str(wheel)
         pip = [own, "-m", "pip", "--quiet", "--disable-pip-version-check"]
         run([*pip, "download", "--only-binary", ":all:", "--dest", str(fetched), wanted])
         empty = make_environment(python, folder / "empty")
-        install_offline(empty, fetched, f"deepdetect[{EXTRA}]=={version}")
+        install_offline(empty, fetched, f"deepdetect=={version}")
         use(empty, folder, version)
 
 
@@ -172,10 +171,10 @@ def check_archive_installs(python: str, archive: Path, version: str) -> None:
         fetched = folder / "fetched"
         own = make_environment(python, folder / "first")
         pip = [own, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-        needed = [f"{archive}[{EXTRA}]", "hatchling>=1.27"]
+        needed = [str(archive), "hatchling>=1.27"]
         run([*pip, "download", "--dest", str(fetched), *needed])
         empty = make_environment(python, folder / "empty")
-        install_offline(empty, fetched, f"deepdetect[{EXTRA}]=={version}")
+        install_offline(empty, fetched, f"deepdetect=={version}")
         use(empty, folder, version)
 
 
@@ -201,7 +200,7 @@ def use(python: str, folder: Path, version: str) -> None:
     doctor = json.loads(run([command, "doctor", "--json"], folder))
     if not doctor["ok"]:
         fail("deepdetect doctor finds a problem in an empty environment")
-    if str(ROOT) in doctor["findings"][0]["details"]["folder"]:
+    if str(ROOT) in doctor["findings"][0]["value"]:
         fail("the package was imported from the repository, and not from the wheel")
     found = json.loads(run([command, "detect", "picture.png", "--json"], folder))
     if not found["images"][0]["keypoints"] > 1000:

@@ -44,36 +44,32 @@ class LockFile:
     groups: tuple[str, ...]
     extras: tuple[str, ...] = ()
     package: bool = True
-    overrides: str | None = None
+    overrides: str = "requirements/opencv.in"
     lowest: bool = False
 
 
-# `labels` and `opencv` bring two packages of one folder; `standard` brings `opencv`. Ray is large.
-ALL_EXTRAS = tuple(
-    extra
-    for extra in PROJECT["project"]["optional-dependencies"]
-    if extra not in ("opencv", "ray", "standard")
-)
+# Ray is large.
+ALL_EXTRAS = tuple(extra for extra in PROJECT["project"]["optional-dependencies"] if extra != "ray")
 LOCK_FILES = (
     LockFile("uv.txt", groups=("lock",), package=False),
     LockFile("lock.txt", groups=("dev",), extras=ALL_EXTRAS),
-    LockFile("demo.txt", groups=("build",), extras=("demo", "labels", "match")),
+    LockFile("demo.txt", groups=("build",), extras=("demo", "labels")),
     LockFile(
         "opencv4.txt",
         groups=("build", "test"),
-        extras=("benchmark", "demo", "labels", "match", "onnx"),
+        extras=("benchmark", "demo", "onnx"),
         overrides="requirements/opencv4.in",
     ),
-    LockFile("ray.txt", groups=("build", "test"), extras=("demo", "labels", "match", "ray")),
+    LockFile("ray.txt", groups=("build", "test"), extras=("demo", "labels", "ray")),
     LockFile(
         "integrations.txt",
         groups=("build", "test", "integrations"),
-        extras=("demo", "labels", "match", "train"),
+        extras=("demo", "train"),
     ),
     LockFile(
         "docs.txt",
         groups=("build", "docs", "release", "test"),
-        extras=("demo", "labels", "match"),
+        extras=("demo", "labels"),
     ),
     LockFile("lowest.txt", groups=("build", "test"), extras=ALL_EXTRAS, lowest=True),
 )
@@ -93,7 +89,7 @@ def make(lock: LockFile, *, upgrade: bool) -> None:
             *(["pyproject.toml"] if lock.package else []),
             *(option for extra in lock.extras for option in ("--extra", extra)),
             *(option for group in lock.groups for option in ("--group", group)),
-            *(["--overrides", lock.overrides] if lock.overrides else []),
+            *("--overrides", lock.overrides),
             *(["--resolution", "lowest-direct"] if lock.lowest else ["--universal"]),
             # Otherwise uv keeps locked versions that fit, though lower ones may be allowed by now.
             *(f"--upgrade-package={each.name}" for each in _declared(lock) if lock.lowest),
@@ -122,9 +118,11 @@ def _declared(lock: LockFile) -> list[Requirement]:
         listed += PROJECT["build-system"]["requires"]
     for extra in lock.extras:
         listed += project["optional-dependencies"][extra]
-    if lock.overrides:
-        listed += (FOLDER.parent / lock.overrides).read_text().splitlines()
-    return [Requirement(text) for text in listed if text and not text.startswith("#")]
+    text = re.sub("#.*", "", (FOLDER.parent / lock.overrides).read_text())
+    overrides = [Requirement(line) for line in text.splitlines() if line]
+    left_out = {each.name for each in overrides if each.marker} | {project["name"]}
+    declared = [Requirement(text) for text in listed] + overrides
+    return [each for each in declared if each.name not in left_out]
 
 
 def _is_lowest(version: Version, requirement: Requirement) -> bool:

@@ -171,7 +171,7 @@ def test_the_commands_of_the_table_run(
             with Image.open(fountain / f"{number:04d}.jpg") as photograph:
                 photograph.resize((768, 512)).save(folder / "photos" / f"{number}.jpg")
     if "extract" in words or "match-many" in words:
-        pytest.importorskip("h5py", reason="needs h5py, of the extra hdf5")
+        pytest.importorskip("h5py", reason="needs h5py")
     if "match-many" in words:
         run(["deepdetect", "extract", "photos", "-o", "features.h5"])
         Path("pairs.txt").write_text("left.png another.png\n")

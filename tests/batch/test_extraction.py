@@ -23,7 +23,7 @@ FEW = SelectionOptions(max_keypoints=50)
 
 @pytest.fixture(autouse=True)
 def _h5py() -> None:
-    pytest.importorskip("h5py", reason="needs h5py (the extra hdf5)")
+    pytest.importorskip("h5py", reason="needs h5py")
 
 
 def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: Path) -> None:

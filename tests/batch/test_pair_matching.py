@@ -18,7 +18,7 @@ PAIR = ("a/00.png", "b/01.png")
 
 @pytest.fixture(autouse=True)
 def _h5py() -> None:
-    pytest.importorskip("h5py", reason="needs h5py (the extra hdf5)")
+    pytest.importorskip("h5py", reason="needs h5py")
 
 
 @pytest.fixture

@@ -38,7 +38,7 @@ def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def _ray() -> None:
     pytest.importorskip("ray", reason="needs Ray (the extra ray)")
-    pytest.importorskip("h5py", reason="needs h5py (the extra hdf5)")
+    pytest.importorskip("h5py", reason="needs h5py")
 
 
 @pytest.mark.slow

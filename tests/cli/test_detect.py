@@ -290,7 +290,7 @@ def test_an_edited_output_of_a_changed_image_is_not_replaced(run, photos: Path) 
         (["--format", "csv", "--density", 0.1], "--density"),
     ],
 )
-def test_what_was_made_with_other_settings_is_replaced_on_request_only(
+def test_what_was_made_with_other_settings_is_replaced_and_named(
     run, photos: Path, more: list[object], told: str
 ) -> None:
     mask = np.zeros((150, 200), np.uint8)
@@ -299,14 +299,33 @@ def test_what_was_made_with_other_settings_is_replaced_on_request_only(
     detect(run, photos / "cat.jpg")
     before = contents(Path("out"))
     result = run("detect", photos / "cat.jpg", "-o", "out", "--no-pictures", *more)
-    assert result.exit_code == 2
-    assert f"made with other settings ({told})" in result.stderr
-    assert "--overwrite" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
-    assert contents(Path("out")) == before
-    assert not detect(run, photos / "cat.jpg", *more, "--overwrite")[0]["skipped"]
+    assert result.exit_code == 0, result.output
+    assert f"results of {photos / 'cat.jpg'} with other options ({told})" in result.stderr
     assert contents(Path("out")) != before
+    assert len(contents(Path("out"))) == 1
     assert detect(run, photos / "cat.jpg", *more)[0]["skipped"]
+
+
+def test_the_first_thing_that_one_tries_works(run, photos: Path) -> None:
+    assert run("detect", photos / "cat.jpg").exit_code == 0
+    result = run("detect", photos / "cat.jpg", "--max-keypoints", 50)
+    assert result.exit_code == 0, result.output
+    assert "with other options (--max-keypoints)" in result.stderr
+    names = {"cat.npz", "cat_keypoints.jpg", "cat_heatmap.jpg"}
+    assert set(contents(Path("deepdetect-output"))) == names
+    assert len(load_keypoints("deepdetect-output/cat.npz")) == 50
+
+
+def test_results_appear_whole_or_not_at_all(
+    run, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise DeepDetectError("no picture today")
+
+    monkeypatch.setattr("deepdetect.viz.draw.draw_logits", fail)
+    result = run("detect", photos / "cat.jpg", "-o", "out")
+    assert result.exit_code == 2
+    assert not contents(Path("out"))
 
 
 def _of_another_image(photos: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
+pytest.importorskip("h5py", reason="needs h5py")
 
 from deepdetect.sfm.colmap import import_pycolmap
 from tests.cli.conftest import one_sentence

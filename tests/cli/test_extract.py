@@ -9,7 +9,7 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def _h5py() -> None:
-    pytest.importorskip("h5py", reason="needs h5py (the extra hdf5)")
+    pytest.importorskip("h5py", reason="needs h5py")
 
 
 def shapes(path: str) -> dict[str, tuple[int, ...]]:
@@ -91,7 +91,7 @@ def test_a_start_without_ray_leaves_nothing(
     monkeypatch.setitem(sys.modules, "ray", None)
     result = run("extract", photos, "--engine", "ray")
     assert result.exit_code == 2
-    assert "deepdetect[ray]" in result.stderr
+    assert "pip install 'ray[data]'" in result.stderr
     assert list(Path().iterdir()) == []
 
 

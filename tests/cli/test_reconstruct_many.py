@@ -20,7 +20,7 @@ from .conftest import one_sentence
 def fountain(shared: Path, tmp_path: Path) -> Path:
     """Small photographs of the fountain, and a black one."""
     pytest.importorskip("h5py", reason="needs h5py")
-    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
     folder = tmp_path / "photos"
     folder.mkdir()
     for name in ("0004", "0005", "0006"):
@@ -144,7 +144,7 @@ def test_without_pycolmap_it_says_what_to_install(run, tmp_path: Path, monkeypat
     result = run("reconstruct", tmp_path, "-o", "model")
     assert result.exit_code == 2
     assert one_sentence(result.stderr)
-    assert "pip install 'deepdetect[sfm]'" in result.stderr
+    assert "run pip install pycolmap h5py" in result.stderr
     assert not Path("model").exists()
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
-pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[sfm]'")
+pytest.importorskip("pycolmap", reason="needs pycolmap")
+pytest.importorskip("h5py", reason="needs h5py")
 pytest.importorskip("matplotlib", reason="needs matplotlib")
 
 from tests.cli.conftest import one_sentence

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
+pytest.importorskip("h5py", reason="needs h5py")
 
 from deepdetect import Keypoints
 from deepdetect.interchange import Collection, PairMatches, match_photographs
@@ -53,14 +53,14 @@ def fountain(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def fountain_collection(fountain: Path) -> Collection:
     """Their keypoints and matches, all pairs."""
-    pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
+    pytest.importorskip("h5py", reason="needs h5py")
     return match_photographs(fountain, max_keypoints=1500, workers=1)
 
 
 @pytest.fixture(scope="session")
 def map_database() -> Callable[[Path, Path, Path], object]:
     """Map a database by COLMAP, and return the largest model."""
-    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
     from deepdetect.sfm.colmap import quiet_pycolmap
 
     def run(database: Path, photographs: Path, folder: Path) -> object:

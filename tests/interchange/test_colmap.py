@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+pytest.importorskip("pycolmap", reason="needs pycolmap")
 
 from deepdetect import Camera, Keypoints, OptionError
 from deepdetect.interchange import Collection

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
+pytest.importorskip("h5py", reason="needs h5py")
 
 from deepdetect import Keypoints, OptionError
 from deepdetect.interchange import Collection, PairMatches, read_collection
@@ -93,7 +93,7 @@ def test_two_pairs_of_one_group_are_refused(tmp_path: Path) -> None:
 
 def test_it_is_mapped(fountain, fountain_collection, map_database, tmp_path: Path) -> None:
     """As `hloc.reconstruction.main`: keypoints with hloc's half pixel, matches, verification."""
-    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
     from deepdetect.sfm.colmap import quiet_pycolmap
 
     features, matches, pairs = write_hloc(fountain_collection, tmp_path / "hloc")

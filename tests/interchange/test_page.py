@@ -23,7 +23,7 @@ BLOCKS = re.findall(r"^( *)```(sh|python)\n(.*?)^ *```", PAGE, re.S | re.M)
 
 @pytest.mark.slow
 def test_the_page_runs(fountain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
     from deepdetect.sfm.colmap import import_pycolmap
 
     shutil.copytree(fountain, tmp_path / "photos")

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[hdf5]'")
+pytest.importorskip("h5py", reason="needs h5py")
 
 from deepdetect import DeepDetectError, OptionError, match_images, save_keypoints, save_matches
 from deepdetect._shared.errors import BatchError

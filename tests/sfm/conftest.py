@@ -12,7 +12,7 @@ FOUNTAIN = ("0003", "0004", "0005", "0006")
 def pycolmap():
     """The package, where it is installed; after OpenCV."""
     pytest.importorskip("h5py", reason="needs h5py")
-    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
     from deepdetect.sfm.colmap import import_pycolmap
 
     return import_pycolmap()

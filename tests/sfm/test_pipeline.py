@@ -85,7 +85,7 @@ def pose_errors(views, truth) -> tuple[float, float, float]:
 def small(write_fountain, tmp_path_factory) -> tuple[Path, Path]:
     """A folder of good and bad photographs, and the one that its model was written to."""
     pytest.importorskip("h5py", reason="needs h5py")
-    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
     data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
     from PIL import Image
 

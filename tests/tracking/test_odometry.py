@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
-pytest.importorskip("h5py", reason="needs h5py: pip install 'deepdetect[sfm]'")
+pytest.importorskip("pycolmap", reason="needs pycolmap")
+pytest.importorskip("h5py", reason="needs h5py")
 
 from deepdetect import OptionError
 from deepdetect.evaluation.metrics.trajectory import trajectory_errors

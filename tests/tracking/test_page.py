@@ -23,7 +23,7 @@ BLOCKS = re.findall(r"^```(sh|python)\n(.*?)^```", PAGE, re.S | re.M)
 def test_the_page_runs(
     shared: Path, moving_photo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
     import cv2
 
     (tmp_path / "frames").mkdir()

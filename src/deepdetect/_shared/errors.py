@@ -121,17 +121,28 @@ WITHOUT_GPU = (
 """How pip takes the build of torch for processors; on Linux it takes that for CUDA otherwise."""
 
 
+DISTRIBUTIONS = {
+    "cv2": "opencv-python-headless",
+    "faiss": "faiss-cpu",
+    "lightning_fabric": "lightning-fabric",
+    "ray": "'ray[data]'",
+    "skimage": "scikit-image",
+}
+"""What modules are called on PyPI, where it is another name."""
+
+
 def install_command(*packages: str) -> str:
-    """Return the command that installs packages, for the sentence of a `MissingExtraError`.
+    """Return the command that installs modules, for the sentence of a `MissingExtraError`.
 
     Example:
-        >>> install_command("onnx")
-        'pip install onnx'
+        >>> install_command("h5py", "faiss")
+        'pip install h5py faiss-cpu'
         >>> install_command("torch", "onnx")
         'pip install torch onnx, without a GPU with the option --extra-index-url \
 https://download.pytorch.org/whl/cpu, which spares 6 GB'
     """
-    command = f"pip install {' '.join(packages)}"
+    names = " ".join(DISTRIBUTIONS.get(package, package) for package in packages)
+    command = f"pip install {names}"
     return f"{command}, {WITHOUT_GPU}" if "torch" in packages else command
 
 

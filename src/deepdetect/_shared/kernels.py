@@ -21,10 +21,12 @@ from .errors import MissingExtraError
 
 _lock = threading.Lock()
 _announcement: list[Callable[[], object]] = []
+_cache_folders: set[Path] = set()
+"""Where numba keeps the kernels of the modules that have been imported."""
 
 
 def announce_compilation(tell: Callable[[], object]) -> None:
-    """Have a function called once, before the first kernel is compiled that no cache holds."""
+    """Have a function called before the first kernel is compiled, where no cache holds any."""
     _announcement[:] = [tell]
 
 
@@ -36,7 +38,9 @@ def _listen() -> None:
     class Listener(events.Listener):
         def on_start(self, event: Any) -> None:
             if _announcement:
-                _announcement.pop()()
+                tell = _announcement.pop()
+                if not any(any(folder.glob("*.nbi")) for folder in _cache_folders):
+                    tell()
 
         def on_end(self, event: Any) -> None:
             pass
@@ -64,9 +68,7 @@ def require_compiler(task: str, instead: str = "") -> None:
 
 
 def _missing(task: str, instead: str = "", reason: str = "is not installed") -> MissingExtraError:
-    return MissingExtraError(
-        f'{task} needs numba, which {reason}: run `pip install "deepdetect[match]"`{instead}'
-    )
+    return MissingExtraError(f"{task} needs numba, which {reason}: run pip install numba{instead}")
 
 
 def _import_numba() -> Any:
@@ -102,9 +104,12 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
-            return numba.njit(cache=True, **flags)(function)
+            kernel = numba.njit(cache=True, **flags)(function)
         except RuntimeError:  # numba found no writable folder
-            return _compiled_elsewhere(function, flags)
+            kernel = _compiled_elsewhere(function, flags)
+        if kernel.stats.cache_path is not None:
+            _cache_folders.add(Path(kernel.stats.cache_path))
+        return kernel
 
     return decorate
 

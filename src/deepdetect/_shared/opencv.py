@@ -1,7 +1,7 @@
 """OpenCV, imported when it is first used, whichever of its packages is installed.
 
-This package depends on none of them: they all install into one folder `cv2`, so that a second one
-would replace the first. Modules write `from .._shared.opencv import cv2`.
+They all install into one folder `cv2`, a later one over an earlier one. Modules write
+`from .._shared.opencv import cv2`.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def import_opencv() -> ModuleType:
         if error.name != "cv2":
             raise
         raise MissingExtraError(
-            'OpenCV is not installed: `pip install "deepdetect[opencv]"` brings it, '
-            f"and so does any other package of OpenCV {_text(LOWEST_VERSION)} or later"
+            "OpenCV is not installed: run pip install opencv-python-headless, or any other "
+            f"package of OpenCV {_text(LOWEST_VERSION)} or later"
         ) from None
     except ImportError as error:
         reason = (str(error).splitlines() or ["no reason given"])[0]
@@ -107,12 +107,11 @@ def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
             factory: Callable[..., cv2.Feature2D] = getattr(home, name)
             return factory
     short = name.removesuffix("_create").removesuffix("FeatureDetector").upper()
-    others = " ".join(each for each in installed_distributions() if "contrib" not in each)
+    headless = "opencv-python" not in installed_distributions()
     raise MissingExtraError(
         f"{short} needs OpenCV's contrib modules, which the installed OpenCV {cv2.__version__} "
-        "lacks: "
-        + (f"pip uninstall {others}, then " if others else "")
-        + "pip install --force-reinstall --no-deps opencv-contrib-python-headless"
+        "lacks: run pip install --force-reinstall --no-deps opencv-contrib-python"
+        + ("-headless" if headless else "")
     )
 
 

@@ -72,7 +72,7 @@ def import_h5py() -> Any:
         import h5py
     except ImportError:
         raise MissingExtraError(
-            "files of features and matches need h5py: pip install 'deepdetect[hdf5]'"
+            "files of features and matches need h5py: run pip install h5py"
         ) from None
     return h5py
 

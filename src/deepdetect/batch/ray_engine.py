@@ -128,7 +128,7 @@ def _import_ray() -> Any:
         import ray.exceptions
     except ImportError:
         raise MissingExtraError(
-            "the engine ray needs Ray: pip install 'deepdetect[ray]', or use the engine processes"
+            "the engine ray needs Ray: run pip install 'ray[data]', or use the engine processes"
         ) from None
     return ray
 

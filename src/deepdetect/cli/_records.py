@@ -25,6 +25,8 @@ class OutputRecords:
     Two commands may write to one folder: a record is written before the outputs, which both then
     know as theirs, and again, with their sizes and digests, when they are whole.
 
+    `changed` names the settings by which outputs that `find` has seen differ; they are replaced.
+
     Args:
         command: its name.
         folder: of the outputs; the records are in `.deepdetect/COMMAND` in it.
@@ -39,14 +41,15 @@ class OutputRecords:
         self.folder = folder / FOLDER / command
         self.settings = dict(settings)
         self.overwrite = overwrite
+        self.changed: dict[Path, list[str]] = {}
+        self._stale: dict[Path, list[Path]] = {}
         clear_abandoned(folder)
 
     def find(self, source: Path, outputs: Sequence[Path]) -> dict[str, Any] | None:
         """Return the numbers of an input whose outputs are done, None where work is left.
 
         Raises:
-            OptionError: outputs exist that were made from another file, with other settings or by
-                something else.
+            OptionError: outputs exist that were made from another file or by something else.
         """
         if self.overwrite:
             return None
@@ -61,13 +64,14 @@ class OutputRecords:
         if record["input"] != str(source.resolve()):
             raise _exists(there[0], f"made from {record['input']}")
         before = record["settings"]
-        names = sorted(n for n in {**before, **self.settings} if _differ(before, self.settings, n))
-        if names:
-            other = ", ".join(f"`{name}`" for name in names)
-            raise _exists(there[0], f"made with other settings ({other})")
         for path in there:
             if path.name not in files or not _unchanged(path, files[path.name]):
                 raise _exists(path, f"and is not what was made from {source}")
+        names = sorted(n for n in {**before, **self.settings} if _differ(before, self.settings, n))
+        if names:
+            self.changed[source] = names
+            self._stale[source] = [path for path in there if path not in outputs]
+            return None
         done = all(path in there and files[path.name] is not None for path in outputs)
         numbers = record["numbers"]
         same_input = record["state"] == _state(source)
@@ -84,9 +88,13 @@ class OutputRecords:
     def finish(self, source: Path, outputs: Sequence[Path], numbers: Mapping[str, Any]) -> None:
         """Note that the outputs of an input are whole; `find` gives the numbers back.
 
+        What was made with other settings, and is not made with these, is removed.
+
         Raises:
             DeepDetectError: the folder cannot be written.
         """
+        for path in self._stale.pop(source, ()):
+            path.unlink(missing_ok=True)
         self._write(source, {path.name: _fingerprint(path) for path in outputs}, numbers)
 
     def _path(self, source: Path) -> Path:

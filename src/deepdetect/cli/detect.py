@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from .. import __version__
-from ._generated import generated_command, given_only
+from ._generated import generated_command, given_only, with_flags
 from ._options import (
     DETECTOR,
     NOTHING_FOUND,
@@ -70,8 +71,9 @@ def detect(
     where they are pixels) and STEM_heatmap.jpg (logits). With --max-keypoints they are the best
     keypoints of all scales; without, all pixels over the threshold.
 
-    Images that are done are skipped when the same command runs again. What was made from other
-    images, with other options or by something else is replaced with --overwrite only. An image
+    Images that are done are skipped when the same command runs again, and done again with other
+    options. What was made from other images of the same name, or by something else, is replaced
+    with --overwrite only. An image
     that cannot be read does not stop the others: they are listed at the end, with exit code 1.
     Where no image has any keypoint the exit code is 3.
 
@@ -80,11 +82,13 @@ def detect(
     deepdetect detect photos/ -o keypoints --max-keypoints 2048 --spread grid
     deepdetect detect photo.jpg --density 0.1 --format csv
     """
+    from .._shared.opencv import import_opencv
     from .._shared.progress import progress
     from ..features.selection import SelectionOptions
     from ..io.masks import load_mask
     from ._records import OutputRecords, file_digest
 
+    import_opencv()  # what is missing is said before anything is written
     paths = expand_images(images, output)
     selecting = {name: value for name, value in values.items() if name not in DETECTOR.names}
     chosen = SelectionOptions(**given_only(selecting))
@@ -108,6 +112,14 @@ def detect(
     records = OutputRecords("detect", output, settings, overwrite)
     for path, files in outputs.items():  # before any work
         records.find(path, list(files.values()))
+    if records.changed:
+        names = sorted({name for changed in records.changed.values() for name in changed})
+        others = with_flags(
+            ", ".join(f"`{name}`" for name in names), click.get_current_context().command
+        )
+        count = len(records.changed)
+        whose = str(next(iter(records.changed))) if count == 1 else f"{count} images"
+        click.echo(f"replacing the results of {whose} with other options ({others})", err=True)
     results: list[dict[str, Any]] = []
     failures = []
     with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:
@@ -157,6 +169,7 @@ def _detect_one(
     records: OutputRecords,
 ) -> dict[str, Any]:
     """Detect, save and draw the keypoints of one image unless it is done; return its numbers."""
+    from .._shared.atomic import atomic_path
     from .._shared.errors import DeepDetectError, MissingExtraError, WeightsError
     from ..features.selection import SelectionOptions, select_keypoints
     from ..io.image import load_image
@@ -189,14 +202,16 @@ def _detect_one(
         named = str(error) if str(path) in str(error) else f"{path}: {error}"
         raise _Failure(named) from error
     records.begin(path, paths)
-    save_keypoints(keypoints, files["file"])
-    if drawn:
-        save_picture(draw_best_keypoints(rgb, keypoints), drawn["keypoints"])
-        if "dense" in drawn:
-            save_picture(draw_dense_keypoints(rgb, keypoints), drawn["dense"])
-        else:
-            _, logits = detector.heatmap_and_logits(rgb)
-        save_picture(draw_logits(logits), drawn["heatmap"])
+    with contextlib.ExitStack() as whole:  # all of them appear, or none
+        made = {name: whole.enter_context(atomic_path(file)) for name, file in files.items()}
+        save_keypoints(keypoints, made["file"])
+        if drawn:
+            save_picture(draw_best_keypoints(rgb, keypoints), made["keypoints"])
+            if "dense" in drawn:
+                save_picture(draw_dense_keypoints(rgb, keypoints), made["dense"])
+            else:
+                _, logits = detector.heatmap_and_logits(rgb)
+            save_picture(draw_logits(logits), made["heatmap"])
     numbers = {
         "width": keypoints.image_size[0],
         "height": keypoints.image_size[1],

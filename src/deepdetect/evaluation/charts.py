@@ -147,7 +147,7 @@ def _figure(width: float, height: float):  # type: ignore[no-untyped-def]
     except ImportError:
         raise MissingExtraError(
             "the report's charts need the package matplotlib, which is not installed: "
-            "run pip install 'deepdetect[benchmark]'"
+            "run pip install matplotlib"
         ) from None
     return Figure(figsize=(width, height), layout="constrained")
 

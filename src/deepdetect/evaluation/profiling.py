@@ -195,6 +195,6 @@ def _process() -> Any:
     except ImportError:
         raise MissingExtraError(
             "measuring memory needs the package psutil, which is not installed: "
-            "run pip install 'deepdetect[benchmark]'"
+            "run pip install psutil"
         ) from None
     return psutil.Process()

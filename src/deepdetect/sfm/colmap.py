@@ -33,7 +33,7 @@ def import_pycolmap(purpose: str = "a reconstruction from many photographs") -> 
         import pycolmap
     except ImportError:
         raise MissingExtraError(
-            f"{purpose} needs pycolmap and h5py: pip install 'deepdetect[sfm]'"
+            f"{purpose} needs pycolmap and h5py: run pip install pycolmap h5py"
         ) from None
     if first:
         _restore_sigterm()

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .._shared.errors import WITHOUT_GPU, MissingExtraError
+from .._shared.errors import MissingExtraError, install_command
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from .recipe import DeviceOptions, InitWeights, Stage, TrainingOptions
@@ -209,14 +209,14 @@ def _peak_memory_bytes() -> int | None:
     return peak if sys.platform == "darwin" else peak * 1024
 
 
-INSTALL_TRAINING = f'pip install "deepdetect[train]", {WITHOUT_GPU}'
+TRAINING_PACKAGES = ("torch", "lightning_fabric", "matplotlib", "safetensors", "onnx")
 
 
 def require_packages() -> None:
     """Raise a MissingExtraError that says what to install where training cannot run."""
-    for package in ("torch", "lightning_fabric", "safetensors", "onnx"):
+    for package in TRAINING_PACKAGES:
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(
                 f"training needs the package {package.replace('_', '-')}, which is not installed: "
-                f"run {INSTALL_TRAINING}"
+                f"run {install_command(*TRAINING_PACKAGES)}"
             )

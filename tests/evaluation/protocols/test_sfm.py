@@ -198,7 +198,7 @@ def test_what_cannot_be_reconstructed_is_a_result(
     write_posed_fountain, tmp_path: Path, monkeypatch
 ) -> None:
     """Without matches no photographs hang together: none is registered."""
-    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
     from deepdetect.evaluation.protocols import sfm_methods as module
 
     folder = write_posed_fountain(tmp_path / "fountain", ("0004", "0005", "0006"), 128)
@@ -219,7 +219,7 @@ def test_what_cannot_be_reconstructed_is_a_result(
 
 @pytest.mark.slow
 def test_a_whole_run_on_small_photographs(write_posed_fountain, tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap", reason="needs pycolmap: pip install 'deepdetect[sfm]'")
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
     names = [f"{number:04}" for number in range(2, 8)]
     folder = write_posed_fountain(tmp_path / "fountain", names)
     options = BenchmarkOptions(DeepDetect())

@@ -181,8 +181,7 @@ def _kd_tree(points: np.ndarray) -> Any:
         from scipy.spatial import KDTree
     except ImportError:
         raise MissingExtraError(
-            "repeatability needs the package scipy, which is not installed: "
-            "run pip install 'deepdetect[benchmark]'"
+            "repeatability needs the package scipy, which is not installed: run pip install scipy"
         ) from None
     return KDTree(np.asarray(points, np.float64).reshape(-1, 2))
 

@@ -74,7 +74,7 @@ def faiss_neighbours(
         import faiss
     except ImportError:
         raise MissingExtraError(
-            "the matcher faiss needs faiss: pip install 'deepdetect[faiss]', or use flann"
+            "the matcher faiss needs faiss: run pip install faiss-cpu, or use flann"
         ) from None
     quantizer = faiss.ScalarQuantizer
     kind = quantizer.QT_8bit_direct if base.dtype == np.uint8 else quantizer.QT_8bit
