@@ -23,7 +23,6 @@ BLOCKS = re.findall(r"^```(sh|python)\n(.*?)^```", PAGE, re.S | re.M)
 def test_the_page_runs(
     shared: Path, moving_photo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("pycolmap", reason="needs pycolmap")
     import cv2
 
     (tmp_path / "frames").mkdir()
@@ -48,6 +47,5 @@ def test_the_page_runs(
             result = CliRunner().invoke(main, words[1:], catch_exceptions=False)
             assert result.exit_code == 0, f"{line}\n{result.output}"
             done += 1
-    assert done == 4
+    assert done == 3
     assert {path.name for path in tmp_path.iterdir()} >= {"tracks.csv", "frames.csv", "frames.mp4"}
-    assert len((tmp_path / "poses.txt").read_text().splitlines()) == 8

@@ -8,7 +8,7 @@ import pytest
 
 from deepdetect import DeepDetectError, OptionError
 from deepdetect.tracking import TrackedFrame, load_tracks, save_tracks
-from deepdetect.tracking.tracks import common_rows, write_tracks
+from deepdetect.tracking.tracks import write_tracks
 
 
 def frame(number: int, tracks: list[int], ages: list[int]) -> TrackedFrame:
@@ -29,11 +29,6 @@ def test_the_table_is_read_by_other_programs_and_by_us(tmp_path: Path) -> None:
         assert one.number == other.number
         for name in ("tracks", "xy", "scores", "ages"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
-def test_common_rows() -> None:
-    rows0, rows1 = common_rows(frame(0, [2, 5, 9], [0, 0, 0]), frame(1, [1, 5, 9], [0, 1, 1]))
-    assert (rows0.tolist(), rows1.tolist()) == ([1, 2], [1, 2])
 
 
 @pytest.mark.parametrize(

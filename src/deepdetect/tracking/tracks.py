@@ -56,23 +56,6 @@ class TrackedFrame:
         return int(np.count_nonzero(self.ages == 0))
 
 
-def common_rows(first: TrackedFrame, second: TrackedFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of the tracks that two frames share.
-
-    Example:
-        >>> frames = [
-        ...     TrackedFrame(k, np.array(t), np.zeros((2, 2)), np.ones(2), np.zeros(2))
-        ...     for k, t in enumerate(([3, 5], [5, 8]))
-        ... ]
-        >>> common_rows(*frames)
-        (array([1]), array([0]))
-    """
-    _, rows0, rows1 = np.intersect1d(
-        first.tracks, second.tracks, assume_unique=True, return_indices=True
-    )
-    return rows0, rows1
-
-
 class TracksWriter:
     """Writes the table of tracks frame by frame: columns frame, track, x, y and score."""
 

@@ -1,0 +1,261 @@
+"""The path of a calibrated camera from the tracks of its video (monocular visual odometry).
+
+Two frames with enough motion give the first pose and points (essential matrix, triangulation). From
+then on each frame is placed by the points that it sees (PnP), keyframes add points, and the last
+keyframes are adjusted together with their points: that keeps the scale, which one camera cannot
+know. Poses and adjustment are COLMAP's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deepdetect import Calibration, Camera
+from deepdetect.geometry.triangulation import triangulate
+from deepdetect.sfm.colmap import PIXEL_CENTRE, import_pycolmap, quiet_pycolmap
+from deepdetect.tracking import TrackedFrame
+
+pycolmap = import_pycolmap("visual odometry")
+
+MIN_MOTION_PX = 5.0  # median motion of the tracks from one keyframe to the next
+MIN_FIRST_MOTION_PX = 15.0  # the same of the two frames that make the first points
+MIN_TRACKED = 0.7  # a frame that sees a smaller share of the last keyframe's points is a keyframe
+MAX_ERROR_PX = 2.0  # of a position that agrees with a pose and a point
+MIN_INLIERS = 20  # points that must agree with a pose
+MIN_ANGLE_DEG = 1.0  # between the rays to a new point
+WINDOW = 10  # keyframes that are adjusted together
+ANCHORS = 5  # keyframes before these, which stay where they are
+ROBUST_SCALE_PX = 0.5  # of the adjustment's loss (Cauchy)
+MAX_ITERATIONS = 10  # of the adjustment
+MAX_STRIKES = 2  # a track that has not agreed so often may be on something that moves: left out
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """A frame whose observations make the map, and its pose, world to camera."""
+
+    frame: TrackedFrame
+    pose: pycolmap.Rigid3d
+
+
+class VisualOdometry:
+    """Estimates the path of a camera, frame by frame.
+
+    Its world is the camera of the first frame; its unit is the distance between the two frames that
+    made the first points.
+
+    Args:
+        camera: of all frames, without distortion.
+
+    Attributes:
+        lost: number of the frame from which on no pose could be found, or None. Later frames have
+            no poses: their scale would be another.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self.lost: int | None = None
+        (fx, fy), (cx, cy) = camera.focal_px, camera.centre
+        self._colmap_camera = pycolmap.Camera(
+            camera_id=1,
+            model="PINHOLE",
+            width=camera.size[0],
+            height=camera.size[1],
+            params=[fx, fy, cx + PIXEL_CENTRE, cy + PIXEL_CENTRE],
+        )
+        self._waiting: list[TrackedFrame] = []
+        self._keyframes: list[Keyframe] = []
+        self._placed: list[tuple[int, int, pycolmap.Rigid3d]] = []  # frame, keyframe, from it
+        self._points = np.empty((0, 3))  # by the number of the track, NaN where it has none
+        self._strikes = np.empty(0, np.int64)
+        self._pose = self._motion = pycolmap.Rigid3d()
+
+    def update(self, frame: TrackedFrame) -> bool:
+        """Estimate the pose of the next frame; return whether it has one.
+
+        The first frames get theirs when the camera has moved enough.
+        """
+        if self.lost is not None:
+            return False
+        new = int(frame.tracks.max(initial=-1)) + 1 - len(self._points)
+        if new > 0:
+            self._points = np.concatenate([self._points, np.full((new, 3), np.nan)])
+            self._strikes = np.append(self._strikes, np.zeros(new, np.int64))
+        with quiet_pycolmap():
+            if not self._keyframes:
+                self._waiting.append(frame)
+                return self._begin()
+            if not self._place(frame):
+                self.lost = frame.number
+        return self.lost is None
+
+    def trajectory(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (F,) numbers of frames and (F, 3, 4) float64 poses, camera to world."""
+        poses = [
+            (relative * self._keyframes[keyframe].pose).inverse().matrix()
+            for _, keyframe, relative in self._placed
+        ]
+        numbers = [number for number, _, _ in self._placed]
+        return np.array(numbers, np.int64), np.array(poses).reshape(-1, 3, 4)
+
+    def _begin(self) -> bool:
+        """Make the first points, where the last frame shows that the camera has moved enough."""
+        first, last = self._waiting[0], self._waiting[-1]
+        tracks, rows0, rows1 = np.intersect1d(first.tracks, last.tracks, True, True)
+        if len(tracks) < MIN_INLIERS:  # too much has changed: begin here
+            self._waiting = [last]
+            return False
+        xy0, xy1 = first.xy[rows0].astype(float), last.xy[rows1].astype(float)
+        if np.median(np.linalg.norm(xy1 - xy0, axis=1)) < MIN_FIRST_MOTION_PX:
+            return False
+        options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True)
+        options.min_num_inliers = MIN_INLIERS
+        options.ransac.max_error = MAX_ERROR_PX / 2
+        options.ransac.random_seed = 0
+        matches = np.repeat(np.arange(len(tracks), dtype=np.uint32)[:, None], 2, axis=1)
+        places = (self._colmap_camera, xy0 + PIXEL_CENTRE, self._colmap_camera, xy1 + PIXEL_CENTRE)
+        geometry = pycolmap.estimate_calibrated_two_view_geometry(*places, matches, options)
+        agreeing = geometry.inlier_matches[:, 0]
+        if len(agreeing) < MIN_INLIERS or geometry.cam2_from_cam1 is None:
+            return False
+        keyframes = [Keyframe(first, pycolmap.Rigid3d())]
+        keyframes.append(Keyframe(last, geometry.cam2_from_cam1))
+        self._triangulate(*keyframes, tracks[agreeing], MAX_ERROR_PX)
+        if np.isfinite(self._points[tracks, 0]).sum() < MIN_INLIERS:
+            return False
+        self._keyframes = keyframes
+        self._adjust()
+        self._placed.append((first.number, 0, pycolmap.Rigid3d()))
+        for frame in self._waiting[1:-1]:
+            pose = self._solve(frame)
+            if pose is not None:
+                self._placed.append((frame.number, 0, pose))
+        self._placed.append((last.number, 1, pycolmap.Rigid3d()))
+        return True
+
+    def _place(self, frame: TrackedFrame) -> bool:
+        """Estimate the pose of a frame by the points that it sees; make it a keyframe or not."""
+        pose = self._solve(frame)
+        if pose is None:
+            return False
+        outliers = self._errors(frame, pose) >= MAX_ERROR_PX
+        self._strikes[frame.tracks[outliers & self._known(frame)]] += 1
+        self._points[self._strikes >= MAX_STRIKES] = np.nan
+        last = self._keyframes[-1]
+        _, rows0, rows1 = np.intersect1d(last.frame.tracks, frame.tracks, True, True)
+        motion = np.linalg.norm(last.frame.xy[rows0] - frame.xy[rows1], axis=1)
+        known = self._known(last.frame)
+        tracked = known[rows0].sum() / max(1, known.sum())
+        if tracked >= MIN_TRACKED and np.median(motion) < MIN_MOTION_PX:
+            self._placed.append(
+                (frame.number, len(self._keyframes) - 1, pose * last.pose.inverse())
+            )
+            return True
+        new = Keyframe(frame, pose)
+        self._keyframes.append(new)
+        self._placed.append((frame.number, len(self._keyframes) - 1, pycolmap.Rigid3d()))
+        for keyframe in self._keyframes[-WINDOW:-1]:
+            unknown = frame.tracks[
+                ~self._known(frame) & (self._strikes[frame.tracks] < MAX_STRIKES)
+            ]
+            tracks = np.intersect1d(keyframe.frame.tracks, unknown, True)
+            self._triangulate(keyframe, new, tracks, MAX_ERROR_PX / 2)
+        self._adjust()
+        return True
+
+    def _known(self, frame: TrackedFrame) -> np.ndarray:
+        """Return which tracks of a frame have a point."""
+        return np.isfinite(self._points[frame.tracks, 0])
+
+    def _errors(self, frame: TrackedFrame, pose: pycolmap.Rigid3d) -> np.ndarray:
+        """Return reprojection errors of a frame's tracks; infinite behind it, NaN unknown."""
+        matrix = pose.matrix()
+        seen = self._points[frame.tracks] @ matrix[:, :3].T + matrix[:, 3]
+        with np.errstate(invalid="ignore"):
+            errors = np.linalg.norm(self.camera.project(seen) - frame.xy, axis=1)
+        return np.where(seen[:, 2] <= 0, np.inf, errors)
+
+    def _solve(self, frame: TrackedFrame) -> pycolmap.Rigid3d | None:
+        """Return a frame's pose by the points that it sees, or None."""
+        known = self._known(frame)
+        if known.sum() < MIN_INLIERS:
+            return None
+        options = pycolmap.AbsolutePoseEstimationOptions()
+        options.ransac.max_error = MAX_ERROR_PX
+        options.ransac.random_seed = 0
+        xy, points = frame.xy[known] + PIXEL_CENTRE, self._points[frame.tracks[known]]
+        found = pycolmap.estimate_and_refine_absolute_pose(xy, points, self._colmap_camera, options)
+        if found is None or found["num_inliers"] < MIN_INLIERS:
+            return None
+        return found["cam_from_world"]
+
+    def _triangulate(
+        self, first: Keyframe, second: Keyframe, tracks: np.ndarray, max_error_px: float
+    ) -> None:
+        """Give points to tracks that two keyframes see, where their rays agree."""
+        if not len(tracks):
+            return
+        relative = second.pose * first.pose.inverse()
+        xy0, xy1 = (
+            each.frame.xy[np.searchsorted(each.frame.tracks, tracks)].astype(float)
+            for each in (first, second)
+        )
+        calibration = Calibration(self.camera, self.camera)
+        found = triangulate(xy0, xy1, calibration, relative.rotation.matrix(), relative.translation)
+        good = (
+            found.cheirality
+            & (found.triangulation_angle > np.radians(MIN_ANGLE_DEG))
+            & (found.reprojection_errors < max_error_px)
+        )
+        matrix = first.pose.inverse().matrix()
+        self._points[tracks[good]] = found.points[good] @ matrix[:, :3].T + matrix[:, 3]
+
+    def _adjust(self) -> None:
+        """Adjust the last keyframes and their points, and leave out what does not agree."""
+        window = self._keyframes[-WINDOW - ANCHORS :]
+        seen_by: dict[int, list[tuple[int, int]]] = {}
+        for k, keyframe in enumerate(window, 1):
+            used = self._errors(keyframe.frame, keyframe.pose) < MAX_ERROR_PX
+            for row in np.flatnonzero(used).tolist():
+                seen_by.setdefault(int(keyframe.frame.tracks[row]), []).append((k, row))
+        model = pycolmap.Reconstruction()
+        model.add_camera_with_trivial_rig(self._colmap_camera)
+        config = pycolmap.BundleAdjustmentConfig()
+        config.set_constant_cam_intrinsics(1)
+        for k, keyframe in enumerate(window, 1):
+            xy = keyframe.frame.xy + PIXEL_CENTRE
+            image = pycolmap.Image(name=str(k), keypoints=xy, camera_id=1, image_id=k)
+            model.add_image_with_trivial_frame(image, keyframe.pose)
+            config.add_image(k)
+            if k <= max(1, len(window) - WINDOW):
+                config.set_constant_rig_from_world_pose(k)
+        numbers = {}
+        for track, places in seen_by.items():
+            if len(places) > 1:
+                elements = [pycolmap.TrackElement(k, row) for k, row in places]
+                numbers[track] = model.add_point3D(self._points[track], pycolmap.Track(elements))
+        options = pycolmap.BundleAdjustmentOptions()
+        options.print_summary = False
+        options.refine_focal_length = options.refine_extra_params = False
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = ROBUST_SCALE_PX
+        options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
+        before = np.linalg.norm((window[1].pose * window[0].pose.inverse()).translation)
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+        for k, keyframe in enumerate(window, 1):
+            keyframe.pose = model.images[k].cam_from_world()
+        for track, number in numbers.items():
+            self._points[track] = model.points3D[number].xyz
+        if len(window) <= WINDOW + 1:  # a single fixed camera leaves the scale free
+            after = np.linalg.norm((window[1].pose * window[0].pose.inverse()).translation)
+            self._points *= before / after
+            for keyframe in window:
+                keyframe.pose.translation *= before / after
+        counts = np.zeros(len(self._points), np.int64)
+        for keyframe in window:
+            used = self._errors(keyframe.frame, keyframe.pose) < MAX_ERROR_PX
+            counts[keyframe.frame.tracks[used]] += 1
+        recent = np.unique(np.concatenate([keyframe.frame.tracks for keyframe in window]))
+        self._points[recent[counts[recent] < 2]] = np.nan
