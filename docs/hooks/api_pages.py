@@ -94,8 +94,8 @@ _PAGES = (
     ),
     ApiPage(
         "api/tracking.md",
-        "Tracking and odometry",
-        "Points followed through a video, and the path of the camera.",
+        "Tracking",
+        "Points followed through a video.",
         ("tracking",),
     ),
     ApiPage(

@@ -4,7 +4,6 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip("h5py", reason="needs h5py")
@@ -38,7 +37,6 @@ def summary(result) -> dict[str, object]:
     [
         ("colmap", {"made"}),
         ("hloc", {"features.h5", "matches.h5", "pairs.txt"}),
-        ("opencv", {"cat.jpg.yml", "left.png.yml", "right.png.yml", "matches.yml"}),
     ],
 )
 def test_saved_files_in_all_formats(
@@ -57,24 +55,6 @@ def test_saved_files_in_all_formats(
     one = summary(run("export", form, *npz, "--images", photos, "-o", f"npz-{output}", "--json"))
     assert (one["images"], one["pairs"]) == (3, 1)
     assert one["matches"] > many["matches"] > 50
-
-
-def test_jpeg_files_for_bundler(run, photos: Path, tmp_path: Path) -> None:
-    from PIL import Image
-
-    (tmp_path / "jpg").mkdir()
-    for name in ("left", "right"):
-        with Image.open(photos / f"{name}.png") as image:
-            image.convert("RGB").save(tmp_path / "jpg" / f"{name}.jpg")
-    words = ("jpg", "-o", "made", "--max-keypoints", 300, "--workers", 1, "--focal", 500, "--json")
-    made = summary(run("export", "bundler", *words))
-    assert {Path(file).name for file in made["files"]} == {
-        *("left.key", "right.key", "list.txt", "matches.init.txt")
-    }
-    assert (tmp_path / "made/list.txt").read_text() == "left.jpg 0 500.0000\nright.jpg 0 500.0000\n"
-    first, count, *rows = (tmp_path / "made/matches.init.txt").read_text().splitlines()
-    assert (first, int(count)) == ("0 1", len(rows))
-    assert made["matches"] == len(rows) > 20
 
 
 def test_straight_from_photographs(run, photos: Path, tmp_path: Path) -> None:
@@ -104,30 +84,16 @@ def test_text_files_of_colmap(run, saved: Path, photos: Path) -> None:
     assert "leave out --focal" in result.output
 
 
-def test_opencv_reads_the_keypoints_of_detect(run, saved: Path) -> None:
-    import cv2
-
-    made = summary(
-        run("export", "opencv", "out/cat.npz", "-o", "points", "--format", "json", "--json")
-    )
-    assert "points/cat.json" in made["files"]
-    storage = cv2.FileStorage(str(saved / "points/cat.json"), cv2.FileStorage_READ)
-    first = storage.getNode("keypoints").at(0)
-    with np.load(saved / "out/cat.npz") as arrays:
-        expected = arrays["keypoints"][0]
-    np.testing.assert_allclose([first.at(0).real(), first.at(1).real()], expected, rtol=1e-6)
-
-
 def test_nothing_is_replaced_silently(run, saved: Path) -> None:
     (saved / "full").mkdir()
-    (saved / "full" / "cat.jpg.yml").write_text("mine")
-    result = run("export", "opencv", "f.h5", "-o", "full")
+    (saved / "full" / "features.txt").write_text("mine")
+    result = run("export", "hloc", "f.h5", "-o", "full")
     assert result.exit_code == 2
     assert "not empty" in result.output
-    assert (saved / "full" / "cat.jpg.yml").read_text() == "mine"
-    assert run("export", "opencv", "f.h5", "-o", "full", "--overwrite").exit_code == 0
-    assert run("export", "opencv", "f.h5", "-o", "full").exit_code == 0  # our own
-    result = run("export", "opencv", "out/cat.npz", "-o", "full")
+    assert (saved / "full" / "features.txt").read_text() == "mine"
+    assert run("export", "hloc", "f.h5", "-o", "full", "--overwrite").exit_code == 0
+    assert run("export", "hloc", "f.h5", "-o", "full").exit_code == 0  # our own
+    result = run("export", "hloc", "out/cat.npz", "-o", "full")
     assert result.exit_code == 2
     assert "made from" in result.output
 
@@ -143,9 +109,8 @@ def test_nothing_is_replaced_silently(run, saved: Path) -> None:
         ("hloc f.h5 -o a --pairs pairs.txt", "--pairs is for a folder"),
         ("hloc f.h5 out/cat.npz -o a", "one HDF5 file of features"),
         ("hloc out/left_right_matches.npz --matches m.h5 -o a", "leave out --matches"),
-        ("bundler out/cat.npz -o a", "no SIFT descriptors"),
-        ("bundler f.h5 --matches m.h5 -o a", "rename or convert left.png"),
-        ("opencv m.h5 -o a", "holds no features"),
+        ("colmap out/cat.npz -o a", "no SIFT descriptors"),
+        ("hloc m.h5 -o a", "holds no features"),
         ("hloc {photos} -o a --pairs none.txt", "no file none.txt"),
     ],
 )
@@ -169,13 +134,13 @@ def test_a_bad_photograph_does_not_stop_the_export(run, photos: Path, tmp_path: 
     shutil.copytree(photos, tmp_path / "photos")
     (tmp_path / "photos" / "broken.jpg").write_bytes(b"no image")
     words = ("photos", "--max-keypoints", 200, "--workers", 1)
-    result = run("export", "opencv", *words, "-o", "made", "--json")
+    result = run("export", "hloc", *words, "-o", "made", "--json")
     assert result.exit_code == 1, result.output
     assert "1 of the photographs and pairs failed" in result.stderr
     assert "broken.jpg is not an image" in result.stderr
     made = json.loads(result.stdout)
     assert (made["images"], made["pairs"], len(made["failures"])) == (3, 3, 1)
-    assert (tmp_path / "made" / "cat.jpg.yml").is_file()
+    assert (tmp_path / "made" / "features.h5").is_file()
     result = run("export", "hloc", *words, "-o", "small", "--max-megapixels", 0.001)
     assert result.exit_code == 1
     assert "--max-megapixels" in result.stderr
@@ -186,7 +151,6 @@ def test_a_bad_photograph_does_not_stop_the_export(run, photos: Path, tmp_path: 
     [
         ("colmap photos -o a.db --focal -5", "focal length must be above 0"),
         ("colmap photos -o a.db --calibration none.json", "no file none.json"),
-        ("bundler photos -o a", "rename or convert left.png"),
         ("hloc photos -o a", "rename 'my cat.jpg'"),
     ],
 )

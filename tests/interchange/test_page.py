@@ -50,7 +50,7 @@ def test_the_page_runs(fountain: Path, tmp_path: Path, monkeypatch: pytest.Monke
             result = CliRunner().invoke(main, words[1:], catch_exceptions=False)
             assert result.exit_code == 0, f"{line}\n{result.output}"
             done += 1
-    assert done >= 13
+    assert done >= 10
     pycolmap = import_pycolmap()
     assert pycolmap.Reconstruction("sparse/0").num_reg_images() == len(names)
     for name, count in (("database.db", 6), ("many.db", 6), ("few.db", 2)):

@@ -11,8 +11,7 @@ from deepdetect.geometry.posed_view import PosedView
 from deepdetect.sfm.dense import find_references, limited_view
 from deepdetect.sfm.fusion import DenseOptions
 from deepdetect.sfm.lens import Lens
-from deepdetect.sfm.mapping import SparseModel
-from deepdetect.sfm.track_refinement import Observations
+from deepdetect.sfm.mapping import Observations, SparseModel
 
 SIZE = (320, 240)
 

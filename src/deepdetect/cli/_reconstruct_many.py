@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 MANY = FieldOptions(
     "sfm.pipeline:reconstruct_many",
-    names=("pairs", "sequential", "dense", "stride_px", "refine_tracks", "single_camera"),
+    names=("pairs", "sequential", "dense", "stride_px", "single_camera"),
     flags={
         "stride_px": "--stride",
         "single_camera": "--single-camera/--camera-each",
     },
     metavars={"sequential": "N", "stride_px": "PX"},
-    defaults={"refine_tracks": "no", "stride_px": "2"},
+    defaults={"stride_px": "2"},
 )
 """Options that two photographs do not have."""
 

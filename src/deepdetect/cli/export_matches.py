@@ -1,4 +1,4 @@
-"""`deepdetect export colmap`, `hloc`, `opencv` and `bundler`: keypoints and matches."""
+"""`deepdetect export colmap` and `hloc`: keypoints and matches."""
 
 from __future__ import annotations
 
@@ -168,52 +168,6 @@ def export_hloc(sources: tuple[Path, ...], output: Path, descriptors: bool, **va
     _export("hloc", sources, output, descriptors, values)
 
 
-@click.command("opencv", short_help="Keypoints and matches for cv::FileStorage.")
-@_with(*_COMMON)
-@_folder_output("opencv-files")
-@click.option(
-    "--format",
-    "file_format",
-    type=click.Choice(["yml", "yml.gz", "xml", "json"]),
-    default="yml",
-    show_default=True,
-    help="Of the files.",
-)
-@click.option(
-    "--descriptors/--no-descriptors",
-    default=True,
-    show_default=True,
-    help="Describe keypoints that have no descriptors (needs --images).",
-)
-def export_opencv(
-    sources: tuple[Path, ...], output: Path, file_format: str, descriptors: bool, **values: Any
-) -> None:
-    """Write files that cv::FileStorage reads into vectors of KeyPoint and DMatch, and a Mat.
-
-    SOURCE as of deepdetect export colmap.
-
-    \b
-    deepdetect export opencv photo.npz -o points/
-    deepdetect export opencv features.h5 --matches matches.h5 -o points/ --format json
-    """
-    _export("opencv", sources, output, descriptors, values, file_format=file_format)
-
-
-@click.command("bundler", short_help="Keypoints and matches as files of Bundler.")
-@_with(*_COMMON, *_CAMERAS)
-@_folder_output("bundler-files")
-def export_bundler(sources: tuple[Path, ...], output: Path, **values: Any) -> None:
-    """Write list.txt, Lowe's .key files and matches.init.txt, for Bundler.
-
-    SOURCE as of deepdetect export colmap. Photographs are JPEG files that end in .jpg: Bundler does
-    not know the sizes of others.
-
-    \b
-    deepdetect export bundler photos/ -o bundler/
-    """
-    _export("bundler", sources, output, True, values)
-
-
 def _export(
     form: str,
     sources: tuple[Path, ...],
@@ -232,7 +186,7 @@ def _export(
         values: of the options that several commands share.
         settings: of the format.
     """
-    from ..interchange import describe_collection, get_format
+    from ..interchange import describe_collection, write_colmap, write_colmap_text, write_hloc
     from ..sfm.colmap import import_pycolmap
 
     as_json, overwrite = values.pop("as_json"), values.pop("overwrite")
@@ -242,7 +196,7 @@ def _export(
     if one_file:  # what is missing is said before the work
         import_pycolmap("a database of COLMAP")
     _check_before_work(form, sources, camera)
-    marker = output if one_file else output / MARKERS[form].format(**settings)
+    marker = output if one_file else output / MARKERS[form]
     if not (one_file or overwrite or marker.exists()) and _has_files(output):
         raise OptionError(
             f"{output} is a folder that is not empty: choose another with -o, or write into it "
@@ -255,7 +209,12 @@ def _export(
             collection = describe_collection(collection, quiet=False)
         if camera:
             settings["lenses"] = _lenses(collection, camera)
-        files = get_format(form)(collection, output, **settings)
+        writers: dict[str, Callable[..., tuple[Path, ...]]] = {
+            "colmap": write_colmap,
+            "colmap-text": write_colmap_text,
+            "hloc": write_hloc,
+        }
+        files = writers[form](collection, output, **settings)
     keypoints = sum(len(points) for points in collection.keypoints.values())
     matches = sum(len(found) for found in collection.matches.values())
     print_result(
@@ -299,8 +258,10 @@ def _check_before_work(form: str, sources: tuple[Path, ...], camera: Mapping[str
     if len(sources) == 1 and sources[0].is_dir():
         paths = find_images(sources[0])
         check_not_made(sources[0], paths)
-        check_names(form, (path.relative_to(sources[0]).as_posix() for path in paths))
-        check_upright(form, paths)
+        if form != "colmap":
+            check_names(path.relative_to(sources[0]).as_posix() for path in paths)
+        if form == "hloc":
+            check_upright(paths)
 
 
 def _has_files(folder: Path) -> bool:
@@ -308,12 +269,7 @@ def _has_files(folder: Path) -> bool:
     return folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir())
 
 
-MARKERS = {
-    "colmap-text": "matches.txt",
-    "hloc": "features.h5",
-    "opencv": "matches.{file_format}",
-    "bundler": "list.txt",
-}
+MARKERS = {"colmap-text": "matches.txt", "hloc": "features.h5"}
 """File of a folder by which it is known whose it is."""
 
 
@@ -351,4 +307,4 @@ def _lenses(collection: Collection, camera: Mapping[str, Any]) -> dict[str, Lens
     )
 
 
-EXPORTS_OF_MATCHES = (export_colmap, export_hloc, export_opencv, export_bundler)
+EXPORTS_OF_MATCHES = (export_colmap, export_hloc)

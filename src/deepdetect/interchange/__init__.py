@@ -1,15 +1,17 @@
-"""Keypoints and matches in the files of other programs: COLMAP, hloc, OpenCV, Bundler."""
+"""Keypoints and matches in the files of other programs: COLMAP, hloc."""
 
 from .collection import Collection, PairMatches, describe_collection
-from .formats import FORMATS, get_format
+from .colmap import write_colmap, write_colmap_text
+from .hloc import write_hloc
 from .sources import match_photographs, read_collection
 
 __all__ = [
-    "FORMATS",
     "Collection",
     "PairMatches",
     "describe_collection",
-    "get_format",
     "match_photographs",
     "read_collection",
+    "write_colmap",
+    "write_colmap_text",
+    "write_hloc",
 ]

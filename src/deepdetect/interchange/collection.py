@@ -23,19 +23,6 @@ ROOT_SIFT_NORM = 512
 
 SIFT_NUMBERS = 128
 
-MATCHES_NAME = "matches"
-"""Of a file of all matches beside one file for each photograph, without its ending."""
-
-BLANK_SEPARATED = {
-    "bundler": "Bundler's lists",
-    "colmap-text": "COLMAP's lists of matches",
-    "hloc": "hloc's lists of pairs",
-}
-"""Formats with lists of names that have a blank between them."""
-
-BUNDLER_ENDINGS = (".jpg", ".pgm", ".bmp")
-"""Of files whose sizes Bundler reads; it takes 1504x1000 pixels for that of all others."""
-
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
@@ -108,8 +95,8 @@ class Collection:
                     )
 
     @property
-    def photographs(self) -> list[Path]:
-        """Files of the photographs, as far as they are known."""
+    def paths(self) -> list[Path]:
+        """Files of the images, as far as they are known."""
         return [path for name in self.keypoints if (path := self.path(name)) is not None]
 
     def path(self, name: str) -> Path | None:
@@ -153,45 +140,30 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
     return replace(collection, keypoints=described)
 
 
-def check_names(form: str, names: Iterable[str]) -> None:
-    """Refuse names that the reader of a format would misunderstand.
+def check_names(names: Iterable[str]) -> None:
+    """Refuse names that a list of names with blanks between them cannot hold.
 
     Raises:
-        OptionError: a name has a blank, where lists of names are separated by blanks, or an ending
-            that Bundler does not know.
+        OptionError: a name has a blank.
 
     Example:
-        >>> check_names("hloc", ["db/1.jpg"])
+        >>> check_names(["db/1.jpg"])
     """
-    if form not in BLANK_SEPARATED:
-        return
     for name in names:
         if len(name.split()) != 1:
-            raise OptionError(f"{BLANK_SEPARATED[form]} separate by blanks: rename {name!r}")
-        if form == "bundler" and not name.endswith(BUNDLER_ENDINGS):
-            raise OptionError(
-                "Bundler reads the sizes of files that end in .jpg, .pgm or .bmp, in small letters "
-                f"only: rename or convert {name}"
-            )
+            raise OptionError(f"lists of this format separate names by blanks: rename {name!r}")
 
 
-READS_AS_STORED = {"bundler": "Bundler", "hloc": "hloc"}
-"""Readers that take the size of a photograph from its file, and do not turn it by EXIF."""
-
-
-def check_upright(form: str, photographs: Iterable[Path]) -> None:
-    """Refuse photographs that EXIF turns where the reader of a format does not turn them.
+def check_upright(paths: Iterable[Path]) -> None:
+    """Refuse images that EXIF turns, for readers that take the size from the file as it is stored.
 
     Args:
-        form: the format.
-        photographs: their files; those that cannot be read are not checked.
+        paths: of images; those that cannot be read are not checked.
 
     Raises:
         OptionError: one is to be turned.
     """
-    if form not in READS_AS_STORED:
-        return
-    for path in photographs:
+    for path in paths:
         try:
             with open_image(path) as image:
                 turned = image.getexif().get(ORIENTATION_TAG, 1) != 1
@@ -199,22 +171,9 @@ def check_upright(form: str, photographs: Iterable[Path]) -> None:
             continue
         if turned:
             raise OptionError(
-                f"{path} is turned by its EXIF orientation, which {READS_AS_STORED[form]} does not "
-                "do: save it upright, without that tag (mogrify -auto-orient)"
+                f"{path} is turned by its EXIF orientation, which hloc does not do: save it "
+                "upright, without that tag (mogrify -auto-orient)"
             )
-
-
-def check_matches_name(names: Iterable[str]) -> None:
-    """Refuse a photograph whose file would be that of the matches.
-
-    Raises:
-        OptionError: one is named "matches", without an ending.
-    """
-    if MATCHES_NAME in names:
-        raise OptionError(
-            f"the keypoints of {MATCHES_NAME!r} would have the file of the matches: rename their "
-            "file, or name the folder of the photographs as `images`"
-        )
 
 
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:

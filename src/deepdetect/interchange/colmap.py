@@ -19,7 +19,10 @@ from ..sfm.colmap import PIXEL_CENTRE, import_pycolmap
 from ..sfm.database import DatabaseImage, write_database
 from ..sfm.lens import Lens
 from ..sfm.mapping import MappingOptions, verify_pairs
-from .collection import MATCHES_NAME, Collection, check_matches_name, check_names, sift_bytes
+from .collection import Collection, check_names, sift_bytes
+
+MATCHES_NAME = "matches"
+"""Of the text file of all matches, without its ending."""
 
 DEFAULT_SIZE_PX = 3.0
 """Diameter of keypoints without a size: that of dense keypoints."""
@@ -104,8 +107,12 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
             the list of matches has a blank; or a photograph is named "matches", without an ending.
         DeepDetectError: a file cannot be written.
     """
-    check_names("colmap-text", (name for pair in collection.matches for name in pair))
-    check_matches_name(collection.keypoints)
+    check_names(name for pair in collection.matches for name in pair)
+    if MATCHES_NAME in collection.keypoints:
+        raise OptionError(
+            f"the keypoints of {MATCHES_NAME!r} would have the file of the matches: rename their "
+            "file, or name the folder of the images as `images`"
+        )
     folder = Path(output)
     written = []
     for name, points in collection.keypoints.items():

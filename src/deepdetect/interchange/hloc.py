@@ -41,8 +41,8 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
         DeepDetectError: a file cannot be written.
         MissingExtraError: h5py is not installed.
     """
-    check_names("hloc", (name for pair in collection.matches for name in pair))
-    check_upright("hloc", collection.photographs)
+    check_names(name for pair in collection.matches for name in pair)
+    check_upright(collection.paths)
     features, matches, pairs = (Path(output) / name for name in FILES)
 
     def feature_groups() -> Iterator[Group]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from ..geometry.posed_view import PosedView
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .lens import Lens
 from .pair_selection import largest_group
-from .track_refinement import Observations, TrackRefinementOptions, refine_observations
 
 Pair = tuple[str, str]
 
@@ -39,11 +38,7 @@ class MappingOptions:
         forward_angle_deg: COLMAP begins with a pair whose points are seen at large angles, and
             which did not move straight ahead. Where there is none, as in a clip from a car, or
             where more photographs are left than mapped, it may have, and this angle is enough.
-        refine_tracks: align the patches around all observations of a point before the last
-            adjustment.
-        track_refinement: how they are aligned.
         robust_scale_px: of the loss (Cauchy) of the last adjustment: larger errors count less.
-        refined_scale_px: the same where tracks are aligned.
         min_views_of_principal_point: photographs of each camera from which that adjustment also
             estimates its principal point: with fewer it is in the middle.
         seed: of all random choices.
@@ -58,10 +53,7 @@ class MappingOptions:
     max_models: int = 5
     max_first_pairs: int = 20
     forward_angle_deg: float = 4.0
-    refine_tracks: bool = False
-    track_refinement: TrackRefinementOptions = field(default_factory=TrackRefinementOptions)
     robust_scale_px: float = 1.0
-    refined_scale_px: float = 0.3
     min_views_of_principal_point: int = 8
     seed: int = 0
 
@@ -70,12 +62,27 @@ class MappingOptions:
             self,
             positive=(
                 *("min_verified", "max_verification_error_px"),
-                *("robust_scale_px", "refined_scale_px", "max_models", "max_first_pairs"),
+                *("robust_scale_px", "max_models", "max_first_pairs"),
                 "forward_angle_deg",
             ),
             not_negative=("seed",),
             between={"min_views": (2, np.inf), "min_views_of_principal_point": (3, np.inf)},
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Where points are seen: one row for each point in each photograph that sees it.
+
+    Attributes:
+        points: (K,) int64 rows of the points, ascending.
+        views: (K,) int64 numbers of the photographs.
+        xy: (K, 2) float64 positions in pixels.
+    """
+
+    points: np.ndarray
+    views: np.ndarray
+    xy: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,46 +284,6 @@ def _mean_errors(
         distances[own] = np.linalg.norm(projected - seen.xy[own], axis=1)
     sums = np.bincount(seen.points, distances, minlength=len(points))
     return sums / np.maximum(np.bincount(seen.points, minlength=len(points)), 1)
-
-
-def align_tracks(
-    model: Any,
-    images: Mapping[str, np.ndarray],
-    options: TrackRefinementOptions = TrackRefinementOptions(),
-) -> None:
-    """Align the observations of each point; an adjustment must follow.
-
-    Observations that do not align are left out, points with fewer than two others too.
-
-    Args:
-        model: a `pycolmap.Reconstruction`, which is changed.
-        images: (H, W) uint8 luma by name.
-        options: how.
-    """
-    sparse = read_sparse_model(model)
-    numbers = sorted(model.points3D)
-    places = [
-        (element.image_id, element.point2D_idx)
-        for number in numbers
-        for element in model.points3D[number].track.elements
-    ]
-    straight = {
-        number: sparse.lenses[number].undistort(images[view.name])
-        for number, view in sparse.views.items()
-    }
-    refined, aligned = refine_observations(
-        straight, sparse.views, sparse.points, sparse.seen, options
-    )
-    for number, lens in sparse.lenses.items():
-        own = sparse.seen.views == number
-        refined[own] = lens.from_pinhole(refined[own])
-    for (image, row), xy, good in zip(places, refined, aligned, strict=True):
-        if good:
-            model.images[image].points2D[row].xy = xy + PIXEL_CENTRE
-    for (image, row), good in zip(places, aligned, strict=True):
-        # The last observation but one takes the point with it.
-        if not good and model.images[image].points2D[row].has_point3D():
-            model.delete_observation(image, row)
 
 
 def adjust(

@@ -48,7 +48,6 @@ def reconstruct_many(
     max_keypoints: int | None = None,
     dense: bool = True,
     stride_px: int | None = None,
-    refine_tracks: bool | None = None,
     single_camera: bool | None = None,
     detector: Mapping[str, Any] | None = None,
     seed: int | None = None,
@@ -79,8 +78,6 @@ def reconstruct_many(
         max_keypoints: of each photograph.
         dense: whether dense points are made.
         stride_px: a dense point is sought at every so many pixels of a row and of a column.
-        refine_tracks: whether the patches around the observations of each sparse point are aligned,
-            which makes the errors of these points smaller.
         single_camera: whether photographs of one size were taken by one camera.
         detector: arguments of `DeepDetect`.
         seed: of all random choices.
@@ -110,7 +107,6 @@ def reconstruct_many(
         "sequential": sequential,
         "max_keypoints": max_keypoints,
         "stride_px": stride_px if chosen.dense is not None else None,
-        "refine_tracks": refine_tracks,
         "single_camera": single_camera,
     }
     chosen = replace_options(

@@ -26,7 +26,7 @@ from ..batch.extraction import extract_features
 from ..batch.pair_list import pair_name
 from ..batch.pair_matching import match_pairs
 from ..batch.parted_file import open_hdf5
-from ..io.image import find_images, load_image, luma
+from ..io.image import find_images
 from .colmap import import_pycolmap
 from .database import DatabaseImage, write_database
 from .dense import Reference, dense_points, find_references, limited_view
@@ -35,7 +35,6 @@ from .lens import Lens
 from .mapping import (
     SparseModel,
     adjust,
-    align_tracks,
     map_photographs,
     normalise_model,
     verify_pairs,
@@ -240,15 +239,7 @@ class Stages:
                 lambda count: bar.update(min(count, len(images) - bar.n)),
             )
         shutil.rmtree(space, ignore_errors=True)
-        if options.refine_tracks:
-            grays = {
-                model.images[number].name: luma(load_image(folder / model.images[number].name))
-                for number in model.reg_image_ids()
-            }
-            align_tracks(model, grays, options.track_refinement)
-            adjust(model, known, options.refined_scale_px, options)
-        else:
-            adjust(model, known, options.robust_scale_px, options)
+        adjust(model, known, options.robust_scale_px, options)
         normalise_model(model)
         record.unlink(missing_ok=True)
         write_sparse_model(model, sparse)

@@ -21,10 +21,9 @@ from deepdetect.evaluation.protocols.sfm_methods import (
 from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry.camera import Camera
 from deepdetect.geometry.posed_view import PosedView
-from deepdetect.sfm.mapping import SparseModel
+from deepdetect.sfm.mapping import Observations, SparseModel
 from deepdetect.sfm.options import MultiViewOptions
 from deepdetect.sfm.stages import Stages
-from deepdetect.sfm.track_refinement import Observations
 
 NAMES = ("0004", "0005", "0006")
 MAX_KEYPOINTS = 800
