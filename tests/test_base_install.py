@@ -104,7 +104,7 @@ def test_what_needs_no_extra(run: Run, command: str) -> None:
 def test_without_opencv_nothing_is_written(run: Run, command: str, tmp_path: Path) -> None:
     code, said = run(NO_OPENCV, *command.split())
     assert code == 2
-    assert said.splitlines()[-1].startswith("deepdetect: OpenCV is not installed: ")
+    assert said.splitlines()[-1].startswith("deepdetect: OpenCV cannot be imported (")
     assert "run pip install opencv-python-headless" in said
     assert "Traceback" not in said
     assert sorted(path.name for path in tmp_path.rglob("*.*")) == ["left.png", "right.png"]

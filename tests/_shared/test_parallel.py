@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 import os
-import platform
 import signal
 import subprocess
 import sys
@@ -18,11 +17,8 @@ from hypothesis import strategies as st
 from deepdetect._shared import parallel
 from deepdetect._shared.errors import DeepDetectError, ImageError, OptionError
 from deepdetect._shared.parallel import (
-    available_memory,
-    disable_malloc_trim,
     map_in_processes,
     parallel_for,
-    processor_count,
 )
 from deepdetect.io.image import load_image
 
@@ -94,10 +90,6 @@ def test_errors_reach_the_caller(
     if error is ImageError:
         assert "there is no file" in str(caught.value)
         assert str(tmp_path) in str(caught.value)
-
-
-def test_processor_count() -> None:
-    assert 1 <= processor_count() <= (os.cpu_count() or 1)
 
 
 def test_a_dead_worker_is_one_sentence() -> None:
@@ -266,42 +258,3 @@ def test_calls_from_several_threads_do_not_meet() -> None:
     for caller in callers:
         caller.join()
     assert all(results[number] == list(range(50)) for number in range(4))
-
-
-ARRAYS = """
-import resource
-import sys
-from deepdetect._shared.parallel import disable_malloc_trim
-
-def make_and_free():
-    for _ in range(20):
-        blocks = [bytearray(3_000_000) for _ in range(10)]
-
-if sys.argv[1] == "keep":
-    disable_malloc_trim()
-make_and_free()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-make_and_free()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-"""
-
-
-def page_faults(mode: str) -> int:
-    done = subprocess.run(
-        [sys.executable, "-c", ARRAYS, mode], check=True, capture_output=True, text=True
-    )
-    return int(done.stdout)
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
-def test_freed_memory_is_used_again_without_new_pages() -> None:
-    assert page_faults("keep") < 0.1 * page_faults("give")
-
-
-def test_on_another_c_library_nothing_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
-    assert not disable_malloc_trim()
-
-
-def test_there_is_memory_but_not_endlessly() -> None:
-    assert 0 < available_memory() < 2**50

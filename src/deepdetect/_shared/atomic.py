@@ -106,15 +106,11 @@ def clear_abandoned(folder: Path) -> None:
     container, has ended is not known: its files are removed when they are a day old.
     """
     folder = folder.absolute()
-    if folder in _cleared:
-        return
-    _cleared.add(folder)
-    with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        for entry in entries:
-            match = _TEMPORARY.fullmatch(entry.name)
-            if match is not None and _is_abandoned(entry, match["machine"], int(match["process"])):
-                with contextlib.suppress(OSError):
-                    os.unlink(entry)
+    if folder not in _cleared:
+        _cleared.add(folder)
+        for entry in _abandoned(folder, _TEMPORARY):
+            with contextlib.suppress(OSError):
+                os.unlink(entry)
 
 
 def private_folder(prefix: str) -> Path:
@@ -139,7 +135,9 @@ def private_folder(prefix: str) -> Path:
     """
     try:
         parent = Path(tempfile.gettempdir())
-        _clear_abandoned_folders(parent, prefix)
+        for entry in _abandoned(parent, re.compile(re.escape(prefix) + _OWNER.pattern)):
+            if _is_own_folder(entry):
+                shutil.rmtree(entry, ignore_errors=True)
         folder = parent / f"{prefix}{_owner()}"
         folder.mkdir(mode=0o700)
     except OSError as error:
@@ -150,17 +148,16 @@ def private_folder(prefix: str) -> Path:
     return folder
 
 
-def _clear_abandoned_folders(parent: Path, prefix: str) -> None:
-    """Remove this user's folders of `private_folder` whose processes have ended."""
-    with contextlib.suppress(OSError), os.scandir(parent) as entries:
-        for entry in entries:
-            match = _OWNER.fullmatch(entry.name.removeprefix(prefix))
-            if match is None or not entry.name.startswith(prefix):
-                continue
-            if _is_own_folder(entry) and _is_abandoned(
-                entry, match["machine"], int(match["process"])
-            ):
-                shutil.rmtree(entry, ignore_errors=True)
+def _abandoned(folder: Path, names: re.Pattern[str]) -> list[os.DirEntry[str]]:
+    """List what processes that have ended have left in a folder, by the names of it."""
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        matches = [(entry, names.fullmatch(entry.name)) for entry in entries]
+        return [
+            entry
+            for entry, match in matches
+            if match and _is_abandoned(entry, match["machine"], int(match["process"]))
+        ]
+    return []
 
 
 def _is_own_folder(entry: os.DirEntry[str]) -> bool:

@@ -8,7 +8,6 @@ container, it is cached in a folder of this user in the temporary directory, or 
 from __future__ import annotations
 
 import functools
-import importlib.util
 import os
 import stat
 import tempfile
@@ -21,12 +20,10 @@ from .errors import MissingExtraError
 
 _lock = threading.Lock()
 _announcement: list[Callable[[], object]] = []
-_cache_folders: set[Path] = set()
-"""Where numba keeps the kernels of the modules that have been imported."""
 
 
 def announce_compilation(tell: Callable[[], object]) -> None:
-    """Have a function called before the first kernel is compiled, where no cache holds any."""
+    """Have a function called once, before the first kernel is compiled that no cache holds."""
     _announcement[:] = [tell]
 
 
@@ -38,57 +35,12 @@ def _listen() -> None:
     class Listener(events.Listener):
         def on_start(self, event: Any) -> None:
             if _announcement:
-                tell = _announcement.pop()
-                if not any(any(folder.glob("*.nbi")) for folder in _cache_folders):
-                    tell()
+                _announcement.pop()()
 
         def on_end(self, event: Any) -> None:
             pass
 
     events.register("numba:compile", Listener())  # type: ignore[no-untyped-call]
-
-
-def has_compiler() -> bool:
-    """Return whether numba is installed."""
-    return importlib.util.find_spec("numba") is not None
-
-
-def require_compiler(task: str, instead: str = "") -> None:
-    """Stop before work that ends in compiled code, where numba is not installed.
-
-    Args:
-        task: what needs it, as "guided matching".
-        instead: what does without, for the end of the message.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
-    if not has_compiler():
-        raise _missing(task, instead)
-
-
-def _missing(task: str, instead: str = "", reason: str = "is not installed") -> MissingExtraError:
-    return MissingExtraError(f"{task} needs numba, which {reason}: run pip install numba{instead}")
-
-
-def _import_numba() -> Any:
-    """Import numba.
-
-    Raises:
-        MissingExtraError: it is not installed, or not for the other packages that are.
-    """
-    try:
-        import numba
-    except ModuleNotFoundError as error:
-        if error.name != "numba":
-            raise
-        raise _missing("this") from None
-    except ImportError as error:  # it takes some versions of NumPy only
-        reason = (str(error).splitlines() or ["no reason given"])[0]
-        raise _missing("this", reason=f"cannot be imported ({reason})") from None
-    if _announcement:
-        _listen()
-    return numba
 
 
 def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -98,39 +50,38 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
         flags: of `numba.njit`, all but `cache`.
 
     Raises:
-        MissingExtraError: numba is not installed.
+        MissingExtraError: numba cannot be imported: it takes some versions of NumPy only.
     """
-    numba = _import_numba()
+    try:
+        import numba
+    except ImportError as error:
+        reason = str(error).partition("\n")[0]
+        raise MissingExtraError(
+            f"numba cannot be imported ({reason}): run pip install --upgrade numba"
+        ) from None
+    if _announcement:
+        _listen()
+    config: Any = numba.config  # its names are made at run time
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
-            kernel = numba.njit(cache=True, **flags)(function)
+            return numba.njit(cache=True, **flags)(function)
         except RuntimeError:  # numba found no writable folder
-            kernel = _compiled_elsewhere(function, flags)
-        if kernel.stats.cache_path is not None:
-            _cache_folders.add(Path(kernel.stats.cache_path))
-        return kernel
+            folder = _temporary_folder()
+        if folder is None:
+            return numba.njit(**flags)(function)
+        with _lock:
+            before = config.CACHE_DIR
+            # Read while a function is decorated, not when it is called.
+            config.CACHE_DIR = str(folder)
+            try:
+                return numba.njit(cache=True, **flags)(function)
+            except RuntimeError:  # no space left there, or numba is set to look elsewhere only
+                return numba.njit(**flags)(function)
+            finally:
+                config.CACHE_DIR = before
 
     return decorate
-
-
-def _compiled_elsewhere(function: Callable[..., Any], flags: dict[str, Any]) -> Any:
-    """Compile with a cache folder of our own, or without a cache."""
-    numba = _import_numba()
-    config: Any = numba.config  # its names are made at run time
-    folder = _temporary_folder()
-    if folder is None:
-        return numba.njit(**flags)(function)
-    with _lock:
-        before = config.CACHE_DIR
-        # Read while a function is decorated, not when it is called.
-        config.CACHE_DIR = str(folder)
-        try:
-            return numba.njit(cache=True, **flags)(function)
-        except RuntimeError:  # no space left there, or numba is set to look elsewhere only
-            return numba.njit(**flags)(function)
-        finally:
-            config.CACHE_DIR = before
 
 
 def _temporary_folder() -> Path | None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from .errors import MissingExtraError
 
-LOWEST_VERSION = (4, 10)
+LOWEST_VERSION = "4.10"
 """The first one that works with NumPy 2."""
 
 DISTRIBUTIONS = (
@@ -55,32 +55,24 @@ def import_opencv() -> ModuleType:
     """
     try:
         found = importlib.import_module("cv2")
-    except ModuleNotFoundError as error:
-        if error.name != "cv2":
-            raise
-        raise MissingExtraError(
-            "OpenCV is not installed: run pip install opencv-python-headless, or any other "
-            f"package of OpenCV {_text(LOWEST_VERSION)} or later"
-        ) from None
     except ImportError as error:
-        reason = (str(error).splitlines() or ["no reason given"])[0]
+        reason = str(error).partition("\n")[0]
         if reason.endswith(NO_MEMORY_TO_LOAD):
             raise MemoryError(reason) from None
         raise MissingExtraError(
-            f"the installed OpenCV cannot be imported ({reason}): repair it, or replace it by "
-            "opencv-python-headless, which needs no libraries of a screen"
+            f"OpenCV cannot be imported ({reason}): run pip install opencv-python-headless, which "
+            f"needs no libraries of a screen, or any other package of OpenCV {LOWEST_VERSION} or "
+            "later"
         ) from None
     version = getattr(found, "__version__", None)
     if version is None:  # a folder `cv2` that another package of OpenCV has left behind
-        names = installed_distributions()
         raise MissingExtraError(
             "the folder cv2 of the installed OpenCV is not complete, as after the removal of "
-            "another package of it: pip install --force-reinstall "
-            + (names[0] if names else "opencv-python-headless")
+            "another package of it: pip install --force-reinstall opencv-python-headless"
         )
-    if tuple(int(part) for part in re.findall(r"\d+", version)[:2]) < LOWEST_VERSION:
+    if _numbers(version) < _numbers(LOWEST_VERSION):
         raise MissingExtraError(
-            f"OpenCV {version} is installed, and {_text(LOWEST_VERSION)} or later is needed: "
+            f"OpenCV {version} is installed, and {LOWEST_VERSION} or later is needed: "
             f"pip install --upgrade {' '.join(installed_distributions()) or 'opencv-python'}"
         )
     return found
@@ -89,9 +81,8 @@ def import_opencv() -> ModuleType:
 def is_lack_of_memory(error: Exception) -> bool:
     """Return whether an exception is OpenCV's for lack of memory; OpenCV is not imported for it."""
     loaded = sys.modules.get("cv2")
-    if loaded is None or not isinstance(error, getattr(loaded, "error", ())):
-        return False
-    return bool(getattr(error, "code", None) == loaded.Error.StsNoMem)
+    wanted = loaded is not None and isinstance(error, loaded.error)
+    return wanted and getattr(error, "code", None) == cv2.Error.StsNoMem
 
 
 def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
@@ -129,5 +120,5 @@ def installed_distributions() -> list[str]:
     return found
 
 
-def _text(version: tuple[int, ...]) -> str:
-    return ".".join(str(part) for part in version)
+def _numbers(version: str) -> list[int]:
+    return [int(part) for part in re.findall(r"\d+", version)[:2]]

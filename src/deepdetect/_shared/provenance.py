@@ -7,6 +7,7 @@ import platform
 import shlex
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from .opencv import DISTRIBUTIONS
@@ -23,50 +24,37 @@ def provenance() -> dict[str, str]:
         >>> sorted(provenance())
         ['command', 'commit', 'machine', 'versions']
     """
+    program, *arguments = sys.argv or [""]
+    name = Path(program).name
+    command = ["deepdetect" if name == "__main__.py" else name, *arguments]
     return {
-        "command": _command(),
+        "command": shlex.join(command),
         "commit": _commit(),
         "machine": f"{platform.system()} {platform.machine()}, {processor_count()} processors",
         "versions": ", ".join(_versions()),
     }
 
 
-def _command() -> str:
-    """Return the command line with the program's name."""
-    program, *arguments = sys.argv or [""]
-    path = Path(program)
-    name = "deepdetect" if path.name == "__main__.py" else path.name
-    return shlex.join([name, *arguments])
-
-
 def _versions() -> list[str]:
     found = [f"python {platform.python_version()}"]
     for name in ("deepdetect", *PACKAGES):
-        try:
+        with suppress(importlib.metadata.PackageNotFoundError):
             found.append(f"{name} {importlib.metadata.version(name)}")
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return found
 
 
 def _commit() -> str:
     """Return the git commit of the sources, with "+" when files are modified, or ""."""
     sources = Path(__file__).resolve().parents[1]
-    run = ["git", "-C", str(sources)]
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(sources), *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        return done.stdout.strip()
+
     try:
-        head = subprocess.run(
-            [*run, "rev-parse", "HEAD"], capture_output=True, text=True, check=True
-        )
         # An installed package may lie in the folder of another project's repository.
-        subprocess.run(
-            [*run, "ls-files", "--error-unmatch", __file__], capture_output=True, check=True
-        )
-        changed = subprocess.run(
-            [*run, "status", "--porcelain", "--", str(sources)],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        git("ls-files", "--error-unmatch", __file__)
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
     except (OSError, subprocess.CalledProcessError):
         return ""
-    return head.stdout.strip() + ("+" if changed.stdout.strip() else "")

@@ -48,8 +48,8 @@ def resolve_name_or_path(
     """
     if is_path(value):
         return Path(value)
-    if str(value) not in registry:
-        raise unknown_name(kind, str(value), (*registry, "or the path of a file"))
+    if value not in registry:
+        raise unknown_name(kind, value, (*registry, "or the path of a file"))
     return registry[str(value)]
 
 

@@ -18,9 +18,8 @@ def handle_signals(
 ) -> Iterator[None]:
     """Have a function called for signals while the block runs.
 
-    A signal that is ignored, as by `nohup`, or that has a handler of its own, is left alone;
-    Python's own for Ctrl+C counts as none. Outside the main thread, where Python allows no
-    handlers, nothing is done.
+    A signal that is ignored, as by `nohup`, is left alone, and one that has a handler already,
+    but for Ctrl+C. Outside the main thread, where Python allows no handlers, nothing is done.
 
     Args:
         handler: called with the number of the signal, and the frame.
@@ -34,14 +33,33 @@ def handle_signals(
     before = {}
     if threading.current_thread() is threading.main_thread():
         for name in names:
-            number = getattr(signal, name, None)
-            if number is not None and signal.getsignal(number) in (
-                signal.SIG_DFL,
-                signal.default_int_handler,
-            ):
-                before[number] = signal.signal(number, handler)
+            usual = signal.getsignal(getattr(signal, name)) if hasattr(signal, name) else None
+            if usual is signal.SIG_DFL or (name == "SIGINT" and usual is not signal.SIG_IGN):
+                before[name] = signal.signal(getattr(signal, name), handler)
     try:
         yield
     finally:
-        for number, usual in before.items():
-            signal.signal(number, usual)
+        for name, usual in before.items():
+            signal.signal(getattr(signal, name), usual)
+
+
+def exit_by_signal(number: int, frame: FrameType | None) -> None:
+    """End the program as a shell reports it; a handler for `handle_signals`."""
+    raise SystemExit(128 + number)
+
+
+@contextmanager
+def signals_held() -> Iterator[None]:
+    """Let Ctrl-C wait while the block starts processes, and in these until they unblock it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    from multiprocessing import resource_tracker
+
+    # Or the first process starts it, and it ends the mask.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +27,7 @@ def read_json(path: str | Path, max_bytes: int) -> Any:
         >>> read_json(path, 1000)
         {'focal_px': 1250}
     """
-    text = _read_text(path, max_bytes)
-    try:
-        return json.loads(text)
-    except RecursionError:
-        raise ValueError("it is nested too deep") from None
+    return _read(path, max_bytes, json.loads)
 
 
 def read_toml(path: str | Path, max_bytes: int) -> dict[str, Any]:
@@ -40,16 +37,15 @@ def read_toml(path: str | Path, max_bytes: int) -> dict[str, Any]:
         OSError: it cannot be read.
         ValueError: it is longer, no UTF-8, no TOML, or nested too deep.
     """
-    text = _read_text(path, max_bytes)
-    try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise ValueError("it is nested too deep") from None
+    return _read(path, max_bytes, tomllib.loads)
 
 
-def _read_text(path: str | Path, max_bytes: int) -> str:
+def _read(path: str | Path, max_bytes: int, parse: Callable[[str], Any]) -> Any:
     with Path(path).open("rb") as file:
         content = file.read(max_bytes + 1)
     if len(content) > max_bytes:
         raise ValueError(f"it is longer than {max_bytes} bytes")
-    return content.decode("utf-8-sig")
+    try:
+        return parse(content.decode("utf-8-sig"))
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None

@@ -13,7 +13,6 @@ import numpy as np
 
 from .. import __version__
 from .._shared.errors import BatchError, InvalidFileError, OptionError
-from .._shared.kernels import require_compiler
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import TaskMap
 from .._shared.progress import progress
@@ -198,9 +197,7 @@ def match_pairs(
 
 def _require_matcher(name: str) -> None:
     """Raise a MissingExtraError where what a matcher needs is not installed."""
-    if name == "patchmatch":
-        require_compiler("the matcher patchmatch", ", or take the matcher flann or exact")
-    elif name == "faiss":
+    if name == "faiss":
         some = np.eye(2, dtype=np.float32)
         get_matcher(name)(some, some, 1, 0)
 

@@ -16,10 +16,10 @@ from contextlib import contextmanager
 from typing import Any
 
 from .._shared.errors import DeepDetectError, MissingExtraError, OptionError
+from .._shared.memory import disable_malloc_trim
 from .._shared.parallel import (
     Outcome,
     Task,
-    disable_malloc_trim,
     processor_count,
     use_one_thread,
 )

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import signal
-import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 
 from .._shared.atomic import atomic_path, clear_abandoned
 from .._shared.errors import DeepDetectError, ImageError, OptionError
+from .._shared.signals import exit_by_signal, handle_signals
 
 FOLDER = ".deepdetect"
 ADVICE = "choose another folder with -o, or replace it with --overwrite"
@@ -197,7 +196,7 @@ def claimed_outputs(
     before = {path: (_state(path), _content(_claim(command, path))) for path in outputs}
     missing = {folder for path in outputs for folder in path.parents if not folder.exists()}
     ours = {path: _record_of(inputs, path) for path in outputs}
-    with _ended_by_signals():
+    with handle_signals(exit_by_signal):
         try:
             claim_outputs(command, inputs, outputs, overwrite)
             yield
@@ -213,26 +212,6 @@ def claimed_outputs(
             _remove_empty({path.parent / FOLDER for path in outputs})
             _remove_empty(missing)
             raise
-
-
-@contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """Let signals that end a process at once raise SystemExit, unless they are handled already."""
-
-    def end(number: int, _: Any) -> None:
-        raise SystemExit(128 + number)  # as a shell has it
-
-    usual = {}
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)  # Windows lacks some
-            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-                usual[number] = signal.signal(number, end)
-    try:
-        yield
-    finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
 
 
 def _record_of(inputs: Sequence[Path], output: Path) -> bytes:

@@ -13,9 +13,9 @@ import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.image_array import Channels, check_channels
+from .._shared.memory import available_memory, release_freed_memory
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
-from .._shared.parallel import available_memory, release_freed_memory
 from ..features.maps import Maps, Rows, bands, sigmoid
 from .backends import Network
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import DeepDetectError
-from .._shared.parallel import release_freed_memory
+from .._shared.memory import release_freed_memory
 from .._shared.progress import progress
 from .backends.onnx_parts import cut_onnx
 from .backends.without_telemetry import import_onnxruntime

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import sys
 import threading
 import time
@@ -14,7 +12,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 from .._shared.errors import DeepDetectError, MissingExtraError
-from .._shared.parallel import use_one_thread
+from .._shared.parallel import start_child
 
 Outcome = TypeVar("Outcome")
 
@@ -163,7 +161,7 @@ def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
 
     # Spawned: a fork would begin with all memory of this process.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context, initializer=_start_child) as pool:
+    with ProcessPoolExecutor(1, mp_context=context, initializer=start_child) as pool:
         try:
             return pool.submit(function, *arguments).result()
         except BrokenProcessPool:
@@ -171,22 +169,6 @@ def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
                 "its process was ended by the system, probably for lack of memory: take fewer or "
                 "smaller images"
             ) from None
-
-
-def _start_child() -> None:
-    """Prepare the process: one thread, and it ends with its parent, or by Ctrl-C, at once."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    use_one_thread()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    import multiprocessing
-
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _process() -> Any:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from .._shared.errors import OptionError
-from .._shared.kernels import require_compiler
 from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .keypoints import on_pixels
@@ -62,7 +61,6 @@ def dense_sift(
         )
     if not on_pixels(xy, gray.shape):
         raise OptionError("dense SIFT needs keypoints on whole pixels within the image")
-    require_compiler("dense SIFT", ", or take the descriptor sift-opencv")
     from .descriptor_kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 
     if not len(xy):

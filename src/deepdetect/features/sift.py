@@ -12,7 +12,6 @@ from collections.abc import Callable
 import numpy as np
 
 from .._shared.errors import OptionError
-from .._shared.kernels import has_compiler
 from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
@@ -48,7 +47,7 @@ def sift_descriptors(
     """
     dense = len(xy) > MIN_DENSE_DENSITY * gray.size
     upright = angle == 0 and MIN_SIZE_PX <= size <= MAX_SIZE_PX
-    if dense and upright and has_compiler() and on_pixels(xy, gray.shape):
+    if dense and upright and on_pixels(xy, gray.shape):
         return dense_sift(gray, xy, size)
     return opencv_sift_descriptors(gray, xy, size, angle)
 

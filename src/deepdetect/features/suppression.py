@@ -7,8 +7,6 @@ import sys
 
 import numpy as np
 
-from .._shared.kernels import has_compiler
-
 MIN_COMPILED_POINTS = 30_000
 """From which importing the compiled code, where there is numba, takes less time than it saves.
 
@@ -55,8 +53,8 @@ def suppress_neighbors(
 
 
 def _saves_time(points: int) -> bool:
-    """Whether compiled code is there, and is worth its import for so many points."""
-    return has_compiler() and (points >= MIN_COMPILED_POINTS or "numba" in sys.modules)
+    """Whether compiled code is worth its import for so many points."""
+    return points >= MIN_COMPILED_POINTS or "numba" in sys.modules
 
 
 def _keep_distant(places: np.ndarray, radii: np.ndarray, cell: float, columns: int) -> list[int]:

@@ -13,7 +13,6 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.image_array import Channels
-from .._shared.kernels import require_compiler
 from .._shared.options import replace_options, suggest_keywords
 from .._shared.timing import StageTimer
 from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
@@ -169,8 +168,6 @@ def match_images(
     )
     if seeds is not None and not chosen.guided:
         raise OptionError("seeds guide the matching: leave them out, or guided=False")
-    if chosen.guided:
-        require_compiler("guided matching", ", or match by descriptors alone with `guided=False`")
     timer = StageTimer(progress)
     rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
     detector = _configured(detector, chosen.heatmap)

@@ -10,7 +10,6 @@ import numpy as np
 
 from .._shared.errors import RegistrationError
 from .._shared.image_array import Channels
-from .._shared.kernels import require_compiler
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.detector import HeatmapDetector
@@ -114,7 +113,6 @@ def register(
         >>> found.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
-    require_compiler("registration")
     first, second = load_image(image0, channels=channels), load_image(image1, channels=channels)
     found = match_images(
         first,

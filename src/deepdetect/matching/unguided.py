@@ -6,16 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .._shared.errors import OptionError
-from .._shared.parallel import available_memory
+from .._shared.memory import require_memory
 from .._shared.timing import StageTimer
 from ..features.keypoints import Keypoints
 from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors
 from ..features.sift import get_descriptor, scaled_sift_descriptors, to_root_sift
 from .options import MatchingOptions
-
-BYTES_PER_KEYPOINT = 1500
-"""Memory that matching takes: 128 float32 of the descriptor, twice with FLANN's trees and copy."""
 
 
 def unguided_matches(
@@ -81,10 +77,8 @@ def check_memory(keypoints: Sequence[int]) -> None:
     Raises:
         OptionError: there are too many.
     """
-    needed = sum(keypoints) * BYTES_PER_KEYPOINT
-    if needed > available_memory():
-        raise OptionError(
-            f"{' and '.join(f'{count:,}' for count in keypoints)} keypoints need about "
-            f"{needed / 1e9:.0f} GB of memory to be matched: make them fewer with "
-            "max_keypoints, density, or a smaller resolution"
-        )
+    require_memory(
+        f"matches of {' and '.join(f'{count:,}' for count in keypoints)} keypoints",
+        "make them fewer with max_keypoints, density, or a smaller resolution",
+        matched_keypoint=sum(keypoints),
+    )

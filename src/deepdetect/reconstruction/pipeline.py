@@ -15,7 +15,6 @@ import numpy as np
 
 from .._shared.errors import OptionError, ReconstructionError
 from .._shared.image_array import Channels
-from .._shared.kernels import require_compiler
 from .._shared.options import replace_options, suggest_keywords
 from .._shared.timing import StageTimer
 from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
@@ -171,7 +170,6 @@ def reconstruct(
     chosen = replace_options(
         chosen, **{name: value for name, value in given.items() if value is not None}
     )
-    require_compiler("reconstruction")
     images = load_image(left, channels=channels), load_image(right, channels=channels)
     sizes = (images[0].shape[1], images[0].shape[0]), (images[1].shape[1], images[1].shape[0])
     known = _calibration(calibration, focal_px, (left, right), sizes)

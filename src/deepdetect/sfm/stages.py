@@ -20,7 +20,8 @@ import numpy as np
 from .. import __version__
 from .._shared.atomic import atomic_path
 from .._shared.errors import ImageError, MissingImageError, OptionError, ReconstructionError
-from .._shared.parallel import available_memory, map_in_processes, processor_count
+from .._shared.memory import available_memory, needed_memory
+from .._shared.parallel import map_in_processes, processor_count
 from .._shared.progress import progress
 from ..batch.extraction import extract_features
 from ..batch.pair_list import pair_name
@@ -49,9 +50,6 @@ WORK = "work"
 LINKS = ".images"
 """Folder of links to listed photographs, within `WORK`. It is hidden, so that they are no further
 photographs of a folder that holds the results."""
-
-BYTES_PER_PIXEL = 700
-"""That dense matching takes at its peak: it bounds the number of processes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +296,7 @@ class Stages:
             * min(1, options.max_side_px / max(view.camera.size)) ** 2
             for view in sparse.views.values()
         )
-        fitting = max(1, int(available_memory() // (BYTES_PER_PIXEL * pixels)))
+        fitting = max(1, int(available_memory() // needed_memory(dense_pixel=pixels)))
         return min(self.workers or processor_count(), fitting)
 
 

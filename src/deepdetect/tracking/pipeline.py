@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -18,6 +16,7 @@ from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
+from .._shared.signals import ENDING, exit_by_signal, handle_signals
 from ..detector.detector import DeepDetect
 from ..features.keypoints import Keypoints
 from .frames import FrameSource
@@ -222,27 +221,13 @@ def _ended_by_signals(live: bool) -> Iterator[Callable[[], bool]]:
     is the caller's, and one that is ignored, as nohup has it, is none.
     """
     noted: list[int] = []
-    if not live or threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    usual: dict[int, Any] = {signal.SIGINT: signal.getsignal(signal.SIGINT)}
-    for name in ("SIGTERM", "SIGHUP"):
-        ending = getattr(signal, name, None)  # Windows lacks some
-        if ending is not None and signal.getsignal(ending) is signal.SIG_DFL:
-            usual[ending] = _exit
+    with ExitStack() as handlers:
 
-    def note(number: int, _: Any) -> None:
-        noted.append(number)
-        for each, handler in usual.items():
-            signal.signal(each, handler)
+        def note(number: int, _: Any) -> None:
+            noted.append(number)
+            handlers.close()
+            handlers.enter_context(handle_signals(exit_by_signal))
 
-    before = {number: signal.signal(number, note) for number in usual}
-    try:
+        if live:
+            handlers.enter_context(handle_signals(note, ("SIGINT", *ENDING)))
         yield lambda: bool(noted)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _exit(number: int, _: Any) -> None:
-    raise SystemExit(128 + number)  # as a shell has it

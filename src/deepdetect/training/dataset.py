@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from .._shared.errors import DeepDetectError, ImageError
+from .._shared.memory import available_memory
 from .._shared.opencv import cv2
-from .._shared.parallel import available_memory
 from .augmentation import flip, jitter_color, transpose
 from .engine import DistributedContext
 from .labels import LabelCache

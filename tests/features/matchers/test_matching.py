@@ -268,7 +268,6 @@ def test_auto_takes_patchmatch_only_where_it_suits(monkeypatch: pytest.MonkeyPat
         return exact_neighbours(*arguments)
 
     monkeypatch.setattr(matching, "patchmatch_neighbours", spy)
-    monkeypatch.setattr(matching, "has_compiler", lambda: True)
     both, floats = (pixels, pixels[order]), base.astype(np.float32)
     automatic = get_matcher("auto")
     for queries, positions in ((base, (pixels + 0.25, pixels)), (base, None), (floats, both)):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetectError, OptionError
+from deepdetect._shared import memory
 from deepdetect.geometry.rescaling import downscale
-from deepdetect.matching.stitching import compositing
 from deepdetect.matching.stitching.compositing import (
     Canvas,
     composite,
@@ -77,8 +77,7 @@ def test_a_canvas_too_large_is_refused(monkeypatch: pytest.MonkeyPatch, one_line
         planned(far, max_canvas_megapixels=3.1)
     one_line(error.value)
     assert planned(far, max_canvas_megapixels=3.13).size == (10_400, 300)
-    needed = planned(far).memory_bytes
-    monkeypatch.setattr(compositing, "available_memory", lambda: needed - 1)
+    monkeypatch.setattr(memory, "available_memory", lambda: 10_400 * 300 * 22)
     with pytest.raises(OptionError, match="GB of memory, more than is free") as error:
         planned(far)
     one_line(error.value)

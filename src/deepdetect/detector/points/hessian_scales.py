@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..._shared.memory import require_memory
 from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
-from ..._shared.parallel import available_memory, parallel_for
+from ..._shared.parallel import parallel_for
 
 NMS_RADIUS = 2
 """A candidate is the maximum of a window of 5x5 in its level."""
@@ -20,9 +21,6 @@ MIN_SIGMA_PX = 0.5
 
 LEAST_RESPONSE = 1e-8
 """Of a candidate, in an image with values in [0, 1]: less is rounding."""
-
-BYTES_PER_PIXEL_AND_LEVEL = 24
-"""Five maps of float32, and room for what is made of them."""
 
 PIXELS_AT_ONCE = 1 << 15
 """Whose derivatives are computed together, so that they stay in the processor's cache."""
@@ -127,12 +125,11 @@ def check_memory(shape: tuple[int, ...], options: ScaleSpaceOptions = ScaleSpace
     Raises:
         OptionError: it would.
     """
-    needed = shape[0] * shape[1] * BYTES_PER_PIXEL_AND_LEVEL * len(options.sigmas_px)
-    if needed > available_memory():
-        raise OptionError(
-            f"points of an image of {shape[1]}x{shape[0]} pixels need about {needed / 1e9:.0f} GB "
-            "of memory: use `resolution='auto'`, or a smaller image"
-        )
+    require_memory(
+        f"points of an image of {shape[1]}x{shape[0]} pixels",
+        "use `resolution='auto'`, or a smaller image",
+        pixel_of_level=shape[0] * shape[1] * len(options.sigmas_px),
+    )
 
 
 def build_scale_space(

@@ -10,7 +10,6 @@ from typing import Protocol
 
 import numpy as np
 
-from ..._shared.kernels import has_compiler
 from ..._shared.registry import look_up
 from ..keypoints import on_pixels
 from .approximate import faiss_neighbours, flann_neighbours
@@ -57,14 +56,14 @@ def automatic_neighbours(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find neighbours exactly where keypoints are few, else by PatchMatch, else by FLANN.
 
-    PatchMatch spreads good matches over dense keypoints: it needs bytes, keypoints on whole pixels
-    of one scale and angle, and numba; FLANN does not.
+    PatchMatch spreads good matches over dense keypoints: it needs bytes, and keypoints on whole
+    pixels of one scale and angle; FLANN does not.
     Arguments and result as of `Matcher`.
     """
     if len(queries) * len(base) <= MAX_EXACT_PRODUCT:
         return exact_neighbours(queries, base, count, seed, positions)
     suits = positions is not None and all(on_pixels(xy) for xy in positions)
-    if suits and queries.dtype == base.dtype == np.uint8 and has_compiler():
+    if suits and queries.dtype == base.dtype == np.uint8:
         return patchmatch_neighbours(queries, base, count, seed, positions)
     return flann_neighbours(queries, base, count, seed, positions)
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..._shared.errors import OptionError
-from ..._shared.kernels import require_compiler
 from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 from ..keypoints import on_pixels
@@ -119,7 +118,6 @@ def _search(
     max_epipolar_distance: float,
     options: PatchMatchOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
-    require_compiler("the matcher patchmatch", ", or take the matcher flann or exact")
     from . import patchmatch_kernel as kernel
 
     xy0, xy1 = (_pixels(xy) for xy in positions)

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..._shared.errors import ImageError, OptionError
 from ..._shared.image_array import Channels
-from ..._shared.kernels import require_compiler
 from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
@@ -205,7 +204,6 @@ def compute_disparity(
     if left.shape != right.shape:
         sizes = " and ".join(f"{view.shape[1]}x{view.shape[0]}" for view in (left, right))
         raise ImageError(f"the views of a rectified pair must have one size, not {sizes}")
-    require_compiler("stereo matching")
     disparities = _disparity_range(left, right, options)
     if disparities is None:
         nowhere = np.zeros(left.shape, bool)

@@ -14,18 +14,14 @@ from itertools import combinations
 import numpy as np
 
 from ..._shared.errors import OptionError, RegistrationError
+from ..._shared.memory import require_memory
 from ..._shared.opencv import cv2
-from ..._shared.parallel import available_memory
 from ...geometry.rescaling import downscale, scaled_homography
 from ...geometry.residuals import transform_points
 from .options import DEFAULTS, StitchingOptions
 
 BLEND_FACTOR = 32
 """Brightness is multiplied by this for blending, whose bands are rounded down to whole numbers."""
-
-BYTES_PER_CANVAS_PIXEL = 22
-BYTES_PER_IMAGE_PIXEL = 25
-"""Memory that blending takes per pixel of the canvas, and of the box of one image on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +37,6 @@ class Canvas:
     size: tuple[int, int]
     homographies: dict[int, np.ndarray]
     boxes: dict[int, tuple[int, int, int, int]]
-
-    @property
-    def memory_bytes(self) -> int:
-        """About the most memory that compositing takes."""
-        drawn = max(
-            (right - left) * (bottom - top) for left, top, right, bottom in self.boxes.values()
-        )
-        return self.size[0] * self.size[1] * BYTES_PER_CANVAS_PIXEL + drawn * BYTES_PER_IMAGE_PIXEL
 
 
 def least_distorted(
@@ -116,11 +104,12 @@ def plan_canvas(
             f"and more than max_canvas_megapixels ({max_canvas_megapixels:g}): raise it, or make "
             "`scale` smaller"
         )
-    if canvas.memory_bytes > available_memory():
-        raise OptionError(
-            f"the panorama would be {width}x{height} pixels and need about "
-            f"{canvas.memory_bytes / 1e9:.1f} GB of memory, more than is free: make `scale` smaller"
-        )
+    require_memory(
+        f"a panorama of {width}x{height} pixels would",
+        "make `scale` smaller",
+        canvas_pixel=width * height,
+        blended_pixel=max((box[2] - box[0]) * (box[3] - box[1]) for box in boxes.values()),
+    )
     return canvas
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..._shared.errors import OptionError
 from ..._shared.image_array import Channels
-from ..._shared.kernels import require_compiler
 from ..._shared.options import suggest_keywords
 from ..._shared.timing import StageTimer
 from ...detector.detector import DeepDetect, HeatmapDetector
@@ -125,7 +124,6 @@ def stitch(
     """
     check_max_keypoints(max_keypoints)
     _check(images, reference, scale, max_canvas_megapixels, registration_side)
-    require_compiler("stitching")
     done = progress or (lambda stage: None)
     timer = StageTimer()
     small: dict[int, tuple[np.ndarray, float]] = {}
