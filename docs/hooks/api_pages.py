@@ -60,7 +60,7 @@ _PAGES = (
             "match_images",
             "Matches",
             "MatchingOptions",
-            "Guide",
+            "TwoViewGeometry",
             "estimate_geometry",
             "Geometry",
             "GeometryOptions",

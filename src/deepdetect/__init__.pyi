@@ -9,6 +9,7 @@ from ._shared.errors import (
     WeightsError as WeightsError,
 )
 from .detector.detector import DeepDetect as DeepDetect
+from .detector.point_detector import PointDetector as PointDetector
 from .detector.heatmap import HeatmapOptions as HeatmapOptions
 from .evaluation.evaluate import Evaluation as Evaluation, evaluate as evaluate
 from .features.keypoints import Keypoints as Keypoints
@@ -16,7 +17,7 @@ from .features.selection import (
     SelectionOptions as SelectionOptions,
     select_keypoints as select_keypoints,
 )
-from .features.matches import Guide as Guide, Matches as Matches
+from .features.matches import TwoViewGeometry as TwoViewGeometry, Matches as Matches
 from .geometry.camera import Calibration as Calibration, Camera as Camera
 from .geometry.estimation import (
     Geometry as Geometry,
@@ -33,8 +34,12 @@ from .io.tables import (
     save_matches as save_matches,
 )
 from .labels import Label as Label, LabelOptions as LabelOptions, fuse as fuse
-from .matching.options import MatchingOptions as MatchingOptions
+from .matching.options import (
+    PUBLISHED_MATCHING as PUBLISHED_MATCHING,
+    MatchingOptions as MatchingOptions,
+)
 from .matching.pipeline import match_images as match_images
+from .matching.unguided import match_features as match_features
 from .matching.registration import Registration as Registration, register as register
 from .matching.stitching import (
     Panorama as Panorama,

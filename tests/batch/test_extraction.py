@@ -15,7 +15,7 @@ import pytest
 from deepdetect import DeepDetect, OptionError, SelectionOptions, load_image
 from deepdetect.batch import extract_features
 from deepdetect.batch.extraction import IMAGES_PER_PART, _extract_part, parts_of
-from deepdetect.features.sift import described_at_own_size, root_sift_descriptors
+from deepdetect.features.sift import describe_keypoints, root_sift_descriptors
 from deepdetect.io.image import luma
 
 FEW = SelectionOptions(max_keypoints=50)
@@ -47,7 +47,7 @@ def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: P
         found = {name: value[()] for name, value in stored.items()}
         assert stored["keypoints"].attrs["uncertainty"] == 1
     expected = DeepDetect().detect(folder / "b/01.png", max_keypoints=50)
-    described = described_at_own_size(luma(load_image(folder / "b/01.png")), expected)
+    described = describe_keypoints(luma(load_image(folder / "b/01.png")), expected)
     assert {name: (value.shape, value.dtype.name) for name, value in found.items()} == {
         "keypoints": ((50, 2), "float32"),
         "descriptors": ((128, 50), "float32"),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, Keypoints, OptionError
-from deepdetect.features.sift import described_at_own_size
+from deepdetect.features.sift import describe_keypoints
 from deepdetect.integrations.lightglue import DeepDetectExtractor, to_lightglue
 from deepdetect.io.image import luma
 
@@ -23,7 +23,7 @@ def test_sift_keypoints_become_what_lightglues_extractor_makes_of_them(views: Vi
     gray = luma(views.first)
     sift = cv2.SIFT_create(50, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(gray, None)
-    points = described_at_own_size(gray, Keypoints.from_opencv(keypoints, (256, 200)))
+    points = describe_keypoints(gray, Keypoints.from_opencv(keypoints, (256, 200)))
     features = to_lightglue(points)
     assert np.array_equal(features["keypoints"][0], [k.pt for k in keypoints])
     assert np.array_equal(features["scales"][0], np.float32([k.size for k in keypoints]))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, Keypoints, OptionError
-from deepdetect.features.sift import described_at_own_size
+from deepdetect.features.sift import describe_keypoints
 from deepdetect.integrations.skimage import DeepDetectFeatures
 from deepdetect.io.image import luma
 
@@ -24,7 +24,7 @@ def test_rows_come_before_columns(views: Views) -> None:
     assert np.array_equal(features.orientations, np.deg2rad(expected.angles))
     assert np.array_equal(features.responses, expected.scores)
     features.extract(views.first)
-    described = described_at_own_size(luma(views.first), expected).descriptors
+    described = describe_keypoints(luma(views.first), expected).descriptors
     assert np.abs(features.descriptors.astype(int) - described).max() <= 1  # angles in radians
     both = DeepDetectFeatures(100)
     both.detect_and_extract(views.first)
@@ -87,7 +87,7 @@ def test_keypoints_of_scikit_images_corners_are_described(views: Views) -> None:
     turned = feature.corner_orientations(gray, corners, np.ones((3, 3)))
     features_turned = DeepDetectFeatures()
     features_turned.extract(gray, corners, 4.0, turned)
-    expected = described_at_own_size(
+    expected = describe_keypoints(
         np.rint(gray * 255).astype(np.uint8),
         Keypoints(
             points.xy,

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, ImageError, Keypoints, OptionError
-from deepdetect.features.sift import described_at_own_size
+from deepdetect.features.sift import describe_keypoints
 from deepdetect.interchange import Collection, PairMatches, describe_collection
 from deepdetect.interchange.collection import check_upright, sift_bytes
 from deepdetect.interchange.colmap import write_colmap_text
@@ -42,7 +42,7 @@ def test_descriptors_come_from_the_photographs(photo: np.ndarray, tmp_path: Path
     points = DeepDetect().detect(photo, max_keypoints=50)
     pixels = Keypoints(np.rint(points.xy), points.scores, points.image_size)
     found = describe_collection(Collection({"p.png": points}, {}, tmp_path)).keypoints["p.png"]
-    expected = described_at_own_size(luma(photo), points).descriptors
+    expected = describe_keypoints(luma(photo), points).descriptors
     np.testing.assert_array_equal(found.descriptors, expected)
     dense = describe_collection(Collection({"p.png": pixels}, {}, tmp_path)).keypoints["p.png"]
     assert dense.descriptors.shape == (len(points), 128)

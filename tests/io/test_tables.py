@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from deepdetect import DeepDetectError, Keypoints, Matches, OptionError
-from deepdetect.features.matches import Guide
+from deepdetect.features.matches import TwoViewGeometry
 from deepdetect.io import tables
 from deepdetect.io.tables import load_keypoints, load_matches, save_keypoints, save_matches
 
@@ -48,7 +48,7 @@ def test_csv_keeps_float32_positions(tmp_path: Path) -> None:
     assert np.array_equal(np.array(row.split(","), np.float32)[:2], points.xy[0])
 
 
-def matches_of(guide: Guide | None = None, matrix: np.ndarray | None = None) -> Matches:
+def matches_of(guide: TwoViewGeometry | None = None, matrix: np.ndarray | None = None) -> Matches:
     points = keypoints(5)
     model = "none" if matrix is None else "homography"
     inliers = np.arange(5) > 2
@@ -60,9 +60,9 @@ def matches_of(guide: Guide | None = None, matrix: np.ndarray | None = None) -> 
 
 GUIDES = {
     None: None,
-    "none": Guide("none", None, 7, 0, float("inf"), 60),
-    "homography": Guide("homography", np.eye(3), 90, 80, -120.5, 0),
-    "fundamental": Guide("fundamental", np.diag([1.0, 2, 0]), 90, 80, -120.5, 6),
+    "none": TwoViewGeometry("none", None, 7, 0, float("inf"), 60),
+    "homography": TwoViewGeometry("homography", np.eye(3), 90, 80, -120.5, 0),
+    "fundamental": TwoViewGeometry("fundamental", np.diag([1.0, 2, 0]), 90, 80, -120.5, 6),
 }
 
 

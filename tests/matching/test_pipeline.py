@@ -59,7 +59,9 @@ def share_correct(matches: Matches, homography: np.ndarray, pixels: float) -> fl
 
 def assert_well_formed(matches: Matches) -> None:
     count = len(matches)
-    by_rows = matches.guide is not None and matches.guide.model == "fundamental"
+    by_rows = (
+        matches.two_view_geometry is not None and matches.two_view_geometry.model == "fundamental"
+    )
     for points, keypoints, whole in (
         (matches.points0, matches.keypoints0, True),
         (matches.points1, matches.keypoints1, not by_rows),
@@ -322,13 +324,15 @@ def test_mutual_matches_do_not_depend_on_which_image_comes_first(
     ]
     np.testing.assert_array_equal(*(np.unique(each, axis=0) for each in pairs))
     assert share_correct(swapped, np.linalg.inv(WARP), 2) > 0.95
-    assert found.guide is not None
-    assert swapped.guide is not None
+    assert found.two_view_geometry is not None
+    assert swapped.two_view_geometry is not None
     if guide == "homography":
-        product = found.guide.matrix @ swapped.guide.matrix
+        product = found.two_view_geometry.matrix @ swapped.two_view_geometry.matrix
         np.testing.assert_allclose(product / product[2, 2], np.eye(3), atol=1e-6)
     else:
-        np.testing.assert_allclose(found.guide.matrix, swapped.guide.matrix.T)
+        np.testing.assert_allclose(
+            found.two_view_geometry.matrix, swapped.two_view_geometry.matrix.T
+        )
 
 
 def test_mutual_leaves_one_to_one(photo: np.ndarray) -> None:
@@ -627,8 +631,8 @@ def test_seeds_take_the_place_of_our_own_matches(photo: np.ndarray) -> None:
     seeds = places, places + (9, -4)
     seeds[1][::4] = np.random.default_rng(1).uniform(20, 180, (10, 2))  # these are wrong
     matches = match_images(photo, second, RandomDetector(), seeds=seeds)
-    assert matches.guide is not None
-    assert (matches.model, matches.guide.sparse_matches) == ("homography", 40)
+    assert matches.two_view_geometry is not None
+    assert (matches.model, matches.two_view_geometry.sparse_matches) == ("homography", 40)
     assert share_correct(matches, shift, 1.01) > 0.99
     assert len(matches) > 1000
 

@@ -47,7 +47,7 @@ def sparse(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarra
         ratio=0.85,
         mutual=True,
     )
-    return described[0].xy[found.rows0], described[1].xy[found.rows1]
+    return described[0].xy[found.indices0], described[1].xy[found.indices1]
 
 
 def refusal(points: tuple[np.ndarray, ...], one_line: Any, **known: Any) -> str:

@@ -12,7 +12,7 @@ from deepdetect.datasets import load_stereo_pair
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.io.image import load_image, luma
-from deepdetect.matching.guided import initial_matches
+from deepdetect.matching.guided import tentative_matches
 from deepdetect.reconstruction.rectification import (
     RectificationOptions,
     detect_rectification,
@@ -41,7 +41,7 @@ def sparse_matches(first: Path, second: Path) -> tuple[np.ndarray, ...]:
         ratio=0.85,
         mutual=True,
     )
-    places = described[0].xy[found.rows0], described[1].xy[found.rows1]
+    places = described[0].xy[found.indices0], described[1].xy[found.indices1]
     return *places, *(gray.shape[::-1] for gray in grays)
 
 
@@ -188,7 +188,7 @@ def test_small_copies_of_large_images_decide_alone(motorcycle: Any) -> None:
     assert not found.swapped
     assert initial is None
     size = left.shape[::-1]
-    fine = initial_matches(left, right)
+    fine = tentative_matches(left, right)
     expected = detect_rectification(fine.points0, fine.points1, size, size)
     for own, other in zip(found.disparities[::2], expected.disparities[::2], strict=True):
         assert own == pytest.approx(other, rel=0.1)

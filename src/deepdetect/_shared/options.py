@@ -130,8 +130,7 @@ def replace_options(options: Options, **changes: Any) -> Options:
         Traceback (most recent call last):
         ...
         deepdetect.OptionError: unknown option 'estimater': did you mean 'estimator'? \
-(known: model, estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations, \
-seed)
+(known: estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations)
     """
     names = option_names(options)
     for name in changes:

@@ -119,7 +119,7 @@ def run_match(
     )
     first, second = (load_image(one.path) for one in images)
     matches = match_images(first, second, progress=stages)
-    if matches.lost:
+    if not matches.success:
         raise DeepDetectError(
             "no geometry between these images can be trusted: they must show the same scene"
         )
@@ -254,13 +254,13 @@ def run_folder_keypoints(
     images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
 ) -> TaskResult:
     """Write the best keypoints of each image, as one CSV file each, into one ZIP file."""
-    from ..detector.detector import DeepDetect
+    from ..detector.point_detector import PointDetector
     from ..io.image import load_image
     from ..io.tables import save_keypoints
     from ..viz.draw import save_picture
 
-    detector, table, failures = DeepDetect(), folder / "table.csv", []
-    count = int(options.get("max_keypoints", FOLDER_KEYPOINTS))
+    detector = PointDetector(int(options.get("max_keypoints", FOLDER_KEYPOINTS)))
+    table, failures = folder / "table.csv", []
     shown, total = "", 0
     with zipfile.ZipFile(folder / "keypoints.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         names = _entry_names(images)
@@ -271,7 +271,7 @@ def run_folder_keypoints(
             except DeepDetectError as error:
                 failures.append(str(error).replace(str(one.path), one.name))
                 continue
-            keypoints = detector.detect(rgb, max_keypoints=count)
+            keypoints = detector.detect(rgb)
             save_keypoints(keypoints, table)
             archive.write(table, name)
             total += len(keypoints)

@@ -5,11 +5,10 @@ https://github.com/cvg/Hierarchical-Localization stores them so; its pixels are 
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +25,16 @@ from .._shared.errors import (
 from .._shared.options import suggest_keywords
 from .._shared.parallel import TaskMap
 from .._shared.progress import progress
-from .._shared.registry import is_path
-from ..detector.detector import DeepDetect
+from ..detector.detector import DeepDetect, check_selection, find_keypoints
 from ..detector.heatmap import MAX_AUTO_PIXELS
+from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
-from ..features.sift import described_at_own_size, root_sift_descriptors
+from ..features.sift import describe_keypoints
 from ..io.image import find_images, load_image, luma
 from ..io.image_file import megapixel_limit
 from .engines import get_engine
 from .parted_file import Group, PartedFile, write_groups
-
-MAX_KEYPOINTS = 2048
-"""Of an image, where nothing else is asked for."""
 
 IMAGES_PER_PART = 16
 """At most: what a killed worker loses, against the number of files."""
@@ -80,9 +76,9 @@ class ExtractionReport:
 def extract_features(
     folder: str | Path,
     path: str | Path,
+    detector: DeepDetect | PointDetector = PointDetector(),
     *,
-    selection: SelectionOptions = SelectionOptions(max_keypoints=MAX_KEYPOINTS),
-    detector: Mapping[str, Any] | None = None,
+    selection: SelectionOptions | None = None,
     max_megapixels: float | None = None,
     engine: str = "processes",
     workers: int | None = None,
@@ -106,8 +102,9 @@ def extract_features(
     Args:
         folder: of the images.
         path: the file.
-        selection: which keypoints.
-        detector: arguments of `DeepDetect`. Its threads are 1 unless they are given.
+        detector: a `PointDetector` or a `DeepDetect`; every process has one, so give the latter
+            `threads=1`.
+        selection: which pixels of a `DeepDetect`; None: those over 0.5.
         max_megapixels: of an image, as of `load_image`; larger ones are failures.
         engine: "processes" of this machine, or "ray" for a cluster.
         workers: number of processes; default one per processor.
@@ -128,21 +125,23 @@ def extract_features(
         ...     extract_features("photos", "features.h5").check()
     """
     map_tasks: TaskMap = get_engine(engine)
-    if selection.ignore is not None:
-        raise OptionError("one mask does not fit many images: leave out `ignore`")
-    arguments = _portable({"threads": 1, **(detector or {})})
+    check_selection(detector, selection)
     root, target = Path(folder).absolute(), Path(path).absolute()
     names = [image.relative_to(root).as_posix() for image in find_images(root)]
     failures = [f"{name}: its name is not UTF-8: rename it" for name in names if not _is_utf8(name)]
     states = {name: _state(root / name) for name in names if _is_utf8(name)}
-    settings = _settings(selection, arguments)
+    settings = {
+        **detector.settings,
+        **({} if selection is None else vars(selection)),
+        "descriptor": DESCRIPTOR,
+        "version": __version__,
+    }
     file = PartedFile(target, settings, overwrite)
     work = partial(
         _extract_part,
         root=root,
         selection=selection,
-        detector=tuple(arguments.items()),
-        digests=(settings["weights"], settings["ranker"]),
+        detector=detector,
         # Other processes do not know that of the command.
         max_megapixels=megapixel_limit(max_megapixels),
     )
@@ -174,42 +173,6 @@ def parts_of(names: Sequence[Any], most: int) -> list[Sequence[Any]]:
     return [names[k : k + size] for k in range(0, len(names), size)]
 
 
-def _portable(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Make paths in the arguments of a detector absolute, and lists hashable.
-
-    Names of weights are the same on all machines.
-    """
-    portable = dict(arguments)
-    for name, value in arguments.items():
-        if name in ("weights", "ranker") and value is not None and is_path(value):
-            portable[name] = str(Path(value).absolute())
-        elif isinstance(value, list):
-            portable[name] = tuple(value)
-    return portable
-
-
-def _settings(selection: SelectionOptions, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what features depend on besides the images; wrong arguments are an error here."""
-    detector = DeepDetect(**arguments)
-    options = {name: value for name, value in vars(selection).items() if name != "ignore"}
-    return {
-        **options,
-        "descriptor": DESCRIPTOR,
-        "weights": _digest(detector.weights),
-        "ranker": _digest(detector.ranker),
-        "resolution": detector.heatmap_options.resolution,
-        "network_channels": detector.heatmap_options.network_channels,
-        "tta": detector.heatmap_options.tta,
-        "backend": detector.runtime,
-        "version": __version__,
-    }
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _is_utf8(name: str) -> bool:
     try:
         name.encode("utf-8")
@@ -233,9 +196,8 @@ Task = tuple[Path, tuple[tuple[str, tuple[int, ...]], ...]]
 def _extract_part(
     task: Task,
     root: Path,
-    selection: SelectionOptions,
-    detector: tuple[tuple[str, Any], ...],
-    digests: tuple[str, str],
+    detector: DeepDetect | PointDetector,
+    selection: SelectionOptions | None,
     max_megapixels: float,
 ) -> tuple[dict[str, int], list[str]]:
     """Write a part; return the number of keypoints by image, and what could not be done."""
@@ -245,10 +207,9 @@ def _extract_part(
 
     def groups() -> Iterator[Group]:
         for name, state in images:
-            opened = _detector(detector, digests)  # what is wrong with it concerns all images
             try:
                 keypoints, uncertainty = _features_of(
-                    root / name, selection, opened, max_megapixels
+                    root / name, detector, selection, max_megapixels
                 )
             except (MissingExtraError, WeightsError):  # concern all images
                 raise
@@ -265,14 +226,11 @@ def _extract_part(
     return counts, failures
 
 
-@lru_cache(maxsize=1)
-def _detector(arguments: tuple[tuple[str, Any], ...], digests: tuple[str, str]) -> DeepDetect:
-    """Open a detector; other content of its files is another one."""
-    return DeepDetect(**dict(arguments))
-
-
 def _features_of(
-    path: Path, selection: SelectionOptions, detector: DeepDetect, max_megapixels: float
+    path: Path,
+    detector: DeepDetect | PointDetector,
+    selection: SelectionOptions | None,
+    max_megapixels: float,
 ) -> tuple[Keypoints, float]:
     """Return described keypoints of an image file, and the size of a pixel that they were found on.
 
@@ -280,15 +238,10 @@ def _features_of(
         DeepDetectError: the image cannot be worked on.
     """
     rgb = load_image(path, max_megapixels=max_megapixels)
-    options = {name: value for name, value in vars(selection).items() if name != "ignore"}
-    keypoints = detector.detect(rgb, **options)
-    gray = luma(rgb)
-    scaled = detector.heatmap_options.resolution != "native" and gray.size > MAX_AUTO_PIXELS
-    uncertainty = math.sqrt(gray.size / MAX_AUTO_PIXELS) if scaled else 1.0
-    if keypoints.sizes is not None and keypoints.angles is not None:
-        return described_at_own_size(gray, keypoints), uncertainty
-    found = root_sift_descriptors(gray, keypoints.xy)
-    return replace(keypoints, descriptors=found), uncertainty
+    gray, resolution = luma(rgb), detector.settings["resolution"]
+    keypoints = describe_keypoints(gray, find_keypoints(detector, rgb, selection))
+    scaled = resolution != "native" and gray.size > MAX_AUTO_PIXELS
+    return keypoints, math.sqrt(gray.size / MAX_AUTO_PIXELS) if scaled else 1.0
 
 
 def feature_group(

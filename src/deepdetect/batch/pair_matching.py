@@ -19,6 +19,7 @@ from .._shared.progress import progress
 from .._shared.registry import look_up
 from ..features.matchers import MATCHERS, get_matcher, match_descriptors
 from ..geometry import GeometryOptions, estimate_geometry
+from ..geometry.estimation import check_model
 from .engines import get_engine
 from .extraction import DESCRIPTOR, parts_of
 from .pair_list import Pair, check_pairs, pair_name, read_pairs
@@ -75,13 +76,7 @@ class PairMatchingOptions:
         look_up("matcher", self.matcher, MATCHERS_OF_FLOATS)
         if self.verify == "essential":
             raise OptionError("`verify` knows no cameras: use fundamental, homography or auto")
-        self.geometry()
-
-    def geometry(self) -> GeometryOptions:
-        """Return the options of the verifying geometry."""
-        return GeometryOptions(
-            model=self.verify, inlier_threshold=self.inlier_threshold, seed=self.seed
-        )
+        check_model(self.verify, self.seed, GeometryOptions())
 
 
 @dataclass(frozen=True)
@@ -377,10 +372,13 @@ def match_features(
         seed=options.seed,
         positions=None if scaled else (features0[0], features1[0]),
     )
-    rows0, rows1, ratios = found.rows0, found.rows1, found.ratios
+    rows0, rows1, ratios = found.indices0, found.indices1, found.ratios
     if options.verify != "none":
         points0, points1 = features0[0][rows0], features1[0][rows1]
-        kept = estimate_geometry(points0, points1, options.geometry()).inliers
+        how = GeometryOptions(inlier_threshold=options.inlier_threshold)
+        kept = estimate_geometry(
+            points0, points1, options.verify, seed=options.seed, options=how
+        ).inliers
         rows0, rows1, ratios = rows0[kept], rows1[kept], ratios[kept]
     matches = np.full(len(features0[0]), -1, np.int32)
     scores = np.zeros(len(features0[0]), np.float32)

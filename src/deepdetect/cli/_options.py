@@ -15,6 +15,8 @@ from ._generated import FieldOptions, given_only
 
 if TYPE_CHECKING:
     from ..detector.detector import DeepDetect
+    from ..detector.point_detector import PointDetector
+    from ..features.selection import SelectionOptions
     from ..labels import LabelOptions
     from ..training import TrainingOptions
 
@@ -64,21 +66,39 @@ DETECTOR = FieldOptions(
         "precision",
         "tta",
         "tile_megapixels",
-        "ranker",
     ),
     types={"resolution": Resolution(), "tile_megapixels": TileSize()},
-    metavars={"weights": "NAME|FILE", "device": "cpu|cuda|PROVIDER", "ranker": "FILE"},
+    metavars={"weights": "NAME|FILE", "device": "cpu|cuda|PROVIDER"},
     defaults={"threads": "the backend's choice"},
+)
+POINTS = FieldOptions(
+    "detector.point_detector:PointDetector",
+    names=("spread", "ranker"),
+    metavars={"ranker": "FILE"},
 )
 
 SELECTION = FieldOptions(
     "features.selection:SelectionOptions",
-    skip=("ignore",),
-    defaults={
-        "nms_radius": "1 with --max-keypoints, else 0",
-        "subpixel": "with --max-keypoints only",
-    },
+    defaults={"max_keypoints": "2048 with --detector points, else all"},
 )
+
+
+def detector_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return the option that chooses between the two detectors.
+
+    Args:
+        default: one of them; or what the help says of a command that chooses itself.
+    """
+    kinds = ["network", "points"]
+    return click.option(
+        "--detector",
+        "kind",
+        type=click.Choice(kinds),
+        default=default if default in kinds else None,
+        help="Pixels of the network's heat map, or ranked points of all scales.  "
+        f"[default: {default}]",
+    )
+
 
 output_option = click.option(
     "-o",
@@ -216,11 +236,51 @@ def chosen_recipe(
 
 
 def make_detector(values: dict[str, Any], weights: str = "default") -> DeepDetect:
-    """Make the detector that `DETECTOR`'s options describe, taking them out of the values."""
+    """Make the network that `DETECTOR`'s options describe, taking them out of the values."""
     from ..detector.detector import DeepDetect
 
     given = given_only({name: values.pop(name) for name in DETECTOR.names})
     return DeepDetect(**{"weights": weights, **given})
+
+
+SELECTED = ("threshold", "density", "nms_radius", "subpixel")
+"""Options of the network's keypoints alone."""
+
+
+def chosen_detector(
+    kind: str,
+    values: dict[str, Any],
+    *,
+    weights: str = "default",
+    max_keypoints: int = 2048,
+    threads: int | None = None,
+) -> tuple[DeepDetect | PointDetector, SelectionOptions | None]:
+    """Make the detector that is chosen, and its selection, taking their options out of the values.
+
+    Args:
+        kind: "network" or "points".
+        values: of `DETECTOR`, `POINTS` and `SELECTION`.
+        weights, threads: of the network, where nothing else is given.
+        max_keypoints: of points, where nothing else is given.
+    """
+    from ..detector.detector import DeepDetect
+    from ..detector.point_detector import PointDetector
+    from ..features.selection import SelectionOptions
+
+    names = (*DETECTOR.names, *POINTS.names, *SELECTED, "max_keypoints")
+    given = given_only({name: values.pop(name) for name in names if name in values})
+    network = [name for name in DETECTOR.names if name != "resolution"]
+    others = (*network, *SELECTED) if kind == "points" else POINTS.names
+    for name in given:
+        if name in others:
+            other = "network" if kind == "points" else "points"
+            flag = "--" + name.replace("_", "-")
+            raise OptionError(f"{flag} is for --detector {other}: leave it out, or choose that")
+    if kind == "points":
+        return PointDetector(**{"max_keypoints": max_keypoints, **given}), None
+    own = {name: given.pop(name) for name in DETECTOR.names if name in given}
+    detector = DeepDetect(**{"weights": weights, "threads": threads, **own})
+    return detector, SelectionOptions(**given)
 
 
 def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:

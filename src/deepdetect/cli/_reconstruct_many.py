@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ._generated import FieldOptions, given_only
-from ._options import DETECTOR, SELECTION, print_result, seconds_rows
+from ._options import chosen_detector, print_result, seconds_rows
 
 if TYPE_CHECKING:
     from ..sfm.result import MultiViewReconstruction
@@ -37,27 +36,27 @@ MAX_LEFT_OUT_ROWS = 10
 def reconstruct_folder(
     images: Sequence[Path],
     output: Path | None,
+    kind: str,
     workers: int | None,
     overwrite: bool,
     as_json: bool,
     values: dict[str, Any],
 ) -> None:
     """Reconstruct many photographs, and print what was found."""
-    from ..features.selection import SelectionOptions
     from ..sfm.colmap import import_pycolmap
-    from ..sfm.options import MultiViewOptions
-    from ..sfm.pipeline import check_output_folder, output_files, reconstruct_many
+    from ..sfm.pipeline import (
+        MAX_KEYPOINTS,
+        check_output_folder,
+        output_files,
+        reconstruct_many,
+    )
     from ..sfm.stages import check_photographs
     from ._records import check_not_made, claim_outputs
 
     target = OUTPUT if output is None else output
-    detector = given_only({name: values.pop(name) for name in DETECTOR.names})
+    detector, selection = chosen_detector(kind, values, max_keypoints=MAX_KEYPOINTS, threads=1)
     if values.pop("rectified") is not None:
         raise click.UsageError("--rectified and --not-rectified are for two photographs")
-    fields = {field.name for field in dataclasses.fields(SelectionOptions)} - {*SELECTION.skip}
-    selection = {name: values.pop(name) for name in fields if name in values}
-    options = MultiViewOptions()
-    chosen = dataclasses.replace(options.selection, **given_only(selection))
     photographs: Path | Sequence[Path] = images[0] if len(images) == 1 else images
     # What is missing or wrong is said before anything is written.
     import_pycolmap()
@@ -69,8 +68,8 @@ def reconstruct_folder(
     found = reconstruct_many(
         photographs,
         target,
-        detector=detector,
-        options=dataclasses.replace(options, selection=chosen),
+        detector,
+        selection=selection,
         workers=workers,
         overwrite=overwrite,
         quiet=False,

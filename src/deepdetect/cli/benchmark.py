@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import click
 
 from ._generated import generated_command
-from ._options import DETECTOR, PATH, json_option, make_detector, print_json
+from ._options import DETECTOR, PATH, POINTS, json_option, make_detector, print_json
 
 NAMES = (
     *("oxford", "hpatches", "middlebury", "pose", "sfm"),
@@ -17,7 +18,12 @@ NAMES = (
 )
 
 
-@generated_command(DETECTOR, short_help="The tables and figures of the paper, with baselines.")
+RANKER = dataclasses.replace(POINTS, names=("ranker",))
+
+
+@generated_command(
+    DETECTOR, RANKER, short_help="The tables and figures of the paper, with baselines."
+)
 @click.argument("name", metavar="|".join(NAMES))
 @click.option("--data", type=PATH, required=True, help="Folder of the data sets.")
 @click.option(
@@ -56,6 +62,7 @@ NAMES = (
 )
 @click.option(
     "--preset",
+    type=click.Choice(["default", "published"]),
     default="default",
     show_default=True,
     help="published: show the network the channels as the paper's code does (BGR).",
@@ -121,7 +128,6 @@ def benchmark(
     from ..evaluation.benchmarks import BENCHMARKS
     from ..evaluation.options import BASELINES, DEFAULT_PROTOCOLS, BenchmarkOptions, SfmOptions
     from ..evaluation.runner import run_benchmarks
-    from ..matching.options import get_preset
 
     if values["resolution"] not in (None, "auto", "native"):
         raise OptionError(
@@ -130,21 +136,22 @@ def benchmark(
     names = list(BENCHMARKS) if name == "all" else [name]
     for each in names:
         look_up("benchmark", each, dict.fromkeys(NAMES))
-    heatmap = get_preset(preset).heatmap
     classical = tuple(BASELINES)
     if baselines is not None:
         listed = [word.strip() for word in baselines.split(",")]
         classical = tuple(word for word in listed if word not in ("", "none"))
+    ranker = values.pop("ranker")
     options = BenchmarkOptions(
         make_detector(values),
         protocols or DEFAULT_PROTOCOLS,
         classical,
         tuple(find_feature(word) for word in words),
-        "rgb" if heatmap is None else heatmap.network_channels,
+        "bgr" if preset == "published" else "rgb",
         geometry_weights,
         PairSelectionOptions(max_pairs),
         degraded_images,
         SfmOptions(max_photographs),
+        ranker,
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)
     paths = report.save(output)

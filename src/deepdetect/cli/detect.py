@@ -5,24 +5,25 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from .. import __version__
-from ._generated import generated_command, given_only, with_flags
+from ._generated import generated_command, with_flags
 from ._options import (
     DETECTOR,
     NOTHING_FOUND,
     PATH,
+    POINTS,
     SELECTION,
     check_inputs_survive,
+    chosen_detector,
+    detector_option,
     expand_images,
     format_option,
     json_option,
-    make_detector,
     max_megapixels_option,
     output_option,
     overwrite_option,
@@ -32,18 +33,23 @@ from ._options import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..detector.detector import DeepDetect
+    from ..detector.point_detector import PointDetector
+    from ..features.selection import SelectionOptions
     from ._records import OutputRecords
 
 NUMBERS = ("width", "height", "keypoints", "density", "seconds")
 """What is told of each image, and recorded."""
 
-PICTURES, DENSE_PICTURES = ("keypoints", "heatmap"), ("keypoints", "dense", "heatmap")
+POINT_PICTURES, PICTURES = ("keypoints",), ("keypoints", "dense", "heatmap")
 
 
-@generated_command(SELECTION, DETECTOR, short_help="Keypoints of photographs.")
+@generated_command(SELECTION, POINTS, DETECTOR, short_help="Keypoints of photographs.")
 @click.argument("images", type=PATH, nargs=-1, required=True)
 @output_option
+@detector_option("network")
 @click.option(
     "--ignore",
     type=PATH,
@@ -57,6 +63,7 @@ PICTURES, DENSE_PICTURES = ("keypoints", "heatmap"), ("keypoints", "dense", "hea
 def detect(
     images: tuple[Path, ...],
     output: Path,
+    kind: str,
     ignore: Path | None,
     file_format: str,
     pictures: bool,
@@ -67,9 +74,8 @@ def detect(
     """Detect the keypoints of IMAGES (files or folders).
 
     Writes for each image STEM.npz (or .csv) with the positions and scores, and the pictures
-    STEM_keypoints.jpg (the best of all parts of the image, coloured by score), STEM_dense.jpg (all,
-    where they are pixels) and STEM_heatmap.jpg (logits). With --max-keypoints they are the best
-    keypoints of all scales; without, all pixels over the threshold.
+    STEM_keypoints.jpg (the best of all parts of the image, coloured by score), and of the network
+    STEM_dense.jpg (all keypoints) and STEM_heatmap.jpg (logits).
 
     Images that are done are skipped when the same command runs again, and done again with other
     options. What was made from other images of the same name, or by something else, is replaced
@@ -79,36 +85,29 @@ def detect(
 
     \b
     deepdetect detect photo.jpg
-    deepdetect detect photos/ -o keypoints --max-keypoints 2048 --spread grid
+    deepdetect detect photos/ -o keypoints --detector points --spread grid
     deepdetect detect photo.jpg --density 0.1 --format csv
     """
     from .._shared.opencv import import_opencv
     from .._shared.progress import progress
-    from ..features.selection import SelectionOptions
     from ..io.masks import load_mask
     from ._records import OutputRecords, file_digest
 
     import_opencv()  # what is missing is said before anything is written
     paths = expand_images(images, output)
-    selecting = {name: value for name, value in values.items() if name not in DETECTOR.names}
-    chosen = SelectionOptions(**given_only(selecting))
-    shown = (PICTURES if chosen.uses_points else DENSE_PICTURES) if pictures else ()
+    shown = (POINT_PICTURES if kind == "points" else PICTURES) if pictures else ()
     outputs = {path: _outputs(path, output, file_format, shown) for path in paths}
     written = [file for files in outputs.values() for file in files.values()]
     check_inputs_survive(written, paths, "choose another folder with -o")
     mask = load_mask(ignore) if ignore is not None else None
-    detector = make_detector(values)
-    selection = vars(replace(chosen, ignore=mask))
+    detector, selection = chosen_detector(kind, values)
     settings = {
-        **selection,
+        **detector.settings,
+        **({} if selection is None else vars(selection)),
         "ignore": None if ignore is None else file_digest(ignore),
-        "weights": file_digest(detector.weights),
-        "ranker": file_digest(detector.ranker),
-        "resolution": detector.heatmap_options.resolution,
-        "tta": detector.heatmap_options.tta,
-        "backend": detector.runtime,
         "version": __version__,
     }
+    backend = getattr(detector, "runtime", None)
     records = OutputRecords("detect", output, settings, overwrite)
     for path, files in outputs.items():  # before any work
         records.find(path, list(files.values()))
@@ -125,20 +124,20 @@ def detect(
     with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:
         for path, files in outputs.items():
             try:
-                results.append(_detect_one(path, detector, selection, files, records))
+                results.append(_detect_one(path, detector, selection, mask, files, records))
             except _Failure as failure:
                 failures.append(str(failure))
             except MemoryError:
                 failures.append(f"{path}: there is not enough memory for it: use a smaller image")
             bar.update(1)
     if as_json:
-        print_json({"backend": detector.runtime, "images": results, "failures": failures})
+        print_json({"backend": backend, "images": results, "failures": failures})
     else:
         for result in results:
             how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"
             count = result["keypoints"]
             found = f"{count:,} keypoint{'' if count == 1 else 's'}"
-            if chosen.max_keypoints is None:  # else the number was asked for
+            if kind == "network":  # else the number was asked for
                 found += f", density {result['density']:.3f}"
             click.echo(f"{result['image']}: {found}, {how} -> {result['file']}")
     report_failures(failures, len(paths))
@@ -163,14 +162,16 @@ def _outputs(
 
 def _detect_one(
     path: Path,
-    detector: DeepDetect,
-    selection: dict[str, Any],
+    detector: DeepDetect | PointDetector,
+    selection: SelectionOptions | None,
+    mask: np.ndarray | None,
     files: dict[str, Path],
     records: OutputRecords,
 ) -> dict[str, Any]:
     """Detect, save and draw the keypoints of one image unless it is done; return its numbers."""
     from .._shared.atomic import atomic_path
     from .._shared.errors import DeepDetectError, MissingExtraError, WeightsError
+    from ..detector.detector import DeepDetect, find_keypoints
     from ..features.selection import SelectionOptions, select_keypoints
     from ..io.image import load_image
     from ..io.tables import save_keypoints
@@ -187,14 +188,16 @@ def _detect_one(
         started = time.perf_counter()
         if drawn:
             rgb = load_image(path)
-        if "dense" in drawn:  # the network is run once for both
+        if drawn and isinstance(detector, DeepDetect):  # the network is run once for both
             heatmap, logits = detector.heatmap_and_logits(rgb)
-            keypoints = select_keypoints(heatmap, SelectionOptions(**selection), logits)
+            keypoints = select_keypoints(
+                heatmap, selection or SelectionOptions(), logits, ignore=mask
+            )
         elif drawn:
-            keypoints = detector.detect(rgb, **selection)
+            keypoints = find_keypoints(detector, rgb, selection, mask)
         else:
             # Nobody holds the image while keypoints are selected and written.
-            keypoints = detector.detect(path, **selection)
+            keypoints = find_keypoints(detector, load_image(path), selection, mask)
         seconds = time.perf_counter() - started
     except (MissingExtraError, WeightsError):  # concern all images
         raise
@@ -207,10 +210,8 @@ def _detect_one(
         save_keypoints(keypoints, made["file"])
         if drawn:
             save_picture(draw_best_keypoints(rgb, keypoints), made["keypoints"])
-            if "dense" in drawn:
-                save_picture(draw_dense_keypoints(rgb, keypoints), made["dense"])
-            else:
-                _, logits = detector.heatmap_and_logits(rgb)
+        if "dense" in drawn:
+            save_picture(draw_dense_keypoints(rgb, keypoints), made["dense"])
             save_picture(draw_logits(logits), made["heatmap"])
     numbers = {
         "width": keypoints.image_size[0],

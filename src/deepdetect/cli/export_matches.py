@@ -275,6 +275,7 @@ MARKERS = {"colmap-text": "matches.txt", "hloc": "features.h5"}
 
 def _collection(sources: tuple[Path, ...], values: Mapping[str, Any]) -> Collection:
     """Read saved keypoints and matches, or find and match those of a folder."""
+    from ..detector.point_detector import PointDetector
     from ..interchange import match_photographs, read_collection
 
     of_folder = {name: values[name] for name in ("pairs", "sequential", "max_keypoints")}
@@ -283,8 +284,10 @@ def _collection(sources: tuple[Path, ...], values: Mapping[str, Any]) -> Collect
             raise OptionError(
                 f"{sources[0]} is a folder of photographs: leave out --matches and --images"
             )
-        given = {name: value for name, value in of_folder.items() if value is not None}
-        return match_photographs(sources[0], workers=values["workers"], quiet=False, **given)
+        count = of_folder.pop("max_keypoints")
+        detector = PointDetector() if count is None else PointDetector(count)
+        workers = values["workers"]
+        return match_photographs(sources[0], detector, workers=workers, quiet=False, **of_folder)
     unused = [name for name, value in of_folder.items() if value is not None]
     if unused:
         flag = "--" + unused[0].replace("_", "-")

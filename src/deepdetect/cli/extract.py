@@ -7,11 +7,14 @@ from typing import Any
 
 import click
 
-from ._generated import FieldOptions, generated_command, given_only
+from ._generated import generated_command
 from ._options import (
     DETECTOR,
     PATH,
+    POINTS,
     SELECTION,
+    chosen_detector,
+    detector_option,
     engine_option,
     json_option,
     max_megapixels_option,
@@ -20,14 +23,10 @@ from ._options import (
     processes_option,
 )
 
-EXTRACTED = FieldOptions(
-    SELECTION.path,
-    skip=SELECTION.skip,
-    defaults={**SELECTION.defaults, "max_keypoints": "2048, but all with --mode dense"},
+
+@generated_command(
+    SELECTION, POINTS, DETECTOR, short_help="Features of a collection of photographs."
 )
-
-
-@generated_command(EXTRACTED, DETECTOR, short_help="Features of a collection of photographs.")
 @click.argument("folder", type=PATH)
 @click.option(
     "-o",
@@ -37,6 +36,7 @@ EXTRACTED = FieldOptions(
     show_default=True,
     help="File for the features.",
 )
+@detector_option("points")
 @max_megapixels_option
 @engine_option
 @processes_option
@@ -45,6 +45,7 @@ EXTRACTED = FieldOptions(
 def extract(
     folder: Path,
     output: Path,
+    kind: str,
     engine: str,
     workers: int | None,
     overwrite: bool,
@@ -64,20 +65,16 @@ def extract(
     deepdetect extract photos/ -o features.h5 --engine ray --workers 64
     deepdetect match-many features.h5 --pairs pairs.txt
     """
-    from ..batch.extraction import MAX_KEYPOINTS, extract_features
-    from ..features.selection import SelectionOptions
+    from ..batch.extraction import extract_features
     from ._records import check_none_made
 
     check_none_made(folder, output)
-    detector = given_only({name: values.pop(name) for name in DETECTOR.names})
-    given = given_only(values)
-    if given.get("mode") != "dense":
-        given.setdefault("max_keypoints", MAX_KEYPOINTS)
+    detector, selection = chosen_detector(kind, values, threads=1)  # one a process
     report = extract_features(
         folder,
         output,
-        selection=SelectionOptions(**given),
-        detector=detector,
+        detector,
+        selection=selection,
         engine=engine,
         workers=workers,
         overwrite=overwrite,

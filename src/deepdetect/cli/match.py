@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,11 +14,14 @@ from ._options import (
     DETECTOR,
     NOTHING_FOUND,
     PATH,
+    POINTS,
+    SELECTED,
     SELECTION,
     check_inputs_survive,
+    chosen_detector,
+    detector_option,
     format_option,
     json_option,
-    make_detector,
     max_megapixels_option,
     output_option,
     overwrite_option,
@@ -26,26 +30,41 @@ from ._options import (
     seconds_rows,
 )
 
+if TYPE_CHECKING:
+    from ..features.matches import Matches
+
+DETECTED = (*DETECTOR.names, *POINTS.names, "max_keypoints")
 MATCHING = FieldOptions(
     "matching.options:MatchingOptions",
-    skip=("heatmap", "selection", "guided_options", "geometry"),
-    flags={"guided": "--guided/--unguided"},
+    skip=("geometry",),
+)
+MATCH = FieldOptions(
+    "matching.pipeline:match_images",
+    names=("guided_matching", "model", "mutual", "seed"),
+    flags={"guided_matching": "--guided/--unguided"},
 )
 GEOMETRY = FieldOptions(
     "geometry.estimation:GeometryOptions",
-    names=("model", "estimator", "inlier_threshold", "confidence", "iterations", "seed"),
-    defaults={"model": "auto"},
+    names=("estimator", "inlier_threshold", "confidence", "iterations"),
 )
 
 
 @generated_command(
-    SELECTION, MATCHING, GEOMETRY, DETECTOR, short_help="Matches between two photographs."
+    SELECTION,
+    POINTS,
+    MATCH,
+    MATCHING,
+    GEOMETRY,
+    DETECTOR,
+    short_help="Matches between two photographs.",
 )
 @click.argument("image0", type=PATH)
 @click.argument("image1", type=PATH)
 @output_option
+@detector_option("network")
 @click.option(
     "--preset",
+    type=click.Choice(["default", "published"]),
     default="default",
     show_default=True,
     help="Options to start from: default, or published (exactly the paper's code).",
@@ -64,6 +83,7 @@ def match(
     image0: Path,
     image1: Path,
     output: Path,
+    kind: str,
     preset: str,
     homography: Path | None,
     camera0: Path | None,
@@ -90,9 +110,11 @@ def match(
     deepdetect match a.png b.png --preset published --homography H1to2p
     """
     from .._shared.progress import stage_progress
+    from ..detector.detector import DeepDetect
+    from ..geometry import GeometryOptions
     from ..io.image import load_image
     from ..io.tables import save_matches
-    from ..matching.options import UNGUIDED_ONLY, get_preset
+    from ..matching.options import PUBLISHED_MATCHING, UNGUIDED_ONLY, MatchingOptions
     from ..matching.pipeline import match_images
     from ._records import claimed_outputs
 
@@ -102,25 +124,29 @@ def match(
     files = [path for path in (file, picture) if path is not None]
     check_inputs_survive(files, [image0, image1], "choose another folder with -o")
     rgb0, rgb1 = load_image(image0), load_image(image1)
-    resolution_given = values["resolution"] is not None
-    detector = make_detector(values)
-    given = given_only(values)
-    for name, path in (
-        ("homography", homography),
-        ("camera0", camera0),
-        ("camera1", camera1 or camera0),
-    ):
-        if path is not None:
-            given[name] = _read_matrix(path)
-    if get_preset(preset).heatmap is not None and resolution_given:
-        given["resolution"] = detector.heatmap_options.resolution
-    guided = given.get("guided", get_preset(preset).guided)
+    start, given = MatchingOptions(), given_only(values)
+    if preset == "published":
+        start = PUBLISHED_MATCHING
+        given = {"resolution": 480, "guided_matching": False, "model": "none", **given}
+    for_detector = {name: given.pop(name, None) for name in (*DETECTED, *SELECTED)}
+    detector, selection = chosen_detector(kind, for_detector)
+    if preset == "published" and isinstance(detector, DeepDetect):
+        detector = detector.configured(replace(detector.heatmap_options, network_channels="bgr"))
+    matrices = {"homography": homography, "camera0": camera0, "camera1": camera1 or camera0}
+    geometry = {name: _read_matrix(path) for name, path in matrices.items() if path is not None}
+    geometry |= {name: given.pop(name) for name in GEOMETRY.names if name in given}
+    changes = {name: given.pop(name) for name in vars(start) if name in given}
+    options = replace(start, geometry=GeometryOptions(**geometry), **changes)
+    stages = GUIDED_STAGES if given.get("guided_matching", True) else UNGUIDED_STAGES
     with claimed_outputs("match", [image0, image1], files, overwrite):
-        with stage_progress("matching", GUIDED_STAGES if guided else UNGUIDED_STAGES) as done:
-            matches = match_images(rgb0, rgb1, detector, preset=preset, progress=done, **given)
+        with stage_progress("matching", stages) as done:
+            matches = match_images(
+                rgb0, rgb1, detector, selection=selection, options=options, progress=done, **given
+            )
         save_matches(matches, file)
         if picture is not None:
             _draw(rgb0, rgb1, matches, picture)
+    guide = matches.two_view_geometry
     numbers = {
         "image0": image0,
         "image1": image1,
@@ -133,14 +159,14 @@ def match(
         "model": matches.model,
         "matrix": None if matches.matrix is None else matches.matrix.tolist(),
         "guided": matches.guided,
-        "lost": matches.lost,
-        "guide": _guide_numbers(matches),
-        "backend": detector.runtime,
+        "success": matches.success,
+        "two_view_geometry": _two_view_numbers(matches),
+        "backend": getattr(detector, "runtime", None),
         "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
         "file": file,
         "picture": picture,
     }
-    if matches.guided and (unused := [name for name in UNGUIDED_ONLY if name in given]):
+    if matches.guided and (unused := [name for name in UNGUIDED_ONLY if name in changes]):
         words = " and ".join("--" + name.replace("_", "-") for name in unused)
         verb = "applies" if len(unused) == 1 else "apply"
         click.echo(f"{words} {verb} only to unguided matching: add --unguided", err=True)
@@ -152,13 +178,13 @@ def match(
             ("density", f"{numbers['density0']:.3f} and {numbers['density1']:.3f}"),
             ("matches", f"{len(matches):,}"),
             (_inliers_label(matches.model, homography is not None), f"{numbers['inliers']:,}"),
-            ("guided by", matches.guide.model if matches.guide and matches.guided else "nothing"),
+            ("guided by", guide.model if guide and matches.guided else "nothing"),
             *seconds_rows(matches.seconds),
             ("written", ", ".join(str(path) for path in files)),
         ],
         f"{image0} and {image1}",
     )
-    if matches.lost:
+    if not matches.success:
         click.echo(
             "no geometry between these images can be trusted, so there are no matches: if they "
             "show the same scene, --unguided matches by descriptors alone",
@@ -184,17 +210,12 @@ def _inliers_label(model: str, given: bool) -> str:
     return "within the threshold of --homography" if given else f"inliers ({model})"
 
 
-def _guide_numbers(matches: Any) -> dict[str, Any] | None:
-    guide = matches.guide
-    if guide is None:
+def _two_view_numbers(matches: Matches) -> dict[str, Any] | None:
+    found = matches.two_view_geometry
+    if found is None:
         return None
-    return {
-        "model": guide.model,
-        "sparse_matches": guide.sparse_matches,
-        "sparse_inliers": guide.sparse_inliers,
-        "log10_nfa": guide.log10_nfa if math.isfinite(guide.log10_nfa) else None,
-        "simulated_views": guide.simulated_views,
-    }
+    numbers = {name: value for name, value in vars(found).items() if name != "matrix"}
+    return {**numbers, "log10_nfa": found.log10_nfa if math.isfinite(found.log10_nfa) else None}
 
 
 def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:

@@ -14,10 +14,12 @@ from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
     DETECTOR,
     PATH,
+    POINTS,
     SELECTION,
     check_inputs_survive,
+    chosen_detector,
+    detector_option,
     json_option,
-    make_detector,
     max_megapixels_option,
     overwrite_option,
     print_result,
@@ -38,7 +40,7 @@ CAMERAS = FieldOptions(
     defaults={"focal_px": "from EXIF", "rectified": "detected"},
     types={"calibration": PATH},
 )
-WHOLE_PIXEL_SELECTION = dataclasses.replace(SELECTION, skip=(*SELECTION.skip, "subpixel"))
+WHOLE_PIXEL_SELECTION = dataclasses.replace(SELECTION, skip=("subpixel",))
 DENSE_DETECTOR = dataclasses.replace(
     DETECTOR, defaults={**DETECTOR.defaults, "weights": "dense, of more than two: default"}
 )
@@ -52,6 +54,7 @@ STAGES = 8
 @generated_command(
     CAMERAS,
     WHOLE_PIXEL_SELECTION,
+    POINTS,
     DENSE_DETECTOR,
     MANY,
     short_help="A 3D reconstruction of two photographs, or of many.",
@@ -64,6 +67,7 @@ STAGES = 8
     help="Of two photographs the model, .ply, .glb or .html; the other files get its name and "
     f"stand beside it. Of more the folder for all files.  [default: {MODEL}; {OUTPUT}]",
 )
+@detector_option("network, of more than two images points")
 @max_megapixels_option
 @processes_option
 @overwrite_option
@@ -71,6 +75,7 @@ STAGES = 8
 def reconstruct(
     images: tuple[Path, ...],
     output: Path | None,
+    kind: str | None,
     workers: int | None,
     overwrite: bool,
     as_json: bool,
@@ -102,7 +107,7 @@ def reconstruct(
     if len(images) > 2 or folders:
         if folders and len(images) > 1:
             raise click.UsageError("give one folder, or photographs: not both")
-        reconstruct_folder(images, output, workers, overwrite, as_json, values)
+        reconstruct_folder(images, output, kind or "points", workers, overwrite, as_json, values)
         return
     if len(images) < 2:
         raise click.UsageError("give two photographs, or more, or a folder of them")
@@ -110,6 +115,7 @@ def reconstruct(
     for name in given_only({**of_many, "workers": workers}):
         flag = MANY.flags.get(name, "--" + name.replace("_", "-"))
         raise click.UsageError(f"{flag} is for more than two photographs")
+    values["kind"] = kind or "network"
     _reconstruct_two(images[0], images[1], output or MODEL, overwrite, as_json, **values)
 
 
@@ -120,6 +126,7 @@ def _reconstruct_two(
     overwrite: bool,
     as_json: bool,
     calibration: Path | None,
+    kind: str,
     **values: Any,
 ) -> None:
     """Reconstruct two photographs, and print what was found."""
@@ -130,7 +137,7 @@ def _reconstruct_two(
 
     find_writer(output)
     files = _files(output, [path for path in (left, right, calibration) if path is not None])
-    detector = make_detector(values, weights="dense")
+    detector, selection = chosen_detector(kind, values, weights="dense")
     check_outputs("reconstruct", [left, right], list(files.values()), overwrite)
     chosen = given_only(values)
     # On a terminal only: what is logged stays readable.
@@ -145,6 +152,7 @@ def _reconstruct_two(
             right,
             detector,
             calibration=calibration,
+            selection=selection,
             progress=done,
             **chosen,
         )

@@ -7,14 +7,16 @@ from typing import Any
 
 import click
 
-from ._generated import generated_command, given_only
+from ._generated import generated_command
 from ._options import (
     DETECTOR,
     PATH,
+    POINTS,
     SELECTION,
     check_inputs_survive,
+    chosen_detector,
+    detector_option,
     json_option,
-    make_detector,
     max_megapixels_option,
     output_option,
     overwrite_option,
@@ -24,15 +26,22 @@ from ._options import (
 STAGES = ("keypoints", "guided matching", "geometry")
 
 
-@generated_command(SELECTION, DETECTOR, short_help="One photograph registered to another.")
+@generated_command(SELECTION, POINTS, DETECTOR, short_help="One photograph registered to another.")
 @click.argument("image0", type=PATH)
 @click.argument("image1", type=PATH)
 @output_option
+@detector_option("network")
 @max_megapixels_option
 @overwrite_option
 @json_option
 def register(
-    image0: Path, image1: Path, output: Path, overwrite: bool, as_json: bool, **values: Any
+    image0: Path,
+    image1: Path,
+    output: Path,
+    kind: str,
+    overwrite: bool,
+    as_json: bool,
+    **values: Any,
 ) -> None:
     """Register IMAGE1 to IMAGE0: for planes, and for photographs from one place.
 
@@ -55,10 +64,10 @@ def register(
     files = [output / f"{stem}{name}.png" for name in ("", "_checkerboard", "_difference")]
     files.append(output / f"{stem}_homography.txt")
     check_inputs_survive(files, [image0, image1], "choose another folder with -o")
-    detector = make_detector(values)
+    detector, selection = chosen_detector(kind, values)
     with claimed_outputs("register", [image0, image1], files, overwrite):
         with stage_progress("registering", STAGES) as done:
-            found = register_images(image0, image1, detector, progress=done, **given_only(values))
+            found = register_images(image0, image1, detector, selection=selection, progress=done)
         pictures = found.warped, found.checkerboard(), found.difference()
         for path, picture in zip(files[:-1], pictures, strict=True):
             save_picture(picture, path)

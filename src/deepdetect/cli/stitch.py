@@ -13,9 +13,11 @@ from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
     DETECTOR,
     PATH,
+    POINTS,
     check_inputs_survive,
+    chosen_detector,
+    detector_option,
     json_option,
-    make_detector,
     max_megapixels_option,
     overwrite_option,
     print_result,
@@ -28,11 +30,14 @@ if TYPE_CHECKING:
 
 PANORAMA = FieldOptions(
     "matching.stitching.panorama:stitch",
-    names=("scale", "max_canvas_megapixels", "registration_side", "max_keypoints", "seed"),
+    names=("scale", "max_canvas_megapixels", "registration_side", "seed"),
 )
+MAX_KEYPOINTS = FieldOptions(POINTS.path, names=("max_keypoints",))
 
 
-@generated_command(PANORAMA, DETECTOR, short_help="A panorama of overlapping photographs.")
+@generated_command(
+    PANORAMA, MAX_KEYPOINTS, POINTS, DETECTOR, short_help="A panorama of overlapping photographs."
+)
 @click.argument("images", type=PATH, nargs=-1, required=True)
 @click.option(
     "-o",
@@ -47,6 +52,7 @@ PANORAMA = FieldOptions(
     type=PATH,
     help="The one of IMAGES that is not distorted.  [default: the one in the middle]",
 )
+@detector_option("network")
 @max_megapixels_option
 @overwrite_option
 @json_option
@@ -54,6 +60,7 @@ def stitch(
     images: tuple[Path, ...],
     output: Path,
     reference: Path | None,
+    kind: str,
     overwrite: bool,
     as_json: bool,
     **values: Any,
@@ -78,7 +85,9 @@ def stitch(
     check_inputs_survive([output], images, "give the panorama another name by -o")
     if reference is not None and reference not in images:
         raise OptionError(f"--reference {reference} must be one of the photographs: name it there")
-    detector = make_detector(values)
+    if kind == "network" and values["max_keypoints"] is not None:
+        raise OptionError("--max-keypoints is for --detector points: leave it out, or choose that")
+    detector, _ = chosen_detector(kind, values)
     given = len(images)
     images, failures = _readable(images)
     if len(images) < min(given, 2) or (reference is not None and reference not in images):

@@ -11,11 +11,9 @@ import click
 from .._shared.errors import OptionError
 from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
-    DETECTOR,
     PATH,
     check_inputs_survive,
     json_option,
-    make_detector,
     max_megapixels_option,
     overwrite_option,
     print_result,
@@ -33,7 +31,7 @@ FRAMES = FieldOptions(
 )
 
 
-@generated_command(TRACKING, FRAMES, DETECTOR, short_help="Points followed through a video.")
+@generated_command(TRACKING, FRAMES, short_help="Points followed through a video.")
 @click.argument("source", metavar="VIDEO|FOLDER|CAMERA")
 @click.option(
     "-o",
@@ -69,7 +67,6 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
     files = [path for path in output_files(output) if path is not None]
     given = given_only(values)
     frames = {name: given.pop(name) for name in FRAMES.names if name in given}
-    detection = {name: given.pop(name) for name in DETECTOR.names if name in given}
     options = TrackingOptions(**given)
     with FrameSource(source) as opened:
         live = opened.live
@@ -87,10 +84,7 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
             check_inputs_survive(files, inputs, "choose another name with -o")
         claim = claimed_outputs("track", inputs, files, overwrite)
     with claim:
-        detector = make_detector({**dict.fromkeys(DETECTOR.names), **detection})
-        report = track_points(
-            source, output, detector=detector, options=options, quiet=False, **frames
-        )
+        report = track_points(source, output, options=options, quiet=False, **frames)
     print_result(
         as_json,
         vars(report),

@@ -8,27 +8,41 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from .._shared.errors import ImageError, OptionError
+from .._shared.errors import DeepDetectError, ImageError, OptionError
+from .._shared.image_array import Channels
+from .._shared.opencv import is_lack_of_memory
+from ..io.image import load_image
 
-Images = list[Any] | tuple[Any, ...]
+Images = list[Any] | tuple[Any, ...] | np.ndarray
 Item = TypeVar("Item")
 
 
-def image_list(image: Any) -> list[Any] | None:
-    """Return the images of a list, a tuple, or a batch of four dimensions; None of one image.
+def image_list(images: Images) -> list[Any]:
+    """Return the images of a list, a tuple, or an array of four dimensions.
+
+    Raises:
+        OptionError: it is none of these.
 
     Example:
-        >>> image_list("left.png"), image_list(["left.png", "right.png"])
-        (None, ['left.png', 'right.png'])
         >>> import numpy as np
         >>> len(image_list(np.zeros((5, 3, 20, 30), np.uint8)))
         5
     """
-    if isinstance(image, (list, tuple)):
-        # Rows of numbers are one image.
-        rows = len(image) > 0 and isinstance(image[0], (list, tuple, int, float))
-        return None if rows else list(image)
-    return list(image) if getattr(image, "ndim", 0) == 4 else None
+    if isinstance(images, (list, tuple)) or getattr(images, "ndim", 0) == 4:
+        return list(images)
+    raise OptionError(
+        "a batch is a list of images, or an array of four dimensions: of one image use the method "
+        "without _batch"
+    )
+
+
+def load_each(images: list[Any], channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
+    """Load images when they are asked for, each with its place in the list."""
+    for number, image in enumerate(images):
+        with image_named(number):
+            loaded = number, load_image(image, channels=channels)
+        yield loaded
+        del loaded
 
 
 @contextmanager
@@ -73,15 +87,37 @@ def check_batch_size(batch_size: int) -> None:
         raise OptionError(f"`batch_size` must be a whole number from 1 on, not {batch_size!r}")
 
 
-def ignore_masks(ignore: Any, images: int | None) -> list[Any]:
+def ignore_masks(ignore: Any, images: int) -> list[Any]:
     """Return the ignore mask of each image.
 
     Raises:
         OptionError: their number differs from that of the images.
     """
-    several = isinstance(ignore, (list, tuple)) or getattr(ignore, "ndim", 2) == 3
-    if images is None or not several:
-        return [ignore] * (1 if images is None else images)
+    if not (isinstance(ignore, (list, tuple)) or getattr(ignore, "ndim", 2) == 3):
+        return [ignore] * images
     if len(ignore) != images:
         raise OptionError(f"`ignore` holds {len(ignore)} masks for {images} images: give one each")
     return list(ignore)
+
+
+@contextmanager
+def memory_named(shape: tuple[int, ...], images: int = 1) -> Iterator[None]:
+    """Make lack of memory, in work on images of this shape, an error of one sentence."""
+    try:
+        yield
+        return
+    except MemoryError:
+        pass
+    except Exception as error:
+        if not is_lack_of_memory(error):
+            raise
+    height, width = shape[:2]
+    if images > 1:
+        raise DeepDetectError(
+            f"there is not enough memory for {images} images of {width}x{height} pixels at once: "
+            "use a smaller `batch_size`"
+        )
+    raise DeepDetectError(
+        f"there is not enough memory for an image of {width}x{height} pixels: "
+        "use `resolution='auto'`, fewer keypoints, or a smaller image"
+    )

@@ -180,8 +180,8 @@ class BenchmarkContext:
                     positions=(both[0].xy, both[1].xy),
                 )
             return {
-                "rows0": found.rows0,
-                "rows1": found.rows1,
+                "rows0": found.indices0,
+                "rows1": found.indices1,
                 **pack_profile("describe", describe),
                 **pack_profile("match", match),
             }
@@ -274,4 +274,4 @@ def _pack(features: Keypoints) -> dict[str, np.ndarray]:
 def _unpack(arrays: Arrays) -> Keypoints:
     width, height = arrays["image_size"].tolist()
     optional = {name: arrays.get(name) for name in OPTIONAL}
-    return Keypoints(arrays["xy"], arrays["scores"], (width, height), **optional)
+    return Keypoints(arrays["xy"], arrays["scores"], (width, height), **optional)  # type: ignore[arg-type]

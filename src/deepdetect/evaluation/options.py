@@ -71,6 +71,7 @@ class BenchmarkOptions:
         pair_selection: which pairs of a scene are measured, and at which frame distances.
         degraded_images: which images of a pair the protocol "degraded" degrades.
         sfm: which photographs are reconstructed.
+        ranker: of the points, as of `PointDetector`.
 
     Raises:
         OptionError: a name is unknown, or nothing is left to do.
@@ -85,6 +86,7 @@ class BenchmarkOptions:
     pair_selection: PairSelectionOptions = field(default_factory=PairSelectionOptions)
     degraded_images: DegradedImages = "second"
     sfm: SfmOptions = field(default_factory=SfmOptions)
+    ranker: str | Path | None = None
 
     def __post_init__(self) -> None:
         for protocol in self.protocols:
@@ -154,7 +156,7 @@ class BenchmarkOptions:
             title="DeepDetect, pixels by logits, suppression 3x3, sub-pixel",
             descriptor=COMMON_DESCRIPTOR,
         )
-        points = points_feature(self._native())
+        points = points_feature(self.ranker)
         native = self.deepdetect_native()
         chance = random_feature(native, name="random-native"), all_pixels_feature()
         return without_repeats(

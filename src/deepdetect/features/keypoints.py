@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,9 @@ class Keypoints:
     Attributes:
         xy: (N, 2) float32 positions, x right and y down in pixels, centre of the
             first pixel (0, 0).
-        scores: (N,) float32, the higher the better; probabilities where they are DeepDetect's.
-            Float32 rounds the highest to 1: to rank keypoints, use `best`, or the logits.
+        scores: (N,) float32, the higher the better: of `PointDetector` in (0, 1), no two equal; of
+            `DeepDetect` probabilities, of which float32 rounds the highest to 1: `best` ranks
+            pixels by their logits.
         image_size: (width, height) of the image in pixels.
         logits: (N,) float32 logits of the probabilities, or None.
         sizes: (N,) float32 diameters in pixels, or None where all keypoints have the same.
@@ -41,6 +42,7 @@ class Keypoints:
         octaves: (N,) int32 as OpenCV packs them, or None.
         descriptors: (N, D) uint8 or float32, of a detector that describes its own keypoints, or
             None.
+        descriptor_type: what these are, as "rootsift"; None without any, or of unknown ones.
 
     `len`, iteration over (x, y) rows and indexing by slices, masks and index arrays work.
 
@@ -63,6 +65,7 @@ class Keypoints:
     angles: np.ndarray | None = None
     octaves: np.ndarray | None = None
     descriptors: np.ndarray | None = None
+    descriptor_type: str | None = None
 
     def __post_init__(self) -> None:
         xy = np.asarray(self.xy, np.float32)
@@ -256,7 +259,8 @@ class Keypoints:
 
     def __getitem__(self, index: slice | np.ndarray | list[int] | int) -> Keypoints:
         rows = [int(index)] if isinstance(index, (int, np.integer)) else index
-        parts = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "image_size"}
+        names = ("xy", "scores", *_OPTIONAL, "descriptors")
+        parts = {name: getattr(self, name) for name in names}
         return replace(self, **{k: v[rows] for k, v in parts.items() if v is not None})
 
     def __iter__(self) -> Iterator[np.ndarray]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.image_array import Channels
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .keypoints import Keypoints, nearest_keypoints
 
@@ -23,27 +24,27 @@ _COLUMNS: dict[str, Any] = {
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
-class Guide:
+class TwoViewGeometry:
     """The geometry that guided the matching of two images.
 
     Attributes:
         model: "homography", "fundamental", or "none": no geometry could be trusted, and there are
             no matches.
         matrix: (3, 3) float64, refined, of the first image to the second; None without one.
-        sparse_matches: number of sparse matches that it was first estimated from.
-        sparse_inliers: number of those that agree with it.
+        tentative_matches: number of tentative matches that it was first estimated from.
+        tentative_inliers: number of those that agree with it.
         log10_nfa: decimal logarithm of its number of false alarms (a contrario).
         simulated_views: number of views that were simulated to find it, as in ASIFT.
     """
 
     model: str
     matrix: np.ndarray | None
-    sparse_matches: int
-    sparse_inliers: int
+    tentative_matches: int
+    tentative_inliers: int
     log10_nfa: float
     simulated_views: int
 
-    def swapped(self) -> Guide:
+    def swapped(self) -> TwoViewGeometry:
         """Return the geometry from the second image to the first."""
         if self.matrix is None:
             return self
@@ -58,39 +59,39 @@ class GuidedMatches:
     """Matches of keypoints of the first image.
 
     Attributes:
-        rows0: (M,) int64 keypoints of the first image, rising, each once.
+        indices0: (M,) int64 keypoints of the first image, rising, each once.
         points1: (M, 2) float64 positions in the second image: keypoints of it where a homography
             guided, sub-pixel positions where the pair was rectified.
         scores: (M,) float32 in [0, 1], higher is better.
         subpixel: whether the positions in the second image are sub-pixel.
-        rows1: (M,) int64 keypoints of the second image; None where the positions are others.
+        indices1: (M,) int64 keypoints of the second image; None where the positions are others.
     """
 
-    rows0: np.ndarray
+    indices0: np.ndarray
     points1: np.ndarray
     scores: np.ndarray
     subpixel: bool = False
-    rows1: np.ndarray | None = None
+    indices1: np.ndarray | None = None
 
     def __len__(self) -> int:
-        return len(self.rows0)
+        return len(self.indices0)
 
     def unique(self) -> GuidedMatches:
         """Keep the best match of those that end on the same pixel of the second image."""
         pixels = np.rint(self.points1).astype(np.int64)
-        best_first = np.lexsort((self.rows0, -self.scores))
+        best_first = np.lexsort((self.indices0, -self.scores))
         _, first = np.unique(pixels[best_first], axis=0, return_index=True)
         kept = np.sort(best_first[first])
         return replace(
             self,
-            rows0=self.rows0[kept],
+            indices0=self.indices0[kept],
             points1=self.points1[kept],
             scores=self.scores[kept],
-            rows1=None if self.rows1 is None else self.rows1[kept],
+            indices1=None if self.indices1 is None else self.indices1[kept],
         )
 
 
-class _FoundLater:
+class _Lazy:
     """A field of keypoints, or of a function that finds them when they are first asked for."""
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -108,7 +109,7 @@ class _FoundLater:
         instance.__dict__[self.name] = value
 
 
-def found_later(find: Callable[[], Keypoints]) -> Keypoints:
+def lazy(find: Callable[[], Keypoints]) -> Keypoints:
     """Return what `Matches` takes as keypoints, and finds when they are first asked for."""
     return cast(Keypoints, find)
 
@@ -133,10 +134,11 @@ class Matches:
         matrix: (3, 3) float64, the geometry; None when it could not be estimated, or was not
             asked for. A homography maps the first image to the second; else x1^T M x0 = 0
             (essential: in normalised coordinates).
-        keypoints0, keypoints1: all keypoints of the two images. Of a pair whose geometry was lost
-            before any were needed they are found when they are first asked for.
+        keypoints0, keypoints1: all keypoints of the two images. Of a pair without success they may
+            be lazy: they are found when they are first asked for.
         seconds: time of each stage, both images together.
-        guide: the geometry that guided the matching; None when guided matching was not asked for.
+        two_view_geometry: the geometry that guided the matching; None when guided matching was not
+            asked for.
         subpixel: whether the matching itself found sub-pixel positions in the second image, by
             rectification: they need no refinement.
         indices0, indices1: (M,) int32 rows of `keypoints0` and `keypoints1`: the keypoints that are
@@ -170,10 +172,10 @@ class Matches:
     inliers: np.ndarray
     model: str
     matrix: np.ndarray | None
-    keypoints0: Keypoints = _FoundLater()  # type: ignore[assignment]
-    keypoints1: Keypoints = _FoundLater()  # type: ignore[assignment]
+    keypoints0: Keypoints = _Lazy()  # type: ignore[assignment]
+    keypoints1: Keypoints = _Lazy()  # type: ignore[assignment]
     seconds: dict[str, float] = field(default_factory=dict)
-    guide: Guide | None = None
+    two_view_geometry: TwoViewGeometry | None = None
     subpixel: bool = False
     indices0: np.ndarray = None  # type: ignore[assignment]  # never None once it is made
     indices1: np.ndarray = None  # type: ignore[assignment]
@@ -205,12 +207,37 @@ class Matches:
     @property
     def guided(self) -> bool:
         """Whether a geometry guided these matches."""
-        return self.guide is not None and self.guide.model != "none"
+        return self.two_view_geometry is not None and self.two_view_geometry.model != "none"
 
     @property
-    def lost(self) -> bool:
-        """Whether a geometry was to guide these matches and none could be trusted."""
-        return self.guide is not None and self.guide.model == "none"
+    def success(self) -> bool:
+        """False where a geometry was to guide these matches and none could be trusted."""
+        return self.two_view_geometry is None or self.guided
+
+    @property
+    def homography(self) -> np.ndarray | None:
+        """The (3, 3) homography of the first image to the second; None where it is another."""
+        return self.matrix if self.model == "homography" else None
+
+    @property
+    def fundamental(self) -> np.ndarray | None:
+        """The (3, 3) fundamental matrix, x1^T F x0 = 0; None where the geometry is another."""
+        return self.matrix if self.model == "fundamental" else None
+
+    def to_opencv(self) -> list[cv2.DMatch]:
+        """Convert to OpenCV's matches of `keypoints0.to_opencv()` and `keypoints1.to_opencv()`.
+
+        Their distances are 1 - score. Matches that end at no keypoint are left out.
+
+        Example:
+            >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
+            >>> ends = points.xy, points.xy[::-1]
+            >>> m = Matches(*ends, [0.5, 0.2], [True, True], "none", None, points, points)
+            >>> [(match.queryIdx, match.trainIdx) for match in m.to_opencv()]
+            [(0, 1), (1, 0)]
+        """
+        columns = self.indices0.tolist(), self.indices1.tolist(), (1 - self.scores).tolist()
+        return [cv2.DMatch(i, j, d) for i, j, d in zip(*columns, strict=True) if min(i, j) >= 0]
 
     def unique(self) -> Matches:
         """Return one-to-one matches: those that score highest at both of their ends.
@@ -279,12 +306,13 @@ class Matches:
         """Return what a notebook shows: a small table, and where some of the matches are."""
         from .display import html_summary
 
-        inliers = np.count_nonzero(self.inliers)
-        guide = self.guide.model if self.guide is not None and self.guided else "nothing"
+        inliers, guide = np.count_nonzero(self.inliers), self.two_view_geometry
         rows = {
             "inliers": f"{inliers:,} ({self.model})",
-            "guided by": "no geometry that could be trusted" if self.lost else guide,
+            "guided by": "nothing" if guide is None else guide.model,
         }
+        if not self.success:
+            rows["guided by"] = "no geometry that could be trusted"
         for side, keypoints in enumerate((self.keypoints0, self.keypoints1)):
             width, height = keypoints.image_size
             rows[f"image {side}"] = f"{width}x{height}, {len(keypoints):,} keypoints"
@@ -299,7 +327,7 @@ class Matches:
         return html_summary(f"{len(self):,} matches", rows, points, lines)
 
     def __repr__(self) -> str:
-        if self.lost:  # whose keypoints may have to be found first
+        if not self.success:  # whose keypoints may have to be found first
             return f"Matches({len(self)} matches, as no geometry could be trusted)"
         return (
             f"Matches({len(self)} matches of {len(self.keypoints0)} and {len(self.keypoints1)} "
@@ -332,8 +360,8 @@ class Matches:
 def _ends(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Number what matches end at: keypoints from 0 on, pixels without one below 0."""
     ends = indices.astype(np.int64)
-    lost = np.flatnonzero(indices < 0)
-    if len(lost):
-        pixels = np.floor(points[lost] + np.float32(0.5)).astype(np.int64)
-        ends[lost] = -1 - np.unique(pixels, axis=0, return_inverse=True)[1].reshape(-1)
+    without = np.flatnonzero(indices < 0)
+    if len(without):
+        pixels = np.floor(points[without] + np.float32(0.5)).astype(np.int64)
+        ends[without] = -1 - np.unique(pixels, axis=0, return_inverse=True)[1].reshape(-1)
     return ends

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .._shared.errors import OptionError, unknown_name
-from .._shared.options import replace_options, suggest_keywords
+from .._shared.errors import OptionError
+from .._shared.options import suggest_keywords
 from .keypoints import Keypoints, bayer_order
 from .maps import Maps, bands
 from .peaks import highest_in_window, peak_offset
-
-MODES = ("auto", "dense", "points")
-SPREADS = ("none", "grid", "anms")
 
 
 def check_max_keypoints(count: int | None) -> None:
@@ -25,7 +21,7 @@ def check_max_keypoints(count: int | None) -> None:
 
 
 @suggest_keywords
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class SelectionOptions:
     """Which pixels of a heat map become keypoints.
 
@@ -35,30 +31,19 @@ class SelectionOptions:
             is taken, the most probable ones.
         max_keypoints: at most this many are kept, the most probable ones.
         nms_radius: of non-maximum suppression in pixels: a pixel is kept when it ranks highest
-            within this distance in x and y (0: no suppression). None: 1 (a window of 3x3) with
-            `max_keypoints`, else 0.
+            within this distance in x and y (0: no suppression).
         subpixel: refine positions to the maximum of a parabola through the pixel and its two
-            neighbours, in x and in y. None: with `max_keypoints` only.
-        ignore: (H, W) bool or number array, true where keypoints are ignored.
-        mode: "dense" takes pixels of the heat map; "points" takes the best keypoints of all
-            scales, which are more repeatable where few are wanted, and need no heat map. "auto"
-            means points with `max_keypoints` and no other option of dense keypoints (threshold,
-            density, suppression, `subpixel`), else dense.
-        spread: of points: "none" takes the best; "grid" in turn the best of each cell of a grid;
-            "anms" the best that are as far from each other as their number allows.
+            neighbours, in x and in y.
 
     Raises:
-        OptionError: a value is unknown or out of its range, or options do not fit together.
+        OptionError: a value is out of its range.
     """
 
     threshold: float = 0.5
     density: float | None = None
     max_keypoints: int | None = None
-    nms_radius: int | None = None
-    subpixel: bool | None = None
-    ignore: np.ndarray | None = field(default=None, repr=False)
-    mode: Literal["auto", "dense", "points"] = "auto"
-    spread: Literal["none", "grid", "anms"] = "none"
+    nms_radius: int = 0
+    subpixel: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.threshold <= 1:
@@ -66,56 +51,10 @@ class SelectionOptions:
         if self.density is not None and not 0 < self.density <= 1:
             raise OptionError(f"the density must lie in (0, 1], not {self.density}")
         check_max_keypoints(self.max_keypoints)
-        if self.nms_radius is not None:
-            if self.nms_radius < 0:
-                raise OptionError(f"`nms_radius` must be 0 or more pixels, not {self.nms_radius}")
-            if self.nms_radius != int(self.nms_radius):
-                raise OptionError(
-                    f"`nms_radius` must be a whole number of pixels, not {self.nms_radius}"
-                )
-
-        if self.mode not in MODES:
-            raise unknown_name("mode", self.mode, MODES)
-        if self.spread not in SPREADS:
-            raise unknown_name("spread", self.spread, SPREADS)
-        if self.mode == "points" and self._has_dense_options:
+        if not (self.nms_radius >= 0 and self.nms_radius % 1 == 0):
             raise OptionError(
-                "threshold, density, `nms_radius` and `subpixel` belong to dense keypoints: leave "
-                "them out, or use mode='dense'"
+                f"`nms_radius` must be a whole number of pixels from 0 on, not {self.nms_radius}"
             )
-        if self.spread != "none" and not (self.uses_points and self.max_keypoints is not None):
-            raise OptionError(
-                f"`spread={self.spread!r}` needs `max_keypoints` and no option of dense keypoints"
-            )
-
-    @property
-    def uses_points(self) -> bool:
-        """Whether keypoints of all scales are wanted instead of pixels of the heat map."""
-        if self.mode != "auto":
-            return self.mode == "points"
-        return self.max_keypoints is not None and not self._has_dense_options
-
-    @property
-    def _has_dense_options(self) -> bool:
-        """Whether an option of dense keypoints differs from its default."""
-        return (
-            self.density is not None
-            or self.nms_radius is not None
-            or self.subpixel is not None
-            or self.threshold != SelectionOptions.threshold
-        )
-
-    @property
-    def suppression_radius(self) -> int:
-        """The effective radius of non-maximum suppression in pixels."""
-        if self.nms_radius is None:
-            return 0 if self.max_keypoints is None else 1
-        return int(self.nms_radius)
-
-    @property
-    def refines(self) -> bool:
-        """Whether positions are refined."""
-        return self.max_keypoints is not None if self.subpixel is None else self.subpixel
 
 
 @suggest_keywords
@@ -124,19 +63,12 @@ def select_keypoints(
     options: SelectionOptions = SelectionOptions(),
     logits: np.ndarray | None = None,
     *,
-    threshold: float | None = None,
-    density: float | None = None,
-    max_keypoints: int | None = None,
-    nms_radius: int | None = None,
-    subpixel: bool | None = None,
     ignore: np.ndarray | None = None,
 ) -> Keypoints:
     """Select the dense keypoints of a heat map.
 
     With a heat map and logits of `DeepDetect.heatmap_and_logits` they are exactly those that
-    `detect` finds with `mode="dense"` and the same options, without running the network again.
-    Points, which `detect` returns for `max_keypoints` alone, are found in the image, not in a heat
-    map: they need `detect`.
+    `detect` finds with the same options, without running the network again.
 
     Args:
         heatmap: (H, W) float32 probability.
@@ -145,40 +77,22 @@ def select_keypoints(
         logits: (H, W) float32 logits of the map, by which keypoints are ranked; by default the
             map itself, although float32 rounds its highest probabilities to 1. Ties are broken
             by an order that spreads the keypoints evenly (`bayer_order`).
-        threshold, density, max_keypoints, nms_radius, subpixel, ignore: as of `SelectionOptions`;
-            those that are None are as in `options`.
+        ignore: (H, W) bool or number array, true where keypoints are ignored.
 
     Returns:
         Keypoints in row-major order, on pixel centres unless `subpixel`.
 
     Raises:
-        OptionError: the ignore mask or the logits differ from the map in size, an option is out of
-            its range, or the options ask for points.
+        OptionError: the ignore mask or the logits differ from the map in size.
 
     Example:
         >>> heatmap = np.zeros((16, 16), np.float32)
         >>> heatmap[4, 9] = 0.9
         >>> select_keypoints(heatmap).xy.tolist()
         [[9.0, 4.0]]
-        >>> len(select_keypoints(heatmap, threshold=0.95))
+        >>> len(select_keypoints(heatmap, SelectionOptions(threshold=0.95)))
         0
     """
-    given = {
-        "threshold": threshold,
-        "density": density,
-        "max_keypoints": max_keypoints,
-        "nms_radius": nms_radius,
-        "subpixel": subpixel,
-        "ignore": ignore,
-    }
-    options = replace_options(
-        options, **{name: value for name, value in given.items() if value is not None}
-    )
-    if options.mode == "points" or options.spread != "none":
-        raise OptionError(
-            "a heat map gives dense keypoints: leave out `mode` and `spread`, or find points in "
-            "the image with `DeepDetect.detect`"
-        )
     ranking = heatmap if logits is None else logits
     if ranking.shape != heatmap.shape:
         raise OptionError(
@@ -186,14 +100,16 @@ def select_keypoints(
             "they must be equal"
         )
     maps = Maps(ranking.shape, lambda: heatmap.__getitem__, lambda: ranking)
-    found = select_from_maps(maps, options)
+    found = select_from_maps(maps, options, ignore)
     return found if logits is not None else replace(found, logits=None)
 
 
-def select_from_maps(maps: Maps, options: SelectionOptions) -> Keypoints:
+def select_from_maps(
+    maps: Maps, options: SelectionOptions, ignore: np.ndarray | None = None
+) -> Keypoints:
     """Select keypoints as `select_keypoints` does; their logits are their ranks."""
     height, width = maps.shape
-    passing = _passing(maps, options)
+    passing = _passing(maps, options, ignore)
     ranking = maps.logits()
     chosen = _choose(passing, ranking, options)
     del passing
@@ -209,7 +125,7 @@ def select_from_maps(maps: Maps, options: SelectionOptions) -> Keypoints:
     for rows, part in parts:
         pixels = _unpack(chosen[rows], width)
         logits[part] = ranking[rows].ravel()[pixels]
-        if options.refines:
+        if options.subpixel:
             row, column = np.divmod(pixels, width)
             for k, axis in ((0, 1), (1, 0)):
                 xy[part, k] = peak_offset(ranking, row + rows.start, column, axis)
@@ -222,7 +138,7 @@ def select_from_maps(maps: Maps, options: SelectionOptions) -> Keypoints:
         row, column = np.divmod(_unpack(chosen[rows], width), width)
         for k, whole in ((0, column), (1, row + rows.start)):
             found = whole.astype(np.float32)
-            xy[part, k] = found + xy[part, k] if options.refines else found
+            xy[part, k] = found + xy[part, k] if options.subpixel else found
     del chosen
     return Keypoints(xy, scores, (width, height), logits)
 
@@ -232,10 +148,11 @@ def _unpack(packed: np.ndarray, width: int) -> np.ndarray:
     return np.flatnonzero(np.unpackbits(packed, axis=1, count=width))
 
 
-def _passing(maps: Maps, options: SelectionOptions) -> np.ndarray:
+def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -> np.ndarray:
     """Return the pixels over the threshold that are not ignored, eight of a row in a byte."""
     height, width = maps.shape
-    ignore = None if options.ignore is None else check_ignore(options.ignore, maps.shape)
+    if ignore is not None:
+        ignore = check_ignore(ignore, maps.shape)
     # With a density, all pixels but the impossible ones may be needed.
     threshold = options.threshold if options.density is None else 0.0
     packed = np.empty((height, -(-width // 8)), np.uint8)
@@ -251,7 +168,7 @@ def _passing(maps: Maps, options: SelectionOptions) -> np.ndarray:
 def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions) -> np.ndarray:
     """Return the pixels that become keypoints, packed as those are that pass the threshold."""
     height, width = ranking.shape
-    radius = options.suppression_radius
+    radius = int(options.nms_radius)
     count = _wanted_count(options, ranking.size)
     if not radius and count is None:
         return passing

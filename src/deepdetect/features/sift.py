@@ -6,8 +6,8 @@ it to `DESCRIPTORS`.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,8 +16,12 @@ from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
 from .dense_sift import MAX_SIZE_PX, MIN_SIZE_PX, dense_sift
-from .keypoints import Keypoints, on_pixels
+from .keypoints import UNSET_ANGLE, Keypoints, on_pixels
+from .orientation import dominant_angles
 from .scale_space import LAYERS, nearest_layers
+
+ROOT_SIFT = "rootsift"
+"""`Keypoints.descriptor_type` of RootSIFT."""
 
 MIN_DENSE_DENSITY = 0.02
 """Keypoints per pixel from which all at once (`dense_sift`) is faster than one by one."""
@@ -102,26 +106,44 @@ def scaled_sift_descriptors(
     return _compute(sift, gray, keypoints)
 
 
-def described_at_own_size(gray: np.ndarray, points: Keypoints) -> Keypoints:
-    """Return keypoints with RootSIFT descriptors at their own sizes and angles.
+def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
+    """Return keypoints with RootSIFT descriptors.
+
+    Keypoints with sizes are described at these and at their angles, where they have none at the
+    dominant one; others all alike, with size 3 and upright, as in the paper.
 
     Args:
         gray: (H, W) uint8 luma of the image that they are keypoints of.
-        points: keypoints with sizes and angles.
+        keypoints: of any detector; angles of -1 are unset.
 
     Raises:
-        OptionError: they have no sizes or angles.
+        OptionError: a size is not above 0.
 
     Example:
         >>> gray = np.random.default_rng(0).integers(0, 256, (64, 64)).astype(np.uint8)
         >>> points = Keypoints([[30, 30]], [1], (64, 64), sizes=[5], angles=[90])
-        >>> described_at_own_size(gray, points).descriptors.shape
+        >>> describe_keypoints(gray, points).descriptors.shape
         (1, 128)
     """
-    if points.sizes is None or points.angles is None:
-        raise OptionError("these keypoints have no sizes and angles of their own: give them some")
-    found = scaled_sift_descriptors(gray, points.xy, points.sizes, points.angles)
-    return dataclasses.replace(points, descriptors=to_root_sift(found, overwrite=True))
+    if keypoints.sizes is None:
+        found = sift_descriptors(gray, keypoints.xy)
+        return replace(
+            keypoints, descriptors=to_root_sift(found, overwrite=True), descriptor_type=ROOT_SIFT
+        )
+    if not (keypoints.sizes > 0).all():
+        raise OptionError("keypoints need sizes above 0 to be described: give them some")
+    angles = np.full(len(keypoints), UNSET_ANGLE, np.float32)
+    if keypoints.angles is not None:
+        angles = keypoints.angles.copy()
+    unset = np.flatnonzero(angles < 0)
+    angles[unset] = dominant_angles(gray, keypoints.xy[unset], keypoints.sizes[unset])
+    found = scaled_sift_descriptors(gray, keypoints.xy, keypoints.sizes, angles)
+    return replace(
+        keypoints,
+        angles=angles,
+        descriptors=to_root_sift(found, overwrite=True),
+        descriptor_type=ROOT_SIFT,
+    )
 
 
 def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) -> np.ndarray:

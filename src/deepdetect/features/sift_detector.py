@@ -9,7 +9,7 @@ import numpy as np
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .keypoints import Keypoints
-from .sift import to_root_sift
+from .sift import ROOT_SIFT, to_root_sift
 
 OCTAVE_LAYERS = 3
 """Of SIFT (Lowe): the contrast of a keypoint is compared after multiplication by their number."""
@@ -77,13 +77,15 @@ def detect_sift(gray: np.ndarray, options: SiftOptions = SiftOptions()) -> Keypo
             keypoints = [every[k] for k in np.flatnonzero(contrasts >= threshold)]
             break
     if not len(keypoints) or options.max_keypoints < 1:
-        return replace(Keypoints.empty(size), descriptors=np.empty((0, 128), np.uint8))
+        none = np.empty((0, 128), np.uint8)
+        return replace(Keypoints.empty(size), descriptors=none, descriptor_type=ROOT_SIFT)
     strength = np.array([keypoint.response for keypoint in keypoints])
     xy = cv2.KeyPoint_convert(keypoints)
     chosen = spread_over_grid(xy, strength, size, options.max_keypoints, options.grid_cells)
     kept, descriptors = sift.compute(gray, [keypoints[k] for k in chosen])
     found = Keypoints.from_opencv(kept, size)
-    return replace(found, descriptors=to_root_sift(descriptors.astype(np.uint8)))
+    root = to_root_sift(descriptors.astype(np.uint8))
+    return replace(found, descriptors=root, descriptor_type=ROOT_SIFT)
 
 
 def spread_over_grid(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,27 +21,23 @@ MODEL_NAMES = ("auto", "homography", "fundamental", "essential", "none")
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
 class GeometryOptions:
-    """Which geometry is estimated, and how.
+    """How a geometry is estimated.
 
     Attributes:
-        model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto"
-            (one of these two; `measure_parallax`), "essential" (known cameras), or "none".
         estimator: "magsac" or "ransac".
         inlier_threshold: a match is an inlier when its error is below this, in pixels: the
             transfer error of a homography, else the Sampson distance (in a rectified pair an
             error of d rows counts as d / sqrt(2)).
         homography: a given (3, 3) homography: nothing is estimated, the inliers are the matches
             whose transfer error is below the threshold.
-        camera0, camera1: (3, 3) camera matrices, for "essential".
+        camera0, camera1: (3, 3) camera matrices, for the model "essential".
         confidence: desired probability that the model is the best one.
         iterations: maximum number.
-        seed: of the random samples.
 
     Raises:
         OptionError: a value is unknown, missing or out of its range.
     """
 
-    model: str = "fundamental"
     estimator: str = "magsac"
     inlier_threshold: float = 1.0
     homography: np.ndarray | None = field(default=None, repr=False)
@@ -49,11 +45,8 @@ class GeometryOptions:
     camera1: np.ndarray | None = field(default=None, repr=False)
     confidence: float = 0.999
     iterations: int = 10_000
-    seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.model not in MODEL_NAMES:
-            raise unknown_name("model", self.model, MODEL_NAMES)
         if self.estimator not in ESTIMATORS:
             raise unknown_name("estimator", self.estimator, ESTIMATORS)
         if not 0 < self.confidence < 1:
@@ -61,13 +54,10 @@ class GeometryOptions:
         check_ranges(
             self,
             positive=("inlier_threshold", "iterations"),
-            between={"seed": (0, 2**31 - 1)},
         )
         for name in ("homography", "camera0", "camera1"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _matrix(name, getattr(self, name)))
-        if self.model == "essential":
-            _cameras(self)
 
 
 def _matrix(name: str, value: Any) -> np.ndarray:
@@ -118,57 +108,79 @@ class _Model:
 
 @suggest_keywords
 def estimate_geometry(
-    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions = GeometryOptions()
+    points0: np.ndarray,
+    points1: np.ndarray,
+    model: str = "fundamental",
+    *,
+    seed: int = 0,
+    options: GeometryOptions = GeometryOptions(),
 ) -> Geometry:
     """Estimate the geometry between two images from matches, some of which are wrong.
 
     Args:
         points0, points1: (M, 2) matched positions, centre of the first pixel (0, 0).
-        options: what to estimate and how.
+        model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto"
+            (one of these two; `measure_parallax`), "essential" (known cameras), or "none".
+        seed: of the random samples.
+        options: how.
 
     Returns:
         The geometry; its inliers are the matches with an error below the threshold. With too few
         matches, or when estimation fails, the matrix is None and no match is an inlier.
 
+    Raises:
+        OptionError: the model is unknown, or needs cameras that are not in the options.
+
     Example:
         >>> a = np.array([[0, 0], [9, 0], [9, 9], [0, 9], [4, 5]], float)
-        >>> geometry = estimate_geometry(a, a + 3, GeometryOptions(model="homography"))
+        >>> geometry = estimate_geometry(a, a + 3, "homography")
         >>> geometry
         Geometry(model='homography', 5 inliers of 5 matches)
         >>> geometry.matrix[:2, 2].round(3).tolist()
         [3.0, 3.0]
     """
+    check_model(model, seed, options)
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     if options.homography is not None:
         errors = transfer_errors(points0, points1, options.homography)
         return Geometry("homography", options.homography, errors < options.inlier_threshold)
-    if options.model == "none":
+    if model == "none":
         return Geometry("none", None, np.ones(len(points0), bool))
-    if options.model == "auto":
+    if model == "auto":
         plane, depth = (
-            estimate_geometry(points0, points1, replace(options, model=model))
-            for model in ("homography", "fundamental")
+            estimate_geometry(points0, points1, each, seed=seed, options=options)
+            for each in ("homography", "fundamental")
         )
         if plane.matrix is None or depth.matrix is None:
             return depth if plane.matrix is None else plane
-        parallax = measure_parallax(points0, points1, plane.matrix, seed=options.seed)
+        parallax = measure_parallax(points0, points1, plane.matrix, seed=seed)
         return depth if parallax.is_depth() else plane
-    model = MODELS[options.model]
-    nothing = Geometry(options.model, None, np.zeros(len(points0), bool))
-    if len(points0) < model.min_matches:
+    fitting = MODELS[model]
+    nothing = Geometry(model, None, np.zeros(len(points0), bool))
+    if len(points0) < fitting.min_matches:
         return nothing
     # OpenCV draws the same samples every time; another order of the matches draws others.
-    order = np.random.default_rng(options.seed).permutation(len(points0))
+    order = np.random.default_rng(seed).permutation(len(points0))
     method = cv2.USAC_MAGSAC if options.estimator == "magsac" else cv2.RANSAC
     try:
-        matrix = model.fit(points0[order], points1[order], options, method)
+        matrix = fitting.fit(points0[order], points1[order], options, method)
     except cv2.error:  # degenerate input, as all points in one place
         return nothing
     if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return nothing
-    errors = model.errors(points0, points1, matrix, options)
-    return Geometry(options.model, matrix, errors < options.inlier_threshold)
+    errors = fitting.errors(points0, points1, matrix, options)
+    return Geometry(model, matrix, errors < options.inlier_threshold)
+
+
+def check_model(model: str, seed: int, options: GeometryOptions) -> None:
+    """Raise an OptionError where `estimate_geometry` would, whatever the matches."""
+    if model not in MODEL_NAMES:
+        raise unknown_name("model", model, MODEL_NAMES)
+    if not 0 <= seed < 2**31:
+        raise OptionError(f"the seed must lie in [0, 2147483647], not {seed}")
+    if model == "essential":
+        _cameras(options)
 
 
 def _fit_homography(

@@ -107,16 +107,16 @@ def estimate_relative_pose(
         OptionError: the threshold or the seed is out of its range.
     """
     essential = GeometryOptions(
-        model="essential",
         inlier_threshold=inlier_threshold,
         camera0=calibration.camera0.matrix,
         camera1=calibration.camera1.matrix,
-        seed=seed,
     )
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     every = -(-len(points0) // options.max_matches) if refine and len(points0) else 1
-    geometry = estimate_geometry(points0[::every], points1[::every], essential)
+    geometry = estimate_geometry(
+        points0[::every], points1[::every], "essential", seed=seed, options=essential
+    )
     if geometry.matrix is None or not geometry.inliers.any():
         return None
     kept = np.zeros(len(points0), bool)

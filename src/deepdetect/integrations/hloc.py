@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._shared.errors import OptionError, unknown_name
-from ..detector.detector import DeepDetect
+from ..detector.detector import AnyDetector, DeepDetect
+from ..detector.point_detector import PointDetector
 from ..features.matchers import get_matcher, match_descriptors
 from ..matching.pipeline import match_images
-from .described_points import PointExtractor, image_from_tensor, unit_descriptors
 from .packages import base_class, import_package
+from .tensors import image_from_tensor, unit_descriptors
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -57,7 +58,7 @@ DENSE_MATCHER_CONF: dict[str, Any] = {
 class DeepDetectExtractor(BaseModel):
     """The best keypoints of all scales with RootSIFT descriptors, for `hloc.extract_features`.
 
-    Its options in hloc's configuration: `max_keypoints`; `spread` as of `DeepDetect.detect`; and
+    Its options in hloc's configuration: `max_keypoints` and `spread` as of `PointDetector`; and
     `angle_unit` of `oris`, "degrees" as of hloc's own SIFT, or "radians" as LightGlue wants them.
     Positions are float64, which hloc does not round to half precision.
     """
@@ -79,14 +80,14 @@ class DeepDetectExtractor(BaseModel):
                 f"hloc can match up to {MAX_KEYPOINTS} keypoints, not {conf['max_keypoints']}: "
                 "give fewer as `max_keypoints`"
             )
-        self._points = PointExtractor(conf["max_keypoints"], conf["spread"])
+        self._detector = PointDetector(conf["max_keypoints"], spread=conf["spread"])
         self._radians = conf["angle_unit"] == "radians"
 
     def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
         import torch
 
         image = data["image"]
-        points = self._points.detect_and_describe(image_from_tensor(image[0]))
+        points = self._detector.extract(image_from_tensor(image[0]))
         assert points.angles is not None
         arrays = {
             "keypoints": points.xy.astype(np.float64),
@@ -130,7 +131,7 @@ class DeepDetectMatcher(BaseModel):
         )
         matches = np.full(len(described[0]), -1, np.int64)
         scores = np.zeros(len(described[0]), np.float32)
-        matches[found.rows0], scores[found.rows0] = found.rows1, 1 - found.ratios
+        matches[found.indices0], scores[found.indices0] = found.indices1, 1 - found.ratios
         return {
             "matches0": torch.from_numpy(matches)[None],
             "matching_scores0": torch.from_numpy(scores)[None],
@@ -140,8 +141,9 @@ class DeepDetectMatcher(BaseModel):
 class DeepDetectDenseMatcher(BaseModel):
     """Dense guided matches of two images, for `hloc.match_dense`.
 
-    Its options in hloc's configuration: `weights` as of `DeepDetect`, and `max_keypoints`, None for
-    dense keypoints. Where no geometry can be trusted there are no matches.
+    Its options in hloc's configuration: `max_keypoints` of a `PointDetector`, or None for the dense
+    ones of a `DeepDetect`, and the `weights` of that. Where no geometry can be trusted there are
+    no matches.
     """
 
     default_conf: dict[str, Any] = {"weights": "default", "max_keypoints": None}  # noqa: RUF012
@@ -149,15 +151,17 @@ class DeepDetectDenseMatcher(BaseModel):
 
     def _init(self, conf: dict[str, Any]) -> None:
         _check_names(conf, self.default_conf)
-        self._detector = DeepDetect(conf["weights"])
-        self._max_keypoints = conf["max_keypoints"]
+        count = conf["max_keypoints"]
+        self._detector: AnyDetector = (
+            DeepDetect(conf["weights"]) if count is None else PointDetector(count)
+        )
 
     def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
         import torch
 
         # Hloc wants the positions in the first image to be the refined ones; ours are the second's.
         second, first = (image_from_tensor(data[name][0]) for name in ("image1", "image0"))
-        matches = match_images(second, first, self._detector, max_keypoints=self._max_keypoints)
+        matches = match_images(second, first, self._detector)
         arrays = {
             "keypoints0": matches.points1,
             "keypoints1": matches.points0,

@@ -8,10 +8,10 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
-from ..detector.detector import DeepDetect
+from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
-from .described_points import PointExtractor, Spread, image_from_tensor, unit_descriptors
 from .packages import base_class, import_package
+from .tensors import image_from_tensor, unit_descriptors
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -30,9 +30,7 @@ class DeepDetectDetector(Module):
     gradients pass through it.
 
     Args:
-        max_keypoints: at most this many in an image.
-        spread: "none", "grid" or "anms", as of `DeepDetect.detect`.
-        detector: with options of its own.
+        detector: of the points.
 
     Raises:
         OptionError: an option is unknown or out of its range.
@@ -42,14 +40,11 @@ class DeepDetectDetector(Module):
     @suggest_keywords
     def __init__(
         self,
-        max_keypoints: int = 2048,
-        *,
-        spread: Spread = "none",
-        detector: DeepDetect | None = None,
+        detector: PointDetector = PointDetector(),
     ) -> None:
         super().__init__()
         self._laf_from_center_scale_ori = import_package("kornia.feature").laf_from_center_scale_ori
-        self._points = PointExtractor(max_keypoints, spread, detector)
+        self._detector = detector
 
     def forward(self, img: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Find keypoints.
@@ -69,7 +64,7 @@ class DeepDetectDetector(Module):
         import torch
 
         found = [
-            self._points.detect(image_from_tensor(one), hidden)
+            self._detector.detect(image_from_tensor(one), ignore=hidden)
             for one, hidden in zip(img, _hidden(mask, img), strict=True)
         ]
         lafs = [self._lafs(points) for points in found]
@@ -115,7 +110,7 @@ class DeepDetectFeature(DeepDetectDetector):
         import torch
 
         found = [
-            self._points.detect_and_describe(image_from_tensor(one), hidden)
+            self._detector.extract(image_from_tensor(one), ignore=hidden)
             for one, hidden in zip(img, _hidden(mask, img), strict=True)
         ]
         lafs = [self._lafs(points) for points in found]

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.options import suggest_keywords
-from ..detector.detector import DeepDetect
+from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.scale_space import SIZE_PER_SIGMA
 from ..io.image import load_image
-from .described_points import PointExtractor, Spread, image_from_tensor
 from .packages import base_class
+from .tensors import image_from_tensor
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -64,10 +64,8 @@ class DeepDetectExtractor(Module):
     """Takes the place of an extractor of LightGlue, as `lightglue.SIFT`.
 
     Args:
-        max_num_keypoints: at most this many; LightGlue takes up to 4,096.
-        spread: "none", "grid" or "anms", as of `DeepDetect.detect`.
+        detector: of the points; LightGlue takes up to 4,096.
         scale: as of `to_lightglue`.
-        detector: with options of its own.
 
     Raises:
         OptionError: an option is unknown or out of its range.
@@ -77,22 +75,20 @@ class DeepDetectExtractor(Module):
     @suggest_keywords
     def __init__(
         self,
-        max_num_keypoints: int = 2048,
+        detector: PointDetector = PointDetector(),
         *,
-        spread: Spread = "none",
         scale: Scale = "diameter",
-        detector: DeepDetect | None = None,
     ) -> None:
         super().__init__()
-        if max_num_keypoints > MAX_KEYPOINTS:
+        if detector.max_keypoints is None or detector.max_keypoints > MAX_KEYPOINTS:
             raise OptionError(
-                f"LightGlue takes up to {MAX_KEYPOINTS} keypoints, not {max_num_keypoints}: "
-                "give fewer as `max_num_keypoints`"
+                f"LightGlue takes up to {MAX_KEYPOINTS} keypoints, not "
+                f"{detector.max_keypoints or 'all'}: give the detector a smaller `max_keypoints`"
             )
         if scale not in SCALES:
             raise unknown_name("scale", scale, SCALES)
         self._scale = scale
-        self._points = PointExtractor(max_num_keypoints, spread, detector)
+        self._detector = detector
 
     def extract(self, img: Any) -> dict[str, Tensor]:
         """Find and describe keypoints.
@@ -110,11 +106,11 @@ class DeepDetectExtractor(Module):
         import torch
 
         if not isinstance(img, torch.Tensor):
-            return to_lightglue(self._points.detect_and_describe(load_image(img)), self._scale)
+            return to_lightglue(self._detector.extract(load_image(img)), self._scale)
         if img.ndim == 4 and len(img) != 1:
             raise OptionError(f"extract takes one image, not {len(img)}: call it for each")
         rgb = image_from_tensor(img[0] if img.ndim == 4 else img)
-        features = to_lightglue(self._points.detect_and_describe(rgb), self._scale)
+        features = to_lightglue(self._detector.extract(rgb), self._scale)
         return {name: value.to(img.device) for name, value in features.items()}
 
     def forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:

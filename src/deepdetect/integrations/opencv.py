@@ -12,11 +12,11 @@ from .._shared.errors import OptionError
 from .._shared.image_array import Channels, check_channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
-from ..detector.detector import DeepDetect
+from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.scale_space import nearest_layers
-from ..io.image import load_image
-from .described_points import PointExtractor, Spread
+from ..features.sift import describe_keypoints
+from ..io.image import load_image, luma
 
 
 class DeepDetectFeature2D:
@@ -26,10 +26,8 @@ class DeepDetectFeature2D:
     crashes the interpreter. So functions of OpenCV that ask for a `cv2.Feature2D` refuse it.
 
     Args:
-        max_keypoints: at most this many.
-        spread: "none", "grid" or "anms", as of `DeepDetect.detect`.
+        detector: of the points.
         channels: order of the colours in images: "bgr" as of `cv2.imread`, or "rgb".
-        detector: with options of its own.
 
     Raises:
         OptionError: an option is unknown or out of its range.
@@ -37,7 +35,8 @@ class DeepDetectFeature2D:
     Example:
         >>> image = np.zeros((64, 64, 3), np.uint8)
         >>> image[20:40, 24:44] = 255
-        >>> keypoints, descriptors = DeepDetectFeature2D(4).detectAndCompute(image, None)
+        >>> detector = DeepDetectFeature2D(PointDetector(4))
+        >>> keypoints, descriptors = detector.detectAndCompute(image, None)
         >>> len(keypoints), descriptors.shape
         (4, (4, 128))
     """
@@ -45,15 +44,13 @@ class DeepDetectFeature2D:
     @suggest_keywords
     def __init__(
         self,
-        max_keypoints: int = 2048,
+        detector: PointDetector = PointDetector(),
         *,
-        spread: Spread = "none",
         channels: Channels = "bgr",
-        detector: DeepDetect | None = None,
     ) -> None:
         check_channels(channels)
         self._channels = channels
-        self._points = PointExtractor(max_keypoints, spread, detector)
+        self._detector = detector
 
     def detect(self, image: Any, mask: np.ndarray | None = None) -> tuple[cv2.KeyPoint, ...]:
         """Detect keypoints.
@@ -71,7 +68,7 @@ class DeepDetectFeature2D:
             OptionError: the mask has another size than the image.
         """
         rgb = self._load(image)
-        return _to_opencv(self._points.detect(rgb, _ignored(mask, rgb)))
+        return _to_opencv(self._detector.detect(rgb, ignore=_ignored(mask, rgb)))
 
     def compute(
         self, image: Any, keypoints: Sequence[cv2.KeyPoint], descriptors: None = None
@@ -91,7 +88,7 @@ class DeepDetectFeature2D:
         points = Keypoints.from_opencv(keypoints, (rgb.shape[1], rgb.shape[0]))
         if not len(points):
             return (), None
-        return tuple(keypoints), _as_float(self._points.describe(rgb, points))
+        return tuple(keypoints), _as_float(describe_keypoints(luma(rgb), points))
 
     def detectAndCompute(
         self,
@@ -108,7 +105,7 @@ class DeepDetectFeature2D:
         if useProvidedKeypoints:
             raise OptionError("`useProvidedKeypoints` is not supported: use the method compute")
         rgb = self._load(image)
-        points = self._points.detect_and_describe(rgb, _ignored(mask, rgb))
+        points = self._detector.extract(rgb, ignore=_ignored(mask, rgb))
         return _to_opencv(points), _as_float(points) if len(points) else None
 
     def descriptorSize(self) -> int:

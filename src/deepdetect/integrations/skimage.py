@@ -12,20 +12,18 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
-from ..detector.detector import DeepDetect
+from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.scale_space import SIZE_PER_SIGMA
-from ..io.image import load_image
-from .described_points import PointExtractor, Spread
+from ..features.sift import describe_keypoints
+from ..io.image import load_image, luma
 
 
 class DeepDetectFeatures:
     """The best keypoints of all scales, with RootSIFT descriptors.
 
     Args:
-        max_keypoints: at most this many.
-        spread: "none", "grid" or "anms", as of `DeepDetect.detect`.
-        detector: with options of its own.
+        detector: of the points.
 
     Attributes:
         keypoints: (N, 2) float32 positions as (row, column), best first.
@@ -43,7 +41,7 @@ class DeepDetectFeatures:
     Example:
         >>> image = np.zeros((64, 64))
         >>> image[20:40, 24:44] = 1
-        >>> features = DeepDetectFeatures(4)
+        >>> features = DeepDetectFeatures(PointDetector(4))
         >>> features.detect_and_extract(image)
         >>> features.keypoints.shape, features.descriptors.shape
         ((4, 2), (4, 128))
@@ -58,12 +56,9 @@ class DeepDetectFeatures:
     @suggest_keywords
     def __init__(
         self,
-        max_keypoints: int = 2048,
-        *,
-        spread: Spread = "none",
-        detector: DeepDetect | None = None,
+        detector: PointDetector = PointDetector(),
     ) -> None:
-        self._points = PointExtractor(max_keypoints, spread, detector)
+        self._detector = detector
 
     def detect(self, image: Any) -> None:
         """Detect keypoints, and set all attributes but `descriptors`.
@@ -74,7 +69,7 @@ class DeepDetectFeatures:
         Raises:
             ImageError: the image is not fit.
         """
-        self._set(self._points.detect(load_image(image)))
+        self._set(self._detector.detect(load_image(image)))
 
     def extract(
         self,
@@ -123,11 +118,11 @@ class DeepDetectFeatures:
         given = Keypoints(
             xy, np.zeros(len(xy)), (rgb.shape[1], rgb.shape[0]), sizes=sizes, angles=angles
         )
-        self.descriptors = self._points.describe(rgb, given).descriptors
+        self.descriptors = describe_keypoints(luma(rgb), given).descriptors
 
     def detect_and_extract(self, image: Any) -> None:
         """Detect and describe keypoints, and set all attributes; argument as of `detect`."""
-        self._set(self._points.detect_and_describe(load_image(image)))
+        self._set(self._detector.extract(load_image(image)))
 
     def _set(self, points: Keypoints) -> None:
         assert points.sizes is not None

@@ -21,8 +21,8 @@ from ..features.keypoints import Keypoints
 from ..features.maps import Maps
 from ..features.selection import SelectionOptions, select_from_maps
 from ..io.image import load_image
-from .described_points import image_from_tensor
 from .packages import base_class, import_package
+from .tensors import image_from_tensor
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -44,7 +44,7 @@ class DeepDetectConfig(PreTrainedConfig):
     Args:
         keypoint_threshold: pixels with a probability above it.
         max_keypoints: at most this many, the best ones; None: all.
-        nms_radius: of non-maximum suppression in pixels; None: 1 with `max_keypoints`, else 0.
+        nms_radius: of non-maximum suppression in pixels (0: none).
         p, q, decoder_channels: of `ESPNet`.
         **keywords: of every configuration of transformers.
 
@@ -59,7 +59,7 @@ class DeepDetectConfig(PreTrainedConfig):
         self,
         keypoint_threshold: float = 0.5,
         max_keypoints: int | None = None,
-        nms_radius: int | None = None,
+        nms_radius: int = 0,
         p: int = 5,
         q: int = 9,
         decoder_channels: int = 10,
@@ -78,7 +78,6 @@ class DeepDetectConfig(PreTrainedConfig):
             self.keypoint_threshold,
             max_keypoints=self.max_keypoints,
             nms_radius=self.nms_radius,
-            mode="dense",
         )
 
 
@@ -140,7 +139,7 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
         *,
         keypoint_threshold: float = 0.5,
         max_keypoints: int | None = None,
-        nms_radius: int | None = None,
+        nms_radius: int = 0,
     ) -> DeepDetectForKeypointDetection:
         """Return the model with weights of DeepDetect, in evaluation mode.
 

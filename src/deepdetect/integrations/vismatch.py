@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..detector.detector import DeepDetect
+from ..detector.detector import AnyDetector, DeepDetect
+from ..detector.point_detector import PointDetector
 from ..matching.pipeline import match_images
-from .described_points import image_from_tensor
 from .packages import base_class
+from .tensors import image_from_tensor
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,18 +44,14 @@ class DeepDetectMatcher(BaseMatcher):
         **keywords: Any,
     ) -> None:
         super().__init__(device, **keywords)
-        self._detector = DeepDetect(weights)
-        self._max_keypoints = max_num_keypoints
+        self._detector: AnyDetector = (
+            DeepDetect(weights) if max_num_keypoints is None else PointDetector(max_num_keypoints)
+        )
 
     def _forward(
         self, img0: Tensor, img1: Tensor
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, None, None, np.ndarray]:
         """Return matched points, all keypoints, no descriptors, and the scores of the matches."""
-        matches = match_images(
-            image_from_tensor(img0),
-            image_from_tensor(img1),
-            self._detector,
-            max_keypoints=self._max_keypoints,
-        )
+        matches = match_images(image_from_tensor(img0), image_from_tensor(img1), self._detector)
         all0, all1 = matches.keypoints0.xy, matches.keypoints1.xy
         return matches.points0, matches.points1, all0, all1, None, None, matches.scores

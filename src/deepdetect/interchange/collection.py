@@ -12,7 +12,7 @@ from .._shared.errors import ImageError, OptionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from ..features.keypoints import Keypoints
-from ..features.sift import described_at_own_size, root_sift_descriptors
+from ..features.sift import describe_keypoints
 from ..io.image import ORIENTATION_TAG, load_image, luma
 from ..io.image_file import open_image
 
@@ -131,11 +131,7 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
                     f"image of {points.image_size[0]}x{points.image_size[1]}: name the folder of "
                     "the photographs that they were found in"
                 )
-            if points.sizes is not None and points.angles is not None:
-                described[name] = described_at_own_size(gray, points)
-            else:
-                found = root_sift_descriptors(gray, points.xy)
-                described[name] = replace(points, descriptors=found)
+            described[name] = describe_keypoints(gray, points)
             bar.update()
     return replace(collection, keypoints=described)
 

@@ -11,13 +11,14 @@ import numpy as np
 
 from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
-from ..batch.extraction import MAX_KEYPOINTS, extract_features
+from ..batch.extraction import extract_features
 from ..batch.pair_list import read_pairs
 from ..batch.pair_matching import PairMatchingOptions, match_pairs
 from ..batch.parted_file import import_h5py, open_hdf5
+from ..detector.detector import DeepDetect
+from ..detector.point_detector import PointDetector
 from ..features.keypoints import UNSET_ANGLE, Keypoints
 from ..features.matches import Matches
-from ..features.selection import SelectionOptions
 from ..io.image import find_images
 from ..io.tables import load_keypoints, load_matches
 from .collection import Collection, Pair, PairMatches
@@ -260,11 +261,10 @@ def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pai
 @suggest_keywords
 def match_photographs(
     folder: str | Path,
+    detector: DeepDetect | PointDetector = PointDetector(),
     *,
     pairs: str | Path | Sequence[Pair] | None = None,
     sequential: int | None = None,
-    max_keypoints: int = MAX_KEYPOINTS,
-    detector: Mapping[str, Any] | None = None,
     matching: PairMatchingOptions = PairMatchingOptions(),
     workers: int | None = None,
     quiet: bool = True,
@@ -276,10 +276,9 @@ def match_photographs(
 
     Args:
         folder: of the photographs.
+        detector: as of `extract_features`.
         pairs: of names, or a text file with one on each line; None: all, of up to 50 photographs.
         sequential: number of following photographs that each is matched with, instead of `pairs`.
-        max_keypoints: of each photograph, the best ones.
-        detector: arguments of `DeepDetect`.
         matching: how pairs are matched.
         workers: number of processes; default one per processor.
         quiet: show no progress bars.
@@ -307,12 +306,9 @@ def match_photographs(
             f"all pairs of {len(names)} photographs would take long: name them by `pairs`, or "
             "give `sequential`"
         )
-    selection = SelectionOptions(max_keypoints=max_keypoints)
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
         features, found = Path(temporary, "features.h5"), Path(temporary, "matches.h5")
-        extracted = extract_features(
-            root, features, selection=selection, detector=detector, workers=workers, quiet=quiet
-        )
+        extracted = extract_features(root, features, detector, workers=workers, quiet=quiet)
         if not extracted.images:
             extracted.check()
         keypoints = read_features_file(features)

@@ -16,7 +16,7 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, InvalidFileError, MissingFileError, OptionError
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
-from ..features.matches import Guide, Matches
+from ..features.matches import Matches, TwoViewGeometry
 
 FORMATS = ("npz", "csv")
 
@@ -98,8 +98,8 @@ def save_matches(matches: Matches, path: str | Path) -> None:
             (M,) float32, `inliers` (M,) bool, `model` a string, `matrix` (3, 3), or (0, 0) without
             one; `guided` and `subpixel` bool; `keypoints0` (N, 2) float32, `keypoint_scores0` (N,)
             float32 and `image_size0` (width, height), and the same of the second image; and of a
-            `Guide` its attributes, as `guide_model`) or .csv (columns x0, y0, x1, y1, score,
-            inlier).
+            `TwoViewGeometry` its attributes, as `two_view_model`) or .csv (columns x0, y0, x1, y1,
+            score, inlier).
 
     Raises:
         OptionError: the file's ending is another.
@@ -117,9 +117,11 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         arrays[f"keypoints{side}"] = keypoints.xy
         arrays[f"keypoint_scores{side}"] = keypoints.scores
         arrays[f"image_size{side}"] = keypoints.image_size
-    if matches.guide is not None:
-        arrays |= {f"guide_{name}": value for name, value in vars(matches.guide).items()}
-        arrays["guide_matrix"] = _or_empty(matches.guide.matrix)
+    if matches.two_view_geometry is not None:
+        arrays |= {
+            f"two_view_{name}": value for name, value in vars(matches.two_view_geometry).items()
+        }
+        arrays["two_view_matrix"] = _or_empty(matches.two_view_geometry.matrix)
     _save_npz(path, **{name: np.asarray(value) for name, value in arrays.items()})
 
 
@@ -145,14 +147,14 @@ def load_matches(path: str | Path) -> Matches:
             for side in (0, 1)
         ]
         guide = None
-        if "guide_model" in arrays:
-            guide = Guide(
-                str(arrays["guide_model"]),
-                _or_none(arrays["guide_matrix"]),
-                _integer(arrays["guide_sparse_matches"]),
-                _integer(arrays["guide_sparse_inliers"]),
-                float(arrays["guide_log10_nfa"]),
-                _integer(arrays["guide_simulated_views"]),
+        if "two_view_model" in arrays:
+            guide = TwoViewGeometry(
+                str(arrays["two_view_model"]),
+                _or_none(arrays["two_view_matrix"]),
+                _integer(arrays["two_view_tentative_matches"]),
+                _integer(arrays["two_view_tentative_inliers"]),
+                float(arrays["two_view_log10_nfa"]),
+                _integer(arrays["two_view_simulated_views"]),
             )
         return Matches(
             arrays["points0"],
@@ -163,7 +165,7 @@ def load_matches(path: str | Path) -> Matches:
             _or_none(arrays["matrix"]),
             keypoints[0],
             keypoints[1],
-            guide=guide,
+            two_view_geometry=guide,
             subpixel="subpixel" in arrays and bool(arrays["subpixel"]),
             indices0=arrays.get("indices0"),  # type: ignore[arg-type]  # older files have none
             indices1=arrays.get("indices1"),  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Named sets of matching options: one line each."""
+"""How two images are matched: the options of `match_images`."""
 
 from __future__ import annotations
 
@@ -6,25 +6,22 @@ from dataclasses import dataclass, field
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.options import suggest_keywords
-from .._shared.registry import look_up
-from ..detector.heatmap import HeatmapOptions
 from ..features.matchers import get_matcher
-from ..features.selection import SelectionOptions
 from ..features.sift import get_descriptor
 from ..geometry import GeometryOptions
-from .guided import GuidedOptions
 
-GUIDES = ("auto", "homography", "fundamental")
+TWO_VIEW_MODELS = ("auto", "homography", "fundamental")
 
-GUIDES_OF_MODELS = {
+TWO_VIEW_MODEL_OF = {
     "homography": "homography",
     "fundamental": "fundamental",
     "essential": "fundamental",
 }
-"""The geometry that guides for each `model`; the other models leave it open."""
+"""The geometry that guides for each `model`: a plane would drop what is off it. The other models
+leave it open."""
 
 UNGUIDED_ONLY = ("descriptor", "keypoint_size", "angle", "matcher", "ratio")
-"""Options of `MatchingOptions` that do not apply to guided matches."""
+"""Options of `MatchingOptions` that do not apply to guided matching."""
 
 
 @suggest_keywords
@@ -33,44 +30,32 @@ class MatchingOptions:
     """How two images are matched.
 
     Those of `UNGUIDED_ONLY` (descriptor, keypoint_size, angle, matcher, ratio) apply only to
-    matches by descriptors alone, with `guided=False`.
+    matches by descriptors alone, with `guided_matching=False`.
 
     Attributes:
-        heatmap: how the network sees the images; None leaves the detector's own way.
-        selection: which pixels become keypoints.
+        two_view_model: the geometry that guides where `model` leaves it open: "homography",
+            "fundamental", or "auto": the one that fits the images.
         descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case.
-        keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3).
+        keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3). Keypoints
+            with sizes and angles of their own are described at these.
         angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
         matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
             others), "flann", "exact", "faiss" or "patchmatch" ("hamming" is for binary
             descriptors).
         ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
-        mutual: keep only pairs that are each other's nearest; guided, of those that share a
-            keypoint of the second image only the best, and swapped images give the same matches.
-        guided: whether a geometry from a few matches guides the matching; else the matcher alone
-            decides.
-        guide: which one: "homography", "fundamental", or "auto": the one that fits
-            `geometry.model`, and for the models "auto" and "none" the one that fits the images.
-        geometry: which geometry is estimated in the end, and how.
-        guided_options: all tuned numbers of guided matching.
+        geometry: how the geometry is estimated in the end.
 
     Raises:
-        OptionError: a name is unknown, a value out of its range, or the guide contradicts the
-            model.
+        OptionError: a name is unknown, or a value out of its range.
     """
 
-    heatmap: HeatmapOptions | None = None
-    selection: SelectionOptions = field(default_factory=SelectionOptions)
+    two_view_model: str = "auto"
     descriptor: str = "sift"
     keypoint_size: float = 3.0
     angle: float = 0.0
     matcher: str = "flann"
     ratio: float = 0.99
-    mutual: bool = False
-    guided: bool = True
-    guide: str = "auto"
-    geometry: GeometryOptions = field(default_factory=lambda: GeometryOptions(model="auto"))
-    guided_options: GuidedOptions = field(default_factory=GuidedOptions)
+    geometry: GeometryOptions = field(default_factory=GeometryOptions)
 
     def __post_init__(self) -> None:
         get_descriptor(self.descriptor)
@@ -79,14 +64,8 @@ class MatchingOptions:
             raise OptionError(
                 "the matcher hamming compares binary descriptors, as ORB's: take exact or flann"
             )
-        if self.guide not in GUIDES:
-            raise unknown_name("guide", self.guide, GUIDES)
-        fitting = GUIDES_OF_MODELS.get(self.geometry.model, self.guide)
-        if self.guide not in ("auto", fitting):
-            raise OptionError(
-                f"the guide {self.guide} contradicts the model {self.geometry.model}: "
-                "leave one of them out"
-            )
+        if self.two_view_model not in TWO_VIEW_MODELS:
+            raise unknown_name("two-view model", self.two_view_model, TWO_VIEW_MODELS)
         if not 0 < self.keypoint_size <= 100:
             raise OptionError(
                 f"`keypoint_size` must be above 0 and at most 100 pixels, not {self.keypoint_size}"
@@ -96,36 +75,22 @@ class MatchingOptions:
         if not 0 < self.ratio <= 1:
             raise OptionError(f"the ratio must be above 0 and at most 1, not {self.ratio}")
 
-    @property
-    def guiding_model(self) -> str:
-        """The geometry that guides: a plane would drop what is off it, so `model` decides."""
-        if self.guide != "auto":
-            return self.guide
-        return GUIDES_OF_MODELS.get(self.geometry.model, "auto")
+    def guiding_model(self, model: str) -> str:
+        """Return the geometry that guides where `model` is asked for.
+
+        Raises:
+            OptionError: the two contradict each other.
+        """
+        fitting = TWO_VIEW_MODEL_OF.get(model, self.two_view_model)
+        if self.two_view_model not in ("auto", fitting):
+            raise OptionError(
+                f"`two_view_model={self.two_view_model!r}` contradicts the model {model}: leave "
+                "one of them out"
+            )
+        return fitting
 
 
-PRESETS: dict[str, MatchingOptions] = {
-    "default": MatchingOptions(),
-    # What the authors' published code runs: BGR although the weights were trained on
-    # RGB, the angle unset, and every match evaluated by the true homography.
-    "published": MatchingOptions(
-        heatmap=HeatmapOptions(resolution=480, network_channels="bgr"),
-        selection=SelectionOptions(threshold=0.5, mode="dense"),
-        descriptor="sift",
-        keypoint_size=3.0,
-        angle=-1.0,
-        matcher="flann",
-        ratio=0.99,
-        guided=False,
-        geometry=GeometryOptions(model="none"),
-    ),
-}
-
-
-def get_preset(name: str) -> MatchingOptions:
-    """Look a preset up.
-
-    Raises:
-        OptionError: the name is unknown.
-    """
-    return look_up("preset", name, PRESETS)
+PUBLISHED_MATCHING = MatchingOptions(angle=-1.0, ratio=0.99, matcher="flann")
+"""What the authors' published code runs, with `DeepDetect(resolution=480, network_channels="bgr")`
+(BGR although the weights were trained on RGB), `guided_matching=False` and `model="none"`: every
+match is evaluated by the true homography."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +12,11 @@ from .._shared.errors import RegistrationError
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
-from ..detector.detector import HeatmapDetector
+from ..detector.detector import AnyDetector
+from ..detector.image_lists import Images
+from ..features.selection import SelectionOptions
 from ..geometry.zncc import median_local_zncc, warp_to_reference
-from ..io.image import load_image, luma
-from .guided import GuidedOptions
-from .pipeline import match_images
+from .pipeline import LoadedPair, match_pair
 
 SQUARES = 8
 """Squares of the checkerboard along the shorter side."""
@@ -68,22 +68,13 @@ class Registration:
 def register(
     image0: Any,
     image1: Any,
-    detector: HeatmapDetector | None = None,
+    detector: AnyDetector | None = None,
     *,
     channels: Channels = "rgb",
-    threshold: float | None = None,
-    density: float | None = None,
-    max_keypoints: int | None = None,
-    nms_radius: int | None = None,
-    subpixel: bool | None = None,
-    ignore: np.ndarray | None = None,
-    mode: Literal["auto", "dense", "points"] | None = None,
-    spread: Literal["none", "grid", "anms"] | None = None,
-    resolution: Literal["auto", "native"] | int | None = None,
-    network_channels: Channels | None = None,
-    mutual: bool | None = None,
-    seed: int | None = None,
-    guided_options: GuidedOptions | None = None,
+    selection: SelectionOptions | None = None,
+    ignore: np.ndarray | Images | None = None,
+    mutual: bool = False,
+    seed: int = 0,
     progress: Callable[[str], object] | None = None,
 ) -> Registration:
     """Find the homography between two images and warp the second into the frame of the first.
@@ -93,10 +84,7 @@ def register(
 
     Args:
         image0, image1: anything `load_image` takes.
-        detector: as for `match_images`.
-        channels, threshold, density, max_keypoints, nms_radius, subpixel, ignore, mode, spread,
-            resolution, network_channels, mutual, seed, guided_options, progress: as for
-            `match_images`.
+        detector, channels, selection, ignore, mutual, seed, progress: as for `match_images`.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
@@ -113,25 +101,15 @@ def register(
         >>> found.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
-    first, second = load_image(image0, channels=channels), load_image(image1, channels=channels)
-    found = match_images(
-        first,
-        second,
+    pair = LoadedPair.load(image0, image1, channels)
+    found = match_pair(
+        pair,
         detector,
-        model="homography",
-        threshold=threshold,
-        density=density,
-        max_keypoints=max_keypoints,
-        nms_radius=nms_radius,
-        subpixel=subpixel,
+        selection=selection,
         ignore=ignore,
-        mode=mode,
-        spread=spread,
-        resolution=resolution,
-        network_channels=network_channels,
+        model="homography",
         mutual=mutual,
         seed=seed,
-        guided_options=guided_options,
         progress=progress,
     )
     if not found.guided or found.matrix is None:
@@ -139,6 +117,7 @@ def register(
             "no homography can be trusted between these images: they must overlap, and show a "
             "plane or be taken from one place"
         )
+    first, second = pair.rgb
     size = (first.shape[1], first.shape[0])
     warped, valid = warp_to_reference(second, found.matrix, size)
     return Registration(
@@ -147,5 +126,5 @@ def register(
         warped,
         valid,
         len(found),
-        median_local_zncc(luma(first), luma(second), found.matrix),
+        median_local_zncc(*pair.gray, found.matrix),
     )

@@ -241,7 +241,7 @@ def check_matches(
     }
     epipolar, plane = (
         estimate_geometry(
-            first, second, GeometryOptions(model=model, inlier_threshold=threshold, seed=seed)
+            first, second, model, seed=seed, options=GeometryOptions(inlier_threshold=threshold)
         )
         for model, threshold in thresholds.items()
     )
@@ -298,7 +298,7 @@ def is_planar(
     Example:
         >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
         >>> models = [
-        ...     estimate_geometry(points, points + 5, GeometryOptions(model=model))
+        ...     estimate_geometry(points, points + 5, model)
         ...     for model in ("homography", "fundamental")
         ... ]
         >>> is_planar(points, points + 5, *models)

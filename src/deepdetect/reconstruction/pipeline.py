@@ -9,22 +9,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError, ReconstructionError
+from .._shared.errors import ReconstructionError
 from .._shared.image_array import Channels
-from .._shared.options import replace_options, suggest_keywords
+from .._shared.options import suggest_keywords
 from .._shared.timing import StageTimer
-from ..detector.detector import DeepDetect, HeatmapDetector, find_keypoints
+from ..detector.detector import AnyDetector, DeepDetect, find_keypoints
+from ..detector.image_lists import Images, ignore_masks
 from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
 from ..io.exif import calibration_from_exif
-from ..io.image import load_image, luma
-from ..matching.guided import InitialMatches
-from ..matching.options import get_preset
-from ..matching.pipeline import match_images
+from ..matching.guided import TentativeMatches
+from ..matching.options import MatchingOptions
+from ..matching.pipeline import LoadedPair, match_pair
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .checks import check_images
 from .outliers import PointFilterOptions, sor_inliers_on_grid
@@ -48,87 +48,56 @@ class ReconstructionOptions:
     """How a pair becomes points.
 
     Attributes:
-        selection: which pixels become keypoints. They are whole pixels; `subpixel` does not apply.
-        rectified: whether matches lie on the same row of both images; None: detected.
         rectification: when a pair counts as rectified.
         disparity: the disparity map of rectified pairs; None: `DENSE` for a density of 1, else the
             strict default.
         rectified_checks: thresholds of the checks of rectified pairs.
         two_view: all stages of pairs that are not rectified, with their checks.
         point_filter: which points are kept.
-        seed: of all random choices.
-
-    Raises:
-        OptionError: a value is out of its range.
     """
 
-    selection: SelectionOptions = field(default_factory=SelectionOptions)
-    rectified: bool | None = None
     rectification: RectificationOptions = field(default_factory=RectificationOptions)
     disparity: DisparityOptions | None = None
     rectified_checks: RectifiedCheckOptions = field(default_factory=RectifiedCheckOptions)
     two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
     point_filter: PointFilterOptions = field(default_factory=PointFilterOptions)
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**31:
-            raise OptionError(f"the seed must lie in [0, 2147483647], not {self.seed}")
-
-    @property
-    def disparity_options(self) -> DisparityOptions:
-        """The options of the disparity map, with the default filled in."""
-        if self.disparity is not None:
-            return self.disparity
-        return DENSE if self.selection.density == 1 else DisparityOptions()
 
 
 @suggest_keywords
 def reconstruct(
     left: Any,
     right: Any,
-    detector: HeatmapDetector | None = None,
+    detector: AnyDetector | None = None,
     *,
     channels: Channels = "rgb",
     calibration: Calibration | str | Path | None = None,
     focal_px: float | None = None,
     rectified: bool | None = None,
-    threshold: float | None = None,
-    density: float | None = None,
-    max_keypoints: int | None = None,
-    nms_radius: int | None = None,
-    ignore: np.ndarray | None = None,
-    mode: Literal["auto", "dense", "points"] | None = None,
-    spread: Literal["none", "grid", "anms"] | None = None,
-    disparity: DisparityOptions | None = None,
-    two_view: TwoViewOptions | None = None,
-    point_filter: PointFilterOptions | None = None,
-    seed: int | None = None,
-    options: ReconstructionOptions | None = None,
+    selection: SelectionOptions | None = None,
+    ignore: np.ndarray | Images | None = None,
+    seed: int = 0,
+    options: ReconstructionOptions = ReconstructionOptions(),
     progress: Callable[[str], object] | None = None,
 ) -> Reconstruction:
     """Reconstruct a scene from two photographs.
 
     For a rectified pair the detector only chooses which pixels of a dense disparity map become
-    points; `disparity_map` gives that map without a detector. Every option that is None is as in
-    `options`.
+    points; `disparity_map` gives that map without a detector.
 
     Args:
         left, right: anything `load_image` takes. For a pair that is not rectified "left" is only
             the first one, whose frame the points are in.
-        detector: a `DeepDetect`, or anything with its `heatmap` method; default
-            `DeepDetect("dense")`.
+        detector: as of `match_images`; default `DeepDetect("dense")`.
         channels: order of the colours in images that are arrays, as of `load_image`.
         calibration: JSON file of the cameras (docs/reconstruction.md describes its format), or a
             `Calibration`. Without one the focal length is taken from `focal_px`, or from EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         rectified: whether matches lie on the same row of both images. None: detected.
-        threshold, density, max_keypoints, nms_radius, ignore, mode, spread: which pixels or points
-            become keypoints (`SelectionOptions`). A density of 1 takes every pixel, and `DENSE`
-            disparities. Without `nms_radius`, pairs that are not rectified are matched without
-            suppression.
-        disparity, two_view, point_filter, seed: as of `ReconstructionOptions`.
-        options: all options at once.
+        selection: which pixels of a heat map become keypoints; None: those over 0.5. A density of 1
+            takes every pixel, and `DENSE` disparities; `subpixel` does not apply.
+        ignore: as of `match_images`; of a rectified pair only the mask of the left image counts.
+        seed: of all random choices.
+        options: all else.
         progress: called with the name of each stage when it ends.
 
     Returns:
@@ -147,41 +116,24 @@ def reconstruct(
         >>> x, y = np.meshgrid(np.arange(160, dtype=np.float32), np.arange(96, dtype=np.float32))
         >>> left = cv2.remap(scene, x + 10 + y / 16, y, cv2.INTER_CUBIC)
         >>> right = cv2.remap(scene, x + 20 + y / 8, y, cv2.INTER_CUBIC)
-        >>> found = reconstruct(left, right, focal_px=300, rectified=True, density=1)
+        >>> found = reconstruct(left, right, focal_px=300, rectified=True,
+        ...     selection=SelectionOptions(density=1))
         >>> shift = 10 + found.pixels[:, 1] / 16
         >>> bool(np.median(np.abs(found.disparity - shift)) < 0.1), found.unit
         (True, 'baseline')
     """
-    given = {
-        "rectified": rectified,
-        "threshold": threshold,
-        "density": density,
-        "max_keypoints": max_keypoints,
-        "nms_radius": nms_radius,
-        "ignore": ignore,
-        "mode": mode,
-        "spread": spread,
-        "disparity": disparity,
-        "two_view": two_view,
-        "point_filter": point_filter,
-        "seed": seed,
-    }
-    chosen = ReconstructionOptions() if options is None else options
-    chosen = replace_options(
-        chosen, **{name: value for name, value in given.items() if value is not None}
-    )
-    images = load_image(left, channels=channels), load_image(right, channels=channels)
+    loaded = LoadedPair.load(left, right, channels)
+    images, grays = loaded.rgb, loaded.gray
     sizes = (images[0].shape[1], images[0].shape[0]), (images[1].shape[1], images[1].shape[0])
     known = _calibration(calibration, focal_px, (left, right), sizes)
-    grays = luma(images[0]), luma(images[1])
-    check_images(*grays, chosen.two_view.checks.copy)
+    check_images(*grays, options.two_view.checks.copy)
     timer = StageTimer(progress)
     initial = rectification = None
-    is_rectified = chosen.rectified
+    is_rectified = rectified
     if is_rectified is None:
         with timer.stage("rectified or not"):
             rectification, initial = find_rectification(
-                *grays, known.disparity_offset_px, chosen.seed, chosen.rectification
+                *grays, known.disparity_offset_px, seed, options.rectification
             )
         is_rectified = rectification.rectified
         if rectification.swapped:
@@ -192,11 +144,13 @@ def reconstruct(
             )
     if detector is None:
         detector = DeepDetect("dense")
-    pair = _Pair(images, grays, detector, known, chosen, initial, rectification, timer)
+    masks = ignore_masks(ignore, 2)
+    pair = _Pair(
+        loaded, detector, selection, masks, known, seed, options, initial, rectification, timer
+    )
     return _reconstruct_rectified(pair) if is_rectified else _reconstruct_general(pair)
 
 
-Images = tuple[np.ndarray, np.ndarray]
 Size = tuple[int, int]
 
 
@@ -204,31 +158,34 @@ Size = tuple[int, int]
 class _Pair:
     """What both pipelines begin with."""
 
-    images: Images
-    grays: Images
-    detector: HeatmapDetector
+    loaded: LoadedPair
+    detector: AnyDetector
+    selection: SelectionOptions | None
+    masks: list[np.ndarray | None]
     calibration: Calibration
+    seed: int
     options: ReconstructionOptions
-    initial: InitialMatches | None
+    initial: TentativeMatches | None
     rectification: Rectification | None
     timer: StageTimer
 
 
 def _reconstruct_rectified(pair: _Pair) -> Reconstruction:
     """Take the keypoints of the left image from the disparity map of the pair."""
-    image, options, calibration, timer = pair.images[0], pair.options, pair.calibration, pair.timer
-    checks, disparity_options = options.rectified_checks, options.disparity_options
+    image, options = pair.loaded.rgb[0], pair.options
+    calibration, timer = pair.calibration, pair.timer
+    checks, disparity_options = options.rectified_checks, options.disparity
+    if disparity_options is None:
+        every_pixel = pair.selection is not None and pair.selection.density == 1
+        disparity_options = DENSE if every_pixel else DisparityOptions()
     check_cameras(calibration, checks)
     with timer.stage("keypoints"):
+        keypoints = find_keypoints(pair.detector, image, _whole_pixels(pair), pair.masks[0])
         # Disparities are those of pixels.
-        selection = options.selection
-        if not selection.uses_points:
-            selection = replace(selection, subpixel=False)
-        keypoints = find_keypoints(pair.detector, image, selection)
         keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
-    check_keypoints(len(keypoints), options.selection)
+    check_keypoints(len(keypoints), pair.selection or SelectionOptions())
     with timer.stage("matching"):
-        found = compute_disparity(*pair.grays, disparity_options).at(keypoints)
+        found = compute_disparity(*pair.loaded.gray, disparity_options).at(keypoints)
     matched = found.matched
     unique = disparity_options.uniqueness_ratio > 1
     check_matched(int(np.count_nonzero(matched)), len(keypoints), unique, checks)
@@ -289,33 +246,27 @@ def _reconstruct_rectified(pair: _Pair) -> Reconstruction:
 
 def _reconstruct_general(pair: _Pair) -> Reconstruction:
     """Match the keypoints of both images, estimate the pose and triangulate."""
-    image, options, timer = pair.images[0], pair.options, pair.timer
-    # Matches are refined from whole pixels of the left image. Suppression would leave few pixels
-    # that are keypoints in both images.
-    selection = options.selection
-    if not selection.uses_points:
-        selection = replace(selection, subpixel=False, nms_radius=selection.nms_radius or 0)
+    image, options, timer = pair.loaded.rgb[0], pair.options, pair.timer
     with timer.stage("keypoints and matching"):
-        found = match_images(
-            *pair.images,
+        found = match_pair(
+            pair.loaded,
             pair.detector,
-            options=replace_options(
-                get_preset("default"), selection=selection, matcher="patchmatch"
-            ),
+            selection=_whole_pixels(pair),
+            ignore=pair.masks,
             # A homography would keep the points of one plane, and drop all in front of it.
-            guide="fundamental",
             model="none",
-            seed=options.seed,
-            initial=pair.initial,
+            options=MatchingOptions(two_view_model="fundamental"),
+            seed=pair.seed,
+            tentative_matches=pair.initial,
         )
     made = reconstruct_two_view(
         found.points0,
         found.points1,
         pair.calibration,
-        pair.grays,
+        pair.loaded.gray,
         options.two_view,
         options.point_filter,
-        options.seed,
+        pair.seed,
         timer,
         refined=found.subpixel,
     )
@@ -339,6 +290,11 @@ def _reconstruct_general(pair: _Pair) -> Reconstruction:
         dropped=made.dropped,
         seconds=timer.seconds,
     )
+
+
+def _whole_pixels(pair: _Pair) -> SelectionOptions | None:
+    """Return the selection without refined positions: matches start at whole pixels."""
+    return None if pair.selection is None else replace(pair.selection, subpixel=False)
 
 
 def _calibration(

@@ -18,7 +18,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import grid_subsample
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
-from ..matching.guided import InitialMatches, initial_matches
+from ..matching.guided import TentativeMatches, tentative_matches
 from ..matching.guided.options import InitialGeometryOptions
 from .checks import StaticOptions, is_planar, is_static
 
@@ -122,7 +122,7 @@ def find_rectification(
     offset_px: float = 0.0,
     seed: int = 0,
     options: RectificationOptions = RectificationOptions(),
-) -> tuple[Rectification, InitialMatches | None]:
+) -> tuple[Rectification, TentativeMatches | None]:
     """Decide whether a pair of images is rectified, by the least effort that it takes.
 
     Args:
@@ -150,7 +150,7 @@ def find_rectification(
         found = _first_look(gray0, gray1, offset_px, seed, options)
         if found is not None:
             return found, None
-    initial = initial_matches(gray0, gray1)
+    initial = tentative_matches(gray0, gray1)
     points = initial.points0, initial.points1
     return detect_rectification(*points, size0, size1, offset_px, seed, options), initial
 
@@ -165,7 +165,7 @@ def _first_look(
     """Decide from small copies of two images of one size; None where they leave it open."""
     coarse = InitialGeometryOptions(max_side_px=options.first_side_px)
     coarse = replace(coarse, sift=replace(coarse.sift, max_keypoints=options.first_max_keypoints))
-    initial = initial_matches(gray0, gray1, options=coarse)
+    initial = tentative_matches(gray0, gray1, options=coarse)
     scale, size = initial.scales[0], initial.views[0].shape[::-1]
     # The thresholds are pixels of the copies: what they decide holds with a margin.
     found = detect_rectification(*initial.matched, size, size, offset_px * scale, seed, options)
@@ -241,7 +241,7 @@ def detect_rectification(
     on_rows = np.abs(second[:, 1] - first[:, 1]) <= limit
     # Of a rectified pair Sampson's distance is that in rows over the root of 2.
     epipolar = estimate_geometry(
-        first, second, GeometryOptions(inlier_threshold=limit / np.sqrt(2), seed=seed)
+        first, second, seed=seed, options=GeometryOptions(inlier_threshold=limit / np.sqrt(2))
     )
     other_rows = _best_other_rows(first, second, size0, seed, options)
     disparity = (first - second)[on_rows, 0]
@@ -264,9 +264,9 @@ def detect_rectification(
         plane = estimate_geometry(
             first,
             second,
-            GeometryOptions(
-                model="homography", inlier_threshold=options.max_transfer_error_px, seed=seed
-            ),
+            "homography",
+            seed=seed,
+            options=GeometryOptions(inlier_threshold=options.max_transfer_error_px),
         )
         if is_planar(first, second, plane, epipolar, options.min_planar_ratio, seed):
             reason = "one homography explains all the matches: all move nearly the same"

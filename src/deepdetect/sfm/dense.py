@@ -133,7 +133,7 @@ def dense_points(
         if found is None:
             continue
         places = np.full((len(xy), 2), np.nan)
-        places[found[1].rows0] = found[1].points1
+        places[found[1].indices0] = found[1].points1
         views.append(its_view)
         matches.append(places)
     points, errors, counts = fuse_matches(view, xy, views, matches, options)

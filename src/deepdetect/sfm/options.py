@@ -6,17 +6,9 @@ from dataclasses import dataclass, field
 
 from .._shared.options import check_ranges, suggest_keywords
 from ..batch.pair_matching import PairMatchingOptions
-from ..features.selection import SelectionOptions
 from .fusion import DenseOptions
 from .mapping import MappingOptions
 from .pair_selection import PairSelectionOptions
-
-MAX_KEYPOINTS = 8192
-"""Of a photograph, where nothing else is asked for."""
-
-
-def _points() -> SelectionOptions:
-    return SelectionOptions(max_keypoints=MAX_KEYPOINTS)
 
 
 def _matching() -> PairMatchingOptions:
@@ -29,7 +21,6 @@ class MultiViewOptions:
     """How many photographs become cameras and points.
 
     Attributes:
-        selection: which points become keypoints.
         pair_selection: which photographs are matched with each other.
         matching: of their keypoints.
         mapping: of cameras and sparse points.
@@ -41,7 +32,6 @@ class MultiViewOptions:
         OptionError: a value is out of its range.
     """
 
-    selection: SelectionOptions = field(default_factory=_points)
     pair_selection: PairSelectionOptions = field(default_factory=PairSelectionOptions)
     matching: PairMatchingOptions = field(default_factory=_matching)
     mapping: MappingOptions = field(default_factory=MappingOptions)

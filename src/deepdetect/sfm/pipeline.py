@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError, ReconstructionError
 from .._shared.options import replace_options, suggest_keywords
 from .._shared.timing import StageTimer
+from ..detector.detector import DeepDetect
+from ..detector.point_detector import PointDetector
+from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, Camera
 from ..geometry.point_cloud import PointCloud
 from ..io.html_viewer import write_html_page
@@ -32,6 +35,9 @@ from .pair_selection import Pair
 from .result import MultiViewReconstruction
 from .stages import WORK, Stages
 
+MAX_KEYPOINTS = 8192
+"""Of a photograph, where nothing else is asked for."""
+
 MIN_KEYPOINTS = 15
 """With fewer a photograph cannot be matched."""
 
@@ -40,16 +46,16 @@ MIN_KEYPOINTS = 15
 def reconstruct_many(
     images: str | Path | Sequence[str | Path],
     output: str | Path,
+    detector: DeepDetect | PointDetector = PointDetector(MAX_KEYPOINTS),
     *,
+    selection: SelectionOptions | None = None,
     calibration: Camera | Calibration | str | Path | None = None,
     focal_px: float | None = None,
     pairs: Literal["auto", "all", "sequential", "similar"] | None = None,
     sequential: int | None = None,
-    max_keypoints: int | None = None,
     dense: bool = True,
     stride_px: int | None = None,
     single_camera: bool | None = None,
-    detector: Mapping[str, Any] | None = None,
     seed: int | None = None,
     options: MultiViewOptions | None = None,
     workers: int | None = None,
@@ -68,6 +74,7 @@ def reconstruct_many(
     Args:
         images: a folder, or image files.
         output: folder for the results.
+        detector, selection: as of `extract_features`.
         calibration: JSON file of the camera (docs/reconstruction.md describes its format), or a
             `Camera`, which is taken to be exact. Without one the focal length begins with
             `focal_px`, EXIF, or a guess, and is estimated with the distortion.
@@ -75,11 +82,9 @@ def reconstruct_many(
         pairs: which photographs are matched: all, sequential (neighbours by name), similar, or auto
             (all of up to 50, else similar).
         sequential: number of following photographs that each is matched with; implies `pairs`.
-        max_keypoints: of each photograph.
         dense: whether dense points are made.
         stride_px: a dense point is sought at every so many pixels of a row and of a column.
         single_camera: whether photographs of one size were taken by one camera.
-        detector: arguments of `DeepDetect`.
         seed: of all random choices.
         options: all options at once.
         workers: number of processes; default one per processor.
@@ -105,7 +110,6 @@ def reconstruct_many(
     given = {
         "pairs": "sequential" if pairs is None and sequential is not None else pairs,
         "sequential": sequential,
-        "max_keypoints": max_keypoints,
         "stride_px": stride_px if chosen.dense is not None else None,
         "single_camera": single_camera,
     }
@@ -124,7 +128,7 @@ def reconstruct_many(
     if calibration is not None and focal_px is not None:
         raise ReconstructionError("give `calibration` or `focal_px`, not both")
     stages = Stages(target, chosen, workers, quiet)
-    return _reconstruct(stages, images, calibration, focal_px, detector)
+    return _reconstruct(stages, images, calibration, focal_px, detector, selection)
 
 
 def check_output_folder(output: Path) -> None:
@@ -148,13 +152,14 @@ def _reconstruct(
     images: str | Path | Sequence[str | Path],
     calibration: Camera | Calibration | str | Path | None,
     focal_px: float | None,
-    detector: Mapping[str, Any] | None,
+    detector: DeepDetect | PointDetector,
+    selection: SelectionOptions | None,
 ) -> MultiViewReconstruction:
     """Go through all stages, and write the results."""
     timer, options = StageTimer(None), stages.options
     folder = stages.folder_of(images)
     with timer.stage("features"):
-        features = stages.extract(folder, detector)
+        features = stages.extract(folder, detector, selection)
     names = [name for name, count in features.keypoints.items() if count >= MIN_KEYPOINTS]
     left_out = dict(features.failures)
     for name, count in features.keypoints.items():

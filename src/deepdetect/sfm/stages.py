@@ -27,6 +27,9 @@ from ..batch.extraction import extract_features
 from ..batch.pair_list import pair_name
 from ..batch.pair_matching import match_pairs
 from ..batch.parted_file import open_hdf5
+from ..detector.detector import DeepDetect
+from ..detector.point_detector import PointDetector
+from ..features.selection import SelectionOptions
 from ..io.image import find_images
 from .colmap import import_pycolmap
 from .database import DatabaseImage, write_database
@@ -121,13 +124,18 @@ class Stages:
             _link(path, folder / name)
         return folder
 
-    def extract(self, folder: Path, detector: Mapping[str, Any] | None) -> PhotographFeatures:
+    def extract(
+        self,
+        folder: Path,
+        detector: DeepDetect | PointDetector,
+        selection: SelectionOptions | None = None,
+    ) -> PhotographFeatures:
         """Find and describe the keypoints of all photographs below a folder."""
         report = extract_features(
             folder,
             self.work / "features.h5",
-            selection=self.options.selection,
-            detector=detector,
+            detector,
+            selection=selection,
             workers=self.workers,
             quiet=self.quiet,
         )

@@ -17,8 +17,8 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from .._shared.signals import ENDING, exit_by_signal, handle_signals
-from ..detector.detector import DeepDetect
-from ..features.keypoints import Keypoints
+from ..detector.detector import Detector
+from ..detector.point_detector import PointDetector
 from .frames import FrameSource
 from .tracker import Detect, Tracker, TrackingOptions
 from .tracks import TrackedFrame, write_tracks
@@ -59,18 +59,9 @@ class TrackingReport:
     failures: tuple[str, ...] = ()
 
 
-def point_candidates(detector: DeepDetect, options: TrackingOptions = TrackingOptions()) -> Detect:
-    """Return what finds the best points of a frame, as a `Tracker` wants it.
-
-    Args:
-        detector: a detector.
-        options: how many.
-    """
-
-    def detect(rgb: np.ndarray) -> Keypoints:
-        return detector.detect(rgb, max_keypoints=options.candidates * options.max_keypoints)
-
-    return detect
+def point_candidates(options: TrackingOptions = TrackingOptions()) -> Detect:
+    """Return what finds the best points of a frame, as a `Tracker` wants it."""
+    return PointDetector(options.candidates * options.max_keypoints).detect
 
 
 @suggest_keywords
@@ -110,7 +101,7 @@ def track(
     source: str | Path | int,
     output: str | Path,
     *,
-    detector: DeepDetect | None = None,
+    detector: Detector | None = None,
     options: TrackingOptions = TrackingOptions(),
     every: int = 1,
     max_frames: int | None = None,
@@ -128,7 +119,7 @@ def track(
         source: a video file, a folder of images, or the number of a camera.
         output: ending in .mp4, .mov, .mkv or .avi; the table beside it ends in .csv, with columns
             frame, track, x, y and score. With .csv itself there is no video.
-        detector: that finds the points; None: a new one.
+        detector: that finds the points; None: a `PointDetector` of enough candidates.
         options: how they are followed.
         every: take each frame with a number that this divides.
         max_frames: largest number of frames that are taken. None: all.
@@ -154,8 +145,8 @@ def track(
     begun = time.perf_counter()
     with ExitStack() as stack:
         opened = stack.enter_context(FrameSource(source, every=every, max_frames=max_frames))
-        found = DeepDetect() if detector is None else detector
-        tracker = Tracker(point_candidates(found, options), options)
+        detect = point_candidates(options) if detector is None else detector.detect
+        tracker = Tracker(detect, options)
         stopped = stack.enter_context(_ended_by_signals(opened.live))
         writer = stack.enter_context(write_tracks(table))
         drawn: Any = None

@@ -90,7 +90,7 @@ class Tracker:
 
     Args:
         detect: finds keypoints in a (H, W, 3) uint8 RGB image; a `DeepDetect` has its own method
-            for it: `lambda rgb: detector.detect(rgb, max_keypoints=1000)`.
+            for it: `PointDetector(1000).detect`.
         options: how points are followed.
 
     Example:

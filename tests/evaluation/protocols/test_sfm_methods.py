@@ -66,7 +66,7 @@ def agreement(scene, stages: Stages, matches) -> list[float]:
 def test_random_points_differ_from_ours_in_nothing_but_their_places(scene, tmp_path: Path) -> None:
     from deepdetect import load_image
     from deepdetect.features.keypoints import Keypoints
-    from deepdetect.features.sift import described_at_own_size
+    from deepdetect.features.sift import describe_keypoints
     from deepdetect.io.image import luma
 
     ours, folder = stages_in(tmp_path / "ours", scene)
@@ -90,7 +90,7 @@ def test_random_points_differ_from_ours_in_nothing_but_their_places(scene, tmp_p
             sizes=2 * its["scales"],
             angles=its["oris"],
         )
-        described = described_at_own_size(luma(load_image(folder / name)), points).descriptors
+        described = describe_keypoints(luma(load_image(folder / name)), points).descriptors
         expected = described.astype(np.float32)
         expected /= np.linalg.norm(expected, axis=1, keepdims=True)
         np.testing.assert_allclose(its["descriptors"].T, expected, atol=1e-6)

@@ -244,6 +244,6 @@ def test_it_is_registered_and_serves_the_ratio_test(photo: np.ndarray) -> None:
         kept = ordered[:, 0] / ordered[:, 1] < 0.8
     mutual = (every.min(1) == every.min(0)[every.argmin(1)]) & kept
     assert len(found) > 50
-    assert set(found.rows0) <= set(np.flatnonzero(kept))
+    assert set(found.indices0) <= set(np.flatnonzero(kept))
     # Ties among the columns' nearest alone may distinguish the two.
     assert abs(len(found) - mutual.sum()) <= 0.02 * mutual.sum()

@@ -42,7 +42,7 @@ def random_descriptors(seed: int, count: int) -> np.ndarray:
 
 
 def pairs(matches: DescriptorMatches) -> set[tuple[int, int]]:
-    return set(zip(matches.rows0.tolist(), matches.rows1.tolist(), strict=True))
+    return set(zip(matches.indices0.tolist(), matches.indices1.tolist(), strict=True))
 
 
 @pytest.mark.parametrize(
@@ -73,12 +73,12 @@ def test_known_answer(name: str) -> None:
     second = points((10, 1), (0, 0), (0, 12), (100, 100))
     matches = match_descriptors(first, second, get_matcher(name), ratio=0.99)
     # (5, 5) is at sqrt(41) from (10, 1) and at sqrt(50) from (0, 0).
-    assert matches.rows0.tolist() == [0, 1, 2, 3]
-    assert matches.rows1.tolist() == [1, 0, 2, 0]
+    assert matches.indices0.tolist() == [0, 1, 2, 3]
+    assert matches.indices1.tolist() == [1, 0, 2, 0]
     expected = [0, 1 / 10, 2 / 10, np.sqrt(41 / 50)]
     np.testing.assert_allclose(matches.ratios, expected, rtol=1e-6)
     strict = match_descriptors(first, second, get_matcher(name), ratio=0.5)
-    assert strict.rows0.tolist() == [0, 1, 2]
+    assert strict.indices0.tolist() == [0, 1, 2]
     both = match_descriptors(first, second, get_matcher(name), ratio=0.99, mutual=True)
     # (10, 1) is nearer to (10, 0) than to (5, 5).
     assert pairs(both) == {(0, 1), (1, 0), (2, 2)}
@@ -106,9 +106,9 @@ def test_without_a_second_best_nothing_matches(
         mutual=mutual,
     )
     assert len(matches) == 0
-    assert matches.rows0.shape == matches.rows1.shape == matches.ratios.shape == (0,)
-    assert np.issubdtype(matches.rows0.dtype, np.integer)
-    assert np.issubdtype(matches.rows1.dtype, np.integer)
+    assert matches.indices0.shape == matches.indices1.shape == matches.ratios.shape == (0,)
+    assert np.issubdtype(matches.indices0.dtype, np.integer)
+    assert np.issubdtype(matches.indices1.dtype, np.integer)
     assert matches.ratios.dtype == np.float32
 
 
@@ -137,11 +137,11 @@ def test_shapes_and_types() -> None:
         random_descriptors(0, 30), random_descriptors(1, 40), get_matcher("exact"), ratio=1.0
     )
     assert len(matches) == 30
-    assert matches.rows0.shape == matches.rows1.shape == matches.ratios.shape == (30,)
-    assert np.issubdtype(matches.rows0.dtype, np.integer)
-    assert np.issubdtype(matches.rows1.dtype, np.integer)
+    assert matches.indices0.shape == matches.indices1.shape == matches.ratios.shape == (30,)
+    assert np.issubdtype(matches.indices0.dtype, np.integer)
+    assert np.issubdtype(matches.indices1.dtype, np.integer)
     assert matches.ratios.dtype == np.float32
-    assert (np.diff(matches.rows0) > 0).all()
+    assert (np.diff(matches.indices0) > 0).all()
 
 
 seeds = st.integers(0, 10_000)
@@ -161,7 +161,7 @@ def test_a_lower_ratio_only_removes_matches(
     }
     assert pairs(found[low]) <= pairs(found[high])
     kept = found[high].ratios < low
-    np.testing.assert_array_equal(found[low].rows0, found[high].rows0[kept])
+    np.testing.assert_array_equal(found[low].indices0, found[high].indices0[kept])
 
 
 @given(seed=seeds, count0=counts, count1=counts)
@@ -182,7 +182,7 @@ def test_mutual_only_removes_matches_and_leaves_one_to_one(
     every = match_descriptors(first, second, get_matcher("exact"), ratio=ratio)
     mutual = match_descriptors(first, second, get_matcher("exact"), ratio=ratio, mutual=True)
     assert pairs(mutual) <= pairs(every)
-    assert len(set(mutual.rows1.tolist())) == len(mutual)
+    assert len(set(mutual.indices1.tolist())) == len(mutual)
 
 
 def test_the_documented_names_exist() -> None:

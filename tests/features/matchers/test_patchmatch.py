@@ -47,7 +47,7 @@ def test_finds_the_moved_points_as_the_exact_search_does(pair) -> None:
     correct = []
     for matcher in (exact_neighbours, patchmatch_neighbours):
         found = match_descriptors(*descriptors, matcher, ratio=0.95, positions=positions)
-        moved = positions[0][found.rows0] - positions[1][found.rows1]
+        moved = positions[0][found.indices0] - positions[1][found.indices1]
         correct.append(int((moved == SHIFT).all(axis=1).sum()))
     assert correct[0] > 1000
     assert correct[1] > 0.9 * correct[0]
@@ -91,7 +91,7 @@ def test_mutual_matches_are_each_others(pair) -> None:
         *descriptors, patchmatch_neighbours, ratio=0.95, mutual=True, positions=positions
     )
     back = patchmatch_neighbours(*descriptors[::-1], 1, 0, positions[::-1])[0][:, 0]
-    np.testing.assert_array_equal(back[found.rows1], found.rows0)
+    np.testing.assert_array_equal(back[found.indices1], found.indices0)
     assert len(found) > 800
 
 

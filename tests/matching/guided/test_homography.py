@@ -26,7 +26,7 @@ def matched(
     gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray, xy1: np.ndarray, homography: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     found, _ = match_by_homography(ImagePair(gray0, gray1, xy0, xy1), homography)
-    return found.rows0, found.rows1, found.ratios
+    return found.indices0, found.indices1, found.ratios
 
 
 def every_pixel(gray: np.ndarray) -> np.ndarray:

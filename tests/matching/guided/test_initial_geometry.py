@@ -16,7 +16,7 @@ from deepdetect.matching.guided.initial_geometry import (
     InitialGeometry,
     estimate_initial_geometry,
     find_initial_geometry,
-    initial_matches,
+    tentative_matches,
 )
 from deepdetect.matching.guided.options import InitialGeometryOptions
 
@@ -60,7 +60,7 @@ def art(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 def initial_geometry(
     gray0: np.ndarray, gray1: np.ndarray, model: str = "auto", seed: int = 0
 ) -> InitialGeometry:
-    return estimate_initial_geometry(initial_matches(gray0, gray1), model, seed)
+    return estimate_initial_geometry(tentative_matches(gray0, gray1), model, seed)
 
 
 def corners(gray: np.ndarray) -> np.ndarray:
@@ -189,7 +189,7 @@ def test_matches_that_are_there_already_are_not_made_again(
     gray = luma(photo)
     other = warped(gray, MILD, (256, 256))
     expected = initial_geometry(gray, other)
-    initial = initial_matches(gray, other)
+    initial = tentative_matches(gray, other)
     monkeypatch.setattr("deepdetect.matching.guided.sparse_matches.detect_sift", None)
     found = estimate_initial_geometry(initial)
     np.testing.assert_array_equal(found.matrix, expected.matrix)
@@ -199,7 +199,7 @@ def test_matches_that_are_there_already_are_not_made_again(
 def test_initial_matches_of_a_large_pair_are_at_its_own_size(photo: np.ndarray) -> None:
     gray = cv2.resize(luma(photo), (2400, 2400), interpolation=cv2.INTER_CUBIC)
     shift = np.array([[1.0, 0, 40], [0, 1, -20], [0, 0, 1]])
-    found = initial_matches(gray, warped(gray, shift, (2400, 2400)))
+    found = tentative_matches(gray, warped(gray, shift, (2400, 2400)))
     assert found.scales == (0.5, 0.5)
     np.testing.assert_allclose(
         np.median(found.points1 - found.points0, axis=0), [40, -20], atol=0.2
@@ -238,7 +238,7 @@ def test_stronger_tilts_are_tried_where_something_hints_at_a_geometry(
     image = picture("camera", (200, 150))
     never = InitialGeometryOptions(max_log10_nfa=-1e9)
     for options, tried in ((never, 30), (replace(never, max_hint_log10_nfa=-1e9), 10)):
-        initial = initial_matches(image, image, options=options)
+        initial = tentative_matches(image, image, options=options)
         found = estimate_initial_geometry(initial, options=options)
         assert found.matrix is None
         assert found.num_views == tried
@@ -370,14 +370,14 @@ def test_features_that_are_there_are_taken(photo: np.ndarray) -> None:
     gray = luma(photo)
     second = warped(gray, MILD, (256, 240))
     features = detect_sift(gray), detect_sift(second)
-    found = estimate_initial_geometry(initial_matches(gray, second, features), "homography")
+    found = estimate_initial_geometry(tentative_matches(gray, second, features), "homography")
     whole = initial_geometry(gray, second, "homography")
     assert (found.model, whole.model, whole.num_views) == ("homography", "homography", 0)
     np.testing.assert_allclose(found.matrix, whole.matrix)
     np.testing.assert_array_equal(found.points1, whole.points1)
     assert found.log10_nfa == whole.log10_nfa
     fewest = detect_sift(second, SiftOptions(max_keypoints=100))
-    fewer = initial_matches(gray, second, (features[0], fewest))
+    fewer = tentative_matches(gray, second, (features[0], fewest))
     assert 0 < len(fewer.points0) <= 100
 
 
@@ -385,7 +385,7 @@ def test_views_are_simulated_only_where_they_are_wanted(photo: np.ndarray) -> No
     gray = luma(photo)
     noise = np.random.default_rng(0).integers(0, 256, (240, 256)).astype(np.uint8)
     for other in (noise, np.zeros((64, 64), np.uint8)):
-        initial = initial_matches(gray, other)
+        initial = tentative_matches(gray, other)
         found = estimate_initial_geometry(initial, "homography", simulate_views=False)
         assert_nothing(found)
         assert found.num_views == 0

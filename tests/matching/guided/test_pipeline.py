@@ -42,9 +42,10 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
     photo: np.ndarray, second: np.ndarray
 ) -> None:
     matches = match_images(photo, second, Everywhere())
-    assert (matches.model, matches.guided, matches.guide.model) == ("homography", True) + (
+    assert (matches.model, matches.guided, matches.two_view_geometry.model) == (
         "homography",
-    )
+        True,
+    ) + ("homography",)
     errors = np.linalg.norm(transform_points(matches.points0, WARP) - matches.points1, axis=1)
     assert (errors < 1).mean() > 0.99
     places = transform_points(matches.keypoints0.xy, WARP)
@@ -61,7 +62,7 @@ def test_unguided_gives_fewer(photo: np.ndarray, second: np.ndarray) -> None:
         match_images(photo, second, Everywhere(), guided=guided, model="homography")
         for guided in (True, False)
     )
-    assert unguided.guide is None
+    assert unguided.two_view_geometry is None
     assert not unguided.guided
     assert not unguided.subpixel
     assert not guided.subpixel  # keypoints of the second image
@@ -73,8 +74,8 @@ def test_what_cannot_be_trusted_has_no_matches_and_says_so(photo: np.ndarray) ->
     data = pytest.importorskip("skimage.data")
     other = np.ascontiguousarray(data.coffee()[:256, :256])
     matches = match_images(photo, other, Everywhere(), ratio=0.9)
-    assert matches.guide.model == "none"
-    assert matches.guide.matrix is None
+    assert matches.two_view_geometry.model == "none"
+    assert matches.two_view_geometry.matrix is None
     assert matches.lost
     assert not matches.guided
     assert len(matches) == 0
@@ -111,7 +112,7 @@ def test_a_plane_guides_no_scene_with_depth(shared: Path, pair: str) -> None:
     else:
         images = [shared / f"data/kitti-clip/{int(n):06d}.jpg" for n in numbers.split("-")]
     matches = match_images(*images, density=0.02)
-    assert matches.guide.model != "homography"
+    assert matches.two_view_geometry.model != "homography"
 
 
 @pytest.mark.parametrize("fraction", [1.0, 0.05])
@@ -128,12 +129,12 @@ def test_a_plane_that_the_images_do_not_show_does_not_guide(
     guide, found = guided_matches(gray, other, xy, xy, "auto")
     assert guide.model != "homography"
     if found is not None:  # what the poster shows agrees with a fundamental matrix, too
-        inside = ((xy[found.rows0] > 80) & (xy[found.rows0] < 176)).all(axis=1)
-        errors = np.linalg.norm(found.points1 - xy[found.rows0], axis=1)
+        inside = ((xy[found.indices0] > 80) & (xy[found.indices0] < 176)).all(axis=1)
+        errors = np.linalg.norm(found.points1 - xy[found.indices0], axis=1)
         assert (inside & (errors < 1)).mean() > 0.9
     asked, found = guided_matches(gray, other, xy, xy, "homography")
     assert asked.model == "homography"
-    inside = ((xy[found.rows0] > 80) & (xy[found.rows0] < 176)).all(axis=1)
+    inside = ((xy[found.indices0] > 80) & (xy[found.indices0] < 176)).all(axis=1)
     assert inside.mean() > 0.95
 
 
@@ -148,7 +149,7 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
     assert guided.guided
     assert guided.subpixel
     assert not unguided.subpixel
-    assert guided.model == guided.guide.model == "fundamental"
+    assert guided.model == guided.two_view_geometry.model == "fundamental"
     # The lines are estimated: near a corner they may be some rows off.
     assert (np.abs(guided.points0[:, 1] - guided.points1[:, 1]) <= 2).mean() > 0.98
     score = stereo_score(guided.points0, guided.points1, pair.disparity)
@@ -166,9 +167,11 @@ def test_a_plane_that_is_asked_for_guides(shared: Path, name: str) -> None:
     pair = load_middlebury(shared / "data" / "middlebury" / name)
     for asked in ({"guide": "homography"}, {"model": "homography"}):
         matches = match_images(pair.left, pair.right, Everywhere(), **asked)
-        assert matches.guide.model == "homography"
+        assert matches.two_view_geometry.model == "homography"
         assert matches.model == "homography"
-    assert match_images(pair.left, pair.right, Everywhere()).guide.model == "fundamental"
+    assert (
+        match_images(pair.left, pair.right, Everywhere()).two_view_geometry.model == "fundamental"
+    )
 
 
 @pytest.mark.slow
@@ -181,9 +184,9 @@ def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
     camera = pair.camera
     detector = DeepDetect("dense")
     images = pair.left, pair.right, detector
-    assert match_images(*images).guide.model == "homography"
+    assert match_images(*images).two_view_geometry.model == "homography"
     found = match_images(*images, model=model, camera0=camera, camera1=camera)
-    assert found.guide.model == "fundamental"
+    assert found.two_view_geometry.model == "fundamental"
     assert found.model == model
     x, y = found.points0.astype(int).T
     near = pair.near[y, x]
@@ -276,4 +279,4 @@ def test_an_unknown_guide_brings_the_nearest(photo: np.ndarray) -> None:
 
 def test_the_published_preset_is_unguided(photo: np.ndarray) -> None:
     matches = match_images(photo, photo, preset="published")
-    assert matches.guide is None
+    assert matches.two_view_geometry is None

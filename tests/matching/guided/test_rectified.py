@@ -44,7 +44,7 @@ def every_second(gray: np.ndarray) -> np.ndarray:
 
 def within(found: GuidedMatches, xy0: np.ndarray, cones, move: np.ndarray) -> float:
     """Return the share of the matches with a true place that are within a pixel of it."""
-    x, y = xy0[found.rows0].astype(int).T
+    x, y = xy0[found.indices0].astype(int).T
     disparity = cones[2][y, x]
     true = transform_points(np.column_stack([x - disparity, y]), np.vstack([move, [0, 0, 1]]))
     errors = np.linalg.norm(true - found.points1, axis=1)
@@ -70,7 +70,7 @@ def test_most_keypoints_are_matched_and_right(cones, move: np.ndarray, precision
     assert len(found) > 0.35 * len(xy0)
     assert within(found, xy0, cones, move) > precision
     assert ((found.scores >= 0) & (found.scores <= 1)).all()
-    assert (np.diff(found.rows0) > 0).all()
+    assert (np.diff(found.indices0) > 0).all()
 
 
 def test_low_correlation_is_kept_where_little_is_found_by_chance(cones) -> None:
@@ -80,7 +80,7 @@ def test_low_correlation_is_kept_where_little_is_found_by_chance(cones) -> None:
     strict, lenient = (match(left, right, xy0, false_discovery_rate=rate) for rate in (0.0, 0.01))
     assert strict is not None
     assert lenient is not None
-    assert set(strict.rows0) < set(lenient.rows0)
+    assert set(strict.indices0) < set(lenient.indices0)
     assert len(lenient) > 1.05 * len(strict)
     assert within(lenient, xy0, cones, np.eye(2, 3)) > 0.97
 
@@ -111,8 +111,8 @@ def test_a_matrix_that_is_off_is_corrected(cones) -> None:
         )
         assert found is not None
         matrix, matches = found
-        assert epipolar_errors(xy0[matches.rows0], matches.points1, matrix).max() < 1e-6
-        rows = np.abs(matches.points1[:, 1] - xy0[matches.rows0, 1])
+        assert epipolar_errors(xy0[matches.indices0], matches.points1, matrix).max() < 1e-6
+        rows = np.abs(matches.points1[:, 1] - xy0[matches.indices0, 1])
         assert np.quantile(rows, 0.9) < 0.25
         counts.append(len(matches))
     assert counts[1] > counts[0]

@@ -11,7 +11,7 @@ from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import GuidedOptions, guided_matches
 from deepdetect.matching.guided.options import InitialGeometryOptions
-from deepdetect.matching.guided.sparse_matches import initial_matches, matches_of_points
+from deepdetect.matching.guided.sparse_matches import matches_of_points, tentative_matches
 
 TURNED = np.vstack([cv2.getRotationMatrix2D((128, 128), 30, 1.2), [0, 0, 1]])
 FEW = InitialGeometryOptions(min_points=100)
@@ -68,7 +68,7 @@ def test_guided_matching_begins_with_points(pair, points, monkeypatch) -> None:
     assert guide.model == "homography"
     assert found is not None
     errors = np.linalg.norm(
-        transform_points(places[0][found.rows0], TURNED) - found.points1, axis=1
+        transform_points(places[0][found.indices0], TURNED) - found.points1, axis=1
     )
     assert (errors < 1.5).mean() > 0.95
 
@@ -86,6 +86,6 @@ def test_where_points_give_nothing_sift_is_tried(pair, points) -> None:
 
 
 def test_sparse_matches_of_sift_are_at_the_images_own_size(pair) -> None:
-    found = initial_matches(luma(pair[0]), luma(pair[1]), options=replace(FEW, max_side_px=200))
+    found = tentative_matches(luma(pair[0]), luma(pair[1]), options=replace(FEW, max_side_px=200))
     errors = np.linalg.norm(transform_points(found.points0, TURNED) - found.points1, axis=1)
     assert np.median(errors) < 1

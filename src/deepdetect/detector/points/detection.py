@@ -2,90 +2,51 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
-from ..._shared.errors import OptionError, unknown_name
-from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
-from ...features.selection import SPREADS, check_ignore, check_max_keypoints
+from ...features.selection import check_ignore
 from ...features.sift_detector import spread_over_grid
 from ...features.suppression import spread_by_distance, suppress_neighbors
 from .candidate_features import describe_candidates
-from .hessian_scales import (
-    ScaleSpaceOptions,
-    build_scale_space,
-    check_memory,
-    find_candidates,
-)
+from .hessian_scales import build_scale_space, check_memory, find_candidates
 from .ranker import Ranker, load_ranker
 
+Spread = Literal["none", "grid", "anms"]
+SPREADS = ("none", "grid", "anms")
 
-@suggest_keywords
-@dataclass(frozen=True)
-class PointOptions:
-    """Which candidates become keypoints.
+CANDIDATES_PER_KEYPOINT, MIN_CANDIDATES = 6, 8192
+"""Of a limited number of keypoints that are not spread so many times as many candidates are ranked,
+but at least so many: those with the strongest response."""
 
-    Attributes:
-        max_keypoints: at most this many; None: all.
-        candidates_per_keypoint, min_candidates: with `max_keypoints` and without `spread`, so
-            many times as many candidates are ranked, but at least so many: those with the
-            strongest response.
-        spread: "none": the best; "grid": in turn the best of each cell of a grid; "anms": the
-            best, at least so far from each other that there are just enough (adaptive
-            non-maximal suppression).
-        grid_cells: of "grid", along the longer side.
-        distance_px: least distance of two keypoints, also of different scales.
-        distance_per_sigma: least distance of two keypoints over the smaller one's sigma, so that
-            one structure is not found several times at neighbouring scales.
-        size_per_sigma: diameter of a keypoint, as descriptors take it, over the sigma of its
-            scale.
-        scales: of the scale space.
+GRID_CELLS = 16
+"""Of the spread "grid", along the longer side."""
 
-    Raises:
-        OptionError: a value is unknown or out of its range.
-    """
+DISTANCE_PX = 2.0
+"""Least distance of two keypoints, also of different scales."""
 
-    max_keypoints: int | None = None
-    candidates_per_keypoint: int = 6
-    min_candidates: int = 8192
-    spread: str = "none"
-    grid_cells: int = 16
-    distance_px: float = 2.0
-    distance_per_sigma: float = 1.0
-    size_per_sigma: float = 2.5
-    scales: ScaleSpaceOptions = field(default_factory=ScaleSpaceOptions)
+DISTANCE_PER_SIGMA = 1.0
+"""Least distance of two keypoints over the smaller one's sigma, so that one structure is not found
+several times at neighbouring scales."""
 
-    def __post_init__(self) -> None:
-        check_max_keypoints(self.max_keypoints)
-        if self.spread not in SPREADS:
-            raise unknown_name("spread", self.spread, SPREADS)
-        if self.spread != "none" and self.max_keypoints is None:
-            raise OptionError(f"`spread={self.spread!r}` needs `max_keypoints`: how many to spread")
-        check_ranges(
-            self,
-            positive=("distance_px", "size_per_sigma"),
-            not_negative=("distance_per_sigma",),
-            between={
-                "candidates_per_keypoint": (1, math.inf),
-                "min_candidates": (1, math.inf),
-                "grid_cells": (1, math.inf),
-            },
-        )
+SIZE_PER_SIGMA = 2.5
+"""Diameter of a keypoint, as descriptors take it, over the sigma of its scale."""
 
-    def least_distances(self, sigma_px: np.ndarray) -> np.ndarray:
-        """Return (N,) radii within which a keypoint drives out others of its size or larger."""
-        radii: np.ndarray = np.maximum(self.distance_px, self.distance_per_sigma * sigma_px)
-        return radii
+
+def least_distances(sigma_px: np.ndarray) -> np.ndarray:
+    """Return (N,) radii within which a keypoint drives out others of its size or larger."""
+    radii: np.ndarray = np.maximum(DISTANCE_PX, DISTANCE_PER_SIGMA * sigma_px)
+    return radii
 
 
 def detect_points(
     gray: np.ndarray,
-    options: PointOptions = PointOptions(),
+    max_keypoints: int | None = None,
     *,
+    spread: Spread = "none",
     ignore: np.ndarray | None = None,
     ranker: Ranker | None = None,
 ) -> Keypoints:
@@ -96,14 +57,17 @@ def detect_points(
 
     Args:
         gray: (H, W) uint8.
-        options: how many, and how they are spread.
+        max_keypoints: at most this many; None: all.
+        spread: "none": the best; "grid": in turn the best of each cell of a grid; "anms": the
+            best, at least so far from each other that there are just enough (adaptive
+            non-maximal suppression).
         ignore: (H, W) array, true where no keypoint is wanted.
         ranker: None: the trained one inside the package.
 
     Returns:
         Keypoints with sub-pixel positions (centre of the first pixel (0, 0)), sizes in pixels and
-        angles in degrees, best first; their logits rank them, and their scores are the logits'
-        sigmoid.
+        angles in degrees, best first; their logits rank them, and so do their scores in (0, 1), of
+        which no two are equal.
 
     Raises:
         OptionError: the mask does not fit, or the image is too large for the memory.
@@ -111,11 +75,11 @@ def detect_points(
     Example:
         >>> gray = np.zeros((64, 64), np.uint8)
         >>> gray[20:40, 24:44] = 255
-        >>> len(detect_points(gray, PointOptions(max_keypoints=4)))
+        >>> len(detect_points(gray, 4))
         4
     """
-    check_memory(gray.shape, options.scales)
-    space = build_scale_space(gray, options.scales)
+    check_memory(gray.shape)
+    space = build_scale_space(gray)
     candidates = find_candidates(space)
     size = (gray.shape[1], gray.shape[0])
     if not len(candidates):
@@ -127,29 +91,46 @@ def detect_points(
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted]
     # The strongest alone would leave nothing to spread over dim regions.
-    if options.max_keypoints is not None and options.spread == "none":
-        most = max(options.candidates_per_keypoint * options.max_keypoints, options.min_candidates)
+    if max_keypoints is not None and spread == "none":
+        most = max(CANDIDATES_PER_KEYPOINT * max_keypoints, MIN_CANDIDATES)
         rows = rows[np.argsort(-strength[rows], kind="stable")[:most]]
     logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates, rows))
     candidates = candidates[rows]
-    kept = suppress_neighbors(candidates.xy, logits, options.least_distances(candidates.sigma_px))
-    kept = kept[_choose(candidates.xy[kept], logits[kept], size, options)]
-    decay = np.exp(-np.abs(logits[kept]))
-    scores = np.where(logits[kept] >= 0, 1, decay) / (1 + decay)
-    xy, sizes = candidates.xy[kept], options.size_per_sigma * candidates.sigma_px[kept]
+    kept = suppress_neighbors(candidates.xy, logits, least_distances(candidates.sigma_px))
+    kept = kept[_choose(candidates.xy[kept], logits[kept], size, max_keypoints, spread)]
+    xy, sizes = candidates.xy[kept], SIZE_PER_SIGMA * candidates.sigma_px[kept]
     angles = dominant_angles(gray, xy, sizes)
+    scores = ranking_scores(logits[kept])
     return Keypoints(xy, scores, size, logits=logits[kept], sizes=sizes, angles=angles)
 
 
+def ranking_scores(logits: np.ndarray) -> np.ndarray:
+    """Map logits that do not rise to scores in (0, 1) that fall.
+
+    Args:
+        logits: (N,) float32, the highest first.
+
+    Returns:
+        (N,) float32; where rounding makes two equal, the later one gets the next lower number.
+
+    Example:
+        >>> ranking_scores(np.array([1, 0, 0, -1], np.float32)).round(2).tolist()
+        [0.75, 0.5, 0.5, 0.25]
+    """
+    scores = (0.5 + 0.5 * logits / (1 + np.abs(logits))).astype(np.float32)
+    # Of positive numbers the bits are in the same order.
+    place = np.arange(len(scores), dtype=np.int32)
+    return (np.minimum.accumulate(scores.view(np.int32) + place) - place).view(np.float32)
+
+
 def _choose(
-    xy: np.ndarray, logits: np.ndarray, size: tuple[int, int], options: PointOptions
+    xy: np.ndarray, logits: np.ndarray, size: tuple[int, int], count: int | None, spread: Spread
 ) -> np.ndarray:
     """Return rows of keypoints that are ordered from best to worst, in the same order."""
-    count = options.max_keypoints
     if count is None or count >= len(xy):
         return np.arange(len(xy))
-    if options.spread == "grid":
-        return np.sort(spread_over_grid(xy, logits, size, count, options.grid_cells))
-    if options.spread == "anms":
+    if spread == "grid":
+        return np.sort(spread_over_grid(xy, logits, size, count, GRID_CELLS))
+    if spread == "anms":
         return np.sort(spread_by_distance(xy, logits, count))
     return np.arange(count)

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..._shared.errors import OptionError
 from ..._shared.memory import require_memory
 from ..._shared.opencv import cv2
-from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 
 NMS_RADIUS = 2
 """A candidate is the maximum of a window of 5x5 in its level."""
 
-MIN_SIGMA_PX = 0.5
-"""Of the finest level."""
+SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
+"""Of the Gaussians of all levels, in pixels: seven that have candidates, and one finer and two
+coarser ones, which only the ranking looks at."""
 
 LEAST_RESPONSE = 1e-8
 """Of a candidate, in an image with values in [0, 1]: less is rounding."""
@@ -27,46 +25,6 @@ PIXELS_AT_ONCE = 1 << 15
 
 MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined position is still the one that it was found at."""
-
-
-@suggest_keywords
-@dataclass(frozen=True)
-class ScaleSpaceOptions:
-    """The scales of a scale space.
-
-    Attributes:
-        first_sigma_px: of the Gaussian of the finest level that has candidates, in pixels.
-        ratio: between the sigmas of neighbouring levels.
-        levels: number of levels that have candidates. There are one finer and two coarser ones
-            besides, which only the ranking looks at.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    first_sigma_px: float = 1.5
-    ratio: float = 1.35
-    levels: int = 7
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            between={
-                "ratio": (1.01, 4),
-                "first_sigma_px": (0.5, math.inf),
-                "levels": (1, math.inf),
-            },
-        )
-        if self.first_sigma_px / self.ratio < MIN_SIGMA_PX:
-            raise OptionError(
-                f"`first_sigma_px` must be at least {MIN_SIGMA_PX} pixels times the ratio, not "
-                f"{self.first_sigma_px}"
-            )
-
-    @property
-    def sigmas_px(self) -> np.ndarray:
-        """Sigmas of all levels in pixels, those without candidates included."""
-        return self.first_sigma_px * self.ratio ** np.arange(-1.0, self.levels + 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +77,7 @@ class Candidates:
         return Candidates(*(part[rows] for part in parts))
 
 
-def check_memory(shape: tuple[int, ...], options: ScaleSpaceOptions = ScaleSpaceOptions()) -> None:
+def check_memory(shape: tuple[int, ...]) -> None:
     """Stop before a scale space fills the memory.
 
     Raises:
@@ -128,30 +86,26 @@ def check_memory(shape: tuple[int, ...], options: ScaleSpaceOptions = ScaleSpace
     require_memory(
         f"points of an image of {shape[1]}x{shape[0]} pixels",
         "use `resolution='auto'`, or a smaller image",
-        pixel_of_level=shape[0] * shape[1] * len(options.sigmas_px),
+        pixel_of_level=shape[0] * shape[1] * len(SIGMAS_PX),
     )
 
 
-def build_scale_space(
-    gray: np.ndarray, options: ScaleSpaceOptions = ScaleSpaceOptions()
-) -> ScaleSpace:
+def build_scale_space(gray: np.ndarray) -> ScaleSpace:
     """Smooth an image at all scales, and differentiate it.
 
     Args:
         gray: (H, W) uint8.
-        options: the scales.
 
     Example:
         >>> build_scale_space(np.zeros((32, 48), np.uint8)).smooth.shape
         (10, 32, 48)
     """
-    sigmas = options.sigmas_px
-    maps = [np.empty((len(sigmas), *gray.shape), np.float32) for _ in range(5)]
+    maps = [np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(5)]
     smooth, determinant, trace, gradient, highest = maps
     window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)
     strength = np.empty(gray.shape, np.float32)
     current, reached = gray.astype(np.float32) / np.float32(255), 0.0
-    for k, sigma in enumerate(sigmas):
+    for k, sigma in enumerate(SIGMAS_PX):
         # Gaussians add up by their variances: each level smooths the one before.
         current = cv2.GaussianBlur(current, (0, 0), float(np.sqrt(sigma**2 - reached**2)))
         reached = sigma
@@ -165,7 +119,7 @@ def build_scale_space(
             strength,
         )
         cv2.dilate(strength, window, dst=highest[k])
-    return ScaleSpace(sigmas, smooth, determinant, trace, gradient, highest)
+    return ScaleSpace(SIGMAS_PX, smooth, determinant, trace, gradient, highest)
 
 
 def _differentiate(

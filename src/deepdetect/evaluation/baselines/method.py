@@ -5,17 +5,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError
 from ...detector.detector import DeepDetect, find_keypoints
-from ...detector.heatmap import HeatmapOptions
-from ...detector.image_points import find_points
-from ...detector.points.detection import PointOptions
-from ...detector.points.ranker import load_ranker
-from ...detector.pretrained import RANKER
+from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
 from ...features.selection import SelectionOptions
@@ -173,17 +170,15 @@ def deepdetect_feature(
     )
 
 
-def points_feature(detector: DeepDetect) -> LocalFeature:
+def points_feature(ranker: str | Path | None = None) -> LocalFeature:
     """Make a local feature of the ranked keypoints of all scales, at the image's own size."""
-    selection, native = SelectionOptions(mode="points"), HeatmapOptions("native")
-    path = getattr(detector, "ranker", RANKER)  # a detector from outside the package has none
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    detector = PointDetector(None, resolution="native", ranker=ranker)
     return LocalFeature(
         "deepdetect-points",
         "DeepDetect, points",
-        lambda rgb: find_points(rgb, selection, native, load_ranker(path)),
+        detector.detect,
         PAPER_DESCRIPTOR.describe,
-        version=f"{digest} {PointOptions()}",
+        version=str(detector.settings),
         own_scale=OwnScaleDescriptor(),
     )
 

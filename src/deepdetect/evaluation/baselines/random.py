@@ -55,7 +55,7 @@ def random_feature(like: LocalFeature, seed: int = 0, *, name: str = "random") -
         size = (rgb.shape[1], rgb.shape[0])
         if not count:
             return Keypoints.empty(size)
-        options = SelectionOptions(threshold=0, max_keypoints=count, nms_radius=0, subpixel=False)
+        options = SelectionOptions(threshold=0, max_keypoints=count)
         points = select_keypoints(RandomDetector(seed + own).heatmap(rgb), options)
         return Keypoints(points.xy, points.scores, size)
 

@@ -68,7 +68,7 @@ class GuidedPair:
     """The matches of a pair by one seed, as `match_images` gives them.
 
     Attributes:
-        kind: what guided, as of `Guide`; with "none" there are no matches.
+        kind: what guided, as of `TwoViewGeometry`; with "none" there are no matches.
         matrix: the geometry, or None.
         points0, points1: (M, 2) matched positions.
         profile: of the guided matching alone, also where it found nothing: heat map and keypoints
@@ -210,7 +210,7 @@ def match_guided(
         return {
             "kind": np.array(guide.model),
             "matrix": np.empty((0, 3)) if guide.matrix is None else guide.matrix,
-            "rows0": np.empty(0, np.int32) if found is None else found.rows0.astype(np.int32),
+            "rows0": np.empty(0, np.int32) if found is None else found.indices0.astype(np.int32),
             "points1": np.empty((0, 2)) if found is None else found.points1,
             **pack_profile("guided", profile),
         }

@@ -13,6 +13,7 @@ from ..._shared.opencv import cv2
 from ...datasets.posed_images import PosedPair
 from ...detector.detector import DeepDetect
 from ...detector.heatmap import HeatmapOptions
+from ...matching.options import MatchingOptions
 from ...matching.pipeline import match_images
 from ..baselines.method import LocalFeature
 from ..baselines.opencv import CLASSICAL, STANDARD
@@ -76,7 +77,7 @@ def pose_methods(context: BenchmarkContext, options: BenchmarkOptions) -> list[P
     own = options.deepdetect_native()
     ways: dict[str, dict[str, Any]] = {
         DEEPDETECT: {},
-        f"{DEEPDETECT}, unguided": {"guided": False, "matcher": "patchmatch", "mutual": True},
+        f"{DEEPDETECT}, unguided": {"guided_matching": False, "mutual": True},
     }
     chosen = {"sift": CLASSICAL["sift"], "orb": STANDARD["orb"]}
     classical = [feature for name, feature in chosen.items() if name in options.classical]
@@ -94,8 +95,11 @@ def pose_methods(context: BenchmarkContext, options: BenchmarkOptions) -> list[P
 
 
 def _match_images(detector: DeepDetect, way: Mapping[str, Any], pair: PosedPair) -> FoundMatches:
-    found = match_images(pair.first.path, pair.second.path, detector, model="none", **way)
-    guided_by = found.guide.model if found.guide is not None else None
+    options = MatchingOptions(matcher="patchmatch")
+    found = match_images(
+        pair.first.path, pair.second.path, detector, model="none", options=options, **way
+    )
+    guided_by = found.two_view_geometry.model if found.two_view_geometry is not None else None
     return FoundMatches(found.points0, found.points1, sum(found.seconds.values()), guided_by)
 
 

@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -34,6 +33,7 @@ from ..report import Cell, Column, Figure, Table
 from ..tasks import Part, SectionPlan, Shown, Task
 from .sfm_methods import (
     OPTIONS,
+    SFM_POINTS,
     SfmMethod,
     SfmTask,
     find_points,
@@ -118,16 +118,11 @@ def choose_photographs(scene: PosedScene, most: int) -> SfmScene:
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
     """Return the ranked points, SIFT where it is among the baselines, and random points."""
-    detector = (
-        ("weights", str(options.detector.weights)),
-        ("ranker", str(options.detector.ranker)),
-    )
-    digests = " ".join(file_digest(Path(path)) for _, path in detector)
-    methods = [SfmMethod(POINTS, partial(find_points, detector=detector), depends=digests)]
+    digest = str(SFM_POINTS.settings)
+    methods = [SfmMethod(POINTS, find_points, depends=digest)]
     if "sift" in options.classical:
         methods.append(SfmMethod(SIFT, find_sift, match_sift))
-    random = partial(find_random_points, detector=detector)
-    return [*methods, SfmMethod(RANDOM, random, depends=digests, chance=True)]
+    return [*methods, SfmMethod(RANDOM, find_random_points, depends=digest, chance=True)]
 
 
 Results = Mapping[tuple[str, str], SfmResult]

@@ -18,9 +18,10 @@ import numpy as np
 from ..._shared.errors import NoDepthError
 from ...batch.extraction import feature_group
 from ...batch.parted_file import Group, import_h5py, open_hdf5, write_groups
+from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
-from ...features.sift import described_at_own_size
+from ...features.sift import describe_keypoints
 from ...geometry.camera import Camera
 from ...io.image import load_image, luma
 from ...sfm.colmap import PIXEL_CENTRE, quiet_pycolmap
@@ -29,6 +30,7 @@ from ...sfm.intrinsics import photograph_lenses
 from ...sfm.mapping import SparseModel, read_sparse_model
 from ...sfm.options import MultiViewOptions
 from ...sfm.pair_selection import PairSelectionOptions
+from ...sfm.pipeline import MAX_KEYPOINTS
 from ...sfm.stages import Stages
 from ..metrics.multi_view import cloud_agreement
 from ..profiling import peak_memory
@@ -99,19 +101,22 @@ class _Clock:
         self.cpu_seconds += time.process_time() - own
 
 
-def find_points(stages: Stages, folder: Path, detector: tuple[tuple[str, str], ...] = ()) -> None:
+SFM_POINTS = PointDetector(MAX_KEYPOINTS)
+
+
+def find_points(stages: Stages, folder: Path, detector: PointDetector = SFM_POINTS) -> None:
     """Find the ranked points, as `reconstruct_many` does.
 
     Args:
         stages: of the reconstruction.
         folder: of the photographs.
-        detector: arguments of `DeepDetect`.
+        detector: of the points.
     """
-    stages.extract(folder, dict(detector))
+    stages.extract(folder, detector)
 
 
 def find_random_points(
-    stages: Stages, folder: Path, detector: tuple[tuple[str, str], ...] = (), seed: int = 0
+    stages: Stages, folder: Path, detector: PointDetector = SFM_POINTS, seed: int = 0
 ) -> None:
     """Put as many random points in place of the ranked ones.
 
@@ -135,7 +140,7 @@ def find_random_points(
                 sizes=sizes,
                 angles=dominant_angles(gray, xy, sizes),
             )
-            made = feature_group(name, described_at_own_size(gray, points)).arrays
+            made = feature_group(name, describe_keypoints(gray, points)).arrays
             for kind in ("keypoints", "descriptors", "scores", "scales", "oris"):
                 group[kind][...] = made[kind]
 
@@ -146,7 +151,7 @@ def find_sift(stages: Stages, folder: Path) -> None:
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureExtractionOptions()
         how.num_threads = 1
-        how.sift.max_num_features = stages.options.selection.max_keypoints
+        how.sift.max_num_features = MAX_KEYPOINTS
         pycolmap.extract_features(
             stages.work / DATABASE, folder, image_names=names, extraction_options=how
         )

@@ -147,10 +147,13 @@ def _corner_errors(
     size: tuple[int, int],
 ) -> list[float]:
     def error(seed: int) -> float:
-        options = GeometryOptions(
-            model="homography", inlier_threshold=INLIER_THRESHOLD_PX, seed=seed
-        )
-        estimated = estimate_geometry(matches.points0, matches.points1, options).matrix
+        estimated = estimate_geometry(
+            matches.points0,
+            matches.points1,
+            "homography",
+            seed=seed,
+            options=GeometryOptions(inlier_threshold=INLIER_THRESHOLD_PX),
+        ).matrix
         return corner_error(estimated, pair.homography, size)
 
     depends = {

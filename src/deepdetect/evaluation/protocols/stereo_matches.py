@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from ..._shared.progress import progress
 from ...datasets.types import StereoPair
-from ...detector.detector import HeatmapDetector
+from ...detector.detector import AnyDetector
 from ...features.matches import Matches
+from ...features.selection import SelectionOptions
 from ...matching.pipeline import match_images
 from ..baselines.random import AllPixels, RandomDetector
 from ..metrics.stereo import StereoScore, stereo_score
@@ -32,7 +33,7 @@ class StereoMatchScore:
 
 
 def score_stereo_matches(
-    sources: Mapping[str, HeatmapDetector], pairs: Sequence[StereoPair], *, quiet: bool = True
+    sources: Mapping[str, AnyDetector], pairs: Sequence[StereoPair], *, quiet: bool = True
 ) -> list[StereoMatchScore]:
     """Match rectified pairs with several sources of keypoints, and evaluate the matches.
 
@@ -68,12 +69,15 @@ def score_stereo_matches(
         return rows + [evaluated("all pixels", pair, match_stereo(pair, every)) for pair in pairs]
 
 
-def match_stereo(
-    pair: StereoPair, detector: HeatmapDetector, density: float | None = None
-) -> Matches:
+def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None = None) -> Matches:
     """Match both views by descriptors alone and without estimating their geometry."""
     return match_images(
-        pair.left, pair.right, detector, guided=False, model="none", density=density
+        pair.left,
+        pair.right,
+        detector,
+        selection=SelectionOptions(density=density),
+        guided_matching=False,
+        model="none",
     )
 
 

@@ -14,10 +14,11 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ...datasets.types import CalibratedStereoPair
-from ...detector.detector import DeepDetect, HeatmapDetector
+from ...detector.detector import AnyDetector, DeepDetect
 from ...detector.heatmap import HeatmapOptions
 from ...features.matchers import match_descriptors
 from ...features.matchers.approximate import flann_neighbours
+from ...features.selection import SelectionOptions
 from ...matching.stereo.matching import find_disparity_range
 from ...matching.unguided import check_memory
 from ...reconstruction.pipeline import reconstruct
@@ -151,7 +152,7 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
 
 
 def _ours(
-    detector: HeatmapDetector, density: float | None = None
+    detector: AnyDetector, density: float | None = None
 ) -> Callable[[CalibratedStereoPair], StereoPoints]:
     def run(scene: CalibratedStereoPair) -> StereoPoints:
         _compile_kernels()
@@ -170,7 +171,7 @@ def _random(like: DeepDetect) -> Callable[[CalibratedStereoPair], StereoPoints]:
 
 
 def _reconstruct(
-    scene: CalibratedStereoPair, detector: HeatmapDetector, density: float | None
+    scene: CalibratedStereoPair, detector: AnyDetector, density: float | None
 ) -> StereoPoints:
     with StageProfiler() as profiler:
         found = reconstruct(
@@ -179,7 +180,7 @@ def _reconstruct(
             detector,
             calibration=scene.calibration,
             rectified=True,
-            density=density,
+            selection=SelectionOptions(density=density),
             progress=lambda stage: profiler.record(stage if stage in STAGES else "geometry"),
         )
         profiler.record("geometry")
@@ -224,8 +225,8 @@ def paper_points(
     found = match_descriptors(first, second, flann, ratio=settings.ratio)
     profiler.record("matching")
     kept = essential_inliers(
-        features[0].xy[found.rows0].astype(np.float64),
-        features[1].xy[found.rows1].astype(np.float64),
+        features[0].xy[found.indices0].astype(np.float64),
+        features[1].xy[found.indices1].astype(np.float64),
         settings.camera_matrix,
     )
     profiler.record("geometry")

@@ -6,7 +6,6 @@ from .matching import (
     Matcher,
     get_matcher,
     match_descriptors,
-    unique_matches,
 )
 
 __all__ = [
@@ -15,5 +14,4 @@ __all__ = [
     "Matcher",
     "get_matcher",
     "match_descriptors",
-    "unique_matches",
 ]

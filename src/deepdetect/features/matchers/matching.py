@@ -92,16 +92,16 @@ class DescriptorMatches:
     """Matches between two sets of descriptors.
 
     Attributes:
-        rows0, rows1: (M,) int, matched rows of the first and of the second set.
+        indices0, indices1: (M,) int, matched rows of the first and of the second set.
         ratios: (M,) float32, Lowe's ratio: distance of the best over that of the second-best.
     """
 
-    rows0: np.ndarray
-    rows1: np.ndarray
+    indices0: np.ndarray
+    indices1: np.ndarray
     ratios: np.ndarray
 
     def __len__(self) -> int:
-        return len(self.rows0)
+        return len(self.indices0)
 
 
 def match_descriptors(
@@ -131,7 +131,7 @@ def match_descriptors(
 
     Example:
         >>> a = np.eye(3, 128, dtype=np.float32)
-        >>> match_descriptors(a, a[::-1].copy(), get_matcher("exact")).rows1.tolist()
+        >>> match_descriptors(a, a[::-1].copy(), get_matcher("exact")).indices1.tolist()
         [2, 1, 0]
     """
     if len(descriptors0) == 0 or len(descriptors1) < 2:
@@ -161,23 +161,3 @@ def _is_exhaustive(matcher: Matcher, count0: int, count1: int) -> bool:
     if matcher is automatic_neighbours:
         return count0 * count1 <= MAX_EXACT_PRODUCT
     return matcher in (exact_neighbours, hamming_neighbours)
-
-
-def unique_matches(found: DescriptorMatches) -> DescriptorMatches:
-    """Keep the match with the smallest ratio of those that share a row of the second set.
-
-    Args:
-        found: matches with every row of the first set once; of equal ratios the lowest such row
-            is kept.
-
-    Example:
-        >>> rows0, rows1 = np.array([0, 1, 2, 3]), np.array([5, 4, 5, 4])
-        >>> found = DescriptorMatches(rows0, rows1, np.array([0.5, 0.2, 0.4, 0.2], np.float32))
-        >>> kept = unique_matches(found)
-        >>> kept.rows0.tolist(), kept.rows1.tolist()
-        ([1, 2], [4, 5])
-    """
-    best_first = np.lexsort((found.rows0, found.ratios, found.rows1))
-    _, first = np.unique(found.rows1[best_first], return_index=True)
-    kept = np.sort(best_first[first])
-    return DescriptorMatches(found.rows0[kept], found.rows1[kept], found.ratios[kept])

@@ -4,14 +4,14 @@ from ...features.matches import GuidedMatches
 from .initial_geometry import InitialGeometry
 from .options import GuidedOptions
 from .pipeline import guided_matches, guiding_geometry
-from .sparse_matches import InitialMatches, initial_matches
+from .sparse_matches import TentativeMatches, tentative_matches
 
 __all__ = [
     "GuidedMatches",
     "GuidedOptions",
     "InitialGeometry",
-    "InitialMatches",
+    "TentativeMatches",
     "guided_matches",
     "guiding_geometry",
-    "initial_matches",
+    "tentative_matches",
 ]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..._shared.errors import OptionError, unknown_name
-from ...features.matches import Guide
+from ...features.matches import TwoViewGeometry
 from ...geometry import GeometryOptions, estimate_geometry
 from ...geometry.acontrario import log10_nfa
 from ...geometry.model_selection import Parallax, measure_parallax
@@ -27,7 +27,7 @@ from ...geometry.semi_calibrated import (
 from .along_lines import log10_chance, match_along_lines
 from .asift import simulated_views
 from .options import InitialGeometryOptions
-from .sparse_matches import InitialMatches, Points, initial_matches, match_features, separate
+from .sparse_matches import Points, TentativeMatches, match_features, separate, tentative_matches
 
 MODELS = ("homography", "fundamental")
 
@@ -57,11 +57,11 @@ class InitialGeometry:
     log10_nfa: float
     num_views: int
     parallax: Parallax | None = None
-    initial: InitialMatches | None = None
+    initial: TentativeMatches | None = None
 
-    def as_guide(self) -> Guide:
+    def as_two_view_geometry(self) -> TwoViewGeometry:
         """Return what the user is told of it."""
-        return Guide(
+        return TwoViewGeometry(
             self.model,
             self.matrix,
             self.num_matches,
@@ -77,7 +77,7 @@ def find_initial_geometry(
     model: str = "auto",
     seed: int = 0,
     options: InitialGeometryOptions = InitialGeometryOptions(),
-    initial: InitialMatches | None = None,
+    initial: TentativeMatches | None = None,
 ) -> InitialGeometry:
     """Find the geometry of a pair, by the least effort that it takes.
 
@@ -86,7 +86,7 @@ def find_initial_geometry(
         model: as of `estimate_initial_geometry`.
         seed: of the random samples.
         options: sizes, thresholds, and which views are simulated.
-        initial: sparse matches, where `initial_matches` has made them already.
+        initial: sparse matches, where `tentative_matches` has made them already.
 
     Returns:
         The geometry, or one with the model "none".
@@ -103,33 +103,33 @@ def find_initial_geometry(
     first_side = min(options.first_side_px, options.max_side_px)
     if initial is None and longest > first_side and model != "fundamental":
         small = _scaled_down(options, first_side, options.first_max_keypoints)
-        look = initial_matches(gray0, gray1, options=small)
+        look = tentative_matches(gray0, gray1, options=small)
         found = estimate_initial_geometry(look, model, seed, small, simulate_views=False)
         if _is_clearly_a_plane(found, options) or _is_clearly_depth(found, options):
             return found
     if initial is None:
-        initial = initial_matches(gray0, gray1, options=options)
+        initial = tentative_matches(gray0, gray1, options=options)
     found = estimate_initial_geometry(initial, model, seed, options, simulate_views=False)
     if found.matrix is not None:
         return replace(found, initial=initial)
     simulated_side = min(options.simulated_side_px, options.max_side_px)
     if longest > simulated_side:
         options = _scaled_down(options, simulated_side, options.simulated_max_keypoints)
-        initial = initial_matches(gray0, gray1, options=options)
+        initial = tentative_matches(gray0, gray1, options=options)
     return estimate_initial_geometry(initial, model, seed, options)
 
 
-def geometry_of_seeds(
-    seeds: Points,
+def geometry_of_points(
+    tentative: Points,
     sizes: tuple[tuple[int, int], tuple[int, int]],
     model: str = "auto",
     seed: int = 0,
     options: InitialGeometryOptions = InitialGeometryOptions(),
 ) -> InitialGeometry:
-    """Estimate the geometry of a pair from sparse matches that were found elsewhere.
+    """Estimate the geometry of a pair from tentative matches that were found elsewhere.
 
     Args:
-        seeds: (K, 2) positions in both images, some of them wrong.
+        tentative: (K, 2) positions in both images, some of them wrong.
         sizes: (width, height) of both images.
         model: as of `estimate_initial_geometry`.
         seed: of the random samples.
@@ -139,23 +139,29 @@ def geometry_of_seeds(
         The geometry, or one with the model "none".
 
     Raises:
-        OptionError: the model is unknown, or the seeds are not two (K, 2) arrays of finite numbers.
+        OptionError: the model is unknown, or the matches are not two (K, 2) arrays of finite
+            numbers.
 
     Example:
         >>> points = np.random.default_rng(0).uniform(0, 99, (30, 2))
-        >>> geometry_of_seeds((points, points + 3), ((110, 110), (110, 110))).matrix[:2, 2].round(3)
+        >>> found = geometry_of_points((points, points + 3), ((110, 110), (110, 110)))
+        >>> found.matrix[:2, 2].round(3)
         array([3., 3.])
     """
     if model not in ("auto", *MODELS):
         raise unknown_name("model", model, ("auto", *MODELS))
     try:
-        points0, points1 = (np.array(points, np.float64) for points in seeds)
+        points0, points1 = (np.array(points, np.float64) for points in tentative)
     except (TypeError, ValueError):
         points0 = points1 = np.empty(0)
     if points0.ndim != 2 or points0.shape[1:] != (2,) or points0.shape != points1.shape:
-        raise OptionError("seeds must be two arrays of shape (K, 2): positions in both images")
+        raise OptionError(
+            "tentative matches must be two arrays of shape (K, 2): positions in both images"
+        )
     if not (np.isfinite(points0).all() and np.isfinite(points1).all()):
-        raise OptionError("seeds must be finite positions: leave out those that are not")
+        raise OptionError(
+            "tentative matches must be finite positions: leave out those that are not"
+        )
     scales = [min(1.0, options.max_side_px / max(size)) for size in sizes]
     width, height = (
         [round(size[axis] * scale) for size, scale in zip(sizes, scales, strict=True)]
@@ -171,7 +177,7 @@ def geometry_of_seeds(
 
 
 def estimate_initial_geometry(
-    initial: InitialMatches,
+    initial: TentativeMatches,
     model: str = "auto",
     seed: int = 0,
     options: InitialGeometryOptions = InitialGeometryOptions(),
@@ -246,7 +252,7 @@ def _nothing(num_matches: int) -> InitialGeometry:
 
 
 def _more_and_more_matches(
-    initial: InitialMatches, options: InitialGeometryOptions
+    initial: TentativeMatches, options: InitialGeometryOptions
 ) -> Iterator[tuple[Points, np.ndarray, int]]:
     """Yield matched positions, ratios and the number of simulated views, up to strong tilts."""
     (points0, points1), ratios = initial.matched, initial.ratios
@@ -298,8 +304,8 @@ def _fit(
 ) -> InitialGeometry:
     """Estimate one model, trusted or not."""
     threshold = options.threshold_px(model)
-    chosen = GeometryOptions(model=model, inlier_threshold=threshold, seed=seed)
-    geometry = estimate_geometry(*points, chosen)
+    chosen = GeometryOptions(inlier_threshold=threshold)
+    geometry = estimate_geometry(*points, model, seed=seed, options=chosen)
     if geometry.matrix is None:
         return _nothing(len(points[0]))
     errors_of = transfer_errors if model == "homography" else epipolar_errors
@@ -330,7 +336,7 @@ def _found(
 def _with_further_evidence(
     found: InitialGeometry,
     used: np.ndarray,
-    initial: InitialMatches,
+    initial: TentativeMatches,
     options: InitialGeometryOptions,
 ) -> InitialGeometry:
     """Let keypoints that no match was made of decide where a fundamental matrix is in doubt."""
@@ -344,7 +350,7 @@ def _with_further_evidence(
 
 def _with_further_matches(
     found: InitialGeometry,
-    initial: InitialMatches,
+    initial: TentativeMatches,
     sizes: tuple[Size, Size],
     options: InitialGeometryOptions,
 ) -> InitialGeometry:

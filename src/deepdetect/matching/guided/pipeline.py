@@ -12,7 +12,7 @@ import numpy as np
 
 from ...features.keypoints import Keypoints
 from ...features.matchers import DescriptorMatches
-from ...features.matches import Guide, GuidedMatches
+from ...features.matches import GuidedMatches, TwoViewGeometry
 from .homography import (
     ImagePair,
     match_by_homography,
@@ -23,11 +23,11 @@ from .initial_geometry import (
     InitialGeometry,
     estimate_initial_geometry,
     find_initial_geometry,
-    geometry_of_seeds,
+    geometry_of_points,
 )
 from .options import GuidedOptions
 from .rectified import match_by_rectification
-from .sparse_matches import InitialMatches, matches_of_points
+from .sparse_matches import Points, TentativeMatches, matches_of_points
 
 
 def guided_matches(
@@ -37,12 +37,11 @@ def guided_matches(
     xy1: np.ndarray,
     model: str = "auto",
     seed: int = 0,
-    initial: InitialMatches | None = None,
+    tentative: Points | TentativeMatches | None = None,
     options: GuidedOptions = GuidedOptions(),
-    seeds: tuple[np.ndarray, np.ndarray] | None = None,
     points: tuple[Keypoints, Keypoints] | None = None,
     first: InitialGeometry | None = None,
-) -> tuple[Guide, GuidedMatches | None]:
+) -> tuple[TwoViewGeometry, GuidedMatches | None]:
     """Match the keypoints of two images by their geometry.
 
     Args:
@@ -50,9 +49,9 @@ def guided_matches(
         xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
         model: "homography", "fundamental" or "auto".
         seed: of all random choices.
-        initial: sparse matches of the pair, where `initial_matches` has made them already.
+        tentative: matches of the pair, where `tentative_matches` has made them already; or two
+            (K, 2) arrays of positions, which take the place of these.
         options: all tuned numbers.
-        seeds: (K, 2) sparse matches in both images that take the place of our own.
         points: keypoints of both images, best first; where they have sizes and angles and are
             enough, the sparse matches are made of them.
         first: the geometry to begin with, where `guiding_geometry` has found it already.
@@ -61,21 +60,20 @@ def guided_matches(
         The geometry that guided, and the matches; None when no geometry could be trusted.
 
     Raises:
-        OptionError: the model is unknown, or the seeds are no matches.
+        OptionError: the model is unknown, or the tentative matches are none.
     """
     if first is None:
-        first = guiding_geometry(gray0, gray1, model, seed, initial, options, seeds, points)
+        first = guiding_geometry(gray0, gray1, model, seed, tentative, options, points)
     if first.matrix is None:
-        return first.as_guide(), None
+        return first.as_two_view_geometry(), None
     pair = ImagePair(gray0, gray1, xy0, xy1)
     matrix, found = first.matrix, None
     if first.model == "homography":
         matrix, found = _match_plane(pair, first, options, seed)
         if found is None:
-            views, known = first.num_views, initial or first.initial
-            first = guiding_geometry(
-                gray0, gray1, "fundamental", seed, known, options, seeds, points
-            )
+            views = first.num_views
+            known = first.initial if tentative is None else tentative
+            first = guiding_geometry(gray0, gray1, "fundamental", seed, known, options, points)
             first = replace(first, num_views=first.num_views + views)
             if first.matrix is None:
                 return _no_guide(first), None
@@ -86,7 +84,7 @@ def guided_matches(
         matrix, found = _match_scene_with_depth(pair, first, options, seed)
     if len(found) < options.min_matches:
         return _no_guide(first), None
-    return replace(first, matrix=matrix).as_guide(), found
+    return replace(first, matrix=matrix).as_two_view_geometry(), found
 
 
 def guiding_geometry(
@@ -94,26 +92,25 @@ def guiding_geometry(
     gray1: np.ndarray,
     model: str = "auto",
     seed: int = 0,
-    initial: InitialMatches | None = None,
+    tentative: Points | TentativeMatches | None = None,
     options: GuidedOptions = GuidedOptions(),
-    seeds: tuple[np.ndarray, np.ndarray] | None = None,
     points: tuple[Keypoints, Keypoints] | None = None,
 ) -> InitialGeometry:
-    """Return the geometry to begin with: of seeds, of points where they suffice, else of SIFT.
+    """Return the geometry to begin with: of given matches, of enough points, else of SIFT's.
 
     Arguments and errors are those of `guided_matches`.
     """
     chosen = options.initial_geometry
-    if seeds is not None:
+    if isinstance(tentative, tuple):
         sizes = gray0.shape[::-1], gray1.shape[::-1]
-        return geometry_of_seeds(seeds, sizes, model, seed, chosen)
-    if initial is None and points is not None:
+        return geometry_of_points(tentative, sizes, model, seed, chosen)
+    if tentative is None and points is not None:
         matches = matches_of_points(gray0, gray1, points, chosen)
         if matches is not None:
             found = estimate_initial_geometry(matches, model, seed, chosen, simulate_views=False)
             if len(found.points0) >= chosen.min_first_inliers:
                 return found
-    return find_initial_geometry(gray0, gray1, model, seed, chosen, initial)
+    return find_initial_geometry(gray0, gray1, model, seed, chosen, tentative)
 
 
 def _match_plane(
@@ -168,15 +165,17 @@ def _sparse_matches(pair: ImagePair, first: InitialGeometry) -> GuidedMatches:
     found = GuidedMatches(
         rows[near].astype(np.int64), moved, np.full(np.count_nonzero(near), 0.5, np.float32)
     )
-    order = np.unique(found.rows0, return_index=True)[1]
-    return GuidedMatches(found.rows0[order], found.points1[order], found.scores[order])
+    order = np.unique(found.indices0, return_index=True)[1]
+    return GuidedMatches(found.indices0[order], found.points1[order], found.scores[order])
 
 
 def _at_keypoints(pair: ImagePair, found: DescriptorMatches) -> GuidedMatches:
     scores = np.clip(1 - found.ratios, 0, 1)
-    places = pair.xy1[found.rows1].astype(np.float64)
-    return GuidedMatches(found.rows0, places, scores, rows1=found.rows1)
+    places = pair.xy1[found.indices1].astype(np.float64)
+    return GuidedMatches(found.indices0, places, scores, indices1=found.indices1)
 
 
-def _no_guide(first: InitialGeometry) -> Guide:
-    return replace(first, model="none", matrix=None, points0=first.points0[:0]).as_guide()
+def _no_guide(first: InitialGeometry) -> TwoViewGeometry:
+    return replace(
+        first, model="none", matrix=None, points0=first.points0[:0]
+    ).as_two_view_geometry()

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...features.keypoints import Keypoints
 from ...features.matchers import get_matcher, match_descriptors
-from ...features.sift import described_at_own_size
+from ...features.sift import describe_keypoints
 from ...features.sift_detector import detect_sift
 from ...geometry.rescaling import downscale, scaled_points
 from .options import InitialGeometryOptions
@@ -18,7 +18,7 @@ Points = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class InitialMatches:
+class TentativeMatches:
     """Sparse matches of two images, before any geometry.
 
     Attributes:
@@ -45,9 +45,9 @@ class InitialMatches:
         """Matched positions in the second image at its own size, (M, 2) float64."""
         return scaled_points(self.matched[1], 1 / self.scales[1])
 
-    def swapped(self) -> InitialMatches:
+    def swapped(self) -> TentativeMatches:
         """Return the matches from the second image to the first."""
-        return InitialMatches(
+        return TentativeMatches(
             self.views[::-1],
             self.scales[::-1],
             self.features[::-1],
@@ -56,12 +56,12 @@ class InitialMatches:
         )
 
 
-def initial_matches(
+def tentative_matches(
     gray0: np.ndarray,
     gray1: np.ndarray,
     features: tuple[Keypoints, Keypoints] | None = None,
     options: InitialGeometryOptions = InitialGeometryOptions(),
-) -> InitialMatches:
+) -> TentativeMatches:
     """Match sparse SIFT keypoints of two images, exactly, mutually and by the ratio test.
 
     Args:
@@ -72,7 +72,7 @@ def initial_matches(
 
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
-        >>> found = initial_matches(image, image)
+        >>> found = tentative_matches(image, image)
         >>> bool((found.points0 == found.points1).all()), len(found.points0) > 10
         (True, True)
     """
@@ -84,7 +84,7 @@ def initial_matches(
             of_second = detect_sift(view1, options.sift)
             features = of_first.result(), of_second
     points0, points1, ratios = match_features(features[0], features[1], options)
-    return InitialMatches((view0, view1), (scale0, scale1), features, (points0, points1), ratios)
+    return TentativeMatches((view0, view1), (scale0, scale1), features, (points0, points1), ratios)
 
 
 def matches_of_points(
@@ -92,7 +92,7 @@ def matches_of_points(
     gray1: np.ndarray,
     points: tuple[Keypoints, Keypoints],
     options: InitialGeometryOptions = InitialGeometryOptions(),
-) -> InitialMatches | None:
+) -> TentativeMatches | None:
     """Match points of all scales, described at their own sizes and angles, as sparse keypoints.
 
     Of two photographs in unlike light, or of which one is blurred, they give two to five times as
@@ -112,10 +112,10 @@ def matches_of_points(
     for gray, each in zip((gray0, gray1), points, strict=True):
         if each.sizes is None or each.angles is None:
             return None
-        best = described_at_own_size(gray, each[: options.sift.max_keypoints])
+        best = describe_keypoints(gray, each[: options.sift.max_keypoints])
         scale = min(1.0, options.max_side_px / max(gray.shape))
         described.append(replace(best, xy=scaled_points(best.xy, scale)))
-    return initial_matches(gray0, gray1, (described[0], described[1]), options)
+    return tentative_matches(gray0, gray1, (described[0], described[1]), options)
 
 
 def match_features(
@@ -131,7 +131,7 @@ def match_features(
         ratio=max(options.max_ratios),
         mutual=True,
     )
-    points0, points1 = first.xy[found.rows0], second.xy[found.rows1]
+    points0, points1 = first.xy[found.indices0], second.xy[found.indices1]
     return separate(points0, points1, found.ratios, min_separation_px=options.min_separation_px)
 
 

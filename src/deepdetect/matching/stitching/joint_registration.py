@@ -14,14 +14,14 @@ from itertools import combinations
 import numpy as np
 
 from ..._shared.errors import RegistrationError
-from ...detector.detector import HeatmapDetector, find_keypoints
+from ...detector.detector import AnyDetector, find_keypoints
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
-from ...features.sift import described_at_own_size
+from ...features.sift import describe_keypoints
 from ...features.sift_detector import detect_sift
 from ...geometry.residuals import transform_points
 from ...io.image import luma
-from ..guided import InitialMatches, guided_matches, initial_matches
+from ..guided import TentativeMatches, guided_matches, tentative_matches
 from ..guided.initial_geometry import estimate_initial_geometry
 from .joint_fit import Correspondences, fit_jointly
 from .options import DEFAULTS, StitchingOptions
@@ -75,10 +75,9 @@ class _Image:
 
 def register_jointly(
     images: Sequence[np.ndarray],
-    detector: HeatmapDetector,
+    detector: AnyDetector,
     *,
     reference: int | None = None,
-    max_keypoints: int | None = None,
     options: StitchingOptions = DEFAULTS,
     seed: int = 0,
 ) -> JointRegistration:
@@ -86,17 +85,16 @@ def register_jointly(
 
     Args:
         images: two or more, (H, W, 3) uint8 RGB each, their longer sides at most 1200 pixels.
-        detector: gives the heat maps.
+        detector: of points, which find the overlaps and confirm the homographies; or of heat maps:
+            SIFT's keypoints find the overlaps, dense ones confirm.
         reference: number of an image that must be among them; None for the most images.
-        max_keypoints: points of each image that find the overlaps and confirm the homographies;
-            None: SIFT's keypoints find them, dense ones confirm them.
         options: of panoramas.
         seed: of all random choices.
 
     Raises:
         RegistrationError: no two images overlap, or the reference with none.
     """
-    views = [_prepare(image, detector, max_keypoints, options) for image in images]
+    views = [_prepare(image, detector, options) for image in images]
     pairs = _registered_pairs(views, options.min_partners, seed)
     groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
@@ -132,18 +130,15 @@ def register_jointly(
 
 def _prepare(
     image: np.ndarray,
-    detector: HeatmapDetector,
-    max_keypoints: int | None,
+    detector: AnyDetector,
     options: StitchingOptions,
 ) -> _Image:
     gray = luma(image)
-    if max_keypoints is not None:
-        found = find_keypoints(detector, image, SelectionOptions(max_keypoints=max_keypoints))
-        if found.sizes is not None and found.angles is not None:
-            return _Image(gray, described_at_own_size(gray, found), np.rint(found.xy))
+    if not hasattr(detector, "heatmap"):
+        points = describe_keypoints(gray, find_keypoints(detector, image))
+        return _Image(gray, points, np.rint(points.xy))
     # Without suppression: neighbouring pixels are what the verification compares.
-    most = options.max_keypoints if max_keypoints is None else max_keypoints
-    selection = SelectionOptions(mode="dense", max_keypoints=most, nms_radius=0, subpixel=False)
+    selection = SelectionOptions(max_keypoints=options.max_keypoints)
     keypoints = find_keypoints(detector, image, selection)
     return _Image(gray, detect_sift(gray, options.sift), keypoints.xy)
 
@@ -152,10 +147,10 @@ def _registered_pairs(
     views: Sequence[_Image], min_partners: int, seed: int
 ) -> list[RegisteredPair]:
     """Register the pairs that overlap most, until all are connected and have enough partners."""
-    overlaps: list[tuple[int, int, int, InitialMatches]] = []
+    overlaps: list[tuple[int, int, int, TentativeMatches]] = []
     for first, second in combinations(range(len(views)), 2):
         a, b = views[first], views[second]
-        initial = initial_matches(a.gray, b.gray, (a.features, b.features))
+        initial = tentative_matches(a.gray, b.gray, (a.features, b.features))
         found = estimate_initial_geometry(initial, "homography", seed, simulate_views=False)
         if found.model != "none":
             overlaps.append((len(found.points0), first, second, initial))
@@ -171,7 +166,7 @@ def _registered_pairs(
             a.gray, b.gray, a.keypoints, b.keypoints, "homography", seed, initial
         )
         if guide.matrix is not None and matches is not None and len(matches):
-            points = a.keypoints[matches.rows0]
+            points = a.keypoints[matches.indices0]
             pairs.append(RegisteredPair(first, second, guide.matrix, points))
             partners[first] += 1
             partners[second] += 1

@@ -13,8 +13,7 @@ from ..._shared.errors import OptionError
 from ..._shared.image_array import Channels
 from ..._shared.options import suggest_keywords
 from ..._shared.timing import StageTimer
-from ...detector.detector import DeepDetect, HeatmapDetector
-from ...features.selection import check_max_keypoints
+from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.rescaling import downscale, scaled_homography
 from ...io.image import load_image
 from ..guided import GuidedOptions
@@ -68,12 +67,11 @@ def stitch(
     images: Sequence[Any],
     *,
     channels: Channels = "rgb",
-    detector: HeatmapDetector | None = None,
+    detector: AnyDetector | None = None,
     reference: int | None = None,
     scale: float = 1.0,
     max_canvas_megapixels: float = 50.0,
     registration_side: int = 640,
-    max_keypoints: int | None = None,
     options: StitchingOptions = DEFAULTS,
     seed: int = 0,
     progress: Callable[[str], object] | None = None,
@@ -88,16 +86,15 @@ def stitch(
         images: two or more, in any order; each anything `load_image` takes. Paths are read when
             they are needed, so that only one photograph at its full size is in the memory.
         channels: order of the colours in images that are arrays, as of `load_image`.
-        detector: a `DeepDetect`, or anything with its `heatmap` method; default `DeepDetect()`.
+        detector: a `DeepDetect`, or anything with its `heatmap` method: SIFT's keypoints find the
+            overlaps, dense ones confirm them; or a `PointDetector`, whose points do both. Default
+            `DeepDetect()`.
         reference: number of the photograph in whose frame the panorama is; None for the one in
             the middle.
         scale: pixels of the panorama per pixel of the reference.
         max_canvas_megapixels: a larger panorama is refused before it is drawn. It takes 22
             to 47 bytes of memory per pixel.
         registration_side: longer side in pixels to which photographs are reduced for registration.
-        max_keypoints: of each photograph at that size, by which the overlaps are found and
-            confirmed: the best points of all scales, which need no network. None: SIFT's find
-            them, dense keypoints confirm them.
         options: what counts as an overlap, the joint fit, exposure, seams and blending.
         seed: of all random choices.
         progress: called with the name of each stage (`STAGES`) when it ends.
@@ -122,7 +119,6 @@ def stitch(
         >>> panorama.image.shape
         (160, 240, 3)
     """
-    check_max_keypoints(max_keypoints)
     _check(images, reference, scale, max_canvas_megapixels, registration_side)
     done = progress or (lambda stage: None)
     timer = StageTimer()
@@ -140,7 +136,6 @@ def stitch(
             [rgb for rgb, _ in small.values()],
             DeepDetect() if detector is None else detector,
             reference=reference,
-            max_keypoints=max_keypoints,
             options=options,
             seed=seed,
         )

@@ -12,14 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...detector.points.detection import PointOptions
+from ...detector.points.detection import least_distances
 from ...features.suppression import suppress_neighbors
 from .pairs import CandidatePair, Correspondences, Side
 from .recipe import PointsTrainingOptions
 
 CLOSE_PX, NEAR_PX = 1.0, 3.0
-RUN_TIME = PointOptions()
-"""Keypoints keep their distance as at run time."""
 
 MIN_CHOICE = 0.1
 """Candidates that are chosen with less than this have and are no partners."""
@@ -85,7 +83,7 @@ def _choose(
     options: PointsTrainingOptions,
 ) -> Chosen:
     logits = ranker(torch.from_numpy(side.features))
-    radii = RUN_TIME.least_distances(side.sigma_px)
+    radii = least_distances(side.sigma_px)  # as at run time
     kept = torch.from_numpy(suppress_neighbors(side.xy, logits.detach().numpy(), radii))
     fixed = logits[kept].detach()
     spread = fixed.std() if len(fixed) > 1 else fixed.new_ones(())

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ...detector.detector import DeepDetect
-from ...detector.points.detection import PointOptions, detect_points
+from ...detector.points.detection import detect_points
 from ...detector.points.ranker import Ranker
 from ...evaluation.baselines.hessian import detect_hessian, detect_hessian_scales
 from ...evaluation.baselines.opencv import STANDARD
@@ -139,7 +139,7 @@ def _correct(pair: ViewPair, points: Sequence[Keypoints], sizes: Sizes) -> int:
     matches = match_descriptors(
         described[0], described[1], get_matcher("exact"), ratio=RATIO, mutual=True
     )
-    first, second = points[0].xy[matches.rows0], points[1].xy[matches.rows1]
+    first, second = points[0].xy[matches.indices0], points[1].xy[matches.indices1]
     found = match_accuracy(first, second, points[0].xy, points[1].xy, pair.homography, sizes)
     return int(found.correct[0])
 
@@ -154,7 +154,7 @@ def _valid(points: Keypoints, valid: np.ndarray) -> Keypoints:
 
 def points_detector(ranker: Ranker) -> Detect:
     """Return a detector that ranks by a ranker."""
-    return partial(detect_points, options=PointOptions(), ranker=ranker)
+    return partial(detect_points, ranker=ranker)
 
 
 def rivals() -> dict[str, Detect]:

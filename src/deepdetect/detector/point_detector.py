@@ -1,0 +1,192 @@
+"""The detector of ranked points: an image in, its best keypoints of all scales out."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from .._shared.errors import OptionError, unknown_name
+from .._shared.image_array import Channels
+from .._shared.opencv import cv2
+from .._shared.options import suggest_keywords
+from ..features.keypoints import Keypoints
+from ..features.selection import check_ignore, check_max_keypoints
+from ..features.sift import describe_keypoints
+from ..io.image import load_image, luma
+from .heatmap import MAX_AUTO_PIXELS
+from .image_lists import Images, ignore_masks, image_list, image_named, load_each, memory_named
+from .points.detection import SPREADS, Spread, detect_points
+from .points.ranker import load_ranker
+from .pretrained import RANKER
+
+
+class PointDetector:
+    """The best keypoints of all scales, ranked by how surely they are found again.
+
+    They are maxima of |det Hessian|, which a small trained network ranks; the network of
+    `DeepDetect` is not run. Where a few thousand keypoints are wanted they are better than the best
+    pixels of its heat map.
+
+    Args:
+        max_keypoints: at most this many; None: all.
+        spread: "none": the best; "grid": in turn the best of each cell of a grid; "anms": the best
+            that are as far from each other as their number allows.
+        resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
+            that) or "native" (always as it is).
+        ranker: npz file of `deepdetect train-points` that ranks the points. None: the one inside
+            the package.
+
+    Raises:
+        WeightsError: the ranker is missing, damaged or does not fit.
+        OptionError: an option is unknown or out of its range.
+
+    Example:
+        >>> image = np.zeros((64, 64), np.uint8)
+        >>> image[20:40, 24:44] = 255
+        >>> points = PointDetector(max_keypoints=4)
+        >>> len(points.detect(image)), points.extract(image).descriptors.shape
+        (4, (4, 128))
+    """
+
+    @suggest_keywords
+    def __init__(
+        self,
+        max_keypoints: int | None = 2048,
+        *,
+        spread: Spread = "none",
+        resolution: Literal["auto", "native"] = "auto",
+        ranker: str | Path | None = None,
+    ) -> None:
+        check_max_keypoints(max_keypoints)
+        if spread not in SPREADS:
+            raise unknown_name("spread", spread, SPREADS)
+        if spread != "none" and max_keypoints is None:
+            raise OptionError(f"`spread={spread!r}` needs `max_keypoints`: how many to spread")
+        if resolution not in ("auto", "native"):
+            raise unknown_name("resolution of points", resolution, ("auto", "native"))
+        self.max_keypoints, self.spread, self.resolution = max_keypoints, spread, resolution
+        self.ranker = RANKER if ranker is None else Path(ranker).absolute()
+        load_ranker(self.ranker)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What its keypoints depend on besides the image: options, the digest of the ranker."""
+        return {
+            "detector": "points",
+            "ranker": hashlib.sha256(self.ranker.read_bytes()).hexdigest(),
+            "max_keypoints": self.max_keypoints,
+            "spread": self.spread,
+            "resolution": self.resolution,
+        }
+
+    @suggest_keywords
+    def detect(
+        self, image: Any, *, ignore: np.ndarray | None = None, channels: Channels = "rgb"
+    ) -> Keypoints:
+        """Detect the best keypoints of an image.
+
+        Args:
+            image: anything `load_image` takes.
+            ignore: (H, W) array, true where no keypoint is wanted.
+            channels: order of the colours in arrays and tensors, as of `load_image`.
+
+        Returns:
+            The keypoints, best first, with sub-pixel positions, sizes and angles. Their scores rank
+            them, and are no probabilities.
+
+        Raises:
+            ImageError: the image cannot be read or is not fit.
+            OptionError: the mask has another size than the image.
+        """
+        return self._find(load_image(image, channels=channels), ignore)
+
+    @suggest_keywords
+    def detect_batch(
+        self,
+        images: Images,
+        *,
+        ignore: np.ndarray | Images | None = None,
+        channels: Channels = "rgb",
+    ) -> list[Keypoints]:
+        """Detect the best keypoints of several images.
+
+        Args:
+            images: in a list, a tuple or an array of four dimensions; their sizes may differ.
+            ignore: a mask for each image, or None, in a list or a tuple; or one array for all.
+            channels: as of `detect`.
+
+        Returns:
+            The keypoints of each, in their order.
+
+        Raises:
+            ImageError: an image cannot be read or is not fit.
+            OptionError: a mask has another size than its image.
+        """
+        masks, found = ignore_masks(ignore, len(images)), []
+        for number, rgb in load_each(image_list(images), channels):
+            with image_named(number):
+                found.append(self._find(rgb, masks[number]))
+        return found
+
+    @suggest_keywords
+    def extract(
+        self, image: Any, *, ignore: np.ndarray | None = None, channels: Channels = "rgb"
+    ) -> Keypoints:
+        """Detect the best keypoints of an image, and describe them by RootSIFT.
+
+        Args:
+            image, ignore, channels: as of `detect`.
+
+        Returns:
+            As `detect`, with (N, 128) uint8 descriptors at the keypoints' own sizes and angles.
+
+        Raises:
+            ImageError: the image cannot be read or is not fit.
+            OptionError: the mask has another size than the image.
+        """
+        rgb = load_image(image, channels=channels)
+        return describe_keypoints(luma(rgb), self._find(rgb, ignore))
+
+    def __repr__(self) -> str:
+        return (
+            f"PointDetector(max_keypoints={self.max_keypoints}, spread={self.spread!r}, "
+            f"resolution={self.resolution!r}, ranker={self.ranker.name})"
+        )
+
+    def _find(self, rgb: np.ndarray, ignore: np.ndarray | None) -> Keypoints:
+        """Detect in an image that `load_image` returned."""
+        gray = luma(rgb)
+        height, width = gray.shape
+        if ignore is not None:
+            ignore = check_ignore(ignore, gray.shape)
+        scale = (MAX_AUTO_PIXELS / gray.size) ** 0.5
+        if self.resolution == "native" or scale >= 1:
+            return self._detect(gray, ignore)
+        size = [max(1, round(side * scale)) for side in (width, height)]
+        small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+        if ignore is not None:
+            # Wherever a pixel of the small image, or one beside it, holds something to be ignored.
+            share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
+        found = self._detect(small, ignore)
+        factor = np.divide((width, height), size)
+        return replace(
+            found,
+            xy=(found.xy + 0.5) * factor - 0.5,
+            image_size=(width, height),
+            sizes=None if found.sizes is None else found.sizes * factor.mean(),
+        )
+
+    def _detect(self, gray: np.ndarray, ignore: np.ndarray | None) -> Keypoints:
+        with memory_named(gray.shape):
+            return detect_points(
+                gray,
+                self.max_keypoints,
+                spread=self.spread,
+                ignore=ignore,
+                ranker=load_ranker(self.ranker),
+            )
