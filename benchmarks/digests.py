@@ -18,7 +18,16 @@ from typing import Any
 
 import numpy as np
 
-from deepdetect import DeepDetect, load_image, match_images, reconstruct
+from deepdetect import (
+    PUBLISHED_MATCHING,
+    DeepDetect,
+    MatchingOptions,
+    PointDetector,
+    SelectionOptions,
+    load_image,
+    match_images,
+    reconstruct,
+)
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 OXFORD = ("graf 1 3", "wall 1 4", "bikes 1 4", "boat 1 6", "ubc 1 6", "leuven 1 4")
@@ -51,20 +60,30 @@ def results() -> Any:
         images = [load_image(SHARED / "oxford" / scene / f"img{k}.png") for k in (first, second)]
         yield f"{pair} heat map", [detector.heatmap(image) for image in images]
         yield f"{pair} keypoints", keypoint_arrays(detector.detect(images[0]))
-        yield f"{pair} best", keypoint_arrays(detector.detect(images[0], max_keypoints=2048))
-        yield f"{pair} guided", match_arrays(match_images(*images, detector, **GUIDED))
+        yield f"{pair} best", keypoint_arrays(PointDetector(2048).detect(images[0]))
+        yield f"{pair} guided", match_arrays(match_images(*images, detector))
     images = [load_image(SHARED / "oxford" / "leuven" / f"img{k}.png") for k in (1, 2)]
-    yield "leuven published", match_arrays(match_images(*images, detector, preset="published"))
-    few = {"density": 0.05, "matcher": "exact", "mutual": True}
-    yield "leuven unguided", match_arrays(match_images(*images, detector, **few, **UNGUIDED))
-    few = {"density": 0.2, "matcher": "patchmatch"}
-    yield "leuven patchmatch", match_arrays(match_images(*images, detector, **few, **UNGUIDED))
+    published = DeepDetect(backend="onnxruntime", resolution=480, network_channels="bgr")
+    unguided: dict[str, Any] = {"guided_matching": False}
+    found = match_images(*images, published, model="none", options=PUBLISHED_MATCHING, **unguided)
+    yield "leuven published", match_arrays(found)
+    unguided["selection"] = SelectionOptions(density=0.05)
+    options = MatchingOptions(matcher="exact")
+    found = match_images(*images, detector, mutual=True, options=options, **unguided)
+    yield "leuven unguided", match_arrays(found)
+    unguided["selection"] = SelectionOptions(density=0.2)
+    options = MatchingOptions(matcher="patchmatch")
+    found = match_images(*images, detector, options=options, **unguided)
+    yield "leuven patchmatch", match_arrays(found)
     for scene in MIDDLEBURY:
         folder = SHARED / "middlebury" / scene
         pair = folder / "left.png", folder / "right.png"
         made = reconstruct(*pair, calibration=folder / "calib.json")
         yield f"{scene} cloud", cloud_arrays(made)
-        made = reconstruct(*pair, calibration=folder / "calib.json", density=1, rectified=True)
+        every = SelectionOptions(density=1)
+        made = reconstruct(
+            *pair, calibration=folder / "calib.json", rectified=True, selection=every
+        )
         yield f"{scene} every pixel", cloud_arrays(made)
     fountain = SHARED / "fountain"
     made = reconstruct(fountain / "0004.jpg", fountain / "0005.jpg", focal_px=2759.48 / 2)
@@ -72,13 +91,9 @@ def results() -> Any:
     from skimage.data import stereo_motorcycle
 
     left, right, _ = stereo_motorcycle()
-    yield "motorcycle guided", match_arrays(match_images(left, right, detector, **GUIDED))
+    yield "motorcycle guided", match_arrays(match_images(left, right, detector))
     made = reconstruct(left, right, focal_px=994.978)
     yield "motorcycle cloud", cloud_arrays(made)
-
-
-GUIDED: dict[str, Any] = {}
-UNGUIDED: dict[str, Any] = {"guided": False}
 
 
 def keypoint_arrays(keypoints: Any) -> list[np.ndarray]:

@@ -13,20 +13,26 @@ from typing import Any
 
 import numpy as np
 
-from deepdetect import DeepDetect, match_images
+from deepdetect import DeepDetect, MatchingOptions, match_images
 from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.metrics.stereo import stereo_score
 
+
+def _unguided(mutual: bool = False, **options: Any) -> dict[str, Any]:
+    return {
+        "guided_matching": False,
+        "mutual": mutual,
+        "options": MatchingOptions(**options),
+    }
+
+
 WAYS: dict[str, dict[str, Any]] = {
-    "guided": {"guided": True},
-    "guided=False": {},
-    "... mutual=True": {"mutual": True},
-    "... ratio=0.9": {"ratio": 0.9},
-    "... ratio=0.9, mutual=True": {"ratio": 0.9, "mutual": True},
-    '... ratio=0.9, mutual=True, matcher="patchmatch"': {
-        **{"ratio": 0.9, "mutual": True},
-        "matcher": "patchmatch",
-    },
+    "guided": {},
+    "unguided": _unguided(),
+    "... mutual": _unguided(mutual=True),
+    "... ratio=0.9": _unguided(ratio=0.9),
+    "... ratio=0.9, mutual": _unguided(mutual=True, ratio=0.9),
+    "... ratio=0.9, mutual, patchmatch": _unguided(mutual=True, ratio=0.9, matcher="patchmatch"),
 }
 
 
@@ -38,7 +44,7 @@ def main() -> None:
     pair = load_motorcycle()
     print("| options | matches, within 1 px | inliers, within 1 px |\n|---|---|---|")
     for name, options in WAYS.items():
-        found = match_images(pair.left, pair.right, detector, **{"guided": False, **options})
+        found = match_images(pair.left, pair.right, detector, **options)
         cells = []
         for kept in (np.ones(len(found), bool), found.inliers):
             score = stereo_score(found.points0[kept], found.points1[kept], pair.disparity)

@@ -180,7 +180,8 @@ def keypoint_table(path: Path, folder: Path, samples: list[Path], rounds: int) -
         file = folder / f"keypoints-{count}.onnx"
         write_onnx(path, file, OnnxOptions(max_keypoints=count))
         expected = [
-            detector.detect(image, max_keypoints=count, mode="dense").xy for image in images
+            detector.detect(image, max_keypoints=count, nms_radius=1, subpixel=True).xy
+            for image in images
         ]
         for name, make in makers.items():
             run = make(file, ALL_OUTPUTS)

@@ -19,21 +19,18 @@ from typing import Any
 
 import numpy as np
 
-from deepdetect import DeepDetect, match_images
+from deepdetect import DeepDetect, MatchingOptions, PointDetector, SelectionOptions, match_images
 from deepdetect._shared.parallel import use_one_thread
 from deepdetect.datasets.oxford import find_scene, load_oxford
 from deepdetect.datasets.types import PlanarPair
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
-from deepdetect.matching.guided import GuidedOptions
-from deepdetect.matching.guided.options import InitialGeometryOptions
 
 OXFORD = Path(__file__).parents[2] / "shared" / "data" / "oxford"
 PAIRS = {"graf": 3, "wall": 3, "bikes": 3, "leuven": 3, "trees": 3, "ubc": 3, "boat": 6, "bark": 5}
-NEVER = GuidedOptions(initial_geometry=InitialGeometryOptions(min_points=10**9))
 UNGUIDED = {
-    **{"guided": False, "ratio": 0.85, "mutual": True},
-    **{"descriptor": "rootsift", "matcher": "exact"},
+    **{"guided_matching": False, "mutual": True},
+    "options": MatchingOptions(ratio=0.85, descriptor="rootsift", matcher="exact"),
 }
 
 
@@ -43,15 +40,14 @@ def main() -> None:
     parser.add_argument("--keypoints", type=int, default=2048)
     parser.add_argument("--data", type=Path, default=OXFORD)
     arguments = parser.parse_args()
-    budget = {"max_keypoints": arguments.keypoints}
+    detector, points = DeepDetect(), PointDetector(arguments.keypoints)
+    pixels = SelectionOptions(max_keypoints=arguments.keypoints, nms_radius=1, subpixel=True)
     ways: Mapping[str, Mapping[str, Any]] = {
-        "dense": {},
-        "best pixels": {**budget, "mode": "dense"},
-        "points after SIFT": {**budget, "guided_options": NEVER},
-        "points": budget,
-        "points unguided": {**budget, **UNGUIDED},
+        "dense": {"detector": detector},
+        "best pixels": {"detector": detector, "selection": pixels},
+        "points": {"detector": points},
+        "points unguided": {"detector": points, **UNGUIDED},
     }
-    detector = DeepDetect()
     scenes = load_oxford(arguments.data, "refined")
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     print("pair     " + "".join(f"{name:>28}" for name in ways))
@@ -59,9 +55,7 @@ def main() -> None:
         pair = list(find_scene(scenes, scene).pairs())[number - 2]
         cells = []
         for name, options in ways.items():
-            took, count, right = measure(
-                pair, lambda a, b, o=options: match_images(a, b, detector, **o)
-            )
+            took, count, right = measure(pair, lambda a, b, o=options: match_images(a, b, **o))
             seconds[name].append(took)
             cells.append(f"{took:6.2f} s {right:7,} of {count:7,}")
         print(f"{pair.name:9}" + "".join(f"{cell:>28}" for cell in cells), flush=True)
@@ -77,13 +71,13 @@ def main() -> None:
 def points_beside_heatmap(image: np.ndarray, count: int, rounds: int = 9) -> float:
     """Return the CPU seconds of points in those of the heat map, the median of rounds in turn."""
     use_one_thread()
-    detector = DeepDetect(threads=1)
+    detector, points = DeepDetect(threads=1), PointDetector(count)
     ratios = []
     for _ in range(rounds + 1):  # the first one compiles
         begin = time.process_time()
         detector.heatmap(image)
         middle = time.process_time()
-        detector.detect(image, max_keypoints=count)
+        points.detect(image)
         ratios.append((time.process_time() - middle) / (middle - begin))
     return float(np.median(ratios[1:]))
 

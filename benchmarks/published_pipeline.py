@@ -24,6 +24,7 @@ import numpy as np
 from deepdetect import (
     DeepDetect,
     HeatmapOptions,
+    MatchingOptions,
     MissingExtraError,
     WeightsError,
     load_image,
@@ -161,11 +162,9 @@ def _sides(
         found = match_images(
             *images,
             detector,
-            guided=False,
-            matcher="patchmatch",
-            descriptor="rootsift",
-            ratio=RATIO,
+            guided_matching=False,
             model="none",
+            options=MatchingOptions(matcher="patchmatch", descriptor="rootsift", ratio=RATIO),
         )
         return int(np.count_nonzero(every(found.points0, found.points1)))
 

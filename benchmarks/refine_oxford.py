@@ -162,9 +162,9 @@ def sift_homography(gray0: np.ndarray, gray1: np.ndarray) -> np.ndarray | None:
         return None
     points = [cv2.KeyPoint_convert(keypoints) for keypoints, _ in found]
     matches = match_descriptors(found[0][1], found[1][1], get_matcher("exact"), ratio=START_RATIO)
-    options = GeometryOptions(model="homography", inlier_threshold=3.0)
+    options = GeometryOptions(inlier_threshold=3.0)
     return estimate_geometry(
-        points[0][matches.indices0], points[1][matches.indices1], options
+        points[0][matches.indices0], points[1][matches.indices1], "homography", options=options
     ).matrix
 
 

@@ -12,6 +12,8 @@ import deepdetect
 from deepdetect import OptionError
 from deepdetect.evaluation.baselines.random import RandomDetector
 
+EVERY = deepdetect.SelectionOptions(density=1)
+
 
 def views(photo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two colourful views, whose luma depends on the order of the colours."""
@@ -25,7 +27,7 @@ def as_opencv(images: tuple[np.ndarray, ...]) -> list[np.ndarray]:
 def calls() -> dict[str, Any]:
     def calibrated(left: Any, right: Any, **options: Any) -> np.ndarray:
         found = deepdetect.reconstruct(
-            left, right, RandomDetector(), focal_px=300, rectified=True, density=1, **options
+            left, right, RandomDetector(), focal_px=300, rectified=True, selection=EVERY, **options
         )
         return np.column_stack([found.points, found.colors])
 
@@ -36,7 +38,7 @@ def calls() -> dict[str, Any]:
         "reconstruct": calibrated,
         "disparity_map": lambda a, b, **o: deepdetect.disparity_map(a, b, **o).disparity,
         "fuse": lambda a, b, **o: deepdetect.fuse(a, **o).mask,
-        "points": lambda a, b, **o: deepdetect.DeepDetect().detect(a, max_keypoints=50, **o).xy,
+        "points": lambda a, b, **o: deepdetect.PointDetector(50).detect(a, **o).xy,
     }
 
 

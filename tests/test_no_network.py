@@ -37,14 +37,15 @@ sys.addaudithook(refuse)
 FUNCTIONS = """
 import contextlib
 from deepdetect import (
-    DeepDetect, DeepDetectError, LabelOptions, fuse, load_image, match_images, reconstruct, register
+    DeepDetect, DeepDetectError, LabelOptions, PointDetector, fuse, load_image, match_images,
+    reconstruct, register
 )
 from deepdetect.io.image import luma
 
 if __name__ == "__main__":
     left, right = load_image("left.png"), load_image("right.png")
     detector = DeepDetect()
-    assert len(detector.detect(left)) and len(detector.detect(left, max_keypoints=50))
+    assert len(detector.detect(left)) and len(PointDetector(50).detect(left))
     assert len(match_images(left, right, detector))
     with contextlib.suppress(DeepDetectError):  # little can be seen in so small images
         register(left, right, detector)

@@ -22,6 +22,7 @@ from deepdetect import (
     DeepDetect,
     Keypoints,
     NoDepthError,
+    PointDetector,
     Reconstruction,
     match_images,
     reconstruct,
@@ -75,7 +76,7 @@ def row(
     title: str, left: np.ndarray, right: np.ndarray, truth: np.ndarray, detector: DeepDetect
 ) -> np.ndarray:
     """Detect, match and reconstruct; return four captioned panels."""
-    points = detector.detect(left, max_keypoints=POINTS, spread="grid")
+    points = PointDetector(POINTS, spread="grid").detect(left)
     heatmap = detector.heatmap(left)
     matches = match_images(left, right, detector)
     errors = disparity_errors(matches.points0, matches.points1, truth)

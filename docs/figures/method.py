@@ -14,7 +14,7 @@ import numpy as np
 from day_dark_blurred import POINTS, draw_points
 from layout import caption, write_jpeg
 
-from deepdetect import DeepDetect, LabelOptions, Matches, fuse, match_images
+from deepdetect import DeepDetect, LabelOptions, Matches, PointDetector, fuse, match_images
 from deepdetect.datasets import StereoPair, load_stereo_pair
 from deepdetect.features.display import draw_matches
 from deepdetect.geometry import disparity_errors
@@ -59,7 +59,7 @@ def draw_kinds(rgb: np.ndarray) -> np.ndarray:
     """Draw dense keypoints beside points."""
     detector = DeepDetect()
     dense = detector.detect(rgb)
-    points = detector.detect(rgb, max_keypoints=POINTS, spread="grid")
+    points = PointDetector(POINTS, spread="grid").detect(rgb)
     cells = [
         caption(dense.draw(rgb), f"dense: {len(dense):,} keypoints", KIND_CELL),
         caption(draw_points(rgb, points), f"{len(points)} points, the best in yellow", KIND_CELL),
@@ -73,7 +73,7 @@ def draw_guidance(pair: StereoPair) -> np.ndarray:
     kinds = {"by descriptors alone": False, "guided by a geometry": True}
     cells = []
     for title, guided in kinds.items():
-        matches = match_images(pair.left, pair.right, detector, guided=guided)
+        matches = match_images(pair.left, pair.right, detector, guided_matching=guided)
         cells.append(_matches(pair, matches, title))
     return np.concatenate(cells, axis=1)
 

@@ -12,7 +12,7 @@ from hypothesis import strategies
 from hypothesis.extra import numpy as arrays
 from hypothesis.strategies import SearchStrategy
 
-from deepdetect import DeepDetect, Keypoints, load_image, match_images
+from deepdetect import DeepDetect, Keypoints, PointDetector, load_image, match_images
 
 from ..case import Target, expect, prepared
 
@@ -106,13 +106,14 @@ def detected(generator: np.random.Generator, folder: Path) -> None:
     """Detect keypoints in an array, dense or points."""
     array = draw(any_array(), generator)
     budget = [None, 1, 50][int(generator.integers(3))]
-    found = detector().detect(array, max_keypoints=budget)
+    chosen = detector() if budget is None else PointDetector(budget)
     if array.ndim == 4:  # a batch
+        found = chosen.detect_batch(array)
         expect(len(found) == len(array), f"{len(found)} results for {array.shape}")
         for image, keypoints in zip(array, found, strict=True):
             check_keypoints(image, keypoints, budget)
     else:
-        check_keypoints(array, found, budget)
+        check_keypoints(array, chosen.detect(array), budget)
 
 
 def check_keypoints(image: np.ndarray, found: Keypoints, budget: int | None) -> None:
@@ -134,8 +135,8 @@ def matched(generator: np.random.Generator, folder: Path) -> None:
     if generator.random() < 0.5:  # a pair that has matches
         first = np.kron(generator.integers(0, 256, (20, 24)), np.ones((4, 4))).astype(np.uint8)
         second = np.roll(first, 3, axis=1)
-    budget = [None, 100][int(generator.integers(2))]
-    found = match_images(first, second, detector(), max_keypoints=budget)
+    chosen = [detector(), PointDetector(100)][int(generator.integers(2))]
+    found = match_images(first, second, chosen)
     expect(len(found.points0) == len(found.points1) == len(found.inliers), "rows do not fit")
     expect(np.isfinite(found.points0).all() and np.isfinite(found.points1).all(), "not finite")
 

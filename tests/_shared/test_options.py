@@ -15,9 +15,6 @@ import pytest
 import deepdetect
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.options import check_ranges, option_names, replace_options, suggest_keywords
-from deepdetect.features.selection import SelectionOptions
-from deepdetect.geometry import GeometryOptions
-from deepdetect.matching.options import PRESETS, MatchingOptions
 
 
 @dataclass(frozen=True)
@@ -72,43 +69,6 @@ def test_an_unknown_name(given: str, meant: str) -> None:
 def test_a_refused_value() -> None:
     with pytest.raises(OptionError, match="plain must be 0 or more, not -1"):
         replace_options(Outer(), plain=-1)
-    with pytest.raises(OptionError, match="threshold"):
-        replace_options(MatchingOptions(), threshold=2)
-
-
-def test_matching_options() -> None:
-    options = replace_options(
-        MatchingOptions(), threshold=0.25, ratio=0.8, estimator="ransac", seed=4
-    )
-    assert options.selection.threshold == 0.25
-    assert options.ratio == 0.8
-    assert (options.geometry.estimator, options.geometry.seed) == ("ransac", 4)
-    assert options.geometry.model == MatchingOptions().geometry.model
-
-
-def test_a_whole_group_and_one_value_of_it() -> None:
-    options = replace_options(
-        MatchingOptions(),
-        geometry=GeometryOptions(model="homography"),
-        seed=4,
-        selection=SelectionOptions(nms_radius=2),
-        max_keypoints=9,
-    )
-    assert (options.geometry.model, options.geometry.seed) == ("homography", 4)
-    assert (options.selection.nms_radius, options.selection.max_keypoints) == (2, 9)
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_no_name_is_used_twice(preset: str) -> None:
-    # Keywords go by name alone, so a name must have one home. Those of guided matching are given
-    # as a whole.
-    options = PRESETS[preset]
-    groups = [options, options.selection, options.geometry]
-    groups += [options.heatmap] if options.heatmap is not None else []
-    every = [name for group in groups for name in type(group).__dataclass_fields__]
-    guided = set(option_names(options.guided_options))
-    assert len(every) == len(set(every))
-    assert set(option_names(options)) - set(every) <= guided
 
 
 def test_a_decorated_function_suggests_the_right_keyword() -> None:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 import deepdetect
 from deepdetect import Keypoints, load_image
 from deepdetect.app.server import STATIC
-from deepdetect.detector.points.detection import PointOptions, detect_points
+from deepdetect.detector.points.detection import detect_points
 from deepdetect.detector.pretrained import RANKER
 from deepdetect.features.sift import scaled_sift_descriptors, to_root_sift
 from deepdetect.io.image import luma
@@ -91,7 +91,7 @@ def test_the_points_of_a_photograph(name: str, run_node: Any) -> None:
     gray = gray_of(name)
     parts = points_in_node(run_node, gray, list(BUDGETS))
     for (count, spread), found in zip(BUDGETS, parts, strict=True):
-        expected = detect_points(gray, PointOptions(max_keypoints=count, spread=spread))
+        expected = detect_points(gray, count, spread=spread)
         assert compare(found, expected) >= SHARED, (count, spread)
         assert (np.diff(found[:, 2]) <= 0).all()
 
@@ -99,7 +99,7 @@ def test_the_points_of_a_photograph(name: str, run_node: Any) -> None:
 def test_all_points_of_a_photograph(run_node: Any) -> None:
     gray = gray_of("motorcycle-left.jpg")
     (found,) = points_in_node(run_node, gray, [(50_000, "none")])
-    assert compare(found, detect_points(gray, PointOptions(max_keypoints=50_000))) >= SHARED
+    assert compare(found, detect_points(gray, 50_000)) >= SHARED
 
 
 @pytest.mark.parametrize("shape", [(16, 16), (17, 200), (300, 24)], ids=str)
@@ -107,7 +107,7 @@ def test_the_points_of_small_pictures(shape: tuple[int, int], run_node: Any) -> 
     """Gaussians reach over both borders, more than once."""
     gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
     (found,) = points_in_node(run_node, gray, [(1000, "none")])
-    expected = detect_points(gray, PointOptions(max_keypoints=1000))
+    expected = detect_points(gray, 1000)
     assert len(found) == len(expected)
     assert compare(found, expected) == 1
 
@@ -120,7 +120,7 @@ def test_few_points_of_small_pictures(shape: tuple[int, int], spread: str, run_n
     counts = (1, 2, 5, 3000)
     parts = points_in_node(run_node, gray, [(count, spread) for count in counts])
     for count, found in zip(counts, parts, strict=True):
-        expected = detect_points(gray, PointOptions(max_keypoints=count, spread=spread))
+        expected = detect_points(gray, count, spread=spread)
         assert len(found) == len(expected)
         assert compare(found, expected) == 1
 
@@ -218,7 +218,7 @@ write(new TextEncoder().encode(said));
 
 def test_angles_and_descriptors_at_their_own_size(run_node: Any) -> None:
     gray = gray_of("motorcycle-left.jpg")
-    points = detect_points(gray, PointOptions(max_keypoints=1500))
+    points = detect_points(gray, 1500)
     assert points.sizes is not None
     assert points.angles is not None
     imports = """
@@ -267,7 +267,7 @@ def test_large_photographs_are_reduced_to_the_size_that_points_take(
 
     monkeypatch.setattr(detection, "detect_points", none)
     rgb = np.zeros((size[1], size[0], 3), np.uint8)
-    deepdetect.DeepDetect().detect(rgb, max_keypoints=5)
+    deepdetect.PointDetector(5).detect(rgb)
     found = run_node(
         'import { pointsSize } from "@/pixels.js";\n',
         WRITE + "write(pointsSize(width, height));\n",

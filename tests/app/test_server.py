@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect
+from deepdetect import DeepDetect, PointDetector
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.errors import DeepDetectError, OptionError
 from deepdetect.app import jobs, worker
@@ -294,7 +294,7 @@ def test_a_task_is_done_and_forgotten(serve: Any, photo: np.ndarray) -> None:
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
         assert sorted(archive.namelist()) == ["a b.csv", "failures.txt"]
         table = archive.read("a b.csv").decode().splitlines()
-    expected = DeepDetect().detect(photo, max_keypoints=2048)
+    expected = PointDetector().detect(photo)
     assert len(table) == len(expected) + 1
     for name in ("task.json", "../task.json", "../0000.png", "failures.txt", ""):
         assert client.ask("GET", f"/api/jobs/{job}/files/{name}").status == 404

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, OptionError, SelectionOptions, load_image
+from deepdetect import DeepDetect, OptionError, PointDetector, SelectionOptions, load_image
 from deepdetect.batch import extract_features
 from deepdetect.batch.extraction import IMAGES_PER_PART, _extract_part, parts_of
 from deepdetect.features.sift import describe_keypoints, root_sift_descriptors
 from deepdetect.io.image import luma
 
-FEW = SelectionOptions(max_keypoints=50)
+FEW, PIXELS = PointDetector(50), SelectionOptions(max_keypoints=50)
 
 
 @pytest.fixture(autouse=True)
@@ -31,7 +31,7 @@ def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: P
     import h5py
 
     folder = collection(3)
-    report = extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=1)
+    report = extract_features(folder, tmp_path / "f.h5", FEW, workers=1)
     assert report.images == ("a/00.png", "a/02.png", "b/01.png")
     assert (report.skipped, report.keypoints, report.failures) == (0, 150, ())
     names = []
@@ -46,7 +46,7 @@ def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: P
         stored = file["b/01.png"]
         found = {name: value[()] for name, value in stored.items()}
         assert stored["keypoints"].attrs["uncertainty"] == 1
-    expected = DeepDetect().detect(folder / "b/01.png", max_keypoints=50)
+    expected = FEW.detect(folder / "b/01.png")
     described = describe_keypoints(luma(load_image(folder / "b/01.png")), expected)
     assert {name: (value.shape, value.dtype.name) for name, value in found.items()} == {
         "keypoints": ((50, 2), "float32"),
@@ -71,8 +71,7 @@ def test_dense_keypoints(collection: Callable[..., Path], tmp_path: Path) -> Non
     import h5py
 
     folder = collection(1)
-    dense = SelectionOptions(mode="dense")
-    extract_features(folder, tmp_path / "f.h5", selection=dense, workers=1)
+    extract_features(folder, tmp_path / "f.h5", DeepDetect(threads=1), workers=1)
     expected = DeepDetect(threads=1).detect(folder / "a/00.png")
     gray = luma(load_image(folder / "a/00.png"))
     descriptors = root_sift_descriptors(gray, expected.xy).astype(np.float32)
@@ -103,16 +102,16 @@ def test_what_is_done_is_skipped_and_what_has_changed_is_not(
 ) -> None:
     path = tmp_path / "f.h5"
     folder = collection(2)
-    extract_features(folder, path, selection=FEW, workers=1)
+    extract_features(folder, path, FEW, workers=1)
     before = path.stat().st_mtime_ns
-    report = extract_features(folder, path, selection=FEW, workers=1)
+    report = extract_features(folder, path, FEW, workers=1)
     assert (report.images, report.skipped) == ((), 2)
     assert path.stat().st_mtime_ns == before
     (folder / "c.png").write_bytes((folder / "a/00.png").read_bytes())
     (folder / "a/00.png").write_bytes((folder / "b/01.png").read_bytes())
-    report = extract_features(folder, path, selection=FEW, workers=1)
+    report = extract_features(folder, path, FEW, workers=1)
     assert (report.images, report.skipped) == (("a/00.png", "c.png"), 1)
-    extract_features(folder, tmp_path / "new.h5", selection=FEW, workers=1)
+    extract_features(folder, tmp_path / "new.h5", FEW, workers=1)
     assert same_content(path, tmp_path / "new.h5")
     with pytest.raises(OptionError, match=r"other settings \(`max_keypoints`\)"):
         extract_features(folder, path, workers=1)
@@ -124,18 +123,18 @@ def test_bad_images_do_not_stop_the_others(
     collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
 ) -> None:
     folder = collection(3)
-    extract_features(folder, tmp_path / "good.h5", selection=FEW, workers=1)
+    extract_features(folder, tmp_path / "good.h5", FEW, workers=1)
     (folder / "bad.png").write_bytes(b"not a photograph")
     (folder / os.fsdecode(b"\xff.png")).write_bytes((folder / "a/00.png").read_bytes())
     for expected in ((3, 0), (0, 3)):
-        report = extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=2)
+        report = extract_features(folder, tmp_path / "f.h5", FEW, workers=2)
         assert (len(report.images), report.skipped) == expected
         first, second = report.failures
         assert "bad.png is not an image" in first + second
         assert "not UTF-8" in first + second
     assert same_content(tmp_path / "f.h5", tmp_path / "good.h5")
     (folder / "bad.png").write_bytes((folder / "a/00.png").read_bytes())
-    assert extract_features(folder, tmp_path / "f.h5", selection=FEW).images == ("bad.png",)
+    assert extract_features(folder, tmp_path / "f.h5", FEW).images == ("bad.png",)
 
 
 def test_several_processes_give_the_same(
@@ -143,7 +142,7 @@ def test_several_processes_give_the_same(
 ) -> None:
     folder = collection(6)
     for workers in (1, 2):
-        extract_features(folder, tmp_path / f"{workers}.h5", selection=FEW, workers=workers)
+        extract_features(folder, tmp_path / f"{workers}.h5", FEW, workers=workers)
     assert same_content(tmp_path / "1.h5", tmp_path / "2.h5")
 
 
@@ -157,13 +156,13 @@ def test_images_that_are_gone_lose_their_features(
             return [f"{top}/{name}" for top in file for name in file[top]]
 
     folder = collection(4)
-    extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=1)
+    extract_features(folder, tmp_path / "f.h5", FEW, workers=1)
     (folder / "a/00.png").write_bytes(b"not a photograph")
-    report = extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=1)
+    report = extract_features(folder, tmp_path / "f.h5", FEW, workers=1)
     assert (report.images, report.skipped, len(report.failures)) == ((), 3, 1)
     assert names() == ["a/02.png", "b/01.png", "b/03.png"]
     (folder / "b/03.png").unlink()
-    extract_features(folder, tmp_path / "f.h5", selection=FEW, workers=1)
+    extract_features(folder, tmp_path / "f.h5", FEW, workers=1)
     assert names() == ["a/02.png", "b/01.png"]
 
 
@@ -171,12 +170,11 @@ def test_what_the_network_is_fed_is_a_setting(
     collection: Callable[..., Path], tmp_path: Path
 ) -> None:
     folder = collection(1)
-    listed = {"device": "cpu", "backend": "onnxruntime"}
     for _ in range(2):
-        extract_features(folder, tmp_path / "f.h5", selection=FEW, detector=listed, workers=1)
-    other = {**listed, "network_channels": "bgr"}
+        extract_features(folder, tmp_path / "f.h5", DeepDetect(), selection=PIXELS, workers=1)
+    other = DeepDetect(network_channels="bgr")
     with pytest.raises(OptionError, match=r"other settings \(`network_channels`\)"):
-        extract_features(folder, tmp_path / "f.h5", selection=FEW, detector=other, workers=1)
+        extract_features(folder, tmp_path / "f.h5", other, selection=PIXELS, workers=1)
 
 
 def test_weights_that_have_changed_are_loaded_again(
@@ -185,18 +183,17 @@ def test_weights_that_have_changed_are_loaded_again(
     import h5py
 
     folder, weights = collection(1), tmp_path / "mine.onnx"
-    dense = SelectionOptions(mode="dense", max_keypoints=50)
     for name in ("default", "dense"):
         original = DeepDetect(name, backend="onnxruntime", threads=1)
         weights.write_bytes(original.weights.read_bytes())
         extract_features(
             folder,
             tmp_path / f"{name}.h5",
-            selection=dense,
-            detector={"weights": weights, "backend": "onnxruntime"},
+            DeepDetect(weights, backend="onnxruntime"),
+            selection=PIXELS,
             workers=1,
         )
-        expected = original.detect(folder / "a/00.png", mode="dense", max_keypoints=50)
+        expected = original.detect(folder / "a/00.png", max_keypoints=50)
         with h5py.File(tmp_path / f"{name}.h5") as file:
             np.testing.assert_array_equal(file["a/00.png/keypoints"], expected.xy)
 
@@ -209,9 +206,7 @@ def test_too_large_images_are_failures(
 
     folder = collection(2)
     Image.new("RGB", (200, 200)).save(folder / "large.png")
-    report = extract_features(
-        folder, tmp_path / "f.h5", selection=FEW, max_megapixels=0.03, workers=workers
-    )
+    report = extract_features(folder, tmp_path / "f.h5", FEW, max_megapixels=0.03, workers=workers)
     assert len(report.images) == 2
     assert "large.png has 200x200 pixels, which is over 0.03 megapixels" in report.failures[0]
     with pytest.raises(OptionError, match="`max_megapixels` must be above 0"):
@@ -251,24 +246,22 @@ def test_a_killed_run_goes_on(
     assert report["skipped"] == kept
     assert len(report["images"]) == 60 - kept
     assert not parts.exists()
-    whole = SelectionOptions(max_keypoints=500)
-    extract_features(folder, tmp_path / "whole.h5", selection=whole, workers=2)
+    extract_features(folder, tmp_path / "whole.h5", PointDetector(500), workers=2)
     assert same_content(tmp_path / "f.h5", tmp_path / "whole.h5")
 
 
 MEMORY = """
 import sys
 from pathlib import Path
-from deepdetect import SelectionOptions
+from deepdetect import PointDetector
 from deepdetect.batch import extract_features
 
 def peak():
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0])
 
-few = SelectionOptions(max_keypoints=500)
 for folder in sys.argv[1:]:
-    extract_features(folder, folder + ".h5", selection=few, workers=1)
+    extract_features(folder, folder + ".h5", PointDetector(500), workers=1)
     print(peak())
 """
 

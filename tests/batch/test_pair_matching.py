@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetectError, OptionError, SelectionOptions
+from deepdetect import DeepDetectError, OptionError, PointDetector
 from deepdetect.batch import PairMatchingOptions, extract_features, match_pairs
 from deepdetect.batch.pair_list import pair_name, read_pairs
 from deepdetect.batch.pair_matching import match_features
@@ -25,8 +25,8 @@ def _h5py() -> None:
 def features(collection: Callable[..., Path], tmp_path: Path) -> Path:
     """Features of five crops, 8 px from one to the next."""
     path = tmp_path / "features.h5"
-    few = SelectionOptions(max_keypoints=300)
-    extract_features(collection(5), path, selection=few, workers=1)
+    few = PointDetector(300)
+    extract_features(collection(5), path, few, workers=1)
     return path
 
 
@@ -82,11 +82,11 @@ def test_features_that_have_changed_are_matched_again(
     match_pairs(features, pairs, path, workers=1)
     folder = tmp_path / "photos"
     (folder / "a/00.png").write_bytes((folder / "a/04.png").read_bytes())
-    extract_features(folder, features, selection=SelectionOptions(max_keypoints=300), workers=1)
+    extract_features(folder, features, PointDetector(300), workers=1)
     report = match_pairs(features, pairs, path, workers=1)
     assert (list(report.matches), report.skipped) == ([PAIR], 1)
-    fewer = SelectionOptions(max_keypoints=100)
-    extract_features(folder, features, selection=fewer, workers=1, overwrite=True)
+    fewer = PointDetector(100)
+    extract_features(folder, features, fewer, workers=1, overwrite=True)
     with pytest.raises(OptionError, match="`features`"):
         match_pairs(features, pairs, path, workers=1)
 

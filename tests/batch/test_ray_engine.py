@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from deepdetect import ImageError, MissingExtraError, OptionError, SelectionOptions, load_image
+from deepdetect import ImageError, MissingExtraError, OptionError, PointDetector, load_image
 from deepdetect.batch import ENGINES, extract_features, get_engine
 from deepdetect.batch.ray_engine import map_on_ray
 
@@ -129,8 +129,8 @@ def check(
     assert report["skipped"] == skipped
     assert len(set(report["images"])) == len(report["images"])
     assert set(report["images"]) <= set(names)
-    whole = SelectionOptions(max_keypoints=500)
-    extract_features(folder, output.with_name("whole.h5"), selection=whole, workers=2)
+    whole = PointDetector(500)
+    extract_features(folder, output.with_name("whole.h5"), whole, workers=2)
     assert same_content(output, output.with_name("whole.h5"))
     assert sorted(path.name for path in output.parent.glob("*.h5*")) == ["f.h5", "whole.h5"]
 

@@ -10,7 +10,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, WeightsError, match_images
+from deepdetect import (
+    PUBLISHED_MATCHING,
+    DeepDetect,
+    WeightsError,
+    match_images,
+)
 from deepdetect.datasets.middlebury import load_calibrated_pair
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.io.image import load_image
@@ -34,7 +39,13 @@ def test_counts_as_the_preset_does(script: ModuleType, photo_path: Path) -> None
         return float(np.hypot(x - shift - u, y - v)) < 1
 
     counted = script.published_pipeline(images, script.published_detector(detector), correct)
-    found = match_images(*images, detector, preset="published")
+    found = match_images(
+        *images,
+        detector,
+        guided_matching=False,
+        model="none",
+        options=PUBLISHED_MATCHING,
+    )
     gaps = np.linalg.norm(found.points0 - (shift, 0) - found.points1, axis=1)
     expected = int((gaps < 1).sum())
     assert expected > 5000

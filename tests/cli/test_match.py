@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, load_matches, match_images
+from deepdetect import (
+    PUBLISHED_MATCHING,
+    DeepDetect,
+    MatchingOptions,
+    SelectionOptions,
+    load_matches,
+    match_images,
+)
 
 
 def test_writes_matches_and_a_picture(run, photos: Path) -> None:
@@ -34,13 +41,11 @@ def test_options_reach_the_matcher(run, photos: Path) -> None:
     expected = match_images(
         photos / "left.png",
         photos / "right.png",
-        ratio=0.8,
-        mutual=True,
+        selection=SelectionOptions(max_keypoints=500),
+        guided_matching=False,
         model="none",
-        matcher="exact",
-        max_keypoints=500,
-        descriptor="rootsift",
-        guided=False,
+        mutual=True,
+        options=MatchingOptions(ratio=0.8, matcher="exact", descriptor="rootsift"),
     )
     assert report["keypoints0"] == 500
     assert report["matches"] == len(expected)
@@ -53,7 +58,14 @@ def test_the_preset_is_changed_by_given_options_only(run, photos: Path) -> None:
         *("match", photos / "left.png", photos / "right.png", "--preset", "published", "--json"),
         "--no-pictures",
     )
-    expected = match_images(photos / "left.png", photos / "right.png", preset="published")
+    expected = match_images(
+        photos / "left.png",
+        photos / "right.png",
+        DeepDetect(resolution=480, network_channels="bgr"),
+        guided_matching=False,
+        model="none",
+        options=PUBLISHED_MATCHING,
+    )
     report = json.loads(result.stdout)
     assert report["matches"] == len(expected)
     assert report["model"] == "none"
@@ -80,7 +92,9 @@ def test_csv(run, photos: Path) -> None:
     lines = Path("out/left_right_matches.csv").read_text().splitlines()
     assert lines[0] == "x0,y0,x1,y1,score,inlier"
     table = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
-    expected = match_images(photos / "left.png", photos / "right.png", DeepDetect(), density=0.02)
+    expected = match_images(
+        photos / "left.png", photos / "right.png", selection=SelectionOptions(density=0.02)
+    )
     np.testing.assert_allclose(table[:, :2], expected.points0)
     assert set(table[:, 5]) <= {0.0, 1.0}
 
@@ -92,7 +106,7 @@ def test_images_without_a_match_have_an_exit_code_of_their_own(run, tmp_path: Pa
     assert result.exit_code == 3
     assert "there are no matches" in result.stderr
     report = json.loads(result.stdout)
-    assert (report["matches"], report["lost"]) == (0, False)
+    assert (report["matches"], report["success"]) == (0, True)
 
 
 def test_a_failed_estimate_is_said(run, photos: Path) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import io
 import os
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -17,16 +18,15 @@ import pytest
 from deepdetect import (
     DeepDetect,
     HeatmapOptions,
+    PointDetector,
     SelectionOptions,
     load_image,
     match_images,
     select_keypoints,
 )
 from deepdetect._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
-from deepdetect.detector.points.detection import PointOptions, detect_points
-from deepdetect.detector.points.ranker import load_ranker
 from deepdetect.detector.pretrained import pretrained_weights
-from deepdetect.io.image import luma
+from deepdetect.features.sift import root_sift_descriptors
 
 # The bundled weights change, so nothing here depends on the values that they give.
 
@@ -179,84 +179,12 @@ def test_a_constant_image_has_no_keypoint(
 # The keypoints.
 
 
-def test_a_number_of_keypoints_asks_for_points(detector: DeepDetect, image: np.ndarray) -> None:
-    found = detector.detect(image, max_keypoints=50)
-    wanted = detect_points(luma(image), PointOptions(max_keypoints=50))
-    np.testing.assert_array_equal(found.xy, wanted.xy)
-    assert found.sizes is not None
-    assert found.angles is not None
-    for options in ({"mode": "points"}, {"spread": "grid"}, {"spread": "anms"}):
-        assert detector.detect(image, max_keypoints=50, **options).sizes is not None
-    for options in ({"threshold": 0.6}, {"nms_radius": 1}, {"density": 0.1}, {"mode": "dense"}):
-        assert detector.detect(image, max_keypoints=50, **options).sizes is None
-    assert detector.detect(image).sizes is None  # dense stays the default
-
-
-def test_a_ranker_of_ones_own_ranks(image: np.ndarray, tmp_path: Path) -> None:
-    ranker = load_ranker()
-    layers = [(np.zeros_like(weight), np.zeros_like(bias)) for weight, bias in ranker.layers]
-    values = {f"weight{k}": weight for k, (weight, _) in enumerate(layers)}
-    values |= {f"bias{k}": bias for k, (_, bias) in enumerate(layers)}
-    path = tmp_path / "own.npz"
-    np.savez(path, mean=ranker.mean, deviation=ranker.deviation, notes="{}", **values)
-    own = DeepDetect(backend="onnxruntime", ranker=path)
-    found, bundled = (one.detect(image, max_keypoints=40) for one in (own, DeepDetect()))
-    assert not np.array_equal(found.xy, bundled.xy)
-    # Nothing is added to the first feature: the logarithm of |det Hessian|.
-    assert found.logits.max() <= 3
-    with pytest.raises(WeightsError, match=r"none\.npz"):
-        DeepDetect(ranker=tmp_path / "none.npz")
-
-
-def test_points_need_no_network(
-    detector: DeepDetect, image: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(detector, "_network", None)
-    assert len(detector.detect(image, max_keypoints=20)) == 20
-
-
-def test_points_of_large_images_are_found_on_two_megapixels(
-    detector: DeepDetect, image: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("deepdetect.detector.image_points.MAX_AUTO_PIXELS", image[..., 0].size // 4)
-    whole = detector.configured(HeatmapOptions("native")).detect(image, max_keypoints=200)
-    half = detector.configured(HeatmapOptions("auto")).detect(image, max_keypoints=100)
-    assert half.image_size == whole.image_size
-    gaps = np.linalg.norm(half.xy[:, None] - whole.xy, axis=2)
-    assert np.mean(gaps.min(1) < 1.5) > 0.5
-    assert half.sizes.min() > 1.8 * whole.sizes.min()
-    ignore = np.zeros(image.shape[:2], bool)
-    ignore[:, : image.shape[1] // 2] = True
-    found = detector.configured(HeatmapOptions("auto")).detect(
-        image, max_keypoints=50, ignore=ignore
-    )
-    assert found.xy[:, 0].min() > image.shape[1] // 2 - 2
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"mode": "sparse"},
-        {"mode": "points", "density": 0.1},
-        {"mode": "points", "nms_radius": 1},
-        {"max_keypoints": 10, "spread": "greedy"},
-        {"spread": "grid"},
-        {"max_keypoints": 10, "nms_radius": 2, "spread": "grid"},
-    ],
-)
-def test_options_that_do_not_fit_together_are_reported(
-    detector: DeepDetect, image: np.ndarray, options: dict[str, Any]
-) -> None:
-    with pytest.raises(OptionError):
-        detector.detect(image, **options)
-
-
 @pytest.mark.parametrize(
     "options",
     [
         {},
         {"threshold": 0.3},
-        {"max_keypoints": 50, "mode": "dense"},
+        {"max_keypoints": 50},
         {"density": 0.1},
         {"density": 0.3, "nms_radius": 2},
         {"threshold": 0.1, "nms_radius": 3, "max_keypoints": 20},
@@ -846,12 +774,6 @@ def test_logits_are_the_network_s_own(image: np.ndarray) -> None:
         np.testing.assert_allclose(onnx_maps[0], probability, atol=1e-6)
 
 
-def test_the_heat_map_that_keypoints_came_from(detector: DeepDetect, image: np.ndarray) -> None:
-    keypoints, heatmap = detector.detect(image, 0.7, max_keypoints=50, return_heatmap=True)
-    np.testing.assert_array_equal(heatmap, detector.heatmap(image))
-    np.testing.assert_array_equal(keypoints.xy, detector.detect(image, 0.7, max_keypoints=50).xy)
-
-
 def test_a_detector_says_what_it_is() -> None:
     detector = DeepDetect("dense", resolution=480, backend="onnxruntime")
     assert repr(detector) == (
@@ -889,6 +811,25 @@ def test_images_are_read_once(photo_path: Path, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(module, "load_image", counted)
     monkeypatch.setattr(pipeline, "load_image", counted)
-    found = match_images(photo_path, photo_path, max_keypoints=100)
+    found = match_images(photo_path, photo_path, PointDetector(100))
     assert len(found) == 100
     assert read == [photo_path, photo_path]
+
+
+@pytest.mark.parametrize("weights", ["default", pretrained_weights("dense")])
+def test_a_detector_goes_to_other_processes(weights: Any, image: np.ndarray) -> None:
+    detector = DeepDetect(weights, backend="onnxruntime", threads=1, network_channels="bgr")
+    other = pickle.loads(pickle.dumps(detector.configured(HeatmapOptions(64, "bgr"))))
+    assert other.settings == {**detector.settings, "resolution": 64}
+    np.testing.assert_allclose(
+        other.heatmap(image), detector.configured(HeatmapOptions(64, "bgr")).heatmap(image)
+    )
+
+
+def test_extracted_keypoints_are_the_detected_ones_described(image: np.ndarray) -> None:
+    detector = DeepDetect(backend="onnxruntime")
+    found, expected = (call(image, 0.9) for call in (detector.extract, detector.detect))
+    np.testing.assert_array_equal(found.xy, expected.xy)
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    np.testing.assert_array_equal(found.descriptors, root_sift_descriptors(gray, found.xy))
+    assert found.descriptor_type == found[:3].descriptor_type == "rootsift"

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, DeepDetectError, ImageError, Keypoints, OptionError
+from deepdetect import (
+    DeepDetect,
+    DeepDetectError,
+    ImageError,
+    Keypoints,
+    OptionError,
+    PointDetector,
+)
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.features.selection import SelectionOptions, select_keypoints
 
@@ -32,18 +39,18 @@ def same(found: Keypoints, expected: Keypoints) -> None:
     assert found.image_size == expected.image_size
 
 
-@pytest.mark.parametrize(
-    "options", [{}, {"max_keypoints": 50}, {"density": 0.1, "subpixel": True}], ids=str
-)
+@pytest.mark.parametrize("options", [{}, {"density": 0.1, "subpixel": True}], ids=str)
 @pytest.mark.parametrize("kind", [list, tuple])
 def test_a_list_gives_what_its_images_give(
     detector: DeepDetect, images: list[np.ndarray], options: dict[str, Any], kind: type
 ) -> None:
-    found = detector.detect(kind(images), **options)
-    assert isinstance(found, list)
-    assert len(found) == 3
-    for keypoints, image in zip(found, images, strict=True):
-        same(keypoints, detector.detect(image, **options))
+    found = detector.detect_batch(kind(images), **options)
+    maps = detector.heatmap_batch(kind(images))
+    points = PointDetector(50).detect_batch(kind(images))
+    for k, image in enumerate(images):
+        same(found[k], detector.detect(image, **options))
+        assert maps[k].tobytes() == detector.heatmap(image).tobytes()
+        same(points[k], PointDetector(50).detect(image))
 
 
 def test_batches_of_either_layout(detector: DeepDetect, images: list[np.ndarray]) -> None:
@@ -52,21 +59,11 @@ def test_batches_of_either_layout(detector: DeepDetect, images: list[np.ndarray]
     expected = [detector.detect(image) for image in batch]
     first = np.ascontiguousarray(batch.transpose(0, 3, 1, 2))
     for given in (batch, first, torch.tensor(batch), torch.tensor(first) / 255):
-        found = detector.detect(given)
+        found = detector.detect_batch(given)
         for keypoints, one in zip(found, expected, strict=True):
             same(keypoints, one)
-    (only,) = detector.detect(first[:1])
+    (only,) = detector.detect_batch(first[:1])
     same(only, expected[0])
-
-
-def test_heat_maps_of_a_list(detector: DeepDetect, images: list[np.ndarray]) -> None:
-    maps = detector.heatmap(images)
-    keypoints, others = detector.detect(images, return_heatmap=True)
-    assert [map_.shape for map_ in maps] == [image.shape[:2] for image in images]
-    for map_, other, image, points in zip(maps, others, images, keypoints, strict=True):
-        one, expected = detector.detect(image, return_heatmap=True)
-        assert map_.tobytes() == other.tobytes() == expected.tobytes()
-        same(points, one)
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "openvino", "torch"])
@@ -80,7 +77,7 @@ def test_images_of_one_size_are_run_together(photo: np.ndarray, backend: str, tt
     pieces[3] = np.full_like(pieces[3], 90)  # constant: the network is not run for it
     alone = [detector.heatmap(piece) for piece in pieces]
     shapes.clear()
-    maps = detector.heatmap(pieces, batch_size=3)
+    maps = detector.heatmap_batch(pieces, batch_size=3)
     sizes = [(64, 88)] if tta == "none" else [(64, 88), (88, 64)]
     assert {shape[2:] for shape in shapes} == set(sizes)
     assert [shape[0] for shape in shapes] == ([3, 1] if tta == "none" else [3] * 8 + [1] * 8)
@@ -89,23 +86,14 @@ def test_images_of_one_size_are_run_together(photo: np.ndarray, backend: str, tt
     assert not maps[3].any()
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"max_keypoints": 50}, {"max_keypoints": 50, "mode": "dense"}, {"density": 0.1}],
-    ids=str,
-)
-@pytest.mark.parametrize("return_heatmap", [False, True])
+@pytest.mark.parametrize("options", [{}, {"max_keypoints": 50}, {"density": 0.1}], ids=str)
 def test_together_they_give_what_they_give_alone(
-    detector: DeepDetect, photo: np.ndarray, options: dict[str, Any], return_heatmap: bool
+    detector: DeepDetect, photo: np.ndarray, options: dict[str, Any]
 ) -> None:
     pieces = [photo[k : k + 72, k : k + 104] for k in (0, 10, 20)]
     pieces.insert(1, photo[:40, :56])
-    together = detector.detect(pieces, batch_size=8, return_heatmap=return_heatmap, **options)
-    alone = detector.detect(pieces, return_heatmap=return_heatmap, **options)
-    if return_heatmap:
-        (together, maps), (alone, others) = together, alone
-        for map_, other in zip(maps, others, strict=True):
-            np.testing.assert_allclose(map_, other, atol=1e-5)
+    together = detector.detect_batch(pieces, batch_size=8, **options)
+    alone = detector.detect_batch(pieces, **options)
     for found, expected in zip(together, alone, strict=True):
         assert found.image_size == expected.image_size
         assert len(set(map(tuple, found.xy.round(2))) ^ set(map(tuple, expected.xy.round(2)))) <= 2
@@ -117,7 +105,7 @@ def test_sizes_agree_where_the_network_sees_them(photo: np.ndarray) -> None:
     for resolution, runs in ((64, [3]), ("native", [1, 1, 1])):
         detector = DeepDetect(backend="onnxruntime", resolution=resolution)
         shapes = count_runs(detector)
-        maps = detector.heatmap(pieces, batch_size=4)
+        maps = detector.heatmap_batch(pieces, batch_size=4)
         assert [shape[0] for shape in shapes] == runs
         assert [map_.shape for map_ in maps] == [piece.shape[:2] for piece in pieces]
         np.testing.assert_allclose(maps[1], detector.heatmap(pieces[1]), atol=1e-5)
@@ -126,13 +114,13 @@ def test_sizes_agree_where_the_network_sees_them(photo: np.ndarray) -> None:
 def test_one_by_one_unless_asked(detector: DeepDetect, images: list[np.ndarray]) -> None:
     own = DeepDetect(backend="onnxruntime")
     shapes = count_runs(own)
-    own.detect([images[0]] * 3)
+    own.detect_batch([images[0]] * 3)
     assert [shape[0] for shape in shapes] == [1, 1, 1]
 
 
 @pytest.mark.parametrize("size", [0, -1, 1.5, "8"])
 def test_a_batch_size_is_a_number(detector: DeepDetect, size: Any, one_line) -> None:
-    for call in (detector.detect, detector.heatmap):
+    for call in (detector.detect_batch, detector.heatmap_batch):
         with pytest.raises(OptionError, match="`batch_size` must be") as caught:
             call([], batch_size=size)
         one_line(caught.value)
@@ -149,11 +137,11 @@ def test_a_network_for_one_image_names_the_way_out(
     onnx.save_model(model, str(tmp_path / "one.onnx"))
     detector = DeepDetect(tmp_path / "one.onnx", backend=backend)
     pair = [photo[:64, :64], photo[64:128, :64]]
-    assert len(detector.heatmap(pair)) == 2
+    assert len(detector.heatmap_batch(pair)) == 2
     with pytest.raises(DeepDetectError, match=r"2 images of 64x64 .*`batch_size=1`") as caught:
-        detector.heatmap(pair, batch_size=2)
+        detector.heatmap_batch(pair, batch_size=2)
     one_line(caught.value)
-    assert len(detector.heatmap(pair)) == 2
+    assert len(detector.heatmap_batch(pair)) == 2
 
 
 def count_runs(detector: DeepDetect) -> list[tuple[int, ...]]:
@@ -174,54 +162,54 @@ def test_files_and_arrays_may_be_mixed(
 ) -> None:
     path = tmp_path / "one.png"
     Image.fromarray(images[1]).save(path)
-    found = detector.detect([path, images[0], Image.fromarray(images[1])], max_keypoints=20)
+    found = detector.detect_batch([path, images[0], Image.fromarray(images[1])])
     same(found[0], found[2])
-    same(found[1], detector.detect(images[0], max_keypoints=20))
+    same(found[1], detector.detect(images[0]))
 
 
 def test_no_image_gives_nothing(detector: DeepDetect) -> None:
-    assert detector.detect([]) == []
-    assert detector.heatmap(()) == []
-    assert detector.detect([], return_heatmap=True) == ([], [])
+    assert detector.detect_batch([]) == PointDetector().detect_batch([]) == []
+    assert detector.heatmap_batch(()) == []
 
 
-def test_rows_of_numbers_are_one_image(detector: DeepDetect, images: list[np.ndarray]) -> None:
-    gray = images[0][..., 0]
-    same(detector.detect((gray / 255).tolist()), detector.detect(gray / 255))
+def test_a_batch_is_no_single_image(detector: DeepDetect, images: list[np.ndarray]) -> None:
+    for call in (detector.detect_batch, detector.heatmap_batch, PointDetector().detect_batch):
+        with pytest.raises(OptionError, match="a batch is a list"):
+            call(images[0])
 
 
 def test_a_bad_image_of_a_list_is_named(detector: DeepDetect, images: list[np.ndarray]) -> None:
     with pytest.raises(ImageError, match=r"^images\[1\]: the image is 5x5 pixels"):
-        detector.detect([images[0], np.zeros((5, 5), np.uint8)])
+        detector.detect_batch([images[0], np.zeros((5, 5), np.uint8)])
     with pytest.raises(FileNotFoundError, match=r"^images\[2\]: there is no file missing.png"):
-        detector.detect([*images[:2], "missing.png"])
+        detector.detect_batch([*images[:2], "missing.png"])
 
 
 def test_masks_of_a_list(detector: DeepDetect, images: list[np.ndarray]) -> None:
     masks = [np.zeros(image.shape[:2], bool) for image in images]
     for mask, column in zip(masks, (10, 20, 30), strict=True):
         mask[:, :column] = True
-    found = detector.detect(images, ignore=masks)
+    found = detector.detect_batch(images, ignore=masks)
     for keypoints, image, mask in zip(found, images, masks, strict=True):
         same(keypoints, detector.detect(image, ignore=mask))
-    same(detector.detect(images, ignore=[None, None, masks[2]])[2], found[2])
+    same(detector.detect_batch(images, ignore=[None, None, masks[2]])[2], found[2])
     pair = [images[0], images[2]]
     for given in (masks[0], np.stack([masks[0], masks[0]])):
-        both = detector.detect(pair, ignore=given)
+        both = detector.detect_batch(pair, ignore=given)
         assert [keypoints.xy[:, 0].min() >= 10 for keypoints in both] == [True, True]
     with pytest.raises(OptionError, match="2 masks for 3 images"):
-        detector.detect(images, ignore=masks[:2])
+        detector.detect_batch(images, ignore=masks[:2])
     with pytest.raises(OptionError, match=r"images\[1\]: the ignore mask has shape"):
-        detector.detect(images, ignore=masks[0])
+        detector.detect_batch(images, ignore=masks[0])
 
 
 def test_images_of_opencv(detector: DeepDetect, images: list[np.ndarray]) -> None:
     rgb = images[0]
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    for options in ({}, {"max_keypoints": 30}):
-        same(detector.detect(bgr, channels="bgr", **options), detector.detect(rgb, **options))
-        (found,) = detector.detect([bgr], channels="bgr", **options)
-        same(found, detector.detect(rgb, **options))
+    for own in (detector, PointDetector(30)):
+        same(own.detect(bgr, channels="bgr"), own.detect(rgb))
+        (found,) = own.detect_batch([bgr], channels="bgr")
+        same(found, own.detect(rgb))
     for one, other in zip(
         detector.heatmap_and_logits(bgr, channels="bgr"),
         detector.heatmap_and_logits(rgb),
@@ -240,10 +228,7 @@ def test_images_of_opencv(detector: DeepDetect, images: list[np.ndarray]) -> Non
         {"density": 0.2},
         {"nms_radius": 2},
         {"subpixel": True},
-        {"max_keypoints": 40, "mode": "dense"},
         {"max_keypoints": 40, "nms_radius": 3},
-        {"max_keypoints": 40, "threshold": 0.3, "subpixel": False},
-        {"mode": "dense"},
     ],
     ids=str,
 )
@@ -256,26 +241,13 @@ def test_a_kept_heat_map_is_selected_from_again(
     heatmap, logits = seen.heatmap_and_logits(images[1])
     for ignore in (None, mask):
         expected = seen.detect(images[1], ignore=ignore, **options)
-        again = {name: value for name, value in options.items() if name != "mode"}
-        same(select_keypoints(heatmap, logits=logits, ignore=ignore, **again), expected)
-        chosen = SelectionOptions(ignore=ignore, **options)
-        same(select_keypoints(heatmap, chosen, logits), expected)
-
-
-def test_a_heat_map_has_no_points(detector: DeepDetect, one_line) -> None:
-    heatmap = np.zeros((20, 20), np.float32)
-    for options in (
-        SelectionOptions(mode="points"),
-        SelectionOptions(max_keypoints=5, spread="grid"),
-    ):
-        with pytest.raises(OptionError, match="find points in the image") as caught:
-            select_keypoints(heatmap, options)
-        one_line(caught.value)
+        chosen = SelectionOptions(**options)
+        same(select_keypoints(heatmap, chosen, logits, ignore=ignore), expected)
 
 
 @pytest.mark.parametrize(
     ("image", "words"),
-    [(None, "cv2.imread"), (iter([np.zeros((40, 40), np.uint8)]), "give a list")],
+    [(None, "cv2.imread"), (["a.png", "b.png"], "")],
 )
 def test_what_is_no_image_is_named(detector: DeepDetect, image: object, words: str) -> None:
     with pytest.raises(ImageError, match=words):

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -25,7 +24,7 @@ from deepdetect.evaluation.protocols.paper import OXFORD_PAIRS, mean_correct_mat
 from deepdetect.geometry.residuals import transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.labels import fuse
-from deepdetect.matching.options import get_preset
+from deepdetect.matching.options import PUBLISHED_MATCHING
 
 SIZE = 96
 
@@ -226,14 +225,15 @@ def test_counts_are_those_of_the_published_matching(
     labels = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
     feature = heatmap_feature(labels, SelectionOptions(), name="a", title="A", version="1")
     counts = []
-    published = replace(get_preset("published"), heatmap=None)
     for seed in range(2):
         found = match_images(
             pair.first,
             pair.second,
             labels,
-            options=published,
+            guided_matching=False,
+            model="none",
             seed=seed,
+            options=PUBLISHED_MATCHING,
         )
         errors = transfer_errors(found.points0, found.points1, pair.homography)
         counts.append([np.count_nonzero(errors < 1), len(found)])

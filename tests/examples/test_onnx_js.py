@@ -117,7 +117,7 @@ for (let k = 0; k < keypoint_logits.data.length; k++) {
         ended = subprocess.run(command, cwd=installed, capture_output=True, text=True, check=True)
         rows = [line.replace("Infinity", "inf").split() for line in ended.stdout.splitlines()]
         found = np.array(rows, float)
-        expected = detector.detect(rgb, max_keypoints=count, mode="dense")
+        expected = detector.detect(rgb, max_keypoints=count, nms_radius=1, subpixel=True)
         assert found.shape == (count, 3)
         assert np.isfinite(found[:, 2]).sum() == len(expected) > 5
         xy = found[: len(expected), :2]

@@ -28,7 +28,9 @@ def ranked(
     return sorted(scores, key=lambda one: (-one[0], order[one[1], one[2]]))
 
 
-def reference(heatmap: np.ndarray, options: SelectionOptions) -> list[tuple[int, int]]:
+def reference(
+    heatmap: np.ndarray, options: SelectionOptions, ignore: np.ndarray | None = None
+) -> list[tuple[int, int]]:
     """Select by plain loops: the (x, y) in the order of rows and columns."""
     limit = options.threshold if options.density is None else 0
     height, width = heatmap.shape
@@ -37,12 +39,11 @@ def reference(heatmap: np.ndarray, options: SelectionOptions) -> list[tuple[int,
             (float(heatmap[row, column]), row, column)
             for row in range(height)
             for column in range(width)
-            if heatmap[row, column] > limit
-            and not (options.ignore is not None and options.ignore[row, column])
+            if heatmap[row, column] > limit and not (ignore is not None and ignore[row, column])
         ],
         heatmap.shape,
     )
-    radius = options.suppression_radius
+    radius = options.nms_radius
     kept: list[tuple[float, int, int]] = []
     for position, one in enumerate(candidates):
         near = (
@@ -70,12 +71,12 @@ def test_equals_plain_loops(data: st.DataObject, shape: tuple[int, int]) -> None
         threshold=data.draw(st.sampled_from([0.0, 0.25, 0.5, 0.6])),
         density=data.draw(st.none() | st.floats(0.01, 1)),
         max_keypoints=data.draw(st.none() | st.integers(1, 20)),
-        nms_radius=data.draw(st.none() | st.integers(0, 4)),
-        ignore=data.draw(st.none() | arrays(bool, shape)),
+        nms_radius=data.draw(st.integers(0, 4)),
     )
-    keypoints = select_keypoints(heatmap, options)
+    ignore = data.draw(st.none() | arrays(bool, shape))
+    keypoints = select_keypoints(heatmap, options, ignore=ignore)
     found = [(round(float(x)), round(float(y))) for x, y in keypoints]
-    assert found == reference(heatmap, options)
+    assert found == reference(heatmap, options, ignore)
     assert keypoints.image_size == (shape[1], shape[0])
     assert keypoints.scores.tolist() == [float(heatmap[y, x]) for x, y in found]
 
@@ -193,8 +194,8 @@ def test_ignored_pixels_suppress_nothing() -> None:
     heatmap[4, 4], heatmap[4, 5] = 0.9, 0.8
     ignore = np.zeros((16, 16), bool)
     ignore[4, 4] = True
-    options = SelectionOptions(nms_radius=3, ignore=ignore)
-    assert select_keypoints(heatmap, options).xy.tolist() == [[5, 4]]
+    options = SelectionOptions(nms_radius=3)
+    assert select_keypoints(heatmap, options, ignore=ignore).xy.tolist() == [[5, 4]]
 
 
 @pytest.mark.parametrize("kind", [bool, np.uint8, np.int32, np.float32])
@@ -203,7 +204,7 @@ def test_an_ignore_mask_of_any_number_type(kind: type) -> None:
     ignore = np.zeros((24, 31), kind)
     ignore[5:15, 10:20] = 1
     ignore[0, 0] = 1
-    keypoints = select_keypoints(heatmap, SelectionOptions(0.5, ignore=ignore))
+    keypoints = select_keypoints(heatmap, SelectionOptions(0.5), ignore=ignore)
     expected = (heatmap > 0.5) & (ignore == 0)
     x, y = keypoints.xy.astype(int).T
     np.testing.assert_array_equal(np.argwhere(expected), np.stack([y, x], 1))
@@ -213,7 +214,7 @@ def test_an_ignore_mask_of_any_number_type(kind: type) -> None:
 def test_an_ignore_mask_of_another_size(shape: tuple[int, ...]) -> None:
     heatmap = np.zeros((24, 31), np.float32)
     with pytest.raises(OptionError, match="ignore mask has shape") as caught:
-        select_keypoints(heatmap, SelectionOptions(ignore=np.zeros(shape, bool)))
+        select_keypoints(heatmap, ignore=np.zeros(shape, bool))
     assert "(24, 31)" in str(caught.value)
 
 
@@ -227,7 +228,7 @@ def test_an_ignore_mask_of_another_size(shape: tuple[int, ...]) -> None:
         ({"density": 1.5}, "density must lie in (0, 1], not 1.5"),
         ({"density": float("nan")}, "density must lie in (0, 1], not nan"),
         ({"max_keypoints": 0}, "`max_keypoints` must be a whole number from 1 on, not 0"),
-        ({"nms_radius": -1}, "`nms_radius` must be 0 or more pixels, not -1"),
+        ({"nms_radius": -1}, "`nms_radius` must be a whole number of pixels from 0 on, not -1"),
     ],
 )
 def test_options_out_of_range(changes: dict[str, float], words: str) -> None:
@@ -268,13 +269,13 @@ def test_logits_rank_what_float32_rounds_to_one() -> None:
 def test_the_best_keypoints_of_a_photograph_are_no_lattice(photo: np.ndarray) -> None:
     """Ranked by probabilities, many of which are 1, they lay on a grid of powers of two."""
     detector = DeepDetect()
-    keypoints = detector.detect(photo, max_keypoints=100)
+    keypoints = detector.detect(photo, max_keypoints=100, nms_radius=1)
     assert len(keypoints) == 100
     xy = np.rint(keypoints.xy).astype(int)
     offsets = np.bincount((xy[:, 1] % 4) * 4 + xy[:, 0] % 4, minlength=16) / len(xy)
     ours = offsets.max()
     heatmap, logits = detector.heatmap_and_logits(photo)
-    old = select_keypoints(heatmap, SelectionOptions(max_keypoints=100, nms_radius=0))
+    old = select_keypoints(heatmap, SelectionOptions(max_keypoints=100))
     saturated = (heatmap == 1).sum()
     assert saturated > 200  # else this photograph shows nothing
     assert np.sort(logits[heatmap == 1])[-1] > np.sort(logits[heatmap == 1])[0]
@@ -288,9 +289,9 @@ def test_the_best_keypoints_of_a_photograph_are_no_lattice(photo: np.ndarray) ->
 def test_the_peak_of_a_paraboloid_is_found(x: float, y: float) -> None:
     row, column = np.indices((20, 24))
     heatmap = (0.9 - 0.01 * (column - x) ** 2 - 0.02 * (row - y) ** 2).clip(0).astype(np.float32)
-    found = select_keypoints(heatmap, SelectionOptions(max_keypoints=1))
+    found = select_keypoints(heatmap, SelectionOptions(max_keypoints=1, subpixel=True))
     np.testing.assert_allclose(found.xy, [[x, y]], atol=1e-4)
-    whole = select_keypoints(heatmap, SelectionOptions(max_keypoints=1, subpixel=False))
+    whole = select_keypoints(heatmap, SelectionOptions(max_keypoints=1))
     np.testing.assert_array_equal(whole.xy, [[round(x), round(y)]])
     alone = select_keypoints(heatmap, SelectionOptions(nms_radius=30, subpixel=True))
     np.testing.assert_allclose(alone.xy, [[x, y]], atol=1e-4)
@@ -304,14 +305,6 @@ def test_a_refined_keypoint_stays_with_its_pixel(heatmap: np.ndarray) -> None:
     height, width = heatmap.shape
     assert (refined.xy >= 0).all()
     assert (refined.xy <= (width - 1, height - 1)).all()
-
-
-def test_defaults_of_suppression_and_refinement() -> None:
-    dense, sparse = SelectionOptions(), SelectionOptions(max_keypoints=9)
-    assert (dense.suppression_radius, dense.refines) == (0, False)
-    assert (sparse.suppression_radius, sparse.refines) == (1, True)
-    own = SelectionOptions(max_keypoints=9, nms_radius=0, subpixel=False)
-    assert (own.suppression_radius, own.refines) == (0, False)
 
 
 def test_logits_of_another_size() -> None:

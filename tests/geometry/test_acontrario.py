@@ -123,8 +123,8 @@ def test_random_matches_are_not_trusted(kind: str) -> None:
     measure = {"homography": transfer_errors, "fundamental": epipolar_errors}[kind]
     for seed in range(15):
         points0, points1 = np.random.default_rng(seed).uniform(0, 200, (2, 60, 2))
-        options = GeometryOptions(model=kind, inlier_threshold=threshold, iterations=2000)
-        matrix = estimate_geometry(points0, points1, options).matrix
+        options = GeometryOptions(inlier_threshold=threshold, iterations=2000)
+        matrix = estimate_geometry(points0, points1, kind, options=options).matrix
         if matrix is not None:
             found = measure(points0, points1, matrix)
             assert log10_nfa(found, kind, threshold, (200, 200)) > MAX_LOG10_NFA

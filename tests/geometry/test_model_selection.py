@@ -26,14 +26,14 @@ def matches(depth: float, outliers: float = 0.3) -> tuple[np.ndarray, np.ndarray
 
 @pytest.mark.parametrize(("depth", "kind"), [(0.0, "homography"), (3.0, "fundamental")])
 def test_auto_takes_what_fits(depth: float, kind: str) -> None:
-    options = GeometryOptions(model="auto", inlier_threshold=1.5)
-    found = estimate_geometry(*matches(depth), options)
+    options = GeometryOptions(inlier_threshold=1.5)
+    found = estimate_geometry(*matches(depth), "auto", options=options)
     assert found.model == kind
     assert found.inliers.sum() > 300
 
 
 def test_auto_of_too_few_matches_is_nothing() -> None:
-    found = estimate_geometry(np.zeros((2, 2)), np.zeros((2, 2)), GeometryOptions(model="auto"))
+    found = estimate_geometry(np.zeros((2, 2)), np.zeros((2, 2)), "auto")
     assert found.matrix is None
     assert not found.inliers.any()
 

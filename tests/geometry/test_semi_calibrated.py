@@ -63,8 +63,8 @@ def test_five_points_are_trusted_where_seven_are_not() -> None:
     seven, five = [], []
     for seed in range(5):
         first, second, _ = matches(18, 72, seed=seed)
-        options = GeometryOptions(model="fundamental", inlier_threshold=1.5, seed=seed)
-        plain = estimate_geometry(first, second, options).matrix
+        options = GeometryOptions(inlier_threshold=1.5)
+        plain = estimate_geometry(first, second, seed=seed, options=options).matrix
         errors = epipolar_errors(first, second, plain)
         seven.append(log10_nfa(errors, "fundamental", 1.5, SIZE))
         found = estimate_semi_calibrated(first, second, SIZES, seed=seed)
@@ -122,8 +122,8 @@ def test_a_refined_matrix_is_nearer_to_the_truth(motion: np.ndarray, share: floa
     for seed in range(7):
         first, second, _ = matches(80, 0, motion=motion, noise=0.5, seed=seed)
         unseen = matches(300, 0, motion=motion, noise=0, seed=100 + seed)[:2]
-        options = GeometryOptions(model="fundamental", inlier_threshold=2, seed=seed)
-        start = estimate_geometry(first, second, options).matrix
+        options = GeometryOptions(inlier_threshold=2)
+        start = estimate_geometry(first, second, seed=seed, options=options).matrix
         better = refine_fundamental(first, second, start, SIZES, np.full(80, 0.5))
         plain.append(np.quantile(epipolar_errors(*unseen, start), 0.9))
         refined.append(np.quantile(epipolar_errors(*unseen, better), 0.9))

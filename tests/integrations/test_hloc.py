@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, OptionError
+from deepdetect import OptionError, PointDetector
 from deepdetect.integrations import hloc
 
 from .conftest import Views
@@ -70,7 +70,7 @@ def batch(image: np.ndarray) -> torch.Tensor:
 
 
 def test_the_extractor_gives_described_points(views: Views, load: Callable[..., Any]) -> None:
-    expected = DeepDetect().detect(views.first, max_keypoints=100)
+    expected = PointDetector(100).detect(views.first)
     model = load("extractors", {"name": "deepdetect", "max_keypoints": 100})
     found = model({"image": batch(views.first)})
     assert {name: tuple(value.shape) for name, value in found.items()} == {
@@ -155,7 +155,7 @@ def test_hloc_itself_writes_and_matches(views: Views, tmp_path: Path) -> None:
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("a.png b.png\n")
     features = extract_features.main(hloc.EXTRACTOR_CONF, images, tmp_path)
-    expected = DeepDetect().detect(views.first, max_keypoints=4096)
+    expected = PointDetector(4096).detect(views.first)
     with h5py.File(features) as file:
         assert np.abs(file["a.png/keypoints"][:] - expected.xy).max() < 1e-4
     matches = match_features.main(

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, MissingExtraError, OptionError
+from deepdetect import MissingExtraError, OptionError, PointDetector
 from deepdetect.integrations.kornia import DeepDetectDetector, DeepDetectFeature
 from deepdetect.io.image import luma
 
@@ -19,8 +19,8 @@ def tensor(*images: np.ndarray) -> torch.Tensor:
 
 
 def test_frames_are_those_of_the_detector(views: Views) -> None:
-    expected = DeepDetect().detect(views.first, max_keypoints=100)
-    lafs, scores = DeepDetectDetector(100)(tensor(views.first))
+    expected = PointDetector(100).detect(views.first)
+    lafs, scores = DeepDetectDetector(PointDetector(100))(tensor(views.first))
     assert lafs.shape == (1, 100, 2, 3)
     assert np.array_equal(kornia_feature.get_laf_center(lafs)[0], expected.xy)
     assert np.array_equal(scores[0], expected.scores)
@@ -28,13 +28,13 @@ def test_frames_are_those_of_the_detector(views: Views) -> None:
 
 def test_patches_are_what_sift_describes(views: Views) -> None:
     """A SIFT descriptor covers a square of six times the size, its x axis along the angle."""
-    points = DeepDetect().detect(views.first, max_keypoints=200)
+    points = PointDetector(200).detect(views.first)
     inside = np.abs(points.xy - (127.5, 99.5)) < (127.5, 99.5) - 4.3 * points.sizes[:, None]
     rows = np.flatnonzero(inside.all(axis=1))
     assert len(rows) > 30
     gray = luma(views.first)
     image = tensor(views.first).mean(1, keepdim=True)
-    lafs = DeepDetectDetector(200)(tensor(views.first))[0][:, rows]
+    lafs = DeepDetectDetector(PointDetector(200))(tensor(views.first))[0][:, rows]
     patches = kornia_feature.extract_patches_from_pyramid(image, lafs, 16)[0, :, 0].numpy()
     for row, patch in zip(rows, patches, strict=True):
         (x, y), size, angle = points.xy[row], points.sizes[row], np.deg2rad(points.angles[row])
@@ -71,10 +71,10 @@ def test_sizes_and_angles_are_as_of_kornias_sift(views: Views) -> None:
 
 @pytest.mark.parametrize("descriptor", ["ours", "kornia"])
 def test_matches_of_two_views(views: Views, descriptor: str) -> None:
-    local_feature = DeepDetectFeature(500)
+    local_feature = DeepDetectFeature(PointDetector(500))
     if descriptor == "kornia":
         patches = kornia_feature.LAFDescriptor(kornia_feature.SIFTDescriptor(32, rootsift=True))
-        local_feature = kornia_feature.LocalFeature(DeepDetectDetector(500), patches)
+        local_feature = kornia_feature.LocalFeature(DeepDetectDetector(PointDetector(500)), patches)
     matcher = kornia_feature.LocalFeatureMatcher(
         local_feature, kornia_feature.DescriptorMatcher("smnn", 0.9)
     )
@@ -86,21 +86,21 @@ def test_matches_of_two_views(views: Views, descriptor: str) -> None:
 
 def test_a_batch_is_filled_as_kornia_does(views: Views) -> None:
     flat = np.full_like(views.first, 90)
-    lafs, scores, descriptors = DeepDetectFeature(50)(tensor(views.first, flat))
+    lafs, scores, descriptors = DeepDetectFeature(PointDetector(50))(tensor(views.first, flat))
     assert (lafs.shape[:2], scores.shape, descriptors.shape) == ((2, 50), (2, 50), (2, 50, 128))
     assert kornia_feature.laf_is_filled(lafs).sum(dim=1).tolist() == [50, 0]
     assert torch.allclose(descriptors[0].norm(dim=1), torch.ones(50))
-    alone = DeepDetectFeature(50)(tensor(flat))
+    alone = DeepDetectFeature(PointDetector(50))(tensor(flat))
     assert [len(part[0]) for part in alone] == [0, 0, 0]
 
 
 def test_a_mask_hides(views: Views) -> None:
     mask = torch.zeros(1, 1, 200, 256)
     mask[:, :, :, :100] = 1
-    lafs, _ = DeepDetectDetector(50)(tensor(views.first), mask)
+    lafs, _ = DeepDetectDetector(PointDetector(50))(tensor(views.first), mask)
     assert kornia_feature.get_laf_center(lafs)[..., 0].max() < 101
     with pytest.raises(OptionError, match="the mask must have the shape"):
-        DeepDetectDetector(50)(tensor(views.first), mask[0])
+        DeepDetectDetector(PointDetector(50))(tensor(views.first), mask[0])
 
 
 def test_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Keypoints, OptionError
+from deepdetect import Keypoints, OptionError, PointDetector
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.integrations.lightglue import DeepDetectExtractor, to_lightglue
 from deepdetect.io.image import luma
@@ -38,8 +38,8 @@ def test_sift_keypoints_become_what_lightglues_extractor_makes_of_them(views: Vi
 
 
 def test_the_extractor_gives_points(views: Views) -> None:
-    expected = DeepDetect().detect(views.first, max_keypoints=100)
-    features = DeepDetectExtractor(100).extract(tensor(views.first))
+    expected = PointDetector(100).detect(views.first)
+    features = DeepDetectExtractor(PointDetector(100)).extract(tensor(views.first))
     assert {name: tuple(value.shape) for name, value in features.items()} == {
         "keypoints": (1, 100, 2),
         "keypoint_scores": (1, 100),
@@ -51,7 +51,7 @@ def test_the_extractor_gives_points(views: Views) -> None:
     assert {value.dtype for value in features.values()} == {torch.float32}
     assert np.array_equal(features["keypoints"][0], expected.xy)
     for image in (views.first, tensor(views.first)[None]):
-        again = DeepDetectExtractor(100).extract(image)
+        again = DeepDetectExtractor(PointDetector(100)).extract(image)
         assert all(torch.equal(again[name], features[name]) for name in features)
 
 
@@ -60,8 +60,8 @@ def test_scales_and_angles_are_as_kornia_makes_them_of_frames(views: Views) -> N
     feature = pytest.importorskip("kornia.feature", reason="needs kornia")
     from deepdetect.integrations.kornia import DeepDetectDetector
 
-    lafs, _ = DeepDetectDetector(100)(tensor(views.first)[None])
-    features = DeepDetectExtractor(100, scale="sigma").extract(tensor(views.first))
+    lafs, _ = DeepDetectDetector(PointDetector(100))(tensor(views.first)[None])
+    features = DeepDetectExtractor(PointDetector(100), scale="sigma").extract(tensor(views.first))
     assert torch.allclose(features["scales"], feature.get_laf_scale(lafs)[..., 0, 0] / 6)
     turned = torch.deg2rad(feature.get_laf_orientation(lafs)[..., 0]) + features["oris"]
     assert torch.allclose(torch.cos(turned), torch.ones(1), atol=1e-5)
@@ -74,7 +74,7 @@ def test_lightglue_runs_on_our_points(views: Views) -> None:
     matcher = feature.LightGlue(
         None, input_dim=128, add_scale_ori=True, n_layers=2, filter_threshold=0.0
     ).eval()
-    extractor = DeepDetectExtractor(60)
+    extractor = DeepDetectExtractor(PointDetector(60))
     features = [extractor.extract(tensor(image)) for image in (views.first, views.second)]
     with torch.inference_mode():
         found = matcher({"image0": features[0], "image1": features[1]})
@@ -88,7 +88,7 @@ def test_lightglue_runs_on_our_points(views: Views) -> None:
 
 def test_wrong_use(views: Views) -> None:
     with pytest.raises(OptionError, match="up to 4096 keypoints, not 5000"):
-        DeepDetectExtractor(5000)
+        DeepDetectExtractor(PointDetector(5000))
     with pytest.raises(OptionError, match="did you mean 'sigma'"):
         DeepDetectExtractor(scale="sigmas")  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="takes one image, not 2"):

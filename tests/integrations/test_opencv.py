@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, OptionError
+from deepdetect import OptionError, PointDetector
 from deepdetect.features.sift import to_root_sift
 from deepdetect.integrations.opencv import DeepDetectFeature2D
 
@@ -17,9 +17,9 @@ def bgr(views: Views) -> np.ndarray:
 
 
 def test_keypoints_are_those_of_the_detector(views: Views, bgr: np.ndarray) -> None:
-    expected = DeepDetect().detect(views.first, max_keypoints=200)
+    expected = PointDetector(200).detect(views.first)
     for image, channels in ((bgr, "bgr"), (views.first, "rgb")):
-        keypoints = DeepDetectFeature2D(200, channels=channels).detect(image)
+        keypoints = DeepDetectFeature2D(PointDetector(200), channels=channels).detect(image)
         assert np.array_equal([k.pt for k in keypoints], expected.xy)
         assert np.array_equal([k.size for k in keypoints], expected.sizes)
         assert np.array_equal([k.angle for k in keypoints], expected.angles)
@@ -27,7 +27,7 @@ def test_keypoints_are_those_of_the_detector(views: Views, bgr: np.ndarray) -> N
 
 
 def test_both_steps_in_one_are_the_two_steps(bgr: np.ndarray) -> None:
-    feature = DeepDetectFeature2D(200)
+    feature = DeepDetectFeature2D(PointDetector(200))
     both, descriptors = feature.detectAndCompute(bgr, None)
     keypoints, again = feature.compute(bgr, feature.detect(bgr))
     assert [k.pt for k in keypoints] == [k.pt for k in both]
@@ -41,7 +41,7 @@ def test_both_steps_in_one_are_the_two_steps(bgr: np.ndarray) -> None:
 
 
 def test_sift_describes_our_keypoints_as_we_do(bgr: np.ndarray) -> None:
-    keypoints, ours = DeepDetectFeature2D(200).detectAndCompute(bgr, None)
+    keypoints, ours = DeepDetectFeature2D(PointDetector(200)).detectAndCompute(bgr, None)
     gray = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)
     _, theirs = cv2.SIFT_create(enable_precise_upscale=True).compute(gray, keypoints)
     assert np.array_equal(to_root_sift(theirs.astype(np.uint8)), ours)
@@ -62,14 +62,14 @@ def test_we_describe_sifts_keypoints_as_it_does(bgr: np.ndarray) -> None:
 
 
 def test_keypoints_without_angles_get_one(bgr: np.ndarray) -> None:
-    feature = DeepDetectFeature2D(50)
+    feature = DeepDetectFeature2D(PointDetector(50))
     keypoints, expected = feature.detectAndCompute(bgr, None)
     unset = [cv2.KeyPoint(*k.pt, k.size, -1) for k in keypoints]
     assert np.array_equal(feature.compute(bgr, unset)[1], expected)
 
 
 def test_matches_of_two_views(views: Views, bgr: np.ndarray) -> None:
-    feature = DeepDetectFeature2D(500)
+    feature = DeepDetectFeature2D(PointDetector(500))
     second = np.ascontiguousarray(views.second[:, :, ::-1])
     keypoints0, descriptors0 = feature.detectAndCompute(bgr, None)
     keypoints1, descriptors1 = feature.detectAndCompute(second, None)
@@ -87,7 +87,7 @@ def test_matches_of_two_views(views: Views, bgr: np.ndarray) -> None:
 def test_a_mask_hides(bgr: np.ndarray) -> None:
     mask = np.zeros(bgr.shape[:2], np.uint8)
     mask[:, :100] = 255
-    found = DeepDetectFeature2D(100).detect(bgr, mask)
+    found = DeepDetectFeature2D(PointDetector(100)).detect(bgr, mask)
     assert found
     assert max(k.pt[0] for k in found) < 101
 
@@ -106,10 +106,6 @@ def test_it_is_no_feature2d() -> None:
 def test_wrong_use(bgr: np.ndarray) -> None:
     with pytest.raises(OptionError, match="did you mean 'bgr'"):
         DeepDetectFeature2D(channels="bgra")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="did you mean 'max_keypoints'"):
-        DeepDetectFeature2D(nmax_keypoints=9)  # type: ignore[call-arg]
-    with pytest.raises(OptionError, match="max_keypoints"):
-        DeepDetectFeature2D(0)
     with pytest.raises(OptionError, match="the method compute"):
         DeepDetectFeature2D().detectAndCompute(bgr, useProvidedKeypoints=True)
     with pytest.raises(OptionError, match="sizes above 0"):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Keypoints, OptionError
+from deepdetect import Keypoints, OptionError, PointDetector
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.integrations.skimage import DeepDetectFeatures
 from deepdetect.io.image import luma
@@ -15,8 +15,8 @@ feature = pytest.importorskip("skimage.feature", reason="needs scikit-image")
 
 
 def test_rows_come_before_columns(views: Views) -> None:
-    expected = DeepDetect().detect(views.first, max_keypoints=100)
-    features = DeepDetectFeatures(100)
+    expected = PointDetector(100).detect(views.first)
+    features = DeepDetectFeatures(PointDetector(100))
     features.detect(views.first)
     assert features.descriptors is None
     assert np.array_equal(features.keypoints, expected.xy[:, ::-1])
@@ -26,7 +26,7 @@ def test_rows_come_before_columns(views: Views) -> None:
     features.extract(views.first)
     described = describe_keypoints(luma(views.first), expected).descriptors
     assert np.abs(features.descriptors.astype(int) - described).max() <= 1  # angles in radians
-    both = DeepDetectFeatures(100)
+    both = DeepDetectFeatures(PointDetector(100))
     both.detect_and_extract(views.first)
     assert np.array_equal(both.descriptors, described)
 
@@ -35,7 +35,7 @@ def test_a_bright_spot_is_found_in_its_row_and_column() -> None:
     image = np.zeros((60, 90))
     image[20, 70] = 1
     image = cv2.GaussianBlur(image, (0, 0), 3)
-    features = DeepDetectFeatures(1)
+    features = DeepDetectFeatures(PointDetector(1))
     features.detect(image / image.max())
     assert features.keypoints == pytest.approx(np.array([[20, 70]]), abs=0.2)
     # Scikit-image finds it in the same place.
@@ -43,7 +43,7 @@ def test_a_bright_spot_is_found_in_its_row_and_column() -> None:
 
 
 def test_it_has_the_methods_and_attributes_of_sift(views: Views) -> None:
-    sift, ours = feature.SIFT(), DeepDetectFeatures(50)
+    sift, ours = feature.SIFT(), DeepDetectFeatures(PointDetector(50))
     for name in ("detect", "extract", "detect_and_extract"):
         assert callable(getattr(sift, name))
         assert callable(getattr(ours, name))
@@ -65,7 +65,7 @@ def test_it_has_the_methods_and_attributes_of_sift(views: Views) -> None:
 def test_matches_of_two_views(views: Views) -> None:
     found = []
     for image in (views.first, views.second):
-        features = DeepDetectFeatures(500)
+        features = DeepDetectFeatures(PointDetector(500))
         features.detect_and_extract(image)
         found.append(features)
     rows0, rows1 = feature.match_descriptors(

@@ -168,7 +168,7 @@ def test_options(views: Views, processor: Any) -> None:
     output = run(dense, processor(views.first, return_tensors="pt"))
     (found,) = processor.post_process_keypoint_detection(output, [views.first.shape[:2]])
     expected = DeepDetect("dense", backend="onnxruntime").detect(
-        views.first, max_keypoints=50, nms_radius=3, subpixel=True
+        views.first, max_keypoints=50, nms_radius=3
     )
     assert np.abs(found["keypoints"].numpy() - expected.xy).max() < 1e-2
 

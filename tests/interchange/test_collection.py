@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, ImageError, Keypoints, OptionError
+from deepdetect import ImageError, Keypoints, OptionError, PointDetector
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.interchange import Collection, PairMatches, describe_collection
 from deepdetect.interchange.collection import check_upright, sift_bytes
@@ -39,7 +39,7 @@ def test_descriptors_come_from_the_photographs(photo: np.ndarray, tmp_path: Path
     from PIL import Image
 
     Image.fromarray(photo).save(tmp_path / "p.png")
-    points = DeepDetect().detect(photo, max_keypoints=50)
+    points = PointDetector(50).detect(photo)
     pixels = Keypoints(np.rint(points.xy), points.scores, points.image_size)
     found = describe_collection(Collection({"p.png": points}, {}, tmp_path)).keypoints["p.png"]
     expected = describe_keypoints(luma(photo), points).descriptors

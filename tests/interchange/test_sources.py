@@ -7,7 +7,14 @@ import pytest
 
 pytest.importorskip("h5py", reason="needs h5py")
 
-from deepdetect import DeepDetectError, OptionError, match_images, save_keypoints, save_matches
+from deepdetect import (
+    DeepDetectError,
+    OptionError,
+    PointDetector,
+    match_images,
+    save_keypoints,
+    save_matches,
+)
 from deepdetect._shared.errors import BatchError
 from deepdetect.batch import extract_features, match_pairs
 from deepdetect.interchange import match_photographs, read_collection
@@ -40,9 +47,8 @@ def test_files_of_extract_and_match_many(pair: Path, tmp_path: Path) -> None:
             np.testing.assert_array_equal(
                 getattr(points, kind), getattr(again.keypoints[name], kind)
             )
-    from deepdetect import DeepDetect
 
-    direct = DeepDetect().detect(pair / "right.png", max_keypoints=2048)
+    direct = PointDetector().detect(pair / "right.png")
     np.testing.assert_allclose(found.keypoints["right.png"].xy, direct.xy)
     np.testing.assert_allclose(found.keypoints["right.png"].sizes, direct.sizes, rtol=1e-6)
     ((names, matches),) = found.matches.items()
@@ -166,13 +172,13 @@ def test_the_folder_of_other_photographs_is_refused(tmp_path: Path, one_line) ->
 
 def test_a_bad_photograph_does_not_stop_the_others(pair: Path) -> None:
     (pair / "middle.png").write_bytes(b"no image")
-    found = match_photographs(pair, sequential=1, max_keypoints=300, workers=1)
+    found = match_photographs(pair, PointDetector(300), sequential=1, workers=1)
     assert list(found.keypoints) == ["left_1.png", "right.png"]
     assert list(found.matches) == [("left_1.png", "right.png")]  # the next one that can be read
     (failure,) = found.failures
     assert "middle.png is not an image" in failure
     pairs = [("left_1.png", "right.png"), ("middle.png", "right.png"), ("right.png", "typo.png")]
-    named = match_photographs(pair, pairs=pairs, max_keypoints=300, workers=1)
+    named = match_photographs(pair, PointDetector(300), pairs=pairs, workers=1)
     assert list(named.matches) == pairs[:1]
     assert [failure.split()[-1] for failure in named.failures] == ["JPEG", "typo.png"]
     for name in ("left_1.png", "right.png"):
@@ -182,7 +188,7 @@ def test_a_bad_photograph_does_not_stop_the_others(pair: Path) -> None:
 
 
 def test_pairs_of_a_folder(pair: Path) -> None:
-    one = match_photographs(pair, sequential=1, max_keypoints=100, workers=1)
+    one = match_photographs(pair, PointDetector(100), sequential=1, workers=1)
     assert list(one.matches) == [("left_1.png", "right.png")]
     assert max(len(points) for points in one.keypoints.values()) == 100
     with pytest.raises(OptionError, match="not both"):

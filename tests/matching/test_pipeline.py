@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 from deepdetect import (
+    PUBLISHED_MATCHING,
     DeepDetect,
     HeatmapOptions,
     ImageError,
@@ -18,8 +18,8 @@ from deepdetect import (
     Matches,
     MatchingOptions,
     OptionError,
+    PointDetector,
     SelectionOptions,
-    match_images,
     select_keypoints,
 )
 from deepdetect.detector.detector import find_keypoints
@@ -27,7 +27,8 @@ from deepdetect.evaluation.baselines.random import RandomDetector
 from deepdetect.features.sift import sift_descriptors
 from deepdetect.geometry import transfer_errors
 from deepdetect.matching import pipeline
-from deepdetect.matching.options import PRESETS
+
+from .conftest import match
 
 OneLine = Callable[[BaseException], str]
 
@@ -95,9 +96,12 @@ def assert_indices_fit(matches: Matches, *, exact: bool) -> None:
             assert np.linalg.norm(xy - point, axis=1).min() > 1
 
 
+PUBLISHED = {"options": PUBLISHED_MATCHING, "guided_matching": False, "model": "none"}
+
+
 def unguided(*images: Any, **changes: Any) -> Matches:
     """Match by descriptors alone, whatever the options are otherwise."""
-    return match_images(*images, **{**changes, "guided": False})
+    return match(*images, **{**changes, "guided_matching": False})
 
 
 def assert_same(one: Matches, other: Matches) -> None:
@@ -147,7 +151,7 @@ def test_a_warped_photo_matches_itself(
     photo: np.ndarray, detector: Any, descriptor: str, matcher: str
 ) -> None:
     second = warped(photo, WARP)
-    matches = match_images(
+    matches = match(
         photo,
         second,
         detector,
@@ -215,7 +219,7 @@ def opencv_pipeline(
         made, described = cv2.SIFT_create().compute(gray, made)
         keypoints.append(made)
         descriptors.append(described)
-    cv2.setRNGSeed(options.geometry.seed)
+    cv2.setRNGSeed(0)
     if options.matcher == "flann":
         matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 5}, {"checks": 50})
     else:
@@ -232,24 +236,24 @@ def opencv_pipeline(
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("selection", "options"),
     [
-        MatchingOptions(selection=SelectionOptions(density=0.02), descriptor="sift-opencv"),
-        MatchingOptions(selection=SelectionOptions(threshold=0.8), ratio=0.9, angle=-1.0),
-        MatchingOptions(
-            selection=SelectionOptions(max_keypoints=300), matcher="exact", keypoint_size=5.0
-        ),
-        MatchingOptions(
-            selection=SelectionOptions(nms_radius=2), ratio=0.7, angle=30.0, matcher="exact"
-        ),
+        ({"density": 0.02}, {"descriptor": "sift-opencv"}),
+        ({"threshold": 0.8}, {"ratio": 0.9, "angle": -1.0}),
+        ({"max_keypoints": 300}, {"matcher": "exact", "keypoint_size": 5.0}),
+        ({"nms_radius": 2}, {"ratio": 0.7, "angle": 30.0, "matcher": "exact"}),
     ],
 )
-def test_equals_a_pipeline_of_opencv(photo: np.ndarray, options: MatchingOptions) -> None:
+def test_equals_a_pipeline_of_opencv(
+    photo: np.ndarray, selection: dict[str, Any], options: dict[str, Any]
+) -> None:
     images = [photo, warped(photo, WARP)]
     corners = Corners()
-    matches = unguided(*images, corners, options=options)
+    matches = unguided(*images, corners, **selection, **options)
     maps = [corners.heatmap(image) for image in images]
-    points0, points1, ratios = opencv_pipeline(maps, images, options.selection, options)
+    points0, points1, ratios = opencv_pipeline(
+        maps, images, SelectionOptions(**selection), MatchingOptions(**options)
+    )
     assert len(matches) > 20
     np.testing.assert_array_equal(matches.points0, points0)
     np.testing.assert_array_equal(matches.points1, points1)
@@ -261,8 +265,8 @@ def test_the_published_preset_equals_the_published_pipeline(
     photo: np.ndarray, network: DeepDetect
 ) -> None:
     images = [photo, warped(photo, WARP)]
-    matches = match_images(*images, network, preset="published", homography=WARP)
     squashing = network.configured(HeatmapOptions(480, "bgr"))
+    matches = match(*images, squashing, **PUBLISHED, homography=WARP)
     maps = [squashing.heatmap(image) for image in images]
     points0, points1, _ = opencv_pipeline(
         maps, images, SelectionOptions(threshold=0.5), MatchingOptions(angle=-1.0)
@@ -293,17 +297,10 @@ def test_scores_belong_to_their_rows(photo: np.ndarray) -> None:
 # Options
 
 
-@pytest.mark.parametrize("ratio", [0.5, 0.8, 0.99])
-def test_all_ratios_pass_the_test(photo: np.ndarray, ratio: float) -> None:
-    matches = unguided(photo, warped(photo, WARP), Corners(), density=0.02, ratio=ratio)
-    assert len(matches) > 0
-    assert (matches.scores > 1 - ratio - 1e-6).all()
-
-
 def test_selection_options_reach_both_images(photo: np.ndarray) -> None:
     ignore = np.zeros(photo.shape[:2], bool)
     ignore[:, :100] = True
-    matches = match_images(photo, photo, Corners(), max_keypoints=50, ignore=ignore)
+    matches = match(photo, photo, Corners(), max_keypoints=50, ignore=ignore)
     for keypoints in (matches.keypoints0, matches.keypoints1):
         assert len(keypoints) == 50
         assert (keypoints.xy[:, 0] >= 100).all()
@@ -314,9 +311,9 @@ def test_mutual_matches_do_not_depend_on_which_image_comes_first(
     photo: np.ndarray, guide: str
 ) -> None:
     second = warped(photo, WARP)
-    settings: dict[str, Any] = {"guide": guide, "density": 0.1, "mutual": True}
-    found = match_images(photo, second, **settings)
-    swapped = match_images(second, photo, **settings)
+    settings: dict[str, Any] = {"two_view_model": guide, "density": 0.1, "mutual": True}
+    found = match(photo, second, **settings)
+    swapped = match(second, photo, **settings)
     assert len(found) > 500
     pairs = [
         np.column_stack(points)
@@ -344,24 +341,6 @@ def test_mutual_leaves_one_to_one(photo: np.ndarray) -> None:
     assert len(np.unique(every.points1, axis=0)) < len(every)
 
 
-@pytest.mark.parametrize("model", ["homography", "fundamental", "none"])
-@pytest.mark.parametrize("estimator", ["magsac", "ransac"])
-def test_the_model_is_the_wanted_one(photo: np.ndarray, model: str, estimator: str) -> None:
-    matches = match_images(
-        photo,
-        warped(photo, WARP),
-        Corners(),
-        density=0.02,
-        ratio=0.8,
-        model=model,
-        estimator=estimator,
-    )
-    assert_well_formed(matches)
-    assert matches.model == model
-    assert (matches.matrix is None) == (model == "none")
-    assert matches.inliers.mean() > 0.5
-
-
 def test_the_seed_reaches_the_matcher(photo: np.ndarray) -> None:
     second = warped(photo, WARP)
     found = [
@@ -372,23 +351,10 @@ def test_the_seed_reaches_the_matcher(photo: np.ndarray) -> None:
     )
 
 
-@pytest.mark.slow
-def test_options_and_changes_add_up(photo: np.ndarray) -> None:
-    options = MatchingOptions(
-        selection=SelectionOptions(max_keypoints=200), ratio=0.7, matcher="exact"
-    )
-    given = match_images(photo, photo, Corners(), options=options, max_keypoints=100)
-    single = match_images(photo, photo, Corners(), max_keypoints=100, ratio=0.7, matcher="exact")
-    assert len(given.keypoints0) == 100
-    assert_same(given, single)
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"ratoi": 0.9}, "unknown option 'ratoi': did you mean 'ratio'?"),
-        ({"treshold": 0.9}, "unknown option 'treshold': did you mean 'threshold'?"),
-        ({"preset": "publishd"}, "unknown preset 'publishd': did you mean 'published'?"),
+        ({"modle": "auto"}, "unknown option 'modle': did you mean 'model'?"),
         ({"matcher": "exakt"}, "unknown matcher 'exakt': did you mean 'exact'?"),
         ({"descriptor": "root"}, "unknown descriptor 'root'"),
         ({"model": "homografy"}, "unknown model 'homografy': did you mean 'homography'?"),
@@ -400,15 +366,8 @@ def test_options_and_changes_add_up(photo: np.ndarray) -> None:
 )
 def test_wrong_options(photo: np.ndarray, values: dict[str, Any], message: str) -> None:
     with pytest.raises(OptionError) as caught:
-        match_images(photo, photo, Corners(), **values)
+        match(photo, photo, Corners(), **values)
     assert message in str(caught.value)
-
-
-def test_wrong_options_are_found_before_any_work(tmp_path: Path) -> None:
-    corners = Corners()
-    with pytest.raises(OptionError, match="did you mean 'ratio'"):
-        match_images(tmp_path / "no.png", tmp_path / "no.png", corners, ratoi=1)
-    assert corners.seen == []
 
 
 # Detectors
@@ -417,40 +376,23 @@ def test_wrong_options_are_found_before_any_work(tmp_path: Path) -> None:
 def test_a_stand_in_sees_8_bit_rgb(photo: np.ndarray, photo_path: Path) -> None:
     corners = Corners()
     gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
-    match_images(photo_path, gray, corners, max_keypoints=10)
+    match(photo_path, gray, corners, max_keypoints=10)
     np.testing.assert_array_equal(corners.seen[0], photo)
     np.testing.assert_array_equal(corners.seen[1], np.dstack([gray] * 3))
     assert all(image.dtype == np.uint8 for image in corners.seen)
 
 
-def test_options_for_the_network_need_the_network(photo: np.ndarray) -> None:
-    for values in (
-        {"preset": "published"},
-        {"options": PRESETS["published"]},
-        {"resolution": 64},
-    ):
-        with pytest.raises(OptionError, match="only a DeepDetect detector can follow"):
-            match_images(photo, photo, Corners(), **values)
-
-
-def test_a_preset_without_its_heatmap_options_takes_a_stand_in(photo: np.ndarray) -> None:
-    options = dataclasses.replace(PRESETS["published"], heatmap=None)
-    matches = match_images(photo, photo, Corners(), options=options, threshold=0.9)
-    assert_well_formed(matches)
-    assert len(matches) > 0
-
-
 def test_a_detector_keeps_its_own_resolution(photo: np.ndarray) -> None:
     squashing = DeepDetect(resolution=64, network_channels="bgr")
-    chosen = {"max_keypoints": 100, "mode": "dense"}
-    matches = match_images(photo, photo, squashing, **chosen)
+    chosen = {"max_keypoints": 100}
+    matches = match(photo, photo, squashing, **chosen)
     np.testing.assert_array_equal(matches.keypoints0.xy, squashing.detect(photo, **chosen).xy)
 
 
 @pytest.mark.parametrize("guided", [True, False])
 def test_points_are_matched_at_their_sub_pixel_positions(photo: np.ndarray, guided: bool) -> None:
     moved = photo[5:, 9:]
-    found = match_images(photo, moved, max_keypoints=300, guided=guided, ratio=0.85, mutual=True)
+    found = match(photo, moved, PointDetector(300), guided_matching=guided, ratio=0.85, mutual=True)
     assert found.keypoints0.sizes is not None
     assert len(found) > 100
     rows0 = {tuple(xy) for xy in found.keypoints0.xy.tolist()}
@@ -461,54 +403,19 @@ def test_points_are_matched_at_their_sub_pixel_positions(photo: np.ndarray, guid
     assert np.median(gaps) < 0.1
 
 
-def test_a_size_for_all_keypoints_is_for_points_too(photo: np.ndarray) -> None:
-    settings = {"max_keypoints": 200, "guided": False, "ratio": 0.85, "mutual": True}
-    turned = np.ascontiguousarray(np.rot90(photo))
-    own = match_images(photo, turned, **settings)
-    upright = match_images(photo, turned, keypoint_size=4.0, **settings)
-    assert len(own) > 3 * len(upright)
-
-
-def test_only_our_detector_has_points(photo: np.ndarray) -> None:
-    for options in ({"mode": "points"}, {"max_keypoints": 50, "spread": "grid"}):
-        with pytest.raises(OptionError, match="only a DeepDetect detector has points"):
-            match_images(photo, photo, Corners(), **options)
-    found = match_images(photo, photo, Corners(), max_keypoints=50)
-    assert found.keypoints0.sizes is None
+def test_points_are_no_pixels_to_be_selected(photo: np.ndarray) -> None:
+    with pytest.raises(OptionError, match="detectors with a heat map"):
+        match(photo, photo, PointDetector(), threshold=0.6)
 
 
 def test_points_of_a_turned_image_match_by_their_angles(photo: np.ndarray) -> None:
     turned = np.ascontiguousarray(np.rot90(photo))
-    found = match_images(photo, turned, max_keypoints=300, guided=False, ratio=0.85, mutual=True)
+    found = match(photo, turned, PointDetector(300), guided_matching=False, ratio=0.85, mutual=True)
     width = photo.shape[1]
     seen = np.column_stack([found.points0[:, 1], width - 1 - found.points0[:, 0]])
     right = np.linalg.norm(seen - found.points1, axis=1) < 1
     assert len(found) > 60
     assert right.mean() > 0.9
-
-
-def test_heatmap_options_reach_the_network_and_leave_the_detector(
-    photo: np.ndarray, network: DeepDetect
-) -> None:
-    before = network.heatmap_options
-    chosen = {"max_keypoints": 100, "mode": "dense"}
-    matches = match_images(photo, photo, network, resolution=64, network_channels="bgr", **chosen)
-    assert network.heatmap_options == before
-    expected = DeepDetect(resolution=64, network_channels="bgr").detect(photo, **chosen)
-    np.testing.assert_array_equal(matches.keypoints0.xy, expected.xy)
-    native = network.detect(photo, **chosen)
-    assert not np.array_equal(matches.keypoints0.xy, native.xy)
-
-
-@pytest.mark.slow
-def test_without_a_detector_the_pretrained_weights_are_used(
-    photo: np.ndarray, network: DeepDetect
-) -> None:
-    second = warped(photo, WARP)
-    assert_same(
-        match_images(photo, second, max_keypoints=500),
-        match_images(photo, second, network, max_keypoints=500),
-    )
 
 
 # Images
@@ -535,17 +442,17 @@ def test_a_missing_image_is_an_image_error(photo: np.ndarray, tmp_path: Path, pl
     images: list[Any] = [photo, photo]
     images[place] = tmp_path / "no.png"
     with pytest.raises(ImageError, match=r"no\.png"):
-        match_images(*images, Corners())
+        match(*images, Corners())
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("settings", [{}, PUBLISHED], ids=["default", "published"])
 @pytest.mark.parametrize("constant", [(True, True), (True, False), (False, True)])
 def test_a_constant_image_has_no_matches(
-    photo: np.ndarray, network: DeepDetect, preset: str, constant: tuple[bool, bool]
+    photo: np.ndarray, network: DeepDetect, settings: Any, constant: tuple[bool, bool]
 ) -> None:
     flat = np.full((48, 64, 3), 200, np.uint8)
     images = [flat if is_flat else photo[:64, :64] for is_flat in constant]
-    matches = match_images(*images, network, preset=preset)
+    matches = match(*images, network, **settings)
     assert_well_formed(matches)
     assert len(matches) == 0
     assert matches.matrix is None
@@ -573,7 +480,7 @@ def test_a_flat_stand_in_image_is_described_by_zeros_that_match_nothing() -> Non
     flat = np.full((20, 24), 90, np.uint8)
     for matcher in ("flann", "exact"):
         for descriptor in ("sift", "rootsift"):
-            matches = match_images(
+            matches = match(
                 flat, flat, Everywhere(), matcher=matcher, descriptor=descriptor, ratio=1
             )
             assert len(matches.keypoints0) == 480
@@ -585,20 +492,9 @@ def test_a_flat_stand_in_image_is_described_by_zeros_that_match_nothing() -> Non
 
 def test_the_result_is_the_same_every_time(photo: np.ndarray, detector: Any) -> None:
     second = warped(photo, WARP)
-    first = match_images(photo, second, detector, density=0.05)
+    first = match(photo, second, detector, density=0.05)
     cv2.setRNGSeed(777)  # whatever ran before
-    assert_same(match_images(photo, second, detector, density=0.05), first)
-
-
-def test_every_stage_has_its_time(photo: np.ndarray) -> None:
-    matches = unguided(photo, photo, Corners(), max_keypoints=50)
-    assert list(matches.seconds) == [
-        "keypoints",
-        "descriptors",
-        "matching",
-        "geometry",
-    ]
-    assert all(seconds >= 0 for seconds in matches.seconds.values())
+    assert_same(match(photo, second, detector, density=0.05), first)
 
 
 # The published numbers
@@ -610,11 +506,15 @@ def test_the_published_system_is_reproduced(shared: Path, scene: str, correct: i
     """Correct matches of images 1 and 6 as measured with the authors' own code."""
     pytest.importorskip("torch")
     folder = shared / "data" / "oxford" / scene
-    matches = match_images(
+    matches = match(
         folder / "img1.png",
         folder / "img6.png",
-        DeepDetect(shared / "reference" / "published_matching.safetensors"),
-        preset="published",
+        DeepDetect(
+            shared / "reference" / "published_matching.safetensors",
+            resolution=480,
+            network_channels="bgr",
+        ),
+        **PUBLISHED,
         homography=np.loadtxt(folder / "H1to6p"),
     )
     assert matches.model == "homography"
@@ -630,9 +530,9 @@ def test_seeds_take_the_place_of_our_own_matches(photo: np.ndarray) -> None:
     places = np.random.default_rng(0).uniform(20, 180, (40, 2))
     seeds = places, places + (9, -4)
     seeds[1][::4] = np.random.default_rng(1).uniform(20, 180, (10, 2))  # these are wrong
-    matches = match_images(photo, second, RandomDetector(), seeds=seeds)
+    matches = match(photo, second, RandomDetector(), tentative_matches=seeds)
     assert matches.two_view_geometry is not None
-    assert (matches.model, matches.two_view_geometry.sparse_matches) == ("homography", 40)
+    assert (matches.model, matches.two_view_geometry.tentative_matches) == ("homography", 40)
     assert share_correct(matches, shift, 1.01) > 0.99
     assert len(matches) > 1000
 
@@ -640,8 +540,8 @@ def test_seeds_take_the_place_of_our_own_matches(photo: np.ndarray) -> None:
 def test_seeds_that_do_not_agree_guide_nothing(photo: np.ndarray) -> None:
     rng = np.random.default_rng(0)
     seeds = rng.uniform(0, 200, (40, 2)), rng.uniform(0, 200, (40, 2))
-    matches = match_images(photo, photo, RandomDetector(), seeds=seeds)
-    assert matches.lost
+    matches = match(photo, photo, RandomDetector(), tentative_matches=seeds)
+    assert not matches.success
     assert len(matches) == 0
 
 
@@ -655,23 +555,23 @@ def test_seeds_that_do_not_agree_guide_nothing(photo: np.ndarray) -> None:
 )
 def test_seeds_that_are_no_matches_are_refused(photo: np.ndarray, seeds, message: str) -> None:
     with pytest.raises(OptionError, match=message):
-        match_images(photo, photo, RandomDetector(), seeds=seeds)
+        match(photo, photo, RandomDetector(), tentative_matches=seeds)
 
 
 def test_seeds_guide_nothing_without_guided_matching(photo: np.ndarray) -> None:
     seeds = np.zeros((9, 2)), np.zeros((9, 2))
-    with pytest.raises(OptionError, match="seeds guide the matching"):
-        match_images(photo, photo, RandomDetector(), seeds=seeds, guided=False)
+    with pytest.raises(OptionError, match="`tentative_matches` guide"):
+        match(photo, photo, RandomDetector(), tentative_matches=seeds, guided_matching=False)
 
 
 def test_a_pair_without_a_geometry_has_no_matches() -> None:
     rng = np.random.default_rng(0)
     first, second = (rng.integers(0, 256, (120, 160, 3), np.uint8) for _ in range(2))
-    matches = match_images(first, second, RandomDetector())
-    assert matches.lost
+    matches = match(first, second, RandomDetector())
+    assert not matches.success
     assert not matches.guided
     assert (len(matches), matches.model, matches.matrix) == (0, "none", None)
-    assert not match_images(first, second, RandomDetector(), guided=False).lost
+    assert match(first, second, RandomDetector(), guided_matching=False).success
 
 
 def test_a_pair_without_a_geometry_needs_no_keypoints_before_they_are_asked_for(
@@ -687,8 +587,8 @@ def test_a_pair_without_a_geometry_needs_no_keypoints_before_they_are_asked_for(
         return find_keypoints(*arguments)
 
     monkeypatch.setattr(pipeline, "find_keypoints", counted)
-    matches = match_images(first, second, detector)
-    assert matches.lost
+    matches = match(first, second, detector)
+    assert not matches.success
     assert repr(matches) == "Matches(0 matches, as no geometry could be trusted)"
     assert len(calls) == 0
     found = matches.keypoints1
@@ -697,7 +597,7 @@ def test_a_pair_without_a_geometry_needs_no_keypoints_before_they_are_asked_for(
     np.testing.assert_array_equal(found.xy, detector.detect(second).xy)
     again = pickle.loads(pickle.dumps(matches))
     np.testing.assert_array_equal(again.keypoints0.xy, detector.detect(first).xy)
-    assert again.lost
+    assert not again.success
     assert len(matches[:0]) == len(matches.unique()) == 0
 
 
@@ -707,19 +607,19 @@ def test_a_mask_of_another_size_is_an_error_of_a_pair_without_a_geometry(
     rng = np.random.default_rng(0)
     first, second = (rng.integers(0, 256, (120, 160, 3), np.uint8) for _ in range(2))
     with pytest.raises(OptionError) as caught:
-        match_images(first, second, ignore=np.zeros((5, 5), bool))
+        match(first, second, ignore=np.zeros((5, 5), bool))
     assert "ignore" in one_line(caught.value)
 
 
 @pytest.mark.parametrize("mutual", [False, True])
 @pytest.mark.parametrize("swapped", [False, True])
-@pytest.mark.parametrize("options", [{}, {"max_keypoints": 600}], ids=["dense", "points"])
+@pytest.mark.parametrize("detector", [None, PointDetector(600)], ids=["dense", "points"])
 def test_indices_of_a_scene_with_depth(
-    facade: Any, mutual: bool, swapped: bool, options: dict[str, Any]
+    facade: Any, mutual: bool, swapped: bool, detector: Any
 ) -> None:
     scene = facade(0.2)
     images = (scene.right, scene.left) if swapped else (scene.left, scene.right)
-    found = match_images(*images, model="fundamental", mutual=mutual, **options)
+    found = match(*images, detector, model="fundamental", mutual=mutual)
     assert found.subpixel
     assert len(found) > 100
     assert_indices_fit(found, exact=False)
@@ -737,22 +637,21 @@ def test_indices_of_a_scene_with_depth(
         (indices >= 0).all() and (np.rint(xy) == points).all() for points, xy, indices in ends
     )
     share = min((found.indices0 >= 0).mean(), (found.indices1 >= 0).mean())
-    assert share > (0.4 if options else 0.8)
+    assert share > (0.4 if detector else 0.8)
 
 
-@pytest.mark.parametrize("options", [{}, {"max_keypoints": 500}, {"guided": False}], ids=str)
-def test_tracks_chain_by_their_indices(photo: np.ndarray, options: dict[str, Any]) -> None:
+@pytest.mark.parametrize("way", ["dense", "points", "unguided"])
+def test_tracks_chain_by_their_indices(photo: np.ndarray, network: DeepDetect, way: str) -> None:
     """A keypoint of the image in the middle has one index, whatever the image is matched with."""
     there = np.array([[1, 0.02, -6.0], [-0.02, 1, 4], [0, 0, 1]])
     views = [photo, warped(photo, there), warped(photo, there @ there)]
-    detector = DeepDetect()
-    if "guided" in options:
-        options = {**options, "max_keypoints": 500, "mutual": True}
-    first = match_images(views[0], views[1], detector, model="homography", **options)
-    second = match_images(views[1], views[2], detector, model="homography", **options)
+    detector = network if way == "dense" else PointDetector(500)
+    options = {"guided_matching": False, "mutual": True} if way == "unguided" else {}
+    first = match(views[0], views[1], detector, model="homography", **options)
+    second = match(views[1], views[2], detector, model="homography", **options)
     middle = first.keypoints1
     np.testing.assert_array_equal(middle.xy, second.keypoints0.xy)
-    np.testing.assert_array_equal(middle.xy, detector.detect(views[1], **_selection(options)).xy)
+    np.testing.assert_array_equal(middle.xy, detector.detect(views[1]).xy)
     onward = dict(zip(second.indices0.tolist(), second.indices1.tolist(), strict=True))
     tracks = [
         (int(a), onward[int(b)])
@@ -764,18 +663,14 @@ def test_tracks_chain_by_their_indices(photo: np.ndarray, options: dict[str, Any
     end = second.keypoints1.xy[[c for _, c in tracks]]
     expected = cv2.perspectiveTransform(start[None], there @ there)[0]
     errors = np.linalg.norm(end - expected, axis=1)
-    assert np.mean(errors < 3) > (0.6 if "guided" in options else 0.9)
-
-
-def _selection(options: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if name == "max_keypoints"}
+    assert np.mean(errors < 3) > (0.6 if way == "unguided" else 0.9)
 
 
 def test_seeds_give_indices_too(photo: np.ndarray) -> None:
     moved = warped(photo, WARP)
     seeds = np.random.default_rng(0).uniform(60, 190, (60, 2))
     there = cv2.perspectiveTransform(seeds[None], WARP)[0]
-    found = match_images(photo, moved, Corners(), seeds=(seeds, there), model="homography")
+    found = match(photo, moved, Corners(), tentative_matches=(seeds, there), model="homography")
     assert len(found) > 100
     assert_indices_fit(found, exact=True)
 
@@ -783,15 +678,15 @@ def test_seeds_give_indices_too(photo: np.ndarray) -> None:
 def test_images_of_opencv_are_matched_as_what_they_show(photo: np.ndarray) -> None:
     first, second = photo[:160, :160], photo[20:180, 30:190]
     bgr = [cv2.cvtColor(image, cv2.COLOR_RGB2BGR) for image in (first, second)]
-    expected = match_images(first, second, model="homography")
-    found = match_images(*bgr, channels="bgr", model="homography")
+    expected = match(first, second, model="homography")
+    found = match(*bgr, channels="bgr", model="homography")
     np.testing.assert_array_equal(found.points0, expected.points0)
     np.testing.assert_array_equal(found.points1, expected.points1)
     np.testing.assert_array_equal(found.keypoints1.scores, expected.keypoints1.scores)
     with pytest.raises(OptionError, match="unknown channel order 'brg'"):
-        match_images(*bgr, channels="brg")
+        match(*bgr, channels="brg")
 
 
 def test_patchmatch_refuses_points_with_scales(photo: np.ndarray) -> None:
     with pytest.raises(OptionError, match="dense keypoints of one scale and angle"):
-        match_images(photo, photo, guided=False, matcher="patchmatch", max_keypoints=200)
+        match(photo, photo, PointDetector(200), guided_matching=False, matcher="patchmatch")

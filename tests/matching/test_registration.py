@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from deepdetect import DeepDetectError, OptionError
+from deepdetect import DeepDetectError, OptionError, PointDetector
 from deepdetect.cli import main
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.matching.registration import register
@@ -51,15 +51,9 @@ def test_images_of_different_things_are_refused(photo: np.ndarray) -> None:
         register(photo, noise)
 
 
-@pytest.mark.parametrize("name", ["model", "guided", "homography", "estimator"])
-def test_options_of_the_geometry_are_not_taken(photo: np.ndarray, name: str) -> None:
-    with pytest.raises(OptionError, match=f"unknown option '{name}'"):
-        register(photo, photo, **{name: "none"})
-
-
 @pytest.mark.slow
 def test_other_options_are_taken(photo: np.ndarray, second: np.ndarray) -> None:
-    few = register(photo, second, max_keypoints=2000, seed=3, mutual=True)
+    few = register(photo, second, PointDetector(2000), seed=3, mutual=True)
     assert 0 < few.matches <= 2000
     with pytest.raises(OptionError, match="did you mean 'mutual'"):
         register(photo, second, mutal=True)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, match_images
+from deepdetect import DeepDetect, MatchingOptions, SelectionOptions, match_images
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
@@ -129,7 +129,9 @@ def test_one_view_stored_badly(level: Any, detector: DeepDetect, one_line) -> No
 def test_a_camera_that_only_rotated(
     level: Any, only_turned: np.ndarray, detector: DeepDetect, guide: str, one_line
 ) -> None:
-    found = match_images(level.left, only_turned, detector, guide=guide)
+    found = match_images(
+        level.left, only_turned, detector, options=MatchingOptions(two_view_model=guide)
+    )
     points = found.points0, found.points1
     camera = level.calibration.camera0
     assert "a rotation of the camera explains all" in refusal(
@@ -170,7 +172,14 @@ def test_unrelated_photographs(detector: DeepDetect, unguided: bool, one_line) -
         np.ascontiguousarray(image[:250, :370]) for image in (data.astronaut(), data.coffee())
     )
     if unguided:
-        found = match_images(first, second, detector, guided=False, model="none", density=0.1)
+        found = match_images(
+            first,
+            second,
+            detector,
+            selection=SelectionOptions(density=0.1),
+            guided_matching=False,
+            model="none",
+        )
         points = found.points0, found.points1
         assert len(points[0]) > 1000
     else:
@@ -305,7 +314,7 @@ def test_a_plane_is_one_also_among_wrong_matches_and_depth_is_none(wrong: int) -
         points1[300:] = np.random.default_rng(1).uniform(0, 500, (wrong, 2))
         plane, epipolar = (
             estimate_geometry(
-                points0, points1, GeometryOptions(model=model, inlier_threshold=threshold)
+                points0, points1, model, options=GeometryOptions(inlier_threshold=threshold)
             )
             for model, threshold in (("homography", 2), ("fundamental", 1.5))
         )

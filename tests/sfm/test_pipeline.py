@@ -18,6 +18,7 @@ from deepdetect import (
     MissingExtraError,
     MultiViewReconstruction,
     OptionError,
+    PointDetector,
     ReconstructionError,
     reconstruct_many,
 )
@@ -25,7 +26,7 @@ from deepdetect.sfm.fusion import DenseOptions
 from deepdetect.sfm.options import MultiViewOptions
 from deepdetect.sfm.pair_selection import PairSelectionOptions
 
-QUICK = {"workers": 1, "max_keypoints": 1500}
+QUICK = {"workers": 1, "detector": PointDetector(1500)}
 
 
 def true_poses(shared: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -190,7 +191,7 @@ def test_other_settings_are_not_mixed_with_earlier_ones(small, tmp_path: Path) -
     output = tmp_path / "model"
     shutil.copytree(before, output)
     with pytest.raises(OptionError, match=r"max_keypoints.*--overwrite"):
-        reconstruct_many(folder, output, workers=1, max_keypoints=700)
+        reconstruct_many(folder, output, workers=1, detector=PointDetector(700))
 
 
 def test_a_known_camera_stays_as_it_is(write_fountain, shared: Path, tmp_path: Path, pycolmap):
@@ -322,7 +323,6 @@ def test_unrelated_photographs_are_one_sentence(tmp_path: Path, one_line, pycolm
     ("output", "options", "message"),
     [
         ("model.ply", {}, "name of a file"),
-        ("model", {"max_keypoint": 5}, "did you mean 'max_keypoints'"),
         ("model", {"pairs": "sequentially"}, "did you mean 'sequential'"),
         ("photos", {}, "holds the photographs"),
     ],
@@ -411,4 +411,3 @@ def test_options_are_all_at_once() -> None:
     options = MultiViewOptions(dense=DenseOptions(stride_px=4))
     assert options.dense is not None
     assert options.dense.stride_px == 4
-    assert options.selection.max_keypoints == 8192

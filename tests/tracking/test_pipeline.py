@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, OptionError
+from deepdetect import OptionError
 from deepdetect.tracking import FrameSource, Tracker, TrackingOptions, load_tracks, track
 from deepdetect.tracking.pipeline import track_frames
 
@@ -169,7 +169,7 @@ def test_sigterm_that_the_caller_handles_is_left_to_it(camera, tmp_path: Path) -
 
 
 def test_an_interrupt_of_a_video_leaves_nothing(frame_folder, tmp_path: Path) -> None:
-    class Interrupted(DeepDetect):
+    class Interrupted:
         def detect(self, *arguments: object, **options: object):
             signal.raise_signal(signal.SIGINT)
 

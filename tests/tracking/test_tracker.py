@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Keypoints, OptionError
+from deepdetect import Keypoints, OptionError
 from deepdetect.tracking import Tracker, TrackingOptions, point_candidates
 from deepdetect.tracking.tracker import free_keypoints
 
@@ -74,7 +74,7 @@ def test_a_point_that_is_covered_is_lost(moving_photo) -> None:
 
 def test_points_of_deepdetect(moving_photo) -> None:
     options = TrackingOptions(max_keypoints=200)
-    tracker = Tracker(point_candidates(DeepDetect(), options), options)
+    tracker = Tracker(point_candidates(options), options)
     first = tracker.update(moving_photo(0))
     second = tracker.update(moving_photo(1))
     assert 100 < len(first) <= 200
@@ -83,7 +83,7 @@ def test_points_of_deepdetect(moving_photo) -> None:
 
 def test_a_black_frame_loses_all_and_is_no_error(moving_photo) -> None:
     options = TrackingOptions(max_keypoints=100)
-    tracker = Tracker(point_candidates(DeepDetect(), options), options)
+    tracker = Tracker(point_candidates(options), options)
     assert len(tracker.update(moving_photo(0)))
     assert len(tracker.update(np.zeros((240, 320, 3), np.uint8))) == 0
     again = tracker.update(moving_photo(1))

@@ -153,6 +153,7 @@ def self_test() -> Iterator[Finding]:
     import numpy as np
 
     from ..detector.detector import DeepDetect
+    from ..detector.point_detector import PointDetector
     from ..matching.pipeline import match_images
 
     blocks = np.random.default_rng(0).integers(0, 256, (32, 42, 3), np.uint8)
@@ -161,7 +162,7 @@ def self_test() -> Iterator[Finding]:
     first, second = whole[:240, :320], whole[4:244, 6:326]
     detector = DeepDetect()
     dense = detector.detect(first)
-    points = detector.detect(first, max_keypoints=256)
+    points = PointDetector(256).detect(first)
     matches = match_images(first, second, detector)
     in_flat = (dense.xy[:, 1] < 48).sum()
     precision = np.mean(np.hypot(*(matches.points0 - matches.points1 - (6, 4)).T) < 1)

@@ -19,7 +19,7 @@ from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  #
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 from deepdetect.features.keypoints import Keypoints  # noqa: E402
 from deepdetect.features.maps import sigmoid  # noqa: E402
-from deepdetect.features.selection import select_keypoints  # noqa: E402
+from deepdetect.features.selection import SelectionOptions, select_keypoints  # noqa: E402
 
 COUNT = 90
 SIZES = [(64, 96), (123, 157), (17, 23), (80, 41)]
@@ -57,7 +57,12 @@ def check_keypoints(
 
 def best(rgb: np.ndarray, count: int = COUNT, weights: Any = "default") -> Keypoints:
     detector = DeepDetect(weights, backend="onnxruntime", threads=1)
-    return detector.detect(rgb, max_keypoints=count, mode="dense")
+    return detector.detect(rgb, max_keypoints=count, nms_radius=1, subpixel=True)
+
+
+def best_of(count: int) -> SelectionOptions:
+    """Return how a file with keypoints selects them."""
+    return SelectionOptions(max_keypoints=count, nms_radius=1, subpixel=True)
 
 
 @pytest.fixture(scope="module", params=[MAX_KEYPOINTS, COUNT], ids=["shipped", "made"])
@@ -128,7 +133,7 @@ def test_one_size(
     images = [photo[9 * k : 9 * k + height, 5 * k : 5 * k + width] for k in range(batch)]
     logits, xy, values = session_of(made).run(["logits", *OUTPUTS], {"image": planes_of(*images)})
     for k in range(batch):
-        selected = select_keypoints(sigmoid(logits[k, 0]), logits=logits[k, 0], max_keypoints=500)
+        selected = select_keypoints(sigmoid(logits[k, 0]), best_of(500), logits[k, 0])
         check_keypoints(xy[k], values[k], selected, 500)
         if precision == "fp32":
             check_keypoints(xy[k], values[k], best(images[k], 500), 500)
@@ -158,7 +163,7 @@ def test_eight_bits(tmp_path: Path, photo: np.ndarray) -> None:
     onnx.checker.check_model(onnx.load(small), full_check=True)
     logits, xy, values = session_of(small).run(["logits", *OUTPUTS], {"image": planes_of(rgb)})
     (map_,) = logits[0]
-    selected = select_keypoints(sigmoid(map_), logits=map_, max_keypoints=COUNT)
+    selected = select_keypoints(sigmoid(map_), best_of(COUNT), map_)
     check_keypoints(xy[0], values[0], selected, COUNT)
 
 
@@ -237,8 +242,7 @@ def keypoints_of() -> Any:
         add_keypoints(model, count)
         found = session_of(model.SerializeToString()).run(OUTPUTS, {"image": logits})
         return found, [
-            select_keypoints(sigmoid(each), logits=each, max_keypoints=count)
-            for each in logits[:, 0]
+            select_keypoints(sigmoid(each), best_of(count), each) for each in logits[:, 0]
         ]
 
     return find

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from deepdetect._shared.errors import OptionError
-from deepdetect.detector.points.detection import PointOptions, detect_points
+from deepdetect.detector.points import detection
+from deepdetect.detector.points.detection import detect_points, ranking_scores
 from deepdetect.detector.points.hessian_scales import build_scale_space, find_candidates
 
 
@@ -21,11 +22,11 @@ def gray() -> np.ndarray:
 
 
 def test_points_come_best_first_with_all_that_descriptors_need(gray) -> None:
-    found = detect_points(gray, PointOptions(max_keypoints=300))
+    found = detect_points(gray, 300)
     assert len(found) == 300
     assert found.image_size == (320, 240)
     assert (np.diff(found.logits) <= 0).all()
-    assert (np.diff(found.scores) <= 0).all()
+    assert (np.diff(found.scores) < 0).all()
     level = np.log(found.sizes / 2.5 / 1.5) / np.log(1.35)
     np.testing.assert_allclose(level, np.rint(level), atol=1e-4)
     assert set(np.rint(level)) <= set(range(7))
@@ -34,29 +35,22 @@ def test_points_come_best_first_with_all_that_descriptors_need(gray) -> None:
 
 
 def test_fewer_are_the_best_of_more(gray) -> None:
-    few, more = (detect_points(gray, PointOptions(max_keypoints=n)) for n in (100, 300))
+    few, more = (detect_points(gray, n) for n in (100, 300))
     np.testing.assert_array_equal(few.xy, more.xy[:100])
     assert len(detect_points(gray)) > 1000
 
 
-def test_no_two_are_nearer_than_the_distance(gray) -> None:
-    for distance in (2.0, 6.0):
-        xy = detect_points(gray, PointOptions(max_keypoints=200, distance_px=distance)).xy
-        gaps = np.linalg.norm(xy[:, None] - xy, axis=2) + 1e9 * np.eye(len(xy))
-        assert gaps.min() >= distance - 1e-3
-
-
-def test_large_ones_keep_more_distance(gray) -> None:
-    points = detect_points(gray, PointOptions(max_keypoints=400, distance_per_sigma=2.0))
-    sigmas = points.sizes / PointOptions().size_per_sigma
+def test_no_two_are_nearer_than_the_distance_and_large_ones_keep_more(gray) -> None:
+    points = detect_points(gray, 400)
+    sigmas = points.sizes / detection.SIZE_PER_SIGMA
     gaps = np.linalg.norm(points.xy[:, None] - points.xy, axis=2) + 1e9 * np.eye(len(points))
-    assert (gaps >= 2 * np.minimum(sigmas[:, None], sigmas) - 1e-3).all()
-    assert gaps.min() < 6  # small ones do not
+    assert (gaps >= np.maximum(2, np.minimum(sigmas[:, None], sigmas)) - 1e-3).all()
+    assert gaps.min() < 4  # small ones do not
 
 
 def test_positions_follow_a_shift_of_the_image(gray) -> None:
-    first = detect_points(gray[:200, :280], PointOptions(max_keypoints=200)).xy
-    second = detect_points(gray[7:207, 12:292], PointOptions(max_keypoints=200)).xy + (12, 7)
+    first = detect_points(gray[:200, :280], 200).xy
+    second = detect_points(gray[7:207, 12:292], 200).xy + (12, 7)
     inner = ((first > 50) & (first < (230, 150))).all(1)
     gaps = np.linalg.norm(first[inner, None] - second, axis=2).min(1)
     assert inner.sum() > 30
@@ -65,8 +59,8 @@ def test_positions_follow_a_shift_of_the_image(gray) -> None:
 
 def test_a_zoomed_image_has_the_same_points_at_larger_sizes(gray) -> None:
     double = cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-    first = detect_points(gray, PointOptions(max_keypoints=150))
-    second = detect_points(double, PointOptions(max_keypoints=600))
+    first = detect_points(gray, 150)
+    second = detect_points(double, 600)
     mapped = (second.xy + 0.5) / 2 - 0.5
     gaps = np.linalg.norm(first.xy[:, None] - mapped, axis=2)
     nearest = gaps.argmin(1)
@@ -81,7 +75,7 @@ def test_spread_points_cover_more_of_the_image(gray, spread) -> None:
     shaded = (gray * np.linspace(1, 0.15, 320)[None]).astype(np.uint8)
     cells = []
     for name in ("none", spread):
-        found = detect_points(shaded, PointOptions(max_keypoints=150, spread=name))
+        found = detect_points(shaded, 150, spread=name)
         assert len(found) == 150
         assert (np.diff(found.logits) <= 0).all()
         cells.append(len(np.unique((found.xy // 32).astype(int), axis=0)))
@@ -89,22 +83,21 @@ def test_spread_points_cover_more_of_the_image(gray, spread) -> None:
 
 
 @pytest.mark.parametrize("spread", ["grid", "anms"])
-def test_dim_regions_get_their_share_of_spread_points(spread) -> None:
+def test_dim_regions_get_their_share_of_spread_points(spread, monkeypatch) -> None:
     """Also where the strongest candidates of an image all lie elsewhere."""
     noise = np.random.default_rng(5).standard_normal((600, 800))
     smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
     contrast = np.where(np.arange(800) < 400, 8, 80) / smooth.std() / 3
     shaded = np.uint8(np.clip(128 + smooth * contrast, 0, 255))
-    found = detect_points(
-        shaded, PointOptions(max_keypoints=200, spread=spread, min_candidates=100)
-    )
+    monkeypatch.setattr(detection, "MIN_CANDIDATES", 100)
+    found = detect_points(shaded, 200, spread=spread)
     assert np.mean(found.xy[:, 0] < 400) > 0.3
 
 
 def test_no_point_is_where_the_mask_is_true(gray) -> None:
     ignore = np.zeros(gray.shape, bool)
     ignore[:, :160] = True
-    found = detect_points(gray, PointOptions(max_keypoints=100), ignore=ignore)
+    found = detect_points(gray, 100, ignore=ignore)
     assert len(found) == 100
     assert found.xy[:, 0].min() > 159
     with pytest.raises(OptionError, match="ignore mask"):
@@ -113,32 +106,32 @@ def test_no_point_is_where_the_mask_is_true(gray) -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (40, 40)])
 def test_images_without_structure_have_no_points(shape) -> None:
-    found = detect_points(np.full(shape, 80, np.uint8), PointOptions(max_keypoints=10))
+    found = detect_points(np.full(shape, 80, np.uint8), 10)
     assert len(found) == 0
     assert found.sizes is not None
     assert found.angles is not None
 
 
-def test_the_strongest_candidates_are_enough(gray) -> None:
+def test_the_strongest_candidates_are_enough(gray, monkeypatch) -> None:
     """Ranking a part of the candidates hardly changes the best."""
-    few = detect_points(gray, PointOptions(max_keypoints=100, min_candidates=1))
-    everything = detect_points(gray, PointOptions(max_keypoints=100, min_candidates=10**6))
+    everything = detect_points(gray)[:100]
+    monkeypatch.setattr(detection, "MIN_CANDIDATES", 1)
+    few = detect_points(gray, 100)
     assert len(find_candidates(build_scale_space(gray))) > 600
     same = (np.linalg.norm(few.xy[:, None] - everything.xy, axis=2).min(1) < 0.1).mean()
     assert same > 0.9
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"max_keypoints": 0}, "max_keypoints"),
-        ({"spread": "grid2", "max_keypoints": 5}, "grid"),
-        ({"spread": "anms"}, "how many"),
-        ({"distance_px": 0}, "distance_px"),
-        ({"distance_per_sigma": -1}, "distance_per_sigma"),
-        ({"candidates_per_keypoint": 0}, "candidates_per_keypoint"),
-    ],
-)
-def test_wrong_options_are_reported(change, message) -> None:
-    with pytest.raises(OptionError, match=message):
-        PointOptions(**change)
+def test_scores_rank_without_ties(photo) -> None:
+    found = detect_points(cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY), 500)
+    assert (np.diff(found.scores) < 0).all()
+    assert 0 < found.scores[-1] < found.scores[0] < 1
+    assert found.scores[0] - found.scores[-1] > 0.005
+
+
+def test_equal_logits_get_falling_scores() -> None:
+    logits = np.array([40, 40, 40, 39.99999, 0, 0, -1e9, -1e9], np.float32)
+    scores = ranking_scores(logits)
+    assert (np.diff(scores) < 0).all()
+    expected = 0.5 + 0.5 * logits / (1 + np.abs(logits))
+    np.testing.assert_allclose(scores, expected, atol=1e-6)

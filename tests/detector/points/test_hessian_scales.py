@@ -4,12 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect._shared.errors import OptionError
-from deepdetect.detector.points.hessian_scales import (
-    ScaleSpaceOptions,
-    build_scale_space,
-    find_candidates,
-)
+from deepdetect.detector.points.hessian_scales import build_scale_space, find_candidates
 
 
 def blob(sigma: float, center=(40.3, 32.6), shape=(64, 80)) -> np.ndarray:
@@ -81,12 +76,3 @@ def test_candidates_are_maxima_of_their_windows() -> None:
 def test_flat_and_tiny_images_have_no_candidates() -> None:
     for shape in ((40, 50), (1, 1), (2, 30), (3, 3)):
         assert len(find_candidates(build_scale_space(np.full(shape, 90, np.uint8)))) == 0
-
-
-@pytest.mark.parametrize(
-    "change", [{"levels": 0}, {"ratio": 1.0}, {"first_sigma_px": 0.1}, {"first_sigma_px": 0.6}]
-)
-def test_wrong_options_are_reported(change) -> None:
-    (name,) = change
-    with pytest.raises(OptionError, match=name):
-        ScaleSpaceOptions(**change)

@@ -18,7 +18,6 @@ from deepdetect.evaluation.protocols.sfm_methods import (
     match_sift,
     part_of_model,
 )
-from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry.camera import Camera
 from deepdetect.geometry.posed_view import PosedView
 from deepdetect.sfm.mapping import Observations, SparseModel
@@ -39,8 +38,7 @@ def scene(write_posed_fountain, tmp_path_factory):
 
 
 def stages_in(folder: Path, scene) -> tuple[Stages, Path]:
-    options = MultiViewOptions(selection=SelectionOptions(max_keypoints=MAX_KEYPOINTS))
-    stages = Stages(folder, options, 1, True)
+    stages = Stages(folder, MultiViewOptions(), 1, True)
     return stages, stages.folder_of([image.path for image in scene.images])
 
 

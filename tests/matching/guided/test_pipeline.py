@@ -12,13 +12,15 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from deepdetect import DeepDetect, Matches, OptionError, match_images
+from deepdetect import DeepDetect, Matches, OptionError
 from deepdetect.cli import main
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.metrics.stereo import stereo_score
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches
+
+from ..conftest import match
 
 WARP = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 18.0], [2e-4, 1e-4, 1.0]])
 
@@ -41,7 +43,7 @@ def second(photo: np.ndarray) -> np.ndarray:
 def test_nearly_all_points_of_a_plane_are_matched_right(
     photo: np.ndarray, second: np.ndarray
 ) -> None:
-    matches = match_images(photo, second, Everywhere())
+    matches = match(photo, second, Everywhere())
     assert (matches.model, matches.guided, matches.two_view_geometry.model) == (
         "homography",
         True,
@@ -59,7 +61,7 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
 @pytest.mark.slow
 def test_unguided_gives_fewer(photo: np.ndarray, second: np.ndarray) -> None:
     guided, unguided = (
-        match_images(photo, second, Everywhere(), guided=guided, model="homography")
+        match(photo, second, Everywhere(), guided_matching=guided, model="homography")
         for guided in (True, False)
     )
     assert unguided.two_view_geometry is None
@@ -73,10 +75,10 @@ def test_unguided_gives_fewer(photo: np.ndarray, second: np.ndarray) -> None:
 def test_what_cannot_be_trusted_has_no_matches_and_says_so(photo: np.ndarray) -> None:
     data = pytest.importorskip("skimage.data")
     other = np.ascontiguousarray(data.coffee()[:256, :256])
-    matches = match_images(photo, other, Everywhere(), ratio=0.9)
+    matches = match(photo, other, Everywhere(), ratio=0.9)
     assert matches.two_view_geometry.model == "none"
     assert matches.two_view_geometry.matrix is None
-    assert matches.lost
+    assert not matches.success
     assert not matches.guided
     assert len(matches) == 0
 
@@ -94,8 +96,8 @@ def test_the_command_says_what_guided(
     )
     report = json.loads(good.stdout)
     assert report["guided"] is True
-    assert report["guide"]["model"] == report["model"] == "homography"
-    assert report["guide"]["sparse_inliers"] >= 10
+    assert report["two_view_geometry"]["model"] == report["model"] == "homography"
+    assert report["two_view_geometry"]["tentative_inliers"] >= 10
     bad = CliRunner().invoke(
         main, ["match", str(tmp_path / "a.png"), str(tmp_path / "c.png"), *words]
     )
@@ -111,7 +113,7 @@ def test_a_plane_guides_no_scene_with_depth(shared: Path, pair: str) -> None:
         images = [shared / f"data/fountain/{int(n):04d}.jpg" for n in numbers.split("-")]
     else:
         images = [shared / f"data/kitti-clip/{int(n):06d}.jpg" for n in numbers.split("-")]
-    matches = match_images(*images, density=0.02)
+    matches = match(*images, density=0.02)
     assert matches.two_view_geometry.model != "homography"
 
 
@@ -143,7 +145,7 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
     detector = DeepDetect("dense")
     guided, unguided = (
-        match_images(pair.left, pair.right, detector, guided=guided, matcher="patchmatch")
+        match(pair.left, pair.right, detector, guided_matching=guided, matcher="patchmatch")
         for guided in (True, False)
     )
     assert guided.guided
@@ -165,13 +167,11 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
 def test_a_plane_that_is_asked_for_guides(shared: Path, name: str) -> None:
     """In scenes with depth, where nothing else would choose a plane."""
     pair = load_middlebury(shared / "data" / "middlebury" / name)
-    for asked in ({"guide": "homography"}, {"model": "homography"}):
-        matches = match_images(pair.left, pair.right, Everywhere(), **asked)
+    for asked in ({"two_view_model": "homography"}, {"model": "homography"}):
+        matches = match(pair.left, pair.right, Everywhere(), **asked)
         assert matches.two_view_geometry.model == "homography"
         assert matches.model == "homography"
-    assert (
-        match_images(pair.left, pair.right, Everywhere()).two_view_geometry.model == "fundamental"
-    )
+    assert match(pair.left, pair.right, Everywhere()).two_view_geometry.model == "fundamental"
 
 
 @pytest.mark.slow
@@ -184,8 +184,8 @@ def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
     camera = pair.camera
     detector = DeepDetect("dense")
     images = pair.left, pair.right, detector
-    assert match_images(*images).two_view_geometry.model == "homography"
-    found = match_images(*images, model=model, camera0=camera, camera1=camera)
+    assert match(*images).two_view_geometry.model == "homography"
+    found = match(*images, model=model, camera0=camera, camera1=camera)
     assert found.two_view_geometry.model == "fundamental"
     assert found.model == model
     x, y = found.points0.astype(int).T
@@ -194,8 +194,8 @@ def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
     errors = np.linalg.norm(found.points1 - pair.match(found.points0), axis=1)
     for part in (near, ~near):
         assert (errors[part] < 2).mean() > 0.9
-    with pytest.raises(OptionError, match=f"homography contradicts the model {model}"):
-        match_images(*images, model=model, camera0=camera, camera1=camera, guide="homography")
+    with pytest.raises(OptionError, match=f"contradicts the model {model}"):
+        match(*images, model=model, camera0=camera, camera1=camera, two_view_model="homography")
 
 
 @pytest.mark.slow
@@ -212,14 +212,14 @@ def test_mutual_matches_are_one_to_one(photo: np.ndarray, second: np.ndarray) ->
         pairs = map(tuple, np.column_stack(points).tolist())
         return dict(zip(pairs, found.scores.tolist(), strict=True))
 
-    mutual = match_images(photo, second, Everywhere(), mutual=True)
+    mutual = match(photo, second, Everywhere(), mutual=True)
     assert mutual.guided
     # Which image is first is decided by what is in them: it is the best of one of both ways.
     pairs = scored_pairs(mutual, False)
     agreeing = 0
     for swapped in (False, True):
         images = (second, photo) if swapped else (photo, second)
-        plain = match_images(*images, Everywhere())
+        plain = match(*images, Everywhere())
         assert plain.guided
         best = best_of_each_place(plain)
         if scored_pairs(plain, swapped).items() >= pairs.items():
@@ -264,7 +264,7 @@ def test_the_command_says_which_options_do_not_apply(
 
 @pytest.mark.slow
 def test_is_the_same_on_repetition(photo: np.ndarray, second: np.ndarray) -> None:
-    one, other = (match_images(photo, second, Everywhere()) for _ in range(2))
+    one, other = (match(photo, second, Everywhere()) for _ in range(2))
     np.testing.assert_array_equal(one.points1, other.points1)
     np.testing.assert_array_equal(one.scores, other.scores)
     np.testing.assert_array_equal(one.matrix, other.matrix)
@@ -272,11 +272,6 @@ def test_is_the_same_on_repetition(photo: np.ndarray, second: np.ndarray) -> Non
 
 def test_an_unknown_guide_brings_the_nearest(photo: np.ndarray) -> None:
     with pytest.raises(OptionError, match="did you mean 'homography'"):
-        match_images(photo, photo, Everywhere(), guide="homografy")
+        match(photo, photo, Everywhere(), two_view_model="homografy")
     with pytest.raises(OptionError, match="unknown model"):
         guided_matches(luma(photo), luma(photo), np.zeros((1, 2)), np.zeros((1, 2)), "none")
-
-
-def test_the_published_preset_is_unguided(photo: np.ndarray) -> None:
-    matches = match_images(photo, photo, preset="published")
-    assert matches.two_view_geometry is None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError
+from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError, PointDetector
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.matching.stitching import Panorama, StitchingOptions, stitch
@@ -58,8 +58,8 @@ def test_the_panorama_is_the_photograph(panorama: Panorama, views) -> None:
 
 
 def test_few_points_put_it_together_without_the_network(views, monkeypatch) -> None:
-    monkeypatch.setattr(DeepDetect, "_run", None)
-    few = stitch([views.images[2], views.images[0], views.images[1]], max_keypoints=1000)
+    monkeypatch.setattr(DeepDetect, "select", None)
+    few = stitch([views.images[2], views.images[0], views.images[1]], detector=PointDetector(1000))
     assert few.reference == 2
     true = [views.homographies[k] for k in (2, 0, 1)]
     for number, matrix in few.homographies.items():

@@ -55,7 +55,8 @@ class OnnxOptions:
             which it needs calibration images; it marks other pixels).
         max_calibration_images: at most this many images calibrate int8, evenly chosen.
         max_keypoints: the file gives this many dense keypoints, too, the best ones: what
-            `DeepDetect.detect` finds with the same `max_keypoints` and mode="dense". 0: maps
+            `DeepDetect.detect` finds with the same `max_keypoints`, `nms_radius=1`
+            and `subpixel=True`. 0: maps
             only. None: 2048; with a size 0, as OpenCV 4 refuses files with keypoints.
 
     Raises:
