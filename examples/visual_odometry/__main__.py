@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from odometry import VisualOdometry
 
-from deepdetect import Camera, DeepDetect, DeepDetectError, Keypoints, load_image
+from deepdetect import Camera, DeepDetectError, Keypoints, load_image
 from deepdetect.geometry.relative_pose import rotation_angle
 from deepdetect.io.image import find_images, luma
 from deepdetect.tracking import Tracker, TrackingOptions, point_candidates
@@ -42,7 +42,7 @@ def methods(count: int) -> dict[str, Callable[[np.ndarray], Keypoints]]:
         return Keypoints.from_opencv(points, (rgb.shape[1], rgb.shape[0]))
 
     return {
-        "DeepDetect": point_candidates(DeepDetect(), options),
+        "DeepDetect": point_candidates(options),
         "SIFT": partial(opencv, sift),
         "ORB": partial(opencv, orb),
     }

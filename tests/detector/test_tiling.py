@@ -107,7 +107,7 @@ def test_images_larger_than_the_memory_are_tiled(
     strip: np.ndarray,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    expected, expected_map = detector.detect(strip, **options, return_heatmap=True)
+    expected, expected_map = detector.detect(strip, **options), detector.heatmap(strip)
     monkeypatch.setattr(heatmap, "available_memory", lambda: strip[..., 0].size * 140)
     monkeypatch.setattr(tiling, "DEFAULT_TILE_MEGAPIXELS", 0.05)
     monkeypatch.setattr(detector._network, "_session", None)  # so that it cannot be run whole

@@ -54,7 +54,7 @@ def matches_of(guide: TwoViewGeometry | None = None, matrix: np.ndarray | None =
     inliers = np.arange(5) > 2
     return Matches(
         *(points.xy, points.xy[::-1], points.scores, inliers, model, matrix, points, points[:3]),
-        guide=guide,
+        two_view_geometry=guide,
     )
 
 
@@ -97,9 +97,9 @@ def test_matches_survive_the_round_trip(
         np.testing.assert_array_equal(one.scores, other.scores)
         assert one.image_size == other.image_size
     if guide is None:
-        assert loaded.guide is None
+        assert loaded.two_view_geometry is None
         return
-    found, given = vars(loaded.guide), vars(GUIDES[guide])
+    found, given = vars(loaded.two_view_geometry), vars(GUIDES[guide])
     np.testing.assert_array_equal(found.pop("matrix"), given["matrix"])
     assert found == {name: value for name, value in given.items() if name != "matrix"}
 

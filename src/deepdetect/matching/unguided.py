@@ -16,6 +16,7 @@ from ..features.matches import Matches
 from ..features.sift import get_descriptor, scaled_sift_descriptors, to_root_sift
 from .options import MatchingOptions
 
+
 @suggest_keywords
 def match_features(
     features0: Keypoints,

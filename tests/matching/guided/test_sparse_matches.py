@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Keypoints
+from deepdetect import Keypoints, PointDetector
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import GuidedOptions, guided_matches
@@ -25,8 +25,8 @@ def pair(photo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def points(pair: tuple[np.ndarray, np.ndarray]) -> tuple[Keypoints, Keypoints]:
-    detector = DeepDetect()
-    first, second = (detector.detect(image, max_keypoints=400) for image in pair)
+    detector = PointDetector(400)
+    first, second = (detector.detect(image) for image in pair)
     return first, second
 
 
