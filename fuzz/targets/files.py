@@ -1,4 +1,4 @@
-"""Files that the library writes and reads: keypoints, matches, masks, depth, settings, cameras."""
+"""Files that the library writes and reads: keypoints, matches, masks, settings, cameras."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from hypothesis import strategies
 
 from deepdetect import Keypoints, OptionError, load_keypoints, load_matches, save_keypoints
 from deepdetect.geometry.camera import read_calibration
-from deepdetect.io.depth import load_depth_png, save_depth_png
 from deepdetect.io.masks import encode_mask, load_mask
 from deepdetect.labels.detectors import DETECTORS
 from deepdetect.labels.settings import read_label_settings
@@ -114,25 +113,6 @@ def masks(generator: np.random.Generator, folder: Path) -> None:
     expect(found.dtype == bool and found.ndim == 2 and found.size > 0, "no mask")
 
 
-@prepared
-def depth_file() -> bytes:
-    """Return a depth map."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "depth.png"
-        save_depth_png(np.linspace(1, 4, 480).reshape(20, 24).astype(np.float32), path, "mm")
-        return path.read_bytes()
-
-
-def depth(generator: np.random.Generator, folder: Path) -> None:
-    """Load a damaged depth map."""
-    path = folder / "depth.png"
-    path.write_bytes(mutate(depth_file(), generator))
-    found, _ = load_depth_png(path)
-    expect(found.dtype == np.float32 and found.ndim == 2, "no depth map")
-    known = found[~np.isnan(found)]
-    expect(np.isfinite(known).all() and (known > 0).all(), "depths that cannot be")
-
-
 def calibrations(generator: np.random.Generator, folder: Path) -> None:
     """Read a calibration of any values, damaged, or nested too deeply."""
     content = json.dumps(draw(CALIBRATIONS, generator)).encode()
@@ -178,7 +158,6 @@ def label_settings(generator: np.random.Generator, folder: Path) -> None:
 TARGETS = (
     Target("keypoints", "files of keypoints (npz)", keypoints, 1500),
     Target("masks", "masks", masks, 900),
-    Target("depth", "depth maps", depth, 700),
     Target("calibrations", "calibrations", calibrations, 1200),
     Target("label-settings", "label settings", label_settings, 600, 100),
 )

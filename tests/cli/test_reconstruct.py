@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect.io.depth import load_depth_png
-
 FOCAL, OFFSET, BASELINE = 994.978, 31.086, 193.001
 """In pixels and mm, of the page of skimage.data.stereo_motorcycle."""
 
@@ -133,9 +131,7 @@ def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
     step = values["depth_png"]["value_per_unit"]
     assert values["depth_png"]["known_pixels"] == np.count_nonzero(stored) == values["points"]
     np.testing.assert_allclose(stored[known] / step, depth[known], atol=0.51 / step)
-    read, unit = load_depth_png("out/m_depth.png")
-    assert unit == "mm"
-    np.testing.assert_array_equal(np.isfinite(read), known)
+    np.testing.assert_array_equal(stored > 0, known)
     page = Path("out/m.html").read_text()
     assert f"{values['points']:,}" in page or "Left out" in page
     assert "left.png and right.png" in page

@@ -14,7 +14,6 @@ import pytest
 
 from deepdetect import DeepDetectError, load_image, load_keypoints
 from deepdetect.geometry.camera import read_calibration
-from deepdetect.io.depth import load_depth_png
 from deepdetect.io.masks import load_mask
 from deepdetect.labels.settings import read_label_settings
 
@@ -22,7 +21,6 @@ CORPUS = Path(__file__).parents[2] / "fuzz" / "corpus"
 READERS: dict[str, Callable[[Path], Any]] = {
     "array": lambda path: load_image(np.load(path)),
     "calibration": lambda path: read_calibration(path, (64, 48), (64, 48)),
-    "depth": load_depth_png,
     "image": load_image,
     "keypoints": load_keypoints,
     "label-settings": read_label_settings,

@@ -20,7 +20,7 @@ from PIL import EpsImagePlugin, Image, ImageOps
 from PIL.PngImagePlugin import PngInfo
 
 import deepdetect.io.image
-from deepdetect._shared.errors import ImageError, OptionError
+from deepdetect._shared.errors import ImageError, MissingExtraError, OptionError
 from deepdetect.io.image import (
     IMAGE_SUFFIXES,
     MINIMUM_SIDE,
@@ -719,3 +719,51 @@ def test_enlarging_and_shrinking_gives_the_image_back(photo: np.ndarray) -> None
     assert twice.shape == (512, 512, 3)
     back = scale_short_side(twice, 256)
     assert np.abs(back.astype(int) - photo).mean() < 2
+
+
+@pytest.fixture
+def heic(photo: np.ndarray) -> Callable[..., bytes]:
+    """Write HEIC files, as telephones do, without registering the format."""
+    pillow_heif = pytest.importorskip("pillow_heif")
+
+    def write(**options: Any) -> bytes:
+        file = io.BytesIO()
+        data = np.ascontiguousarray(photo)
+        image = pillow_heif.from_bytes("RGB", photo.shape[1::-1], data.tobytes())
+        image.save(file, quality=95, **options)
+        return file.getvalue()
+
+    return write
+
+
+def test_heic_files_are_read(heic: Callable[..., bytes], photo: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "photo.heic"
+    path.write_bytes(heic())
+    assert np.abs(load_image(path).astype(int) - photo).mean() < 6
+    assert find_images(tmp_path) == [path]
+
+
+def test_heic_files_are_turned_once(heic: Callable[..., bytes], photo: np.ndarray) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    loaded = load_image(heic(exif=exif.tobytes()))
+    assert np.abs(loaded.astype(int) - UPRIGHT[6](photo)).mean() < 6
+
+
+def test_without_pillow_heif_its_name_is_said(
+    heic: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch, one_line: OneLine
+) -> None:
+    content = heic()
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    Image.init()
+    monkeypatch.delitem(Image.OPEN, "HEIF", raising=False)
+    with pytest.raises(MissingExtraError, match="is a HEIF image: run pip install pillow-heif"):
+        load_image(content)
+
+
+def test_names_are_in_natural_order(tmp_path: Path) -> None:
+    names = ["2.png", "10.png", "a9/1.png", "a9/02.png", "a10/1.png"]
+    for name in reversed(names):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert [path.relative_to(tmp_path).as_posix() for path in find_images(tmp_path)] == names

@@ -29,7 +29,6 @@ from ._options import (
 from ._reconstruct_many import MANY, OUTPUT, reconstruct_folder
 
 if TYPE_CHECKING:
-    from ..io.depth import DepthPng
     from ..reconstruction.result import Reconstruction
 
 CAMERAS = FieldOptions(
@@ -204,22 +203,12 @@ def _write(
     numbers = {
         **images,
         **values,
-        "depth_png": _depth_png_values(stored),
+        "depth_png": stored,
         "files": list(files.values()),
     }
     with atomic_path(files[".json"]) as temporary:
         temporary.write_text(json.dumps(numbers, indent=2, default=str) + "\n", encoding="utf-8")
     return numbers
-
-
-def _depth_png_values(stored: DepthPng) -> dict[str, Any]:
-    return {
-        "unit": stored.unit,
-        "value_per_unit": stored.value_per_unit,
-        "unknown": 0,
-        "known_pixels": stored.known,
-        "out_of_range": stored.out_of_range,
-    }
 
 
 def _rows(found: Reconstruction, numbers: dict[str, Any]) -> list[tuple[str, str]]:

@@ -65,7 +65,7 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
     """
     name = file_name(image)
     tags, orientation = _tags(image)
-    turned = orientation in TRANSPOSED and not hasattr(image, "getexif")
+    turned = orientation in TRANSPOSED
     own = (size[1], size[0]) if turned else size
     taken = (_number(tags.get(WIDTH)), _number(tags.get(HEIGHT)))
     if not min(taken) > 0:
@@ -96,16 +96,20 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
 
 
 def _tags(image: Any) -> tuple[dict[int, Any], int]:
-    """Read the EXIF tags and the orientation; unreadable tags count as missing."""
+    """Read the EXIF tags, and the orientation that `load_image` undoes; 1 for PIL images.
+
+    Unreadable tags count as missing.
+    """
     try:
         if hasattr(image, "getexif"):
-            exif = image.getexif()
-        elif is_file(image):
-            with open_image(image) as opened:
-                exif = opened.getexif()
-        else:
+            return dict(image.getexif().get_ifd(EXIF_BLOCK)), 1
+        if not is_file(image):
             return {}, 1
-        return dict(exif.get_ifd(EXIF_BLOCK)), int(exif.get(ORIENTATION, 1))
+        with open_image(image) as opened:
+            exif = opened.getexif()
+        # HEIF images are turned when they are opened.
+        orientation = opened.info.get("original_orientation") or exif.get(ORIENTATION, 1)
+        return dict(exif.get_ifd(EXIF_BLOCK)), int(orientation)
     except Exception:  # Pillow's readers raise many kinds; broken tags are ignored
         return {}, 1
 

@@ -20,7 +20,9 @@ from .image_file import damaged_image, file_name, is_file, open_image
 MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
 
-IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp")
+IMAGE_SUFFIXES = (
+    *(".bmp", ".heic", ".heif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"),
+)
 """File name suffixes of the images that `find_images` lists."""
 
 ORIENTATION_TAG = 0x0112
@@ -68,6 +70,7 @@ def load_image(
         ImageError: the file is missing, truncated, damaged (as far as its format lets one
             see), too large or no image, the array has a wrong shape, type or range or holds
             NaN, or a side is shorter than 16 pixels.
+        MissingExtraError: it is a HEIF image, and pillow-heif is not installed.
         OptionError: `max_megapixels` is not above 0, or the order of the colours is unknown.
 
     Example:
@@ -109,7 +112,7 @@ def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
 
 
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
-    """List the image files below a folder, sorted by path.
+    """List the image files below a folder, sorted by path: "2.png" comes before "10.png".
 
     Args:
         folder: the folder.
@@ -118,19 +121,24 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     Raises:
         ImageError: the folder is missing, is a file, or holds no image.
     """
+    from natsort import natsorted, ns
+
     root = Path(folder)
     if root.is_file():
         raise ImageError(f"{root} is a file: name the folder that it is in")
     if not root.is_dir():
         raise MissingImageError(f"there is no folder {root}: check the path")
     left_out = [path.resolve() for path in exclude if path.resolve() != root.resolve()]
-    found = sorted(
-        path
-        for path in root.rglob("*")
-        if path.suffix.lower() in IMAGE_SUFFIXES
-        and path.is_file()
-        and not any(part.startswith(".") for part in path.relative_to(root).parts)
-        and not any(path.resolve().is_relative_to(other) for other in left_out)
+    found = natsorted(
+        (
+            path
+            for path in root.rglob("*")
+            if path.suffix.lower() in IMAGE_SUFFIXES
+            and path.is_file()
+            and not any(part.startswith(".") for part in path.relative_to(root).parts)
+            and not any(path.resolve().is_relative_to(other) for other in left_out)
+        ),
+        alg=ns.PATH,
     )
     if not found:
         raise ImageError(

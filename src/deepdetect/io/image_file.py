@@ -9,16 +9,22 @@ import struct
 import warnings
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import Any, BinaryIO
 
-from .._shared.errors import ImageError, MissingImageError, OptionError
+from .._shared.errors import (
+    DeepDetectError,
+    ImageError,
+    MissingExtraError,
+    MissingImageError,
+    OptionError,
+)
 
 FORMATS = (
     *("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "AVIF"),
     *("PSD", "QOI", "SGI", "PCX"),
-    *("HEIF", "JXL"),  # where a plug-in of Pillow has registered them
+    *("HEIF", "JXL"),  # where a plug-in of Pillow registers them
     "TGA",  # has no signature, so it comes last
 )
 """Formats that are read: all are decoded in this process, unlike EPS, which starts Ghostscript."""
@@ -31,6 +37,8 @@ SIGNATURE_BYTES = 16
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
+HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
+"""In bytes 8 to 12 of HEIF files, which telephones write (ISO/IEC 23008-12)."""
 
 _limit: ContextVar[float] = ContextVar("max_megapixels", default=MAX_MEGAPIXELS)
 
@@ -85,6 +93,7 @@ def open_image(
     Raises:
         ImageError: the file is missing, truncated, damaged (as far as its format lets one see),
             too large or no image.
+        MissingExtraError: it is a HEIF image, and pillow-heif is not installed.
         OptionError: `max_megapixels` is not above 0.
     """
     limit = megapixel_limit(max_megapixels)
@@ -95,14 +104,14 @@ def open_image(
             with _identify(file, name) as image:
                 _check_size(image.size, name, limit)
                 yield image
+    except DeepDetectError:
+        raise
     except FileNotFoundError:
         raise MissingImageError(f"there is no file {name}: check the path") from None
     except IsADirectoryError:
         raise ImageError(f"{name} is a folder: name an image file") from None
     except PermissionError:
         raise ImageError(f"{name} may not be read: check its rights") from None
-    except (ImageError, OptionError):
-        raise
     except OSError as error:  # of the file system; Pillow's have no number
         if error.errno is None:
             raise damaged_image(name, error) from None
@@ -194,6 +203,12 @@ def _identify(file: BinaryIO, name: str) -> Any:
     _hide_warning_of_large_images()
     Image.init()  # registers all formats; that of AVIF is not in every Pillow
     start = file.read(SIGNATURE_BYTES)
+    heif = start[4:8] == b"ftyp" and start[8:12] in HEIF_BRANDS
+    if heif:
+        with suppress(ModuleNotFoundError):
+            from pillow_heif import register_heif_opener
+
+            register_heif_opener()
     for key in FORMATS:
         if key not in Image.OPEN:
             continue
@@ -205,6 +220,8 @@ def _identify(file: BinaryIO, name: str) -> Any:
                 return factory(file, "")
         except (SyntaxError, IndexError, TypeError, struct.error):
             continue
+    if heif:
+        raise MissingExtraError(f"{name} is a HEIF image: run pip install pillow-heif to read it")
     raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG")
 
 
