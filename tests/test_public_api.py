@@ -81,7 +81,7 @@ def test_results_say_what_they_hold() -> None:
         "PointCloud(4 points, unit='mm')",
         "DisparityMap(30x20, 0.0% known, 0.0% matched)",
         "Registration(30x20, overlap 100%, 1,234 matches, zncc=0.500)",
-        "Panorama(30x20, 2 images, left_out={}, residual_px=0.250)",
+        "Panorama(30x20, 2 images, unregistered={}, residual_px=0.250)",
     ]
 
 

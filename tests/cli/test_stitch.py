@@ -34,7 +34,9 @@ def test_what_cannot_be_connected_is_told(views: list[np.ndarray], tmp_path: Pat
     result = CliRunner().invoke(main, [*words, "--json"])
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
-    assert report["left_out"] == [{"image": files[1], "reason": "it overlaps with no other image"}]
+    assert report["unregistered"] == [
+        {"image": files[1], "reason": "it overlaps with no other image"}
+    ]
     assert report["images"] == [files[0], files[2]]
     assert report["reference"] == files[2]
     assert (report["width"], report["height"]) == (450, 400)
@@ -43,7 +45,7 @@ def test_what_cannot_be_connected_is_told(views: list[np.ndarray], tmp_path: Pat
     assert report["pairs"][0]["images"] == [files[0], files[2]]
     assert report["pairs"][0]["matches"] > 1000
     values = CliRunner().invoke(main, words)
-    assert f"left out: {files[1]}, as it overlaps with no other image" in values.stderr
+    assert f"not in the panorama: {files[1]}, as it overlaps with no other image" in values.stderr
     assert "2 of 3" in values.stdout
 
 
@@ -52,7 +54,8 @@ def test_the_command_writes_the_file(views: list[np.ndarray], tmp_path: Path) ->
         Image.fromarray(view).save(tmp_path / f"{name}.png")
     files = [str(tmp_path / f"{name}.png") for name in "cab"]
     output = tmp_path / "panorama.jpg"
-    result = CliRunner().invoke(main, ["stitch", *files, "-o", str(output)])
+    words = ["--projection", "cylindrical", "--crop"]
+    result = CliRunner().invoke(main, ["stitch", *files, "-o", str(output), *words])
     assert result.exit_code == 0, result.output
     with Image.open(output) as picture:
         width, height = picture.size

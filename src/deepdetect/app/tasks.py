@@ -177,14 +177,14 @@ def run_stitch(
     panorama = stitch([one.path for one in images], progress=stages)
     save_picture(panorama.image, folder / "panorama.jpg")
     height, width = panorama.image.shape[:2]
-    used = len(images) - len(panorama.left_out)
+    used = len(images) - len(panorama.unregistered)
     numbers = {
         "Images": f"{used} of {len(images)}",
         "Size": f"{width}×{height}, {panorama.valid.mean():.0%} covered",
     }
-    left_out = [images[number].name for number in panorama.left_out]
-    if left_out:
-        numbers["Left out"] = ", ".join(left_out)
+    others = [images[number].name for number in panorama.unregistered]
+    if others:
+        numbers["Left out"] = ", ".join(others)
     return TaskResult(numbers, "panorama.jpg", ("panorama.jpg",))
 
 

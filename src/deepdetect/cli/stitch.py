@@ -30,13 +30,18 @@ if TYPE_CHECKING:
 
 PANORAMA = FieldOptions(
     "matching.stitching.panorama:stitch",
-    names=("scale", "max_canvas_megapixels", "registration_side", "seed"),
+    names=("projection", "crop", "seed"),
+)
+OPTIONS = FieldOptions(
+    "matching.stitching.panorama:StitchingOptions",
+    names=("scale", "max_canvas_megapixels", "registration_side"),
 )
 MAX_KEYPOINTS = FieldOptions(POINTS.path, names=("max_keypoints",))
 
 
 @generated_command(
-    PANORAMA, MAX_KEYPOINTS, POINTS, DETECTOR, short_help="A panorama of overlapping photographs."
+    *(PANORAMA, OPTIONS, MAX_KEYPOINTS, POINTS, DETECTOR),
+    short_help="A panorama of overlapping images.",
 )
 @click.argument("images", type=PATH, nargs=-1, required=True)
 @click.option(
@@ -50,7 +55,8 @@ MAX_KEYPOINTS = FieldOptions(POINTS.path, names=("max_keypoints",))
 @click.option(
     "--reference",
     type=PATH,
-    help="The one of IMAGES that is not distorted.  [default: the one in the middle]",
+    help="The one of IMAGES that is not distorted, or in the middle of a curved panorama.  "
+    "[default: the one in the middle]",
 )
 @detector_option("network")
 @max_megapixels_option
@@ -65,17 +71,18 @@ def stitch(
     as_json: bool,
     **values: Any,
 ) -> None:
-    """Make a flat panorama of IMAGES: overlapping photographs from one place, or of a plane.
+    """Make a panorama of IMAGES: overlapping ones from one place, or of a plane.
 
-    They may be in any order. Those that overlap with no other are left out and named. Those that
-    cannot be read do not stop the others: they are listed at the end, with exit code 1. A flat
-    panorama shows 100 to 120 degrees at the most.
+    They may be in any order. Those that overlap with no other are named. Those that cannot be read
+    do not stop the others: they are listed at the end, with exit code 1. A flat panorama shows 100
+    to 120 degrees at the most, a cylindrical or spherical one all around.
 
     \b
     deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
+    deepdetect stitch *.jpg --projection cylindrical --crop -o panorama.jpg
     """
     from .._shared.progress import stage_progress
-    from ..matching.stitching import STAGES
+    from ..matching.stitching import STAGES, StitchingOptions
     from ..matching.stitching import stitch as stitch_images
     from ..viz.draw import picture_suffix, save_picture
     from ._records import claimed_outputs
@@ -88,6 +95,7 @@ def stitch(
     if kind == "network" and values["max_keypoints"] is not None:
         raise OptionError("--max-keypoints is for --detector points: leave it out, or choose that")
     detector, _ = chosen_detector(kind, values)
+    options = StitchingOptions(**given_only({name: values.pop(name) for name in OPTIONS.names}))
     given = len(images)
     images, failures = _readable(images)
     if len(images) < min(given, 2) or (reference is not None and reference not in images):
@@ -100,6 +108,7 @@ def stitch(
                     images,
                     detector=detector,
                     reference=None if reference is None else images.index(reference),
+                    options=options,
                     progress=done,
                     **given_only(values),
                 )
@@ -118,8 +127,8 @@ def stitch(
     numbers = {**_numbers(panorama, images, output), "failures": failures}
     print_result(as_json, numbers, _rows(panorama, images, output), "panorama")
     if not as_json:
-        for left_out in numbers["left_out"]:
-            click.echo(f"left out: {left_out['image']}, as {left_out['reason']}", err=True)
+        for other in numbers["unregistered"]:
+            click.echo(f"not in the panorama: {other['image']}, as {other['reason']}", err=True)
     report_failures(failures, given)
 
 
@@ -144,8 +153,8 @@ def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[s
     used = sorted(panorama.homographies)
     return {
         "images": [images[k] for k in used],
-        "left_out": [
-            {"image": images[k], "reason": reason} for k, reason in panorama.left_out.items()
+        "unregistered": [
+            {"image": images[k], "reason": reason} for k, reason in panorama.unregistered.items()
         ],
         "reference": images[panorama.reference],
         "width": width,
@@ -171,7 +180,7 @@ def _rows(panorama: Panorama, images: Sequence[Path], output: Path) -> list[tupl
         ("photographs", f"{len(panorama.homographies)} of {len(images)}"),
         ("reference", str(images[panorama.reference])),
         ("registered pairs", f"{len(counts)}, with {min(counts):,} to {max(counts):,} matches"),
-        ("residual", f"{panorama.residual_px:.2f} px (root mean square, reduced photographs)"),
+        ("residual", f"{panorama.residual_px:.2f} px (root mean square, reduced images)"),
         ("brightness", f"changed by {min(gains):.2f} to {max(gains):.2f} times"),
         ("size", f"{width}x{height}, {panorama.valid.mean():.0%} covered"),
         *seconds_rows(panorama.seconds),

@@ -7,13 +7,15 @@ import pytest
 from deepdetect import DeepDetectError, OptionError
 from deepdetect._shared import memory
 from deepdetect.geometry.rescaling import downscale
-from deepdetect.matching.stitching.compositing import (
+from deepdetect.matching.stitching.bundle_adjustment import RotatingCamera
+from deepdetect.matching.stitching.canvas import (
     Canvas,
-    composite,
+    PlaneCanvas,
     least_distorted,
-    plan_canvas,
-    warp_to_box,
+    plan_curved,
+    plan_plane,
 )
+from deepdetect.matching.stitching.compositing import composite, crop_box
 
 CAMERA = np.array([[400.0, 0, 199.5], [0, 400, 149.5], [0, 0, 1]])
 SIZE = (400, 300)
@@ -29,10 +31,10 @@ def turned(degrees: float) -> np.ndarray:
     return CAMERA @ rotation @ np.linalg.inv(CAMERA)
 
 
-def planned(homographies: dict[int, np.ndarray], reference: int = 0, **options) -> Canvas:
-    sizes = dict.fromkeys(homographies, SIZE)
-    options = {"scale": 1.0, "max_canvas_megapixels": 50.0, **options}
-    return plan_canvas(sizes, homographies, reference, **options)
+def planned(
+    homographies: dict[int, np.ndarray], reference: int = 0, scale: float = 1.0
+) -> PlaneCanvas:
+    return plan_plane(dict.fromkeys(homographies, SIZE), homographies, reference, scale)
 
 
 def put_together(images: dict[int, np.ndarray], canvas: Canvas):
@@ -72,14 +74,14 @@ def test_what_reaches_the_horizon_is_refused(factor: int, one_line) -> None:
 
 
 def test_a_canvas_too_large_is_refused(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
-    far = {0: np.eye(3), 1: moved(10_000)}
+    canvas = planned({0: np.eye(3), 1: moved(10_000)})
     with pytest.raises(OptionError, match=r"would be 10400x300 pixels, .*max_canvas_mega") as error:
-        planned(far, max_canvas_megapixels=3.1)
+        canvas.check_size(3.1)
     one_line(error.value)
-    assert planned(far, max_canvas_megapixels=3.13).size == (10_400, 300)
+    canvas.check_size(3.13)
     monkeypatch.setattr(memory, "available_memory", lambda: 10_400 * 300 * 22)
     with pytest.raises(OptionError, match="GB of memory, more than is free") as error:
-        planned(far)
+        canvas.check_size(3.13)
     one_line(error.value)
 
 
@@ -92,7 +94,9 @@ def test_the_one_in_the_middle_is_least_stretched() -> None:
 
 
 def test_an_image_is_drawn_where_it_belongs(scene: np.ndarray) -> None:
-    drawn, mask = warp_to_box(scene, moved(40, 10), (30, 0, 700, 405))
+    canvas = PlaneCanvas((700, 405), {0: (30, 0, 700, 405)}, {0: moved(40, 10)})
+    warped = canvas.draw(0, scene, 1, 1)
+    drawn, mask = warped.image, warped.mask
     assert drawn.shape == (405, 670, 3)
     np.testing.assert_array_equal(drawn[10:, 10:610], scene[:395])
     assert (mask[10:, 10:610] == 255).all()
@@ -100,7 +104,8 @@ def test_an_image_is_drawn_where_it_belongs(scene: np.ndarray) -> None:
     # Stripes of one pixel are grey when made smaller, not what sampling hits.
     stripes = np.zeros((200, 200, 3), np.uint8)
     stripes[:, ::2] = 255
-    small, _ = warp_to_box(stripes, np.diag([0.25, 0.25, 1]), (0, 0, 50, 50))
+    shrunk = PlaneCanvas((50, 50), {0: (0, 0, 50, 50)}, {0: np.diag([0.25, 0.25, 1])})
+    small = shrunk.draw(0, stripes, 1, 1).image
     assert np.abs(small[5:-5, 5:-5].astype(int) - 127.5).max() < 30
 
 
@@ -143,3 +148,65 @@ def test_the_same_every_time(scene: np.ndarray) -> None:
     canvas = planned({0: moved(0), 1: turned(3) @ moved(120, 50)})
     first, second = put_together(images, canvas), put_together(images, canvas)
     np.testing.assert_array_equal(first[0], second[0])
+
+
+@pytest.mark.parametrize(
+    ("projection", "height"),
+    [
+        ("cylindrical", lambda x, y, z: y / np.hypot(x, z)),
+        ("spherical", lambda x, y, z: np.arctan2(y, np.hypot(x, z))),
+    ],
+)
+def test_a_curved_canvas_shows_directions(scene: np.ndarray, projection, height) -> None:
+    """Columns are angles about the axis, rows are heights or angles, of what each pixel shows."""
+    cameras = {
+        k: RotatingCamera(300.0 + 40 * k, cv2.Rodrigues(np.radians([5.0 * k, 40.0 * k, 3]))[0])
+        for k in range(2)
+    }
+    canvas = plan_curved(projection, dict.fromkeys(cameras, SIZE), cameras, 0, 0.9)
+    assert canvas.radius_px == 270
+    ramp = np.zeros((300, 400, 3), np.uint8)
+    ramp[..., 0], ramp[..., 1] = np.arange(400) // 2, np.arange(300)[:, None] // 2
+    for number, camera in cameras.items():
+        drawn = canvas.draw(number, ramp, 1, 1)
+        (left, top), shape = drawn.corner, drawn.mask.shape
+        assert canvas.boxes[number] == (left, top, left + shape[1], top + shape[0])
+        for row, column in np.argwhere(drawn.mask)[::3001]:
+            x, y = 2 * drawn.image[row, column, :2].astype(float) + 0.5
+            ray = camera.rotation @ np.linalg.inv(camera.intrinsics(SIZE)) @ [x, y, 1]
+            across = canvas.radius_px * np.arctan2(ray[0], ray[2])
+            assert left + column + canvas.origin[0] == pytest.approx(across, abs=2)
+            down = canvas.radius_px * (height(*ray) + (projection == "spherical") * np.pi / 2)
+            assert top + row + canvas.origin[1] == pytest.approx(down, abs=2)
+
+
+def test_all_around_is_one_strip(scene: np.ndarray) -> None:
+    """Twelve views of 45 degrees of one column of the scene."""
+    cameras = {
+        k: RotatingCamera(480.0, cv2.Rodrigues(np.radians([0.0, 30 * k - 165, 0]))[0])
+        for k in range(12)
+    }
+    canvas: Canvas = plan_curved("cylindrical", dict.fromkeys(cameras, SIZE), cameras, 5, 0.5)
+    assert canvas.size[0] == pytest.approx(2 * np.pi * 240, abs=3)
+    plain = {k: np.full((300, 400, 3), 100, np.uint8) for k in cameras}
+    panorama, valid, _ = put_together(plain, canvas)
+    assert (np.abs(panorama[valid].astype(int) - 100) < 3).all()
+    assert valid[60:-60].all()
+
+
+def test_the_largest_rectangle() -> None:
+    generator = np.random.default_rng(0)
+    for shape in ((7, 9), (12, 5), (1, 6)):
+        valid = cv2.blur(generator.random(shape), (3, 3)) > 0.4
+        sums = np.pad(valid, ((1, 0), (1, 0))).astype(int).cumsum(0).cumsum(1)
+        areas = [
+            (b - t) * (r - x)
+            for t in range(shape[0])
+            for b in range(t + 1, shape[0] + 1)
+            for x in range(shape[1])
+            for r in range(x + 1, shape[1] + 1)
+            if sums[b, r] - sums[t, r] - sums[b, x] + sums[t, x] == (b - t) * (r - x)
+        ]
+        left, top, right, bottom = crop_box(valid)
+        assert valid[top:bottom, left:right].all()
+        assert (right - left) * (bottom - top) == max(areas, default=0)

@@ -1,6 +1,5 @@
-"""Panoramas: photographs registered with each other by dense matches, and put together."""
+"""Panoramas: images registered with each other by dense matches, and composited."""
 
-from .options import StitchingOptions
-from .panorama import STAGES, Panorama, stitch
+from .panorama import STAGES, Panorama, StitchingOptions, stitch
 
 __all__ = ["STAGES", "Panorama", "StitchingOptions", "stitch"]

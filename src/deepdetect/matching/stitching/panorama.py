@@ -1,46 +1,79 @@
-"""Panoramas: from photographs to one picture."""
+"""Panoramas: from images to one."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from ..._shared.errors import OptionError
+from ..._shared.errors import OptionError, unknown_name
 from ..._shared.image_array import Channels
-from ..._shared.options import suggest_keywords
+from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.timing import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.rescaling import downscale, scaled_homography
 from ...io.image import load_image
 from ..guided import GuidedOptions
-from .compositing import composite, least_distorted, plan_canvas
-from .joint_registration import register_jointly
-from .options import DEFAULTS, StitchingOptions
+from .bundle_adjustment import RotatingCamera, level_cameras
+from .canvas import Canvas, least_distorted, plan_curved, plan_plane
+from .compositing import composite, crop_box
+from .registration import Registration, register_images
 
 STAGES = ("reading", "registration", "compositing")
 """Of a panorama."""
+
+Projection = Literal["plane", "cylindrical", "spherical"]
+PROJECTIONS = ("plane", "cylindrical", "spherical")
+
+
+@suggest_keywords
+@dataclass(frozen=True)
+class StitchingOptions:
+    """How images become a panorama.
+
+    Attributes:
+        scale: pixels of the panorama per pixel in the middle of the reference.
+        max_canvas_megapixels: a larger panorama is refused before it is drawn. It takes 22 to 56
+            bytes of memory per pixel.
+        registration_side: longer side in pixels to which images are reduced for registration.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    scale: float = 1.0
+    max_canvas_megapixels: float = 50.0
+    registration_side: int = 640
+
+    def __post_init__(self) -> None:
+        largest = GuidedOptions().initial_geometry.max_side_px
+        check_ranges(
+            self,
+            positive=("scale", "max_canvas_megapixels"),
+            between={"registration_side": (100, largest)},
+        )
 
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Panorama:
-    """Photographs put together.
+    """Images put together.
 
     Attributes:
-        image: (H, W, 3) uint8 RGB, black where no photograph is.
+        image: (H, W, 3) uint8 RGB, black where no image is.
         valid: (H, W) bool, where one is.
-        homographies: (3, 3) from each photograph to `image`, by its number; in the order in
-            which they were connected.
-        reference: number of the photograph that is not distorted.
-        left_out: why each other photograph has no part in it, by its number.
+        homographies: (3, 3) from each image, by its number: of a flat panorama to `image`, of a
+            curved one to the reference; in the order in which they were connected.
+        reference: number of the image that is not distorted, or that a curved panorama has in the
+            middle.
+        unregistered: why each other image has no part in it, by its number.
         matches: number of dense matches of each pair that was registered.
         residual_px: root mean square of the distances that the homographies of the pairs are
-            from those of the panorama, in pixels of the registration; 0 without closed loops.
-        gains: factor that the brightness of each photograph was multiplied by.
+            from those of the panorama, in pixels of the registration; of a flat panorama 0 without
+            closed loops.
+        gains: factor that the brightness of each image was multiplied by.
         seconds: time of each stage.
     """
 
@@ -48,7 +81,7 @@ class Panorama:
     valid: np.ndarray
     homographies: dict[int, np.ndarray]
     reference: int
-    left_out: dict[int, str]
+    unregistered: dict[int, str]
     matches: dict[tuple[int, int], int]
     residual_px: float
     gains: dict[int, float]
@@ -58,56 +91,55 @@ class Panorama:
         height, width = self.valid.shape
         return (
             f"Panorama({width}x{height}, {len(self.homographies)} images, "
-            f"left_out={self.left_out}, residual_px={self.residual_px:.3f})"
+            f"unregistered={self.unregistered}, residual_px={self.residual_px:.3f})"
         )
 
 
 @suggest_keywords
 def stitch(
     images: Sequence[Any],
+    detector: AnyDetector | None = None,
     *,
     channels: Channels = "rgb",
-    detector: AnyDetector | None = None,
+    projection: Projection = "plane",
+    crop: bool = False,
     reference: int | None = None,
-    scale: float = 1.0,
-    max_canvas_megapixels: float = 50.0,
-    registration_side: int = 640,
-    options: StitchingOptions = DEFAULTS,
     seed: int = 0,
+    options: StitchingOptions = StitchingOptions(),
     progress: Callable[[str], object] | None = None,
 ) -> Panorama:
-    """Make a flat panorama of photographs from one place, or of a plane.
+    """Make a panorama of images from one place, or of a plane.
 
-    Pairs are registered by guided matching at reduced size, jointly refined, and
-    drawn onto one canvas with equal brightness, seams where they differ least, and soft borders.
-    A flat canvas shows less than 180 degrees, in practice 100 to 120.
+    Pairs are registered by guided matching at reduced size, jointly refined, and drawn onto one
+    canvas with equal brightness, seams where they differ least, and soft borders. A flat canvas
+    shows less than 180 degrees, in practice 100 to 120; a cylinder or a sphere shows all around.
 
     Args:
         images: two or more, in any order; each anything `load_image` takes. Paths are read when
-            they are needed, so that only one photograph at its full size is in the memory.
-        channels: order of the colours in images that are arrays, as of `load_image`.
+            they are needed, so that only one image at its full size is in the memory.
         detector: a `DeepDetect`, or anything with its `heatmap` method: SIFT's keypoints find the
             overlaps, dense ones confirm them; or a `PointDetector`, whose points do both. Default
             `DeepDetect()`.
-        reference: number of the photograph in whose frame the panorama is; None for the one in
-            the middle.
-        scale: pixels of the panorama per pixel of the reference.
-        max_canvas_megapixels: a larger panorama is refused before it is drawn. It takes 22
-            to 47 bytes of memory per pixel.
-        registration_side: longer side in pixels to which photographs are reduced for registration.
-        options: what counts as an overlap, the joint fit, exposure, seams and blending.
+        channels: order of the colours in images that are arrays, as of `load_image`.
+        projection: "plane" keeps lines straight; "cylindrical" and "spherical" need cameras that
+            only turned, and level the horizon.
+        crop: cut the panorama to the largest rectangle without black.
+        reference: number of the image in whose frame a flat panorama is, or that is in the middle
+            of a curved one; None for the one in the middle of all.
         seed: of all random choices.
+        options: scale, limits and sizes.
         progress: called with the name of each stage (`STAGES`) when it ends.
 
     Returns:
-        The panorama, of all photographs that could be connected.
+        The panorama, of all images that could be connected.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is out of its range, there are fewer than two images, or the
             panorama would be too large.
         MissingExtraError: numba is not installed.
-        RegistrationError: no two images overlap, or one reaches the horizon of the reference.
+        RegistrationError: no two images overlap, or one reaches the horizon of the reference, or
+            the cameras of a curved panorama did more than turn.
 
     Example:
         >>> from deepdetect.evaluation.baselines.random import RandomDetector
@@ -115,11 +147,19 @@ def stitch(
         >>> rng = np.random.default_rng(0)
         >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (160, 240)).astype(np.uint8), (0, 0), 2)
         >>> scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
-        >>> panorama = stitch([scene[:, :160], scene[:, 80:]], detector=RandomDetector())
+        >>> panorama = stitch([scene[:, :160], scene[:, 80:]], RandomDetector())
         >>> panorama.image.shape
         (160, 240, 3)
     """
-    _check(images, reference, scale, max_canvas_megapixels, registration_side)
+    if projection not in PROJECTIONS:
+        raise unknown_name("projection", projection, PROJECTIONS)
+    if len(images) < 2:
+        raise OptionError("a panorama needs two images or more: give more images")
+    if reference is not None and not 0 <= reference < len(images):
+        raise OptionError(
+            f"`reference` must be the number of an image, from 0 to {len(images) - 1}, "
+            f"not {reference}"
+        )
     done = progress or (lambda stage: None)
     timer = StageTimer()
     small: dict[int, tuple[np.ndarray, float]] = {}
@@ -128,42 +168,41 @@ def stitch(
         for number, image in enumerate(images):
             rgb = load_image(image, channels=channels)
             sizes[number] = (rgb.shape[1], rgb.shape[0])
-            small[number] = downscale(rgb, registration_side)
+            small[number] = downscale(rgb, options.registration_side)
         del rgb
     done("reading")
     with timer.stage("registration"):
-        registration = register_jointly(
+        registration = register_images(
             [rgb for rgb, _ in small.values()],
             DeepDetect() if detector is None else detector,
             reference=reference,
-            options=options,
+            turning=projection != "plane",
             seed=seed,
         )
     done("registration")
-    homographies = {
-        number: scaled_homography(matrix, 1 / small[number][1], 1)
-        for number, matrix in registration.homographies.items()
-    }
-    frame = least_distorted(sizes, homographies) if reference is None else reference
-    canvas = plan_canvas(
-        sizes,
-        homographies,
-        frame,
-        scale=scale,
-        max_canvas_megapixels=max_canvas_megapixels,
-        max_depth_ratio=options.max_depth_ratio,
+    scales = {number: scale for number, (_, scale) in small.items()}
+    canvas, homographies, reference = _plan(
+        registration, scales, sizes, projection, reference, options.scale
     )
+    canvas.check_size(options.max_canvas_megapixels)
     with timer.stage("compositing"):
         panorama, valid, gains = composite(
-            lambda number: load_image(images[number], channels=channels), small, canvas, options
+            lambda number: load_image(images[number], channels=channels), small, canvas
         )
+        if crop:
+            left, top, right, bottom = crop_box(valid)
+            part = (slice(top, bottom), slice(left, right))
+            panorama, valid = panorama[part].copy(), valid[part].copy()
+            if projection == "plane":
+                shift = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
+                homographies = {n: shift @ matrix for n, matrix in homographies.items()}
     done("compositing")
     return Panorama(
         panorama,
         valid,
-        canvas.homographies,
-        frame,
-        registration.left_out,
+        homographies,
+        reference,
+        registration.unregistered,
         registration.matches,
         registration.residual_px,
         gains,
@@ -171,26 +210,38 @@ def stitch(
     )
 
 
-def _check(
-    images: Sequence[Any],
+def _plan(
+    registration: Registration,
+    scales: dict[int, float],
+    sizes: dict[int, tuple[int, int]],
+    projection: Projection,
     reference: int | None,
     scale: float,
-    max_canvas_megapixels: float,
-    registration_side: int,
-) -> None:
-    if len(images) < 2:
-        raise OptionError("a panorama needs two photographs or more: give more images")
-    if reference is not None and not 0 <= reference < len(images):
-        raise OptionError(
-            f"`reference` must be the number of an image, from 0 to {len(images) - 1}, "
-            f"not {reference}"
-        )
-    if not (scale > 0 and math.isfinite(scale)):
-        raise OptionError(f"`scale` must be above 0, not {scale}")
-    if not max_canvas_megapixels > 0:
-        raise OptionError(f"`max_canvas_megapixels` must be above 0, not {max_canvas_megapixels}")
-    largest = GuidedOptions().initial_geometry.max_side_px
-    if not 100 <= registration_side <= largest:
-        raise OptionError(
-            f"`registration_side` must lie in [100, {largest}] pixels, not {registration_side}"
-        )
+) -> tuple[Canvas, dict[int, np.ndarray], int]:
+    """Return the canvas, the homographies of the panorama, and the number of the reference.
+
+    `scales` are those at which the images were registered, `sizes` those of the whole images.
+    """
+    if projection == "plane" or registration.cameras is None:
+        homographies = {
+            number: scaled_homography(matrix, 1 / scales[number], 1)
+            for number, matrix in registration.homographies.items()
+        }
+        if reference is None:
+            reference = least_distorted(sizes, homographies)
+        canvas = plan_plane(sizes, homographies, reference, scale)
+        return canvas, canvas.homographies, reference
+    if reference is None:
+        ahead = {number: one.rotation[:, 2] for number, one in registration.cameras.items()}
+        middle = np.sum(list(ahead.values()), axis=0)
+        reference = max(ahead, key=lambda number: float(ahead[number] @ middle))
+    cameras = {
+        number: RotatingCamera(one.focal_px / scales[number], one.rotation)
+        for number, one in level_cameras(registration.cameras, reference).items()
+    }
+    rays = {
+        number: one.rotation @ np.linalg.inv(one.intrinsics(sizes[number]))
+        for number, one in cameras.items()
+    }
+    homographies = {n: np.linalg.inv(rays[reference]) @ ray for n, ray in rays.items()}
+    return plan_curved(projection, sizes, cameras, reference, scale), homographies, reference

@@ -5,7 +5,7 @@ import pytest
 
 from deepdetect import DeepDetect, DeepDetectError
 from deepdetect.evaluation.metrics.homography import corner_error
-from deepdetect.matching.stitching.joint_registration import register_jointly
+from deepdetect.matching.stitching.registration import register_images
 
 
 @pytest.fixture(scope="module")
@@ -21,9 +21,9 @@ def strange() -> np.ndarray:
 
 @pytest.mark.slow
 def test_views_of_one_photograph(views, detector: DeepDetect) -> None:
-    found = register_jointly(views.images, detector)
+    found = register_images(views.images, detector)
     assert sorted(found.homographies) == [0, 1, 2]
-    assert found.left_out == {}
+    assert found.unregistered == {}
     assert (0, 1) in found.matches
     assert (1, 2) in found.matches
     assert min(found.matches.values()) > 1000
@@ -41,24 +41,24 @@ def test_the_larger_group_stays_and_the_others_are_told_why(
 ) -> None:
     apart = [strange[:200, :200], strange[20:220, 40:240]]  # overlap, but only each other
     noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3)).astype(np.uint8)
-    found = register_jointly([apart[0], *views.images, noise, apart[1]], detector)
+    found = register_images([apart[0], *views.images, noise, apart[1]], detector)
     assert sorted(found.homographies) == [1, 2, 3]
-    assert found.left_out == {
-        0: "it overlaps only with images that are left out",
+    assert found.unregistered == {
+        0: "it overlaps only with others that are not in the panorama",
         4: "it overlaps with no other image",
-        5: "it overlaps only with images that are left out",
+        5: "it overlaps only with others that are not in the panorama",
     }
-    chosen = register_jointly([apart[0], *views.images, noise, apart[1]], detector, reference=5)
+    chosen = register_images([apart[0], *views.images, noise, apart[1]], detector, reference=5)
     assert sorted(chosen.homographies) == [0, 5]
-    assert chosen.left_out[1] == "it overlaps only with images that are left out"
+    assert chosen.unregistered[1] == "it overlaps only with others that are not in the panorama"
 
 
 def test_what_overlaps_with_nothing_is_refused(views, detector: DeepDetect, strange, one_line):
     with pytest.raises(DeepDetectError, match="no two of these 2 images overlap") as error:
-        register_jointly([views.images[0], strange], detector)
+        register_images([views.images[0], strange], detector)
     one_line(error.value)
     with pytest.raises(DeepDetectError, match=r"the reference, images\[1\], overlaps with no"):
-        register_jointly([views.images[0], strange, views.images[1]], detector, reference=1)
+        register_images([views.images[0], strange, views.images[1]], detector, reference=1)
     flat = np.full((100, 120, 3), 90, np.uint8)
     with pytest.raises(DeepDetectError, match="no two of these 2 images overlap"):
-        register_jointly([flat, flat], detector)
+        register_images([flat, flat], detector)

@@ -1,6 +1,6 @@
-"""Homographies of many photographs into the frame of one.
+"""Homographies of many images into the frame of one.
 
-Which photographs overlap is found with few keypoints. The pairs that do are registered by guided
+Which images overlap is found with few keypoints. The pairs that do are registered by guided
 matching, whose test by dense keypoints they must pass. The pairs with the most matches make a
 spanning tree; homographies composed along it are the start of a fit to all pairs at once.
 """
@@ -18,13 +18,32 @@ from ...detector.detector import AnyDetector, find_keypoints
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints
-from ...features.sift_detector import detect_sift
+from ...features.sift_detector import SiftOptions, detect_sift
 from ...geometry.residuals import transform_points
 from ...io.image import luma
 from ..guided import TentativeMatches, guided_matches, tentative_matches
 from ..guided.initial_geometry import estimate_initial_geometry
-from .joint_fit import Correspondences, fit_jointly
-from .options import DEFAULTS, StitchingOptions
+from .bundle_adjustment import (
+    Correspondences,
+    RotatingCamera,
+    adjust_cameras,
+    adjust_homographies,
+)
+
+SIFT = SiftOptions(max_keypoints=2000)
+"""Sparse keypoints by which overlaps are found."""
+
+MAX_KEYPOINTS = 30_000
+"""Dense keypoints per image that must confirm a homography."""
+
+MIN_PARTNERS = 3
+"""Pairs that each image takes part in, where it has that many, beyond those that connect all."""
+
+MAX_CORRESPONDENCES = 400
+"""Evenly spread matches per pair that the fit of all uses."""
+
+MAX_CAMERA_RESIDUAL_PX = 3.0
+"""Of cameras that only turned, at the size of the registration: 0.2 to 1 without parallax."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,22 +63,25 @@ class RegisteredPair:
 
 
 @dataclass(frozen=True, eq=False)
-class JointRegistration:
+class Registration:
     """Images in a common frame.
 
     Attributes:
         homographies: (3, 3) each to the frame of the first one, by number of the image; in the
             order in which they were connected.
+        cameras: where these are asked for, the cameras that turned, by number of the image.
         matches: number of dense matches of each pair that was registered among these.
         residual_px: root mean square of the distances between where a pair's own homography
-            takes its matches and where the joint fit does, in pixels; 0 without closed loops.
-        left_out: why each other image is not among them.
+            takes its matches and where the fit of all does, in pixels; of homographies 0 without
+            closed loops.
+        unregistered: why each other image is not among them.
     """
 
     homographies: dict[int, np.ndarray]
+    cameras: dict[int, RotatingCamera] | None
     matches: dict[tuple[int, int], int]
     residual_px: float
-    left_out: dict[int, str]
+    unregistered: dict[int, str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +95,14 @@ class _Image:
         return self.gray.shape[1], self.gray.shape[0]
 
 
-def register_jointly(
+def register_images(
     images: Sequence[np.ndarray],
     detector: AnyDetector,
     *,
     reference: int | None = None,
-    options: StitchingOptions = DEFAULTS,
+    turning: bool = False,
     seed: int = 0,
-) -> JointRegistration:
+) -> Registration:
     """Find the homographies of overlapping images to a common frame.
 
     Args:
@@ -88,14 +110,15 @@ def register_jointly(
         detector: of points, which find the overlaps and confirm the homographies; or of heat maps:
             SIFT's keypoints find the overlaps, dense ones confirm.
         reference: number of an image that must be among them; None for the most images.
-        options: of panoramas.
+        turning: find the cameras, too, which only turned.
         seed: of all random choices.
 
     Raises:
-        RegistrationError: no two images overlap, or the reference with none.
+        RegistrationError: no two images overlap, or the reference with none; or the cameras did
+            more than turn.
     """
-    views = [_prepare(image, detector, options) for image in images]
-    pairs = _registered_pairs(views, options.min_partners, seed)
+    views = [_prepare(image, detector) for image in images]
+    pairs = _registered_pairs(views, seed)
     groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
         group = next(group for group in groups if reference in group)
@@ -109,43 +132,42 @@ def register_jointly(
             f"{what} so that a homography can be trusted: they must show common detail, and be "
             "taken from one place or show a plane"
         )
-    left_out = {
+    unregistered = {
         number: "it overlaps with no other image"
         if len(other) == 1
-        else "it overlaps only with images that are left out"
+        else "it overlaps only with others that are not in the panorama"
         for other in groups
         if other != group
         for number in other
     }
     pairs = [pair for pair in pairs if pair.first in group]
-    homographies, residual_px = fit_jointly(
-        _compose(group, pairs),
-        [_correspondences(pair, views, options.max_correspondences) for pair in pairs],
-        {number: views[number].size for number in group},
-        huber_threshold_px=options.huber_threshold_px,
-    )
+    start = _compose(group, pairs)
+    correspondences = [_correspondences(pair, views) for pair in pairs]
+    sizes = {number: views[number].size for number in group}
+    homographies, residual_px = adjust_homographies(start, correspondences, sizes)
+    cameras = None
+    if turning:
+        cameras, residual_px = adjust_cameras(homographies, correspondences, sizes)
+        if residual_px > MAX_CAMERA_RESIDUAL_PX:
+            raise RegistrationError(
+                f"the cameras of these images did more than turn ({residual_px:.1f} px remain): "
+                "take all from one place, or choose the projection 'plane'"
+            )
     matches = {(pair.first, pair.second): len(pair.points) for pair in pairs}
-    return JointRegistration(homographies, matches, residual_px, left_out)
+    return Registration(homographies, cameras, matches, residual_px, unregistered)
 
 
-def _prepare(
-    image: np.ndarray,
-    detector: AnyDetector,
-    options: StitchingOptions,
-) -> _Image:
+def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
     gray = luma(image)
     if not hasattr(detector, "heatmap"):
         points = describe_keypoints(gray, find_keypoints(detector, image))
         return _Image(gray, points, np.rint(points.xy))
     # Without suppression: neighbouring pixels are what the verification compares.
-    selection = SelectionOptions(max_keypoints=options.max_keypoints)
-    keypoints = find_keypoints(detector, image, selection)
-    return _Image(gray, detect_sift(gray, options.sift), keypoints.xy)
+    keypoints = find_keypoints(detector, image, SelectionOptions(max_keypoints=MAX_KEYPOINTS))
+    return _Image(gray, detect_sift(gray, SIFT), keypoints.xy)
 
 
-def _registered_pairs(
-    views: Sequence[_Image], min_partners: int, seed: int
-) -> list[RegisteredPair]:
+def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair]:
     """Register the pairs that overlap most, until all are connected and have enough partners."""
     overlaps: list[tuple[int, int, int, TentativeMatches]] = []
     for first, second in combinations(range(len(views)), 2):
@@ -158,7 +180,7 @@ def _registered_pairs(
     pairs: list[RegisteredPair] = []
     partners = [0] * len(views)
     for _, first, second, initial in overlaps:
-        enough = min(partners[first], partners[second]) >= min_partners
+        enough = min(partners[first], partners[second]) >= MIN_PARTNERS
         if enough and second in _connected(first, pairs):
             continue
         a, b = views[first], views[second]
@@ -173,10 +195,10 @@ def _registered_pairs(
     return pairs
 
 
-def _correspondences(pair: RegisteredPair, views: Sequence[_Image], count: int) -> Correspondences:
+def _correspondences(pair: RegisteredPair, views: Sequence[_Image]) -> Correspondences:
     """Choose matches of a pair, spread out."""
     order = np.argsort(bayer_order(pair.points, views[pair.first].size), kind="stable")
-    points = pair.points[order[:count]]
+    points = pair.points[order[:MAX_CORRESPONDENCES]]
     # The homography is sharper than keypoints on whole pixels.
     return Correspondences(
         pair.first, pair.second, points, transform_points(points, pair.homography)

@@ -1,0 +1,292 @@
+"""Bundle adjustment of all images of a panorama: of homographies, or of cameras that only turned.
+
+Gauss-Newton with Huber's weights. What counts is how far a point that is taken to the common frame
+and back into its partner image comes from where it belongs there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..._shared.opencv import cv2
+from ...geometry.residuals import transform_points
+
+MAX_ITERATIONS = 20
+MIN_STEP = 1e-7
+"""The fit ends after this many iterations, or with a smaller change of the parameters."""
+
+UNIT_PX = 500.0
+"""Unit of length of the fit, so that all entries of a homography are of one order."""
+
+HUBER_THRESHOLD_PX = 2.0
+"""Larger residuals have less weight."""
+
+FOCAL_LENGTHS = np.geomspace(0.3, 10, 100) * 640 / UNIT_PX
+"""Where the search for the focal length starts, in units: 0.3 to 10 times the longer side."""
+
+FOCAL_WEIGHT = 1e-4
+"""Of a focal length's distance from the common one: half a pixel of noise per tenth of its size."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """Points of two images that belong together.
+
+    Attributes:
+        first, second: numbers of the images.
+        points, targets: (M, 2) in pixels of the first and of the second.
+    """
+
+    first: int
+    second: int
+    points: np.ndarray
+    targets: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class RotatingCamera:
+    """A camera that only turned, with its principal point in the middle of the image.
+
+    Attributes:
+        focal_px: focal length in pixels.
+        rotation: (3, 3) from the camera to the common frame: x right, y down, z forward.
+    """
+
+    focal_px: float
+    rotation: np.ndarray
+
+    def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
+        """Return the (3, 3) intrinsics of an image of (width, height)."""
+        x, y = (np.array(size) - 1) / 2
+        return np.array([[self.focal_px, 0, x], [0, self.focal_px, y], [0, 0, 1]])
+
+
+def adjust_homographies(
+    homographies: Mapping[int, np.ndarray],
+    pairs: Sequence[Correspondences],
+    sizes: Mapping[int, tuple[int, int]],
+) -> tuple[dict[int, np.ndarray], float]:
+    """Fit all homographies but the first, which stays, to all pairs at once.
+
+    Args:
+        homographies: (3, 3) from each image to the frame of the first one, by number, near enough.
+        pairs: what belongs together.
+        sizes: (width, height) of the images.
+
+    Returns:
+        The homographies, and the root mean square of the residuals in pixels.
+
+    Example:
+        >>> grid = np.argwhere(np.ones((5, 5))) * 20.0
+        >>> pair = Correspondences(0, 1, grid, grid - [30, 0])
+        >>> start = {0: np.eye(3), 1: np.array([[1, 0, 25.0], [0, 1, 3], [0, 0, 1]])}
+        >>> found, residual_px = adjust_homographies(start, [pair], {0: (100, 100), 1: (100, 100)})
+        >>> (found[1] / found[1][2, 2])[:2, 2].round(3).tolist(), round(residual_px, 3)
+        ([30.0, 0.0], 0.0)
+    """
+    to_unit, current, samples = _in_units(homographies, pairs, sizes)
+    reference, *moving = homographies
+    columns = {number: 8 * k for k, number in enumerate(moving)}
+    directions = dict.fromkeys(moving, np.eye(9)[:, :8])
+    for _ in range(MAX_ITERATIONS):
+        normal, right = _normal_equations(current, pairs, samples, columns, directions)
+        step = np.linalg.lstsq(normal, right, rcond=None)[0]
+        for number, column in columns.items():  # H (I + E), with the last element of E 0
+            change = np.append(step[column : column + 8], 0).reshape(3, 3)
+            current[number] = _unit_determinant(current[number] @ (np.eye(3) + change))
+        if np.abs(step).max(initial=0) < MIN_STEP:
+            break
+    refined = {
+        number: np.linalg.inv(to_unit[reference]) @ matrix @ to_unit[number]
+        for number, matrix in current.items()
+    }
+    return refined, _residual_px(current, pairs, samples)
+
+
+def adjust_cameras(
+    homographies: Mapping[int, np.ndarray],
+    pairs: Sequence[Correspondences],
+    sizes: Mapping[int, tuple[int, int]],
+) -> tuple[dict[int, RotatingCamera], float]:
+    """Fit rotations and focal lengths of all cameras to all pairs at once.
+
+    Args:
+        homographies: as of `adjust_homographies`.
+        pairs: what belongs together.
+        sizes: (width, height) of the images.
+
+    Returns:
+        The cameras, and the root mean square of the residuals in pixels.
+    """
+    _, to_first, samples = _in_units(homographies, pairs, sizes)
+    starts = [_rotations(to_first, focal) for focal in FOCAL_LENGTHS]
+    best = int(np.argmin([misfit for _, misfit in starts]))
+    rotations, common = starts[best][0], float(FOCAL_LENGTHS[best])
+    focals = dict.fromkeys(rotations, common)
+    columns = {number: 4 * k for k, number in enumerate(rotations)}
+    for _ in range(MAX_ITERATIONS):
+        current = {n: rotations[n] @ np.diag([1 / f, 1 / f, 1]) for n, f in focals.items()}
+        directions = {number: _turns_and_focal(focal) for number, focal in focals.items()}
+        normal, right = _normal_equations(current, pairs, samples, columns, directions)
+        for number, column in columns.items():
+            normal[column + 3, column + 3] += FOCAL_WEIGHT
+            right[column + 3] -= FOCAL_WEIGHT * np.log(focals[number] / common)
+        step = np.linalg.lstsq(normal, right, rcond=None)[0]  # all may turn together
+        for number, column in columns.items():
+            turn = cv2.Rodrigues(step[column : column + 3])[0]
+            rotations[number] = rotations[number] @ turn
+            focals[number] *= float(np.exp(step[column + 3]))
+        if np.abs(step).max() < MIN_STEP:
+            break
+    current = {n: rotations[n] @ np.diag([1 / f, 1 / f, 1]) for n, f in focals.items()}
+    cameras = {n: RotatingCamera(UNIT_PX * focals[n], rotations[n]) for n in rotations}
+    return cameras, _residual_px(current, pairs, samples)
+
+
+def level_cameras(
+    cameras: Mapping[int, RotatingCamera], reference: int
+) -> dict[int, RotatingCamera]:
+    """Turn all cameras together, so that the horizon is level and the reference in the middle.
+
+    The horizon is what the rows of all images are parallel to (Brown and Lowe, "Automatic panoramic
+    image stitching using invariant features", 2007), and where they leave it open, upright to the
+    mean of the columns.
+    """
+    across = np.array([camera.rotation[:, 0] for camera in cameras.values()])
+    down = np.mean([camera.rotation[:, 1] for camera in cameras.values()], axis=0)
+    y = np.linalg.solve(across.T @ across / len(across) + 1e-3 * np.eye(3), down)
+    y /= np.linalg.norm(y)
+    ahead = cameras[reference].rotation[:, 2]
+    z = ahead - ahead @ y * y
+    z /= np.linalg.norm(z)
+    level = np.stack([np.cross(y, z), y, z])
+    return {n: RotatingCamera(one.focal_px, level @ one.rotation) for n, one in cameras.items()}
+
+
+def _in_units(
+    homographies: Mapping[int, np.ndarray],
+    pairs: Sequence[Correspondences],
+    sizes: Mapping[int, tuple[int, int]],
+) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], list[tuple[np.ndarray, np.ndarray]]]:
+    """Return the maps of pixels to units, 0 in the middle; and homographies and points in units."""
+    to_unit = {}
+    for number in homographies:
+        x, y = (np.array(sizes[number]) - 1) / (2 * UNIT_PX)
+        to_unit[number] = np.array([[1 / UNIT_PX, 0, -x], [0, 1 / UNIT_PX, -y], [0, 0, 1]])
+    frame = to_unit[next(iter(homographies))]
+    current = {
+        number: _unit_determinant(frame @ matrix @ np.linalg.inv(to_unit[number]))
+        for number, matrix in homographies.items()
+    }
+    samples = [
+        (
+            transform_points(pair.points, to_unit[pair.first]),
+            transform_points(pair.targets, to_unit[pair.second]),
+        )
+        for pair in pairs
+    ]
+    return to_unit, current, samples
+
+
+def _normal_equations(
+    current: Mapping[int, np.ndarray],
+    pairs: Sequence[Correspondences],
+    samples: Sequence[tuple[np.ndarray, np.ndarray]],
+    columns: Mapping[int, int],
+    directions: Mapping[int, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return both sides of the normal equations.
+
+    `columns` says where the parameters of an image begin; their (9, P) `directions` what a
+    parameter adds to E of H (I + E).
+    """
+    count = sum(matrix.shape[1] for matrix in directions.values())
+    normal, right = np.zeros((count, count)), np.zeros(count)
+    for pair, (points, targets) in zip(pairs, samples, strict=True):
+        residuals, *jacobians = _linearised(
+            current[pair.first], current[pair.second], points, targets
+        )
+        distances = UNIT_PX * np.linalg.norm(residuals, axis=1)
+        weights = np.minimum(1, HUBER_THRESHOLD_PX / np.maximum(distances, 1e-12))
+        blocks = [
+            (columns[number], jacobian @ directions[number])
+            for number, jacobian in zip((pair.first, pair.second), jacobians, strict=True)
+            if number in columns
+        ]
+        for row, jacobian in blocks:
+            weighted = jacobian * weights[:, None, None]
+            rows = slice(row, row + jacobian.shape[2])
+            right[rows] -= np.einsum("mai,ma->i", weighted, residuals)
+            for start, other in blocks:
+                normal[rows, start : start + other.shape[2]] += np.einsum(
+                    "mai,maj->ij", weighted, other
+                )
+    return normal, right
+
+
+def _linearised(
+    first: np.ndarray, second: np.ndarray, points: np.ndarray, targets: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return residuals in the second image (M, 2) and their derivatives by both E (M, 2, 9)."""
+    between = np.linalg.inv(second) @ first
+    homogeneous = np.column_stack([points, np.ones(len(points))])
+    mapped = homogeneous @ between.T
+    x, y, w = mapped.T
+    zero = np.zeros_like(w)
+    projection = np.stack(
+        [
+            np.stack([1 / w, zero, -x / w**2], axis=1),
+            np.stack([zero, 1 / w, -y / w**2], axis=1),
+        ],
+        axis=1,
+    )
+    by_first = np.einsum("mka,mb->mkab", projection @ between, homogeneous)
+    by_second = -np.einsum("mka,mb->mkab", projection, mapped)
+    shape = (len(points), 2, 9)
+    residuals = mapped[:, :2] / w[:, None] - targets
+    return residuals, by_first.reshape(shape), by_second.reshape(shape)
+
+
+def _residual_px(
+    current: Mapping[int, np.ndarray],
+    pairs: Sequence[Correspondences],
+    samples: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> float:
+    """Return the root mean square of the residuals in pixels."""
+    left = [
+        _linearised(current[pair.first], current[pair.second], *sample)[0]
+        for pair, sample in zip(pairs, samples, strict=True)
+    ]
+    squares = np.concatenate([(values**2).sum(1) for values in left])
+    return float(UNIT_PX * np.sqrt(squares.mean()))
+
+
+def _rotations(
+    homographies: Mapping[int, np.ndarray], focal: float
+) -> tuple[dict[int, np.ndarray], float]:
+    """Return the rotations nearest to homographies in units, and how far these are from them."""
+    rotations, misfit = {}, 0.0
+    for number, matrix in homographies.items():
+        left, stretch, right = np.linalg.svd(
+            np.diag([1 / focal, 1 / focal, 1]) @ matrix @ np.diag([focal, focal, 1])
+        )
+        rotations[number] = left @ right
+        misfit += float(((stretch - 1) ** 2).sum())
+    return rotations, misfit
+
+
+def _turns_and_focal(focal: float) -> np.ndarray:
+    """Return the (9, 4) derivatives of E by turns about x, y and z, and by the log focal length."""
+    turns = np.zeros((4, 3, 3))
+    turns[0, 1, 2], turns[0, 2, 1] = -focal, 1 / focal
+    turns[1, 0, 2], turns[1, 2, 0] = focal, -1 / focal
+    turns[2, 0, 1], turns[2, 1, 0] = -1, 1
+    turns[3] = np.diag([-1, -1, 0])
+    return turns.reshape(4, 9).T
+
+
+def _unit_determinant(matrix: np.ndarray) -> np.ndarray:
+    return matrix / np.cbrt(np.linalg.det(matrix))
