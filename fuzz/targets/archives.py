@@ -88,10 +88,12 @@ def tar_file(generator: np.random.Generator, compressed: bool) -> bytes:
 
 def shard_options() -> Any:
     """Return the recipe of the shards."""
+    from deepdetect.labels import LabelOptions
     from deepdetect.training.recipe import Stage, TrainingOptions
 
+    labels = LabelOptions(("fast", "sobel"))
     return TrainingOptions(
-        stages=(Stage(32, 2, 1),), short_sides=(48,), detectors=("fast", "sobel"), val_fraction=0.3
+        stages=(Stage(32, 2, 1),), short_sides=(48,), labels=labels, val_fraction=0.3
     )
 
 

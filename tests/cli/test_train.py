@@ -47,7 +47,7 @@ def test_train_and_shards(run, images: Path, tmp_path: Path) -> None:
     assert "best after epoch" in again.output
     other = run("train", "packed", "-o", "run", *TINY, "--short-side", "96")
     assert other.exit_code == 2
-    assert "other options (--short-side)" in other.stderr
+    assert "other settings (--short-side)" in other.stderr
     timed = run("train", images, "-o", "timed", *TINY, "--workers", "1", "--profile")
     assert "waiting for data" in timed.output, timed.output
     assert "4 crops of 64x64 pixels per step" in timed.output
@@ -64,7 +64,7 @@ def test_train_and_shards(run, images: Path, tmp_path: Path) -> None:
         (["--num-workers", "-1"], "--num-workers must be 0 or more"),
         (["--pos-weight-uncertain"], "--pos-weight-uncertain needs a --pos-weight"),
         (["--stage", "480x8x1@720"], "not among --short-side"),
-        (["--learning-rate", "-1"], "--learning-rate must be at least --final-learning-rate"),
+        (["--learning-rate", "-1"], "--learning-rate must be above 0"),
         (["--optimizer", "sopa"], "did you mean 'soap'"),
     ],
 )
@@ -81,19 +81,19 @@ def test_errors_speak_of_flags(
 def test_a_preset_is_changed_by_options(
     images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import deepdetect.training.trainer as trainer
+    from deepdetect.training import dense
 
     seen: list[tuple] = []
 
-    def make_trainer(*arguments: object) -> None:
+    def initial_network(*arguments: object) -> None:
         seen.append(arguments)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer, "make_trainer", make_trainer)
+    monkeypatch.setattr(dense, "initial_network", initial_network)
     words = ["train", str(images), "-o", str(tmp_path), "--preset", "paper", "--stage", "480x64x9"]
     words += ["--no-interleave", "--flips", "--batch-norm", "--init", "default", "--init", "dense"]
     assert CliRunner().invoke(main, words).exit_code == 130
-    ((_, _, options, _, _, init_weights, *_),) = seen
+    ((options, init_weights),) = seen
     assert [stage.epochs for stage in options.stages] == [9]
     assert options.flips
     assert options.frozen_batch_norm is False

@@ -25,7 +25,6 @@ from deepdetect.training.dataset import (  # noqa: E402
     loading,
     prepare_data,
 )
-from deepdetect.training.engine import DistributedContext  # noqa: E402
 from deepdetect.training.labels import LabelCache  # noqa: E402
 from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
 from deepdetect.training.sampler import CropSampler, Schedule  # noqa: E402
@@ -45,9 +44,9 @@ Batch = tuple[np.ndarray, np.ndarray]
 @pytest.fixture(scope="module")
 def source(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> FolderSource:
     cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.labels)
-    images = list_images(photographs, OPTIONS)
-    cache.make([(image, image.normal + image.dark) for image in images], workers=1)
-    return FolderSource(images, cache, 2**30)
+    made = FolderSource(list_images(photographs, OPTIONS), cache, 2**30)
+    made.make_labels([image.normal + image.dark for image in made.images], workers=1)
+    return made
 
 
 def loader(source, options: TrainingOptions = OPTIONS, workers: int = 0, **steps) -> DataLoader:
@@ -213,10 +212,7 @@ def test_interleaved_batches_are_those_of_the_stages_in_turn(source: FolderSourc
 
 
 def test_processes_share_each_batch(source: FolderSource) -> None:
-    parts = [
-        loader(source, context=DistributedContext(rank, 2, rank, 2), last_step=3)
-        for rank in range(2)
-    ]
+    parts = [loader(source, rank=rank, world_size=2, last_step=3) for rank in range(2)]
     for (images, _), *halves in zip(batches(source, last=3), *parts, strict=True):
         np.testing.assert_array_equal(images, np.concatenate([half[0] for half in halves]))
 
@@ -273,10 +269,23 @@ def test_validation_is_whole_images_first_normal_then_dark(source: FolderSource)
         rgb, mask = whole[index]
         np.testing.assert_array_equal(rgb, render(image.path, view))
         np.testing.assert_array_equal(mask, source.labels.load(image, view))
-    parts = [ValidationDataset(source, DistributedContext(rank, 5, rank, 5)) for rank in range(5)]
+    parts = [ValidationDataset(source, rank, 5) for rank in range(5)]
     assert [len(part) for part in parts] == [6, 6, 4, 4, 4]
     assert torch.equal(parts[3][2][0], whole[15][0])
     assert isinstance(parts[3][2][1], Tensor)
+
+
+def test_a_view_is_rendered_once(
+    source: FolderSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was rendered to be labelled is what crops are taken from."""
+    made = FolderSource(source.images[:2], LabelCache(tmp_path, OPTIONS.labels), 2**30)
+    assert made.make_labels([image.normal for image in made.images], workers=2) == 6
+    monkeypatch.setattr("deepdetect.training.dataset.render", None)
+    for index, image in enumerate(made.images):
+        for view in image.normal:
+            for ours, theirs in zip(made.load(index, view), source.load(index, view), strict=True):
+                np.testing.assert_array_equal(ours, theirs)
 
 
 def test_preparation_makes_only_the_labels_that_are_needed(

@@ -8,6 +8,7 @@ import pytest
 from deepdetect import DeepDetectError
 from deepdetect.io.image import luma
 from deepdetect.labels import LabelOptions, fuse
+from deepdetect.training.dataset import FolderSource
 from deepdetect.training.labels import LabelCache, label_view, settings_digest
 from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.views import digest_images, list_images, render
@@ -21,30 +22,24 @@ OPTIONS = TrainingOptions(
 
 
 @pytest.fixture(scope="module")
-def cache(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> LabelCache:
-    made = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.labels)
-    wanted = [(image, image.normal + image.dark) for image in list_images(photographs, OPTIONS)]
-    assert made.make(wanted[:3], workers=1) == 3 * 4
-    assert made.make(wanted[:4], workers=1) == 4, "labels are made once"
+def source(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> FolderSource:
+    cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.labels)
+    images = list_images(photographs, OPTIONS)
+    for count, expected in ((3, 3 * 4), (4, 4)):
+        made = FolderSource(images[:count], cache)
+        views = [image.normal + image.dark for image in made.images]
+        assert made.make_labels(views, workers=1) == expected, "labels are made once"
     return made
 
 
-def test_labels_are_those_of_the_views(cache: LabelCache, photographs: Path) -> None:
-    image = list_images(photographs, OPTIONS)[0]
+def test_labels_are_those_of_the_views(source: FolderSource) -> None:
+    image = source.images[0]
     for view in image.normal + image.dark:
         rgb = render(image.path, view)
         visibility = "normal" if view.darkening is None else "low"
         expected = fuse(luma(rgb), LabelOptions(OPTIONS.labels.detectors, visibility)).mask
-        np.testing.assert_array_equal(cache.load(image, view), expected)
-
-
-def test_a_view_of_an_array_has_the_same_label(cache: LabelCache, photographs: Path) -> None:
-    from deepdetect import load_image
-
-    image = list_images(photographs, OPTIONS)[1]
-    for view in image.normal + image.dark:
-        made = label_view(load_image(image.path), view, OPTIONS.labels)
-        np.testing.assert_array_equal(made, cache.load(image, view))
+        np.testing.assert_array_equal(source.labels.load(image, view), expected)
+        np.testing.assert_array_equal(label_view(rgb, view, OPTIONS.labels), expected)
 
 
 def test_other_settings_have_another_folder() -> None:
@@ -60,7 +55,7 @@ def test_an_image_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path
     images = list_images(tmp_path, OPTIONS)
     cache = LabelCache(tmp_path / "labels", OPTIONS.labels)
     with pytest.raises(DeepDetectError, match=r"1 of 3 images cannot be read.*broken\.png"):
-        cache.make([(image, image.normal) for image in images], workers=1)
+        FolderSource(images, cache).make_labels([image.normal for image in images], workers=1)
     assert len(list(cache.folder.glob("*.png"))) == 2 * 2, "the others are kept"
 
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -9,7 +8,13 @@ from deepdetect._shared.errors import OptionError
 from deepdetect._shared.options import replace_options
 from deepdetect.cli._options import chosen_recipe
 from deepdetect.labels import LabelOptions, find_label_settings
-from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions, training_preset
+from deepdetect.training.recipe import (
+    DeviceOptions,
+    PointsTrainingOptions,
+    Stage,
+    TrainingOptions,
+    training_preset,
+)
 from deepdetect.training.sampler import Schedule
 
 
@@ -29,7 +34,6 @@ def test_bad_stages_are_refused(text: str) -> None:
         {"stages": (Stage(480, 8, 1),), "short_sides": (240,)},
         {"stages": (Stage(64, 8, 1, (96,)),), "short_sides": (240, 64)},
         {"dark_fraction": 1.5},
-        {"dark_variants": 0},
         {"augmentations": -1},
         {"pos_weight": 0.0},
         {"pos_weight": float("nan")},
@@ -39,7 +43,6 @@ def test_bad_stages_are_refused(text: str) -> None:
         {"val_count": 0},
         {"learning_rate": -1.0},
         {"warm_up": -1},
-        {"detectors": ("siift",)},
         {"short_sides": ()},
     ],
 )
@@ -51,10 +54,6 @@ def test_bad_options_are_refused(bad: dict) -> None:
 def test_an_unknown_option_names_the_nearest() -> None:
     with pytest.raises(OptionError, match="did you mean 'learning_rate'"):
         replace_options(TrainingOptions(), learning_rat=1)
-
-
-def test_options_are_kept_as_json() -> None:
-    assert json.loads(TrainingOptions(seed=7).to_json())["seed"] == 7
 
 
 def test_the_papers_recipe() -> None:
@@ -116,3 +115,18 @@ def test_bad_device_options_are_refused(bad: dict, hint: str) -> None:
 def test_a_cpu_that_trains_has_no_other_loading_processes() -> None:
     assert DeviceOptions("cpu").worker_count() == 0
     assert DeviceOptions("cpu", num_workers=3).worker_count(2) == 3
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"steps": 0},
+        {"min_density": 0},
+        {"min_density": 0.2, "max_density": 0.1},
+        {"match_weight": -1},
+        {"side": 32},
+    ],
+)
+def test_bad_options_of_points_are_refused(bad: dict) -> None:
+    with pytest.raises(OptionError):
+        PointsTrainingOptions(**bad)

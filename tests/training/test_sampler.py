@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from deepdetect import OptionError
 from deepdetect._shared.options import replace_options
-from deepdetect.training.engine import DistributedContext
 from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.sampler import CropSampler, Schedule, epoch_order
+
+OPTIONS = TrainingOptions(stages=(Stage(64, 4, 2), Stage(32, 2, 1)), short_sides=(64,), seed=5)
 
 
 def test_learning_rate_is_a_cosine_from_first_to_final() -> None:
@@ -58,6 +59,11 @@ def test_the_last_step_is_a_milestone(steps: int, count: int) -> None:
     assert min(milestones) > 0
 
 
+def test_crops_are_counted() -> None:
+    schedule = Schedule(OPTIONS, 10)
+    assert [schedule.crops_until(step) for step in (0, 1, 5, 6, 10)] == [0, 4, 20, 22, 30]
+
+
 @given(
     photos=st.integers(1, 50),
     stages=st.lists(st.tuples(st.integers(1, 8), st.integers(1, 4)), min_size=1, max_size=3),
@@ -79,9 +85,6 @@ def test_interleaved_stages_advance_together(photos: int, stages: list[tuple[int
         done[number] += 1
         for number, total in enumerate(mixed.steps_of_stage):
             assert abs(done[number] - total * step / mixed.steps) < len(made) + 1
-
-
-OPTIONS = TrainingOptions(stages=(Stage(64, 4, 2), Stage(32, 2, 1)), short_sides=(64,), seed=5)
 
 
 def test_each_image_is_seen_once_an_epoch() -> None:
@@ -114,12 +117,11 @@ def test_a_sampler_starts_at_any_step() -> None:
 
 def test_processes_share_each_batch() -> None:
     schedule = Schedule(OPTIONS, 10)
-    contexts = [DistributedContext(rank, 2, rank, 2) for rank in range(2)]
-    halves = [CropSampler(schedule, context=context) for context in contexts]
+    halves = [CropSampler(schedule, rank=rank, world_size=2) for rank in range(2)]
     for batch, first, second in zip(CropSampler(schedule), *halves, strict=True):
         assert batch == first + second
     with pytest.raises(OptionError, match="a batch of 4 cannot be divided evenly among 3"):
-        CropSampler(schedule, context=DistributedContext(0, 3, 0, 3))
+        CropSampler(schedule, world_size=3)
 
 
 @given(sizes=st.lists(st.integers(1, 5), min_size=1, max_size=14), epoch=st.integers(0, 3))

@@ -107,7 +107,7 @@ def test_other_options_are_refused(photographs: Path, shards: Shards) -> None:
         stages=OPTIONS.stages, short_sides=(96,), labels=LabelOptions(("fast",))
     )
     with pytest.raises(
-        OptionError, match="`short_sides`, `val_fraction`, `augmentations`, `labels`"
+        OptionError, match="`augmentations`, `labels`, `short_sides`, `val_fraction`"
     ):
         Shards.open(shards.folder, other)
     with pytest.raises(OptionError, match="another folder"):

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from deepdetect import ImageError
 from deepdetect.io.image import scale_short_side
-from deepdetect.training.augmentation import Darkening, augment, darken
+from deepdetect.training.augmentation import (
+    BRIGHTNESS,
+    CONTRAST,
+    Darkening,
+    augment,
+    darken,
+)
 from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.views import (
     SourceImage,
@@ -22,8 +28,7 @@ from deepdetect.training.views import (
     views_of,
 )
 
-OPTIONS = TrainingOptions(stages=(Stage(64, 2, 1),), short_sides=(96, 64), dark_variants=2)
-RANGE = OPTIONS.darkening
+OPTIONS = TrainingOptions(stages=(Stage(64, 2, 1),), short_sides=(96, 64))
 
 
 def images(count: int) -> list[SourceImage]:
@@ -47,18 +52,15 @@ def test_names(view: View, name: str) -> None:
 @given(
     name=st.text("abcAB/._äß0", max_size=20),
     short_sides=st.lists(st.integers(64, 999), min_size=1, max_size=4, unique=True).map(tuple),
-    variants=st.integers(1, 4),
 )
-def test_views_of_a_photograph(name: str, short_sides: tuple[int, ...], variants: int) -> None:
-    options = TrainingOptions(OPTIONS.stages, False, short_sides, dark_variants=variants)
+def test_views_of_an_image(name: str, short_sides: tuple[int, ...]) -> None:
+    options = TrainingOptions(stages=OPTIONS.stages, short_sides=short_sides)
     normal, dark = views_of(name, options)
     assert normal == tuple(View(side) for side in short_sides)
-    assert [view.short_side for view in dark] == [
-        side for side in short_sides for _ in range(variants)
-    ]
+    assert [view.short_side for view in dark] == list(short_sides)
     for view in dark:
-        assert RANGE.brightness[0] <= view.darkening.brightness <= RANGE.brightness[1]
-        assert RANGE.contrast[0] <= view.darkening.contrast <= RANGE.contrast[1]
+        assert BRIGHTNESS[0] <= view.darkening.brightness <= BRIGHTNESS[1]
+        assert CONTRAST[0] <= view.darkening.contrast <= CONTRAST[1]
         # The name holds the exact factors.
         light = view.name.partition("_b")[2].partition("c")
         assert Darkening(float(light[0]), float(light[2])) == view.darkening
@@ -69,13 +71,13 @@ def test_augmented_views_come_last_and_leave_the_others_alone() -> None:
     plain = views_of("a.jpg", OPTIONS)
     options = dataclasses.replace(OPTIONS, augmentations=3)
     normal, dark = views_of("a.jpg", options)
-    assert (normal[:2], dark[:4]) == plain
-    assert [view.short_side for view in normal[2:] + dark[4:]] == [96] * 6
-    assert [view.augmentation for view in normal[2:]] == [view.augmentation for view in dark[4:]]
+    assert (normal[:2], dark[:2]) == plain
+    assert [view.short_side for view in normal[2:] + dark[2:]] == [96] * 6
+    assert [view.augmentation for view in normal[2:]] == [view.augmentation for view in dark[2:]]
     assert len({view.augmentation for view in normal}) == 4
     other, _ = views_of("b.jpg", options)
     assert {view.augmentation for view in other[2:]}.isdisjoint(v.augmentation for v in normal[2:])
-    assert len({view.name for view in normal + dark}) == 5 + 7
+    assert len({view.name for view in normal + dark}) == 5 + 5
 
 
 def test_an_augmented_view_is_darkened_last(photo: np.ndarray) -> None:
@@ -88,7 +90,7 @@ def test_an_augmented_view_is_darkened_last(photo: np.ndarray) -> None:
 def test_photographs_differ_in_their_dark_views() -> None:
     names = [f"photo{number}.jpg" for number in range(30)]
     dark = [views_of(name, OPTIONS)[1] for name in names]
-    assert len({view.darkening for views in dark for view in views}) > 110
+    assert len({view.darkening for views in dark for view in views}) > 55
 
 
 @pytest.mark.parametrize("kind", ["array", "path", "float"])
@@ -116,9 +118,9 @@ def test_views_are_all_sizes_in_both_lights(photographs: Path) -> None:
     assert len(listed) == 12
     for image in listed:
         assert [view.short_side for view in image.normal] == [96, 64]
-        assert [view.short_side for view in image.dark] == [96, 96, 64, 64]
+        assert [view.short_side for view in image.dark] == [96, 64]
         assert all(view.darkening is None for view in image.normal)
-        assert len({view.name for view in image.normal + image.dark}) == 6
+        assert len({view.name for view in image.normal + image.dark}) == 4
     assert list_images(photographs, OPTIONS) == listed, "the same on every call"
 
 

@@ -176,7 +176,7 @@ def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelOpt
 
 RECIPE = FieldOptions(
     "training.recipe:TrainingOptions",
-    skip=("darkening", "augmentation_ranges", "labels"),
+    skip=("labels",),
     flags={
         "stages": "--stage",
         "short_sides": "--short-side",
@@ -193,7 +193,7 @@ RECIPE = FieldOptions(
 
 SHARDS = FieldOptions(
     RECIPE.path,
-    names=("short_sides", "square", "max_images", "val_fraction", "dark_variants", "augmentations"),
+    names=("short_sides", "square", "max_images", "val_fraction", "augmentations"),
     flags=RECIPE.flags,
     defaults=RECIPE.defaults,
 )

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import sys
-import traceback
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from .._shared.errors import DeepDetectError
-from ._generated import FieldOptions, generated_command, given_only, with_flags
+from ._generated import FieldOptions, generated_command, given_only
 from ._options import (
     PATH,
     RECIPE,
@@ -39,9 +34,7 @@ RUN = FieldOptions(
     },
     metavars={"validation": "FOLDER", "labels": "FOLDER", "init_weights": "NAME|FILE"},
 )
-DEVICE = FieldOptions(
-    "training.recipe:DeviceOptions", flags={"checkpoint_interval_s": "--checkpoint-interval"}
-)
+DEVICE = FieldOptions("training.recipe:DeviceOptions")
 
 
 @generated_command(RUN, RECIPE, DEVICE, short_help="Train the network on images.")
@@ -91,44 +84,14 @@ def train(
     arguments["device"] = DeviceOptions(**given_only(chosen))
     arguments |= {"workers": workers, "log": None if as_json else click.echo}
     options = chosen_recipe(preset, detectors, label_settings, values)
-    with _ending_all_processes(click.get_current_context()):
-        if profiling:
-            _print_profiles(profile(images, output, options, **arguments), as_json)
-            return
+    if profiling:
+        _print_profiles(profile(images, output, options, **arguments), as_json)
+    else:
         _print_result(train_network(images, output, options, **arguments), as_json)
 
 
-@contextlib.contextmanager
-def _ending_all_processes(context: click.Context) -> Iterator[None]:
-    """End one of several processes at once, when all is written, or after an error.
-
-    Then torchrun ends the others. The usual way out would first wait for them, which wait
-    for this one; and Python's own end can meet gloo's threads, and hang with them
-    (pytorch#190489). A single process ends the usual way.
-    """
-    from ..training.engine import DistributedContext
-
-    if DistributedContext.from_environment().world_size == 1:
-        yield
-        return
-    status = 0
-    try:
-        yield
-    except DeepDetectError as error:
-        click.echo(f"deepdetect: {with_flags(str(error), context.command)}", err=True)
-        status = 2
-    except BaseException as error:
-        traceback.print_exc()
-        status = 130 if isinstance(error, KeyboardInterrupt) else 1
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
-
-
 def _is_main_process() -> bool:
-    from ..training.engine import DistributedContext
-
-    return DistributedContext.from_environment().is_main
+    return int(os.environ.get("RANK", 0)) == 0  # of torchrun
 
 
 def _print_result(result: TrainingResult, as_json: bool) -> None:
@@ -140,20 +103,20 @@ def _print_result(result: TrainingResult, as_json: bool) -> None:
             {
                 "weights": result.weights,
                 "onnx": result.onnx,
-                "epoch": best.epoch,
-                "validation_loss": best.validation_loss,
-                "normal": {"loss": best.normal_loss, "iou": best.normal_iou},
-                "dark": {"loss": best.dark_loss, "iou": best.dark_iou},
+                "epoch": best["epoch"],
+                "validation_loss": best["validation_loss"],
+                "normal": {"loss": best["normal_loss"], "iou": best["normal_iou"]},
+                "dark": {"loss": best["dark_loss"], "iou": best["dark_iou"]},
                 "images_per_second": round(result.images_per_second, 3),
             }
         )
         return
     print_table(
         [
-            ("best after epoch", f"{best.epoch:.1f}"),
-            ("validation loss", f"{best.validation_loss:.4f}"),
-            ("normal images", f"loss {best.normal_loss:.4f}, IoU {best.normal_iou:.3f}"),
-            ("dark images", f"loss {best.dark_loss:.4f}, IoU {best.dark_iou:.3f}"),
+            ("best after epoch", f"{best['epoch']:.1f}"),
+            ("validation loss", f"{best['validation_loss']:.4f}"),
+            ("normal images", f"loss {best['normal_loss']:.4f}, IoU {best['normal_iou']:.3f}"),
+            ("dark images", f"loss {best['dark_loss']:.4f}, IoU {best['dark_iou']:.3f}"),
             ("480x480 images/s", f"{result.images_per_second:.1f}"),
             ("written", f"{result.weights}, {result.onnx}"),
         ]

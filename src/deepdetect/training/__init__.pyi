@@ -2,11 +2,17 @@ from .dataset import CropDataset as CropDataset, ValidationDataset as Validation
 from .recipe import (
     PRESETS as PRESETS,
     DeviceOptions as DeviceOptions,
+    PointsTrainingOptions as PointsTrainingOptions,
     Stage as Stage,
     TrainingOptions as TrainingOptions,
     training_preset as training_preset,
 )
-from .run import StageProfile as StageProfile, profile as profile, train as train
+from .run import (
+    StageProfile as StageProfile,
+    profile as profile,
+    train as train,
+    train_points as train_points,
+)
 from .sampler import CropSampler as CropSampler, Schedule as Schedule
 from .shards import write_shards as write_shards
-from .trainer import Trainer as Trainer, TrainingResult as TrainingResult
+from .trainer import TrainingResult as TrainingResult

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._shared.errors import OptionError
 from .._shared.opencv import cv2
-from .._shared.options import suggest_keywords
 from ..io.image import luma
 
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
@@ -28,64 +26,34 @@ class Darkening:
     brightness: float
     contrast: float
 
-    def __post_init__(self) -> None:
-        for name in ("brightness", "contrast"):
-            if not 0 < getattr(self, name) <= 1:
-                raise OptionError(f"{name} must be above 0 and at most 1")
+
+BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
+"""Ranges that the factors of a `Darkening` are drawn from. The product stays under 0.25, so that a
+darkened image spans fewer than the 64 grey levels under which an image is of low visibility."""
+
+# What `augment` draws from.
+CROP_SCALE = (0.7, 1.0)
+"""Side of the cut-out square, as a fraction of the largest that fits."""
+
+RELIGHT_PROBABILITY = 0.5
+MAX_LOG_GAMMA = 0.5
+RELIGHT_CONTRAST, MAX_BRIGHTNESS_SHIFT = (0.5, 1.2), 0.15
+"""Of values in [0, 1], around 0.5."""
+
+BLUR_PROBABILITY, BLUR_SIGMA_PX = 0.3, (0.5, 2.5)
+NOISE_PROBABILITY, NOISE_SIGMA_LEVELS = 0.25, (1, 8)
+JPEG_PROBABILITY, JPEG_QUALITY = 0.35, (20, 95)
+
+MAX_JITTER_SATURATION = 1.2
+"""Largest factor of the saturation of rotated colours."""
 
 
-@suggest_keywords
-@dataclass(frozen=True)
-class DarkeningRange:
-    """Ranges that the factors of a `Darkening` are drawn from.
-
-    The product stays under 0.25, so that a darkened image spans fewer than the 64
-    grey levels under which an image counts as of low visibility.
-    """
-
-    brightness: tuple[float, float] = (0.2, 0.45)
-    contrast: tuple[float, float] = (0.3, 0.55)
-
-    def draw(self, generator: np.random.Generator) -> Darkening:
-        """Draw both factors, rounded to thousandths so that a file name can hold them."""
-        return Darkening(
-            round(float(generator.uniform(*self.brightness)), 3),
-            round(float(generator.uniform(*self.contrast)), 3),
-        )
-
-
-@suggest_keywords
-@dataclass(frozen=True)
-class AugmentationRanges:
-    """Probabilities and ranges of `augment`.
-
-    Attributes:
-        crop_scale: side of the cut-out square, as a fraction of the largest that fits.
-        relight_probability: of another gamma, contrast and brightness.
-        max_log_gamma: the gamma is between exp(-x) and exp(x).
-        contrast, max_brightness_shift: of values in [0, 1], around 0.5.
-        blur_probability, blur_sigma_px: of a Gaussian blur.
-        noise_probability, noise_sigma_levels: of Gaussian noise, in grey levels.
-        jpeg_probability, jpeg_quality: of a JPEG compression.
-    """
-
-    crop_scale: tuple[float, float] = (0.7, 1.0)
-    relight_probability: float = 0.5
-    max_log_gamma: float = 0.5
-    contrast: tuple[float, float] = (0.5, 1.2)
-    max_brightness_shift: float = 0.15
-    blur_probability: float = 0.3
-    blur_sigma_px: tuple[float, float] = (0.5, 2.5)
-    noise_probability: float = 0.25
-    noise_sigma_levels: tuple[float, float] = (1, 8)
-    jpeg_probability: float = 0.35
-    jpeg_quality: tuple[int, int] = (20, 95)
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            low, high = value if isinstance(value, tuple) else (value, value)
-            if not 0 <= low <= high or (name.endswith("probability") and high > 1):
-                raise OptionError(f"`{name}` is {value}, which is no probability or range")
+def draw_darkening(generator: np.random.Generator) -> Darkening:
+    """Draw both factors, rounded to thousandths so that a file name can hold them."""
+    return Darkening(
+        round(float(generator.uniform(*BRIGHTNESS)), 3),
+        round(float(generator.uniform(*CONTRAST)), 3),
+    )
 
 
 def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
@@ -118,9 +86,7 @@ def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
 
 
-def jitter_color(
-    rgb: np.ndarray, generator: np.random.Generator, exact: bool, max_saturation: float = 1.2
-) -> np.ndarray:
+def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -> np.ndarray:
     """Remove the colours or rotate the hue, both with the same luma.
 
     Args:
@@ -128,12 +94,11 @@ def jitter_color(
         generator: draws which, the angle, and the factor of the saturation.
         exact: only remove colours: rotating them can change the luma by one level, which
             matters for the keypoints of dark images.
-        max_saturation: of that factor.
     """
     if exact or generator.random() < 0.5:
         return to_gray(rgb)
     angle = generator.uniform(0, 2 * np.pi)
-    return rotate_hue(rgb, angle, generator.uniform(0, max_saturation))
+    return rotate_hue(rgb, angle, generator.uniform(0, MAX_JITTER_SATURATION))
 
 
 def to_gray(rgb: np.ndarray) -> np.ndarray:
@@ -169,10 +134,8 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
     return cv2.convertScaleAbs(rotated)
 
 
-def augment(
-    rgb: np.ndarray, side: int, seed: int, ranges: AugmentationRanges = AugmentationRanges()
-) -> np.ndarray:
-    """Make an augmented view: a part of a photograph, rotated, relit, blurred, noisy, compressed.
+def augment(rgb: np.ndarray, side: int, seed: int) -> np.ndarray:
+    """Make an augmented view: a part of an image, rotated, relit, blurred, noisy, compressed.
 
     Its label is made from the view itself. Other versions of NumPy and OpenCV may give slightly
     different views for the same seed.
@@ -181,37 +144,34 @@ def augment(
         rgb: (H, W, 3) uint8 RGB.
         side: of the view, in pixels.
         seed: of all random choices.
-        ranges: what they are drawn from.
 
     Returns:
-        (side, side, 3) uint8 RGB, all of it from inside the photograph.
+        (side, side, 3) uint8 RGB, all of it from inside the image.
 
     Example:
         >>> augment(np.full((64, 96, 3), 90, np.uint8), 32, seed=1).shape
         (32, 32, 3)
     """
     generator = np.random.default_rng([AUGMENTATION_VERSION, seed])
-    view = _rotated_crop(rgb, side, ranges, generator)
-    if generator.random() < ranges.relight_probability:
-        view = _relight(view, ranges, generator)
-    if generator.random() < ranges.blur_probability:
-        view = cv2.GaussianBlur(view, (0, 0), generator.uniform(*ranges.blur_sigma_px))
-    if generator.random() < ranges.noise_probability:
-        noise = generator.normal(0, generator.uniform(*ranges.noise_sigma_levels), view.shape)
+    view = _rotated_crop(rgb, side, generator)
+    if generator.random() < RELIGHT_PROBABILITY:
+        view = _relight(view, generator)
+    if generator.random() < BLUR_PROBABILITY:
+        view = cv2.GaussianBlur(view, (0, 0), generator.uniform(*BLUR_SIGMA_PX))
+    if generator.random() < NOISE_PROBABILITY:
+        noise = generator.normal(0, generator.uniform(*NOISE_SIGMA_LEVELS), view.shape)
         view = np.clip(np.rint(view + noise), 0, 255).astype(np.uint8)
-    if generator.random() < ranges.jpeg_probability:
-        view = _compress(view, int(generator.integers(*ranges.jpeg_quality)))
+    if generator.random() < JPEG_PROBABILITY:
+        view = _compress(view, int(generator.integers(*JPEG_QUALITY)))
     return view
 
 
-def _rotated_crop(
-    rgb: np.ndarray, side: int, ranges: AugmentationRanges, generator: np.random.Generator
-) -> np.ndarray:
-    """Cut out a square at any angle, whose corners lie inside the photograph."""
+def _rotated_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) -> np.ndarray:
+    """Cut out a square at any angle, whose corners lie inside the image."""
     angle = generator.uniform(0, 2 * math.pi)
     cosine, sine = math.cos(angle), math.sin(angle)
     extent = abs(cosine) + abs(sine)  # of a rotated square of side 1
-    window = (min(rgb.shape[:2]) - 1) / extent * generator.uniform(*ranges.crop_scale)
+    window = (min(rgb.shape[:2]) - 1) / extent * generator.uniform(*CROP_SCALE)
     step = window / side
     if step > 1:  # averaged before it is sampled more coarsely
         factor = 1 / step
@@ -236,14 +196,12 @@ def _rotated_crop(
     )
 
 
-def _relight(
-    rgb: np.ndarray, ranges: AugmentationRanges, generator: np.random.Generator
-) -> np.ndarray:
+def _relight(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """Change gamma, contrast and brightness, by a table of 256 entries."""
     levels = np.arange(256) / 255
-    levels = levels ** math.exp(generator.uniform(-ranges.max_log_gamma, ranges.max_log_gamma))
-    levels = 0.5 + (levels - 0.5) * generator.uniform(*ranges.contrast)
-    levels = levels + generator.uniform(-ranges.max_brightness_shift, ranges.max_brightness_shift)
+    levels = levels ** math.exp(generator.uniform(-MAX_LOG_GAMMA, MAX_LOG_GAMMA))
+    levels = 0.5 + (levels - 0.5) * generator.uniform(*RELIGHT_CONTRAST)
+    levels = levels + generator.uniform(-MAX_BRIGHTNESS_SHIFT, MAX_BRIGHTNESS_SHIFT)
     return np.clip(np.rint(255 * levels), 0, 255).astype(np.uint8)[rgb]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -19,8 +18,10 @@ from torch.optim import Optimizer
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import WeightsError
-from .model_card import CurvePoint
 from .optim import state_shapes
+
+Point = dict[str, float]
+"""A point of the curves: losses and measures by name after a number of steps."""
 
 MAX_INTEGER = 2**53
 """Larger ones may have no equal among the floats that they are divided by."""
@@ -32,62 +33,52 @@ class TrainingState:
 
     Attributes:
         step: optimiser steps done.
-        images: crops seen.
         loss_sum, loss_count: of the training batches since the last point of the curves.
-        points: the loss curves.
+        points: the curves.
     """
 
     step: int = 0
-    images: int = 0
     loss_sum: float = 0.0
     loss_count: int = 0
-    points: list[CurvePoint] = field(default_factory=list)
+    points: list[Point] = field(default_factory=list)
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any], last_step: int) -> TrainingState:
+    def from_json(
+        cls, values: Mapping[str, Any], last_step: int, columns: Sequence[str]
+    ) -> TrainingState:
         """Read the state from a checkpoint's metadata.
+
+        Args:
+            values: the metadata.
+            last_step: of the run.
+            columns: names of the values of a point.
 
         Raises:
             ValueError: a value is missing, of another type or out of its range.
         """
-        counts = {name: read_number(values, name, int) for name in ("step", "images", "loss_count")}
-        if counts["step"] > last_step:
-            raise ValueError(f"step {counts['step']} lies behind the last one, {last_step}")
-        points = [read_point(row) for row in read_rows(values)]
-        check_steps([point.step for point in points], counts["step"])
-        measured = points[-1].step if points else 0
-        if (counts["loss_count"] == 0) != (counts["step"] == measured):
+        step, count = (_number(values.get(name), name, int) for name in ("step", "loss_count"))
+        if step > last_step:
+            raise ValueError(f"step {step} lies behind the last one, {last_step}")
+        rows = values.get("points")
+        if not isinstance(rows, list):
+            raise ValueError("points is not a list")
+        points = [read_point(row, columns) for row in rows]
+        if any(a >= b for a, b in pairwise([*(point["step"] for point in points), step + 1])):
+            raise ValueError("points are not in the order of their steps")
+        if (count == 0) != (step == (points[-1]["step"] if points else 0)):
             raise ValueError("loss_count does not fit the last point")
-        return cls(**counts, loss_sum=read_number(values, "loss_sum", float), points=points)
+        return cls(step, _number(values.get("loss_sum"), "loss_sum", float), count, points)
 
 
-def read_point(row: Any) -> CurvePoint:
-    """Read a point of the loss curves from JSON.
+def read_point(row: Any, columns: Sequence[str]) -> Point:
+    """Read a point of the curves from JSON.
 
     Raises:
-        ValueError: a value is missing, of another type or out of its range.
+        ValueError: a value is missing or not finite.
     """
-    if not isinstance(row, dict):
-        raise ValueError("a point is not an object")
-    kinds = {
-        field.name: int if field.type == "int" else float
-        for field in dataclasses.fields(CurvePoint)
-    }
-    return CurvePoint(**{name: read_number(row, name, kind) for name, kind in kinds.items()})
-
-
-def read_rows(values: Mapping[str, Any]) -> list[Any]:
-    """Return the list "points" of a mapping; raise a ValueError where it is none."""
-    rows = values.get("points")
-    if not isinstance(rows, list):
-        raise ValueError("points is not a list")
-    return rows
-
-
-def check_steps(steps: Sequence[int], last: int) -> None:
-    """Raise a ValueError where the steps of points do not rise, or lie behind the last one."""
-    if any(a >= b for a, b in pairwise([*steps, last + 1])):
-        raise ValueError("points are not in the order of their steps")
+    if not isinstance(row, dict) or row.keys() != set(columns):
+        raise ValueError("a point has other columns")
+    return {name: _number(row[name], name, type(row[name])) for name in columns}
 
 
 @dataclass(frozen=True)
@@ -192,16 +183,11 @@ def _like(value: Tensor, parameter: Tensor) -> Tensor:
     return value.to(parameter.device, copy=True)
 
 
-def read_number(values: Mapping[str, Any], name: str, kind: type) -> Any:
-    """Return a finite number of a mapping, not negative if it is an integer.
-
-    Raises:
-        ValueError: it is missing, of another type or out of its range.
-    """
-    value: Any = values.get(name)
-    whole = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_INTEGER
+def _number(value: Any, name: str, kind: type) -> Any:
+    """Return a finite number, not negative if it is an integer; else raise a ValueError."""
+    whole = type(value) is int and abs(value) <= MAX_INTEGER
     if kind is int and whole and value >= 0:
         return value
-    if kind is float and (whole or (isinstance(value, float) and math.isfinite(value))):
+    if kind is float and (whole or (type(value) is float and math.isfinite(value))):
         return float(value)
     raise ValueError(f"{name} is not a number that it can be")

@@ -13,13 +13,16 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from .._shared.errors import DeepDetectError, ImageError
+from .._shared.errors import BatchError, DeepDetectError, ImageError
 from .._shared.memory import available_memory
 from .._shared.opencv import cv2
+from .._shared.parallel import map_in_processes
+from .._shared.progress import progress
+from ..io.image import load_image
+from ..io.masks import save_mask
 from .augmentation import flip, jitter_color, transpose
-from .engine import DistributedContext
-from .labels import LabelCache
-from .recipe import DeviceOptions, Stage, TrainingOptions
+from .labels import LabelCache, label_view
+from .recipe import Stage, TrainingOptions
 from .sampler import CropIndex
 from .shards import Shards, ShardSource, has_shards
 from .views import SourceImage, View, digest_images, list_images, render, train_val_split
@@ -71,10 +74,76 @@ class FolderSource:
                 f"the label of {source.path} has another size than the image: "
                 f"delete {self.labels.folder} and start again"
             )
+        self._keep(index, view, image, mask)
+        return image, mask
+
+    def _keep(self, index: int, view: View, image: np.ndarray, mask: np.ndarray) -> None:
         if image.nbytes + mask.nbytes <= self.memory_bytes:
             self.memory_bytes -= image.nbytes + mask.nbytes
             self._kept[index, view] = image, mask
-        return image, mask
+
+    def make_labels(
+        self, views: Sequence[tuple[View, ...]], workers: int | None = None, quiet: bool = True
+    ) -> int:
+        """Make the labels that do not exist yet, in parallel; return how many were made.
+
+        The views that are rendered for it are kept.
+
+        Args:
+            views: of each image, those that are needed.
+            workers: number of processes; default one per processor.
+            quiet: show no progress bar.
+
+        Raises:
+            BatchError: images cannot be read; the other labels are made all the same.
+            DeepDetectError: a label cannot be written.
+        """
+        tasks, memory = [], self.memory_bytes
+        for index, (image, needed) in enumerate(zip(self.images, views, strict=True)):
+            if missing := self.labels.missing(image, needed):
+                memory -= sum(4 * view.short_side**2 for view in missing)  # at least
+                tasks.append(_LabelTask(index, image, missing, self.labels, memory > 0))
+        total = sum(len(task.views) for task in tasks)
+        failures = []
+        with progress(total, "labels", "label", quiet) as bar:
+            for task, made, error in map_in_processes(_make_labels, tasks, workers):
+                for view, pair in zip(task.views, made, strict=False):
+                    self._keep(task.index, view, *pair)
+                failures += [error] if error else []
+                bar.update(len(task.views))
+        if failures:
+            raise BatchError(
+                f"{len(failures)} of {len(self.images)} images cannot be read, the labels of the "
+                "others are kept",
+                failures,
+            )
+        return total
+
+
+@dataclass(frozen=True)
+class _LabelTask:
+    index: int
+    image: SourceImage
+    views: tuple[View, ...]
+    labels: LabelCache
+    keep: bool
+
+
+def _make_labels(
+    task: _LabelTask,
+) -> tuple[_LabelTask, list[tuple[np.ndarray, np.ndarray]], str | None]:
+    """Write the labels of an image; return the views with their labels, or what is wrong."""
+    made = []
+    try:
+        image = load_image(task.image.path)
+        for view in task.views:
+            rgb = render(image, view)
+            mask = label_view(rgb, view, task.labels.options)
+            save_mask(mask, task.labels.path(task.image, view))
+            made += [(rgb, mask)] if task.keep else []
+    except ImageError as error:
+        return task, made, str(error)
+    return task, made, None
 
 
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):
@@ -106,7 +175,7 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
             image, mask = transpose(image, mask)
         if generator.random() < options.color_jitter:
             dark = view.darkening is not None
-            image = jitter_color(image, generator, dark, options.max_jitter_saturation)
+            image = jitter_color(image, generator, dark)
         return torch.tensor(image), torch.tensor(mask)
 
     def _choose_view(
@@ -128,11 +197,9 @@ class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
     Those in normal light come first, then the darkened ones.
     """
 
-    def __init__(
-        self, source: ImageSource, context: DistributedContext = DistributedContext()
-    ) -> None:
+    def __init__(self, source: ImageSource, rank: int = 0, world_size: int = 1) -> None:
         self.source = source
-        self.indices = range(context.rank, len(source), context.world_size)
+        self.indices = range(rank, len(source), world_size)
 
     def __len__(self) -> int:
         return 2 * len(self.indices)
@@ -168,21 +235,22 @@ def prepare_data(
     validation: str | Path | None = None,
     labels: str | Path | None = None,
     workers: int | None = None,
-    device: DeviceOptions = DeviceOptions(),
+    processes: int = 1,
+    make_labels: bool = True,
     quiet: bool = True,
 ) -> TrainingData:
     """List the images of a run and make the labels of all their views; arguments of `train`.
 
-    The first process of each machine makes the labels, the others wait for it.
+    Args:
+        images, options, output, validation, labels, workers: as of `train`.
+        processes: of this machine that load images, each with views of its own in memory.
+        make_labels: whether missing labels are made.
+        quiet: show no progress bar.
 
     Raises:
         ImageError: a folder is missing or empty.
-        OptionError: a batch cannot be divided evenly among the processes.
-        DeepDetectError: an image cannot be read.
+        BatchError: images cannot be read.
     """
-    context = DistributedContext.from_environment()
-    for stage in options.stages:
-        context.local_slice(stage.batch)  # an uneven one is reported before the labels are made
     images, output = Path(images), Path(output)
     label_folder = output / "labels" if labels is None else Path(labels)
     cache = LabelCache(label_folder, options.labels)
@@ -194,18 +262,13 @@ def prepare_data(
         held_out = list_images(Path(validation), options, exclude)
     elif not shards:
         listed, held_out = train_val_split(listed, options.val_fraction)
-    if context.local_rank == 0:
-        wanted = [(i, i.normal + i.dark * (options.dark_fraction > 0)) for i in listed]
-        wanted += [(image, image.validation_views) for image in held_out]
-        cache.make(wanted, workers, quiet or not context.is_main)
-    context.barrier()
-    memory = device.view_memory_bytes
-    memory = available_memory() // 2 if memory is None else memory
-    local = context.local_world_size
-    memory //= local * max(1, device.worker_count(local))  # each process has its own
-    held = FolderSource(held_out, cache, memory // 8)
+    memory = available_memory() // 2 // processes
+    source, held = FolderSource(listed, cache, memory), FolderSource(held_out, cache, memory // 8)
+    if make_labels:
+        views = [i.normal + i.dark if options.dark_fraction > 0 else i.normal for i in listed]
+        source.make_labels(views, workers, quiet)
+        held.make_labels([image.validation_views for image in held_out], workers, quiet)
     if not shards:
-        source = FolderSource(listed, cache, memory)
         return TrainingData(source, held, digest_images(listed, held_out))
     packed, sizes = ShardSource(shards.training, options), tuple(n for _, n in shards.training)
     if validation is None:

@@ -1,121 +1,87 @@
-"""What a run reports of its weights: the loss curves and a model card."""
+"""What a run reports of its weights: the curves and a model card."""
 
 from __future__ import annotations
 
 import csv
-import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from .._shared.atomic import atomic_path
+from .checkpoint import Point
 
 
-@dataclass(frozen=True)
-class CurvePoint:
-    """The losses after a number of steps.
-
-    Attributes:
-        step: optimiser steps done.
-        epoch: how often each image was seen, on average.
-        images: crops seen.
-        learning_rate: of the last step.
-        training_loss: mean loss of the training batches since the last point.
-        validation_loss: mean of `normal_loss` and `dark_loss`, weighted by the dark fraction.
-        normal_loss, normal_iou, dark_loss, dark_iou: on the validation images.
-    """
-
-    step: int
-    epoch: float
-    images: int
-    learning_rate: float
-    training_loss: float
-    validation_loss: float
-    normal_loss: float
-    normal_iou: float
-    dark_loss: float
-    dark_iou: float
-
-
-def save_curves(points: Sequence[CurvePoint], folder: Path) -> None:
+def save_curves(points: Sequence[Point], columns: Sequence[str], folder: Path) -> None:
     """Write curves.csv, and curves.png (paper, Figure 5) where matplotlib is installed."""
     with atomic_path(folder / "curves.csv") as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in dataclasses.fields(CurvePoint)])
-        writer.writeheader()
-        for point in points:
-            values = dataclasses.asdict(point).items()
-            writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in values})
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows([_cell(point[name]) for name in columns] for point in points)
     try:
         from matplotlib.figure import Figure
     except ImportError:
         return
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
-    epochs = [point.epoch for point in points]
-    for name, label, style in (
-        ("training_loss", "training", "C0-"),
-        ("validation_loss", "validation", "C1-"),
-        ("normal_loss", "validation, normal", "C2:"),
-        ("dark_loss", "validation, dark", "C3:"),
-    ):
-        axes.plot(epochs, [getattr(point, name) for point in points], style, label=label)
-    axes.set_xlabel("epoch")
-    axes.set_ylabel("binary cross-entropy per pixel")
+    steps = [point["step"] for point in points]
+    for name in columns:
+        if name.endswith(("loss", "score", "correct")):
+            axes.plot(steps, [point[name] for point in points], label=name.replace("_", " "))
+    axes.set_xlabel("step")
     axes.grid(alpha=0.3)
-    axes.legend()
+    axes.legend(fontsize=7)
     with atomic_path(folder / "curves.png") as temporary:
         figure.savefig(temporary, dpi=120)
 
 
 def write_model_card(
-    path: Path, weights: Path, metadata: Mapping[str, str], points: Sequence[CurvePoint]
+    path: Path,
+    weights: Path,
+    describe: Callable[[Point], tuple[str, list[str]]],
+    notes: Mapping[str, Any],
+    points: Sequence[Point],
 ) -> None:
-    """Write a model card as Markdown from the weights' file, its metadata and the loss curves."""
-    best = CurvePoint(**json.loads(metadata["point"]))
-    options = json.loads(metadata["options"])
+    """Write a model card as Markdown.
+
+    Args:
+        path: of the card.
+        weights: the file that it describes.
+        describe: says of the point of these weights what the network is and how good it is.
+        notes: of the weights' file.
+        points: the curves of the run.
+    """
+    network, quality = describe(json.loads(notes["point"]))
+    options = json.loads(notes["options"])
+    known = ("command", "options", "point", "run")
     lines = [
         "# Model card",
         "",
-        f"`{weights.name}`, SHA-256 `{hashlib.sha256(weights.read_bytes()).hexdigest()}`: ESPNet,",
-        "408,039 parameters. Input: RGB in [0, 1]; output: the probability that a pixel is a",
-        "keypoint or an edge for one of the label detectors.",
+        f"`{weights.name}`, SHA-256 `{hashlib.sha256(weights.read_bytes()).hexdigest()}`:",
+        network,
         "",
         "## How good the weights are",
         "",
-        "On the validation images, by which these weights were chosen (mean binary",
-        "cross-entropy per pixel / intersection over union at threshold 0.5):",
-        "",
-        f"- normal: {best.normal_loss:.4f} / {best.normal_iou:.3f}",
-        f"- darkened: {best.dark_loss:.4f} / {best.dark_iou:.3f}",
+        *quality,
         "",
         "## Where they come from",
         "",
         "```sh",
-        metadata["command"],
+        notes["command"],
         "```",
         "",
-        f"- git commit: {metadata['commit'] or 'not known'}",
-        f"- versions: {metadata['versions']}",
-        f"- machine: {metadata['machine']}; run on {metadata['run_on']}",
-        f"- training images: {int(metadata['photographs']):,}; "
-        f"digest of all images: {metadata['photographs_digest']}",
-        f"- SHA-256 of the initial weights: {metadata['start']}",
-        f"- step {best.step:,}, {best.images:,} crops seen",
+        *(f"- {name.replace('_', ' ')}: {notes[name]}" for name in notes if name not in known),
         "",
         "## Recipe",
         "",
-        *_table(["option", "value"], [[name, json.dumps(options[name])] for name in options]),
+        *table(["option", "value"], [[name, json.dumps(options[name])] for name in options]),
         "",
-        "## Losses",
+        "## Curves",
         "",
-        *_table(
-            [field.name.replace("_", " ") for field in dataclasses.fields(CurvePoint)],
-            [
-                [f"{v:.6g}" if isinstance(v, float) else f"{v:,}" for v in dataclasses.astuple(p)]
-                for p in points
-            ],
+        *table(
+            [name.replace("_", " ") for name in points[0]],
+            [[_cell(value) for value in point.values()] for point in points],
         ),
         "",
     ]
@@ -123,7 +89,12 @@ def write_model_card(
         temporary.write_text("\n".join(lines), encoding="utf-8")
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a Markdown table."""
     cells = [[cell.replace("|", "\\|") for cell in row] for row in (header, *rows)]
     lines = [f"| {' | '.join(row)} |" for row in cells]
     return [lines[0], "|---" * len(header) + "|", *lines[1:]]
+
+
+def _cell(value: float) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +13,6 @@ from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import processor_count
 from .._shared.registry import look_up
 from ..labels import LABEL_SETTINGS, LabelOptions
-from .augmentation import AugmentationRanges, DarkeningRange
 
 OPTIMIZERS = ("adam", "soap")
 DEVICES = ("auto", "cpu", "cuda")
@@ -76,6 +73,7 @@ class TrainingOptions:
     """Everything that decides which weights come out, given the images.
 
     Attributes:
+        network: name of the network that is trained.
         stages: what is trained on, one stage after the other. Small crops give many cheap
             steps first; whole images at the end teach what depends on the whole image
             (Harris and Sobel labels are relative to the image's largest response).
@@ -87,23 +85,17 @@ class TrainingOptions:
         max_images: use at most this many images, including those for validation.
         val_fraction: fraction of the images held out for validation, when no folder is given.
         dark_fraction: fraction of darkened crops (paper: a quarter).
-        dark_variants: darkened versions of each image at each size.
-        darkening: ranges of the darkening.
         augmentations: augmented views of each image at the first size, in normal and in dark
             light: rotated, relit, blurred, noisy or compressed. Each is used as often as the plain
             view of a size.
-        augmentation_ranges: probabilities and ranges of their changes.
         flips: mirror crops left to right and upside down. The label of a mirrored image
             is different, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
         transpositions: mirror crops along their diagonal, which changes labels of BRISK only.
         color_jitter: fraction of the crops whose colours are removed, or rotated with the same
             luma, the only thing that labels depend on.
-        max_jitter_saturation: largest factor of the saturation of rotated colours.
-        shuffle_buffer_shards: this many shards are read at a time; their images are shuffled.
         optimizer: "adam", or "soap", which learns more per image (docs/history.md has the
             measurements).
-        learning_rate: at the start of the cosine annealing.
-        final_learning_rate: at its end.
+        learning_rate: at the start of the cosine annealing to 1e-6.
         warm_up: steps over which the learning rate rises from zero. A run that starts from
             trained weights needs them: the first steps of Adam, whose moments are not known
             yet, would undo much.
@@ -128,6 +120,7 @@ class TrainingOptions:
         OptionError: a value is out of its range.
     """
 
+    network: str = "espnet"
     stages: tuple[Stage, ...] = (Stage(240, 16, 44), Stage(480, 8, 10))
     interleave: bool = False
     short_sides: tuple[int, ...] = (480, 360, 240)
@@ -135,18 +128,12 @@ class TrainingOptions:
     max_images: int | None = None
     val_fraction: float = 0.05
     dark_fraction: float = 0.25
-    dark_variants: int = 1
-    darkening: DarkeningRange = field(default_factory=DarkeningRange)
     augmentations: int = 0
-    augmentation_ranges: AugmentationRanges = field(default_factory=AugmentationRanges)
     flips: bool = False
     transpositions: bool = True
     color_jitter: float = 0.5
-    max_jitter_saturation: float = 1.2
-    shuffle_buffer_shards: int = 4
     optimizer: str = "adam"
     learning_rate: float = 1e-3
-    final_learning_rate: float = 1e-6
     warm_up: int = 0
     frozen_batch_norm: bool | None = None
     pos_weight: float = 1.0
@@ -163,8 +150,8 @@ class TrainingOptions:
         self._check_sizes()
         check_ranges(
             self,
-            positive=("dark_variants", "val_count", "shuffle_buffer_shards"),
-            not_negative=("augmentations", "warm_up", "max_jitter_saturation"),
+            positive=("val_count", "learning_rate"),
+            not_negative=("augmentations", "warm_up"),
             fractions=("dark_fraction", "color_jitter"),
             between={
                 "max_images": (2, math.inf),
@@ -177,10 +164,6 @@ class TrainingOptions:
             raise OptionError(f"`val_fraction` must lie in (0, 1), not {self.val_fraction}")
         if self.pos_weight_uncertain and {self.pos_weight, self.low_light_pos_weight or 1} == {1}:
             raise OptionError("`pos_weight_uncertain` needs a `pos_weight` other than 1")
-        if not 0 <= self.final_learning_rate <= self.learning_rate:
-            raise OptionError(
-                "`learning_rate` must be at least `final_learning_rate`, and neither be negative"
-            )
 
     def _check_sizes(self) -> None:
         if not self.stages:
@@ -200,10 +183,6 @@ class TrainingOptions:
                 f"{max(self.short_sides)}: make `short_sides` larger or the crops smaller"
             )
 
-    def to_json(self) -> str:
-        """Return the options as JSON text, which is stored with the weights."""
-        return json.dumps(dataclasses.asdict(self), sort_keys=True)
-
 
 @suggest_keywords
 @dataclass(frozen=True)
@@ -219,10 +198,6 @@ class DeviceOptions:
         num_workers: processes that load and augment crops (of a torch DataLoader), 0 for none
             but the one that trains; by default 0 when training on a CPU, which has no time to
             spare, and one per processor but one when training on a GPU.
-        checkpoint_interval_s: seconds from one checkpoint to the next: a killed run loses at
-            most this much time.
-        view_memory_bytes: memory that rendered views may take, in bytes, on a machine; by default
-            half of what is free.
     """
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -230,8 +205,6 @@ class DeviceOptions:
     compile: bool | None = None
     threads: int | None = None
     num_workers: int | None = None
-    checkpoint_interval_s: float = 60.0
-    view_memory_bytes: int | None = None
 
     def __post_init__(self) -> None:
         for name, known in (("device", DEVICES), ("precision", PRECISIONS)):
@@ -242,8 +215,7 @@ class DeviceOptions:
 
             if not is_available():
                 raise OptionError("there is no CUDA device: use `device=cpu`")
-        counts = "num_workers", "checkpoint_interval_s", "view_memory_bytes"
-        check_ranges(self, positive=("threads",), not_negative=counts)
+        check_ranges(self, positive=("threads",), not_negative=("num_workers",))
 
     @property
     def accelerator(self) -> str:
@@ -254,13 +226,55 @@ class DeviceOptions:
 
         return "cuda" if is_available() else "cpu"
 
-    def worker_count(self, local_world_size: int = 1) -> int:
+    def worker_count(self, processes: int = 1) -> int:
         """Return the number of loading processes, given the training processes of this machine."""
         if self.num_workers is not None:
             return self.num_workers
-        if self.accelerator == "cpu":
-            return 0
-        return max(1, processor_count() // local_world_size - 1)
+        return 0 if self.accelerator == "cpu" else max(1, processor_count() // processes - 1)
+
+
+@suggest_keywords
+@dataclass(frozen=True)
+class PointsTrainingOptions:
+    """A training of the ranker of points.
+
+    Attributes:
+        steps: optimiser steps.
+        pairs: of views in each step.
+        side: of the square views in pixels.
+        learning_rate: the highest; cosine annealing to 2 % of it.
+        min_density, max_density: range of the budgets in keypoints per pixel, log-uniform.
+        match_weight: how much more a keypoint is worth whose upright descriptors match, in
+            multiples of one that is only found again.
+        val_count: how many times the weights are measured after the start.
+        val_pairs: of each kind that they are measured on: zoom, blur, viewpoint, light.
+        seed: of the weights and the pairs.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    steps: int = 3000
+    pairs: int = 4
+    side: int = 224
+    learning_rate: float = 3e-3
+    min_density: float = 0.003
+    max_density: float = 0.025
+    match_weight: float = 0.0
+    val_count: int = 12
+    val_pairs: int = 24
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        counts = dict.fromkeys(("steps", "pairs", "val_count", "val_pairs"), (1, math.inf))
+        check_ranges(
+            self,
+            positive=("learning_rate", "min_density", "max_density"),
+            not_negative=("match_weight", "seed"),
+            between={**counts, "side": (64, math.inf)},
+        )
+        if self.min_density > self.max_density:
+            raise OptionError("`min_density` must not be above `max_density`")
 
 
 PRESETS: dict[str, TrainingOptions] = {
@@ -278,7 +292,6 @@ PRESETS: dict[str, TrainingOptions] = {
         transpositions=False,
         color_jitter=0.0,
         learning_rate=1e-3,
-        final_learning_rate=1e-6,
         val_count=20,
     ),
     # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser

@@ -1,4 +1,4 @@
-"""`train` and `profile`: a training run, and how fast it would be.
+"""`train`, `train_points` and `profile`: training runs, and how fast one would be.
 
 Their module imports no torch, so that the package can offer them where it is missing.
 """
@@ -17,10 +17,13 @@ from typing import TYPE_CHECKING
 from .._shared.errors import MissingExtraError, install_command
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
-from .recipe import DeviceOptions, InitWeights, Stage, TrainingOptions
+from .recipe import DeviceOptions, InitWeights, PointsTrainingOptions, Stage, TrainingOptions
 
 if TYPE_CHECKING:
-    from .trainer import Trainer, TrainingResult
+    from .dense import DenseTask
+    from .trainer import TrainingResult
+
+Log = Callable[[str], None]
 
 
 @suggest_keywords
@@ -34,7 +37,7 @@ def train(
     init_weights: InitWeights | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
-    log: Callable[[str], None] | None = None,
+    log: Log | None = None,
 ) -> TrainingResult:
     """Train the network on a folder of images.
 
@@ -72,15 +75,92 @@ def train(
         >>> result = train("photos", "run", options, init_weights="default")  # doctest: +SKIP
         >>> detector = DeepDetect(result.onnx)  # doctest: +SKIP
     """
-    require_packages()
-    from .trainer import make_trainer
-
-    trainer = make_trainer(
+    task = _dense_task(
         images, output, options, validation, labels, init_weights, device, workers, log
     )
-    result = trainer.fit()
-    trainer.engine.close()
-    return result
+    from .trainer import Trainer
+
+    trainer = Trainer(task, Path(output), log)
+    if trainer.log is not None and trainer.state.step < task.steps:
+        trainer.log(f"training on {task.engine.describe()}")
+        if task.engine.compiled:
+            trainer.log(
+                "the first step of each stage compiles the network, which takes minutes on two "
+                "cores; --no-compile starts at once, and each step takes longer"
+            )
+    return trainer.fit()
+
+
+@suggest_keywords
+def train_points(
+    images: str | Path,
+    validation: str | Path,
+    output: str | Path,
+    options: PointsTrainingOptions = PointsTrainingOptions(),
+    *,
+    num_workers: int = 0,
+    log: Log | None = None,
+) -> TrainingResult:
+    """Train the ranker of points on pairs of views that are made of single images.
+
+    An interrupted run resumes as one of `train` does.
+
+    Args:
+        images: folder of images.
+        validation: folder of others, by which the best weights are chosen.
+        output: folder for checkpoint.safetensors, best.npz, MODEL_CARD.md and the curves.
+        options: the recipe.
+        num_workers: processes that make the pairs, 0 for none but the one that trains.
+        log: takes lines of text for the user; without it there is no progress bar either.
+
+    Returns:
+        The weights' file and the curves.
+
+    Raises:
+        MissingExtraError: torch or safetensors is not installed.
+        ImageError: a folder is missing or empty.
+        OptionError: the folder holds a run with other options or images.
+    """
+    require_packages()
+    from .points.task import RankerTask
+    from .trainer import Trainer
+
+    task = RankerTask(Path(images), Path(validation), options, num_workers)
+    return Trainer(task, Path(output), log).fit()
+
+
+def _dense_task(
+    images: str | Path,
+    output: str | Path,
+    options: TrainingOptions,
+    validation: str | Path | None,
+    labels: str | Path | None,
+    init_weights: InitWeights | None,
+    device: DeviceOptions,
+    workers: int | None,
+    log: Log | None,
+) -> DenseTask:
+    """Make the labels, and what is trained on them; arguments of `train`."""
+    require_packages()
+    from .dataset import prepare_data
+    from .dense import DenseTask, initial_network
+    from .engine import launch
+
+    options, network = initial_network(options, init_weights)  # before the labels, for its errors
+    fabric = launch(device)
+    data = prepare_data(
+        images,
+        options,
+        output,
+        validation=validation,
+        labels=labels,
+        workers=workers,
+        processes=fabric.world_size * max(1, device.worker_count()),
+        make_labels=fabric.local_rank == 0,
+        quiet=log is None or not fabric.is_global_zero,
+    )
+    fabric.barrier()
+    return DenseTask(network, options, data, device, fabric)
 
 
 @dataclass(frozen=True)
@@ -120,7 +200,7 @@ def profile(
     init_weights: InitWeights | None = None,
     device: DeviceOptions = DeviceOptions(),
     workers: int | None = None,
-    log: Callable[[str], None] | None = None,
+    log: Log | None = None,
 ) -> list[StageProfile]:
     """Time some steps of each stage of a run; nothing but the label cache is written.
 
@@ -140,49 +220,46 @@ def profile(
     Example:
         >>> profile("photos", "run")[0].images_per_second  # doctest: +SKIP
     """
-    require_packages()
-    from .trainer import make_trainer
-
     options = dataclasses.replace(options, interleave=False)  # each stage by itself
-    trainer = make_trainer(
-        images, output, options, validation, labels, init_weights, device, workers, log, False
+    task = _dense_task(
+        images, output, options, validation, labels, init_weights, device, workers, log
     )
-    steps_of_stage = trainer.schedule.steps_of_stage
+    steps_of_stage = task.schedule.steps_of_stage
     lengths = [min(n, steps + warm_up_steps) for n in steps_of_stage]
-    if trainer.log is not None:
-        trainer.log(f"timing {trainer.engine.describe()}")
+    quiet = log is None or not task.is_main
+    if not quiet and log is not None:
+        log(f"timing {task.engine.describe()}")
     profiles, first = [], 0
-    with progress(sum(lengths), "timing", "step", trainer.log is None) as bar:
+    with progress(sum(lengths), "timing", "step", quiet) as bar:
         for length, whole in zip(lengths, steps_of_stage, strict=True):
             warm_up = min(warm_up_steps, length - 1)
-            profiles.append(_time_steps(trainer, first, first + length, warm_up, bar.update))
+            profiles.append(_time_steps(task, first, first + length, warm_up, bar.update))
             first += whole
-    trainer.engine.close()
     return profiles
 
 
 def _time_steps(
-    trainer: Trainer, first: int, last: int, warm_up: int, done: Callable[[int], object]
+    task: DenseTask, first: int, last: int, warm_up: int, done: Callable[[int], object]
 ) -> StageProfile:
     import torch
 
     from .dataset import loading
     from .trainer import FULL_IMAGE_PIXELS
 
-    stage = trainer.schedule.position(first).stage
-    on_gpu = trainer.engine.device.type == "cuda"
+    stage = task.schedule.position(first).stage
+    on_gpu = task.engine.device.type == "cuda"
     if on_gpu:
         torch.cuda.reset_peak_memory_stats()
     waited = 0.0
     started = time.perf_counter()
-    with loading(trainer.loader(first, last)) as batches:
+    with loading(task.loader(first, last)) as batches:
         for step in range(first, last):
             asked = time.perf_counter()
             if step == first + warm_up:
                 waited, started = 0.0, asked
-            images, masks = next(batches)
+            batch = next(batches)
             waited += time.perf_counter() - asked
-            trainer.learner.training_step(images, masks, trainer.schedule.learning_rate(step), step)
+            task.training_step(batch, step)
             done(1)
     # Reading the loss has waited for the GPU at each step.
     seconds = time.perf_counter() - started

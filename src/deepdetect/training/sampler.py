@@ -14,8 +14,14 @@ from typing import NamedTuple
 import numpy as np
 from torch.utils.data import Sampler
 
-from .engine import DistributedContext
+from .._shared.errors import OptionError
 from .recipe import Stage, TrainingOptions
+
+FINAL_LEARNING_RATE = 1e-6
+"""At the end of the cosine annealing (paper, Section III-B)."""
+
+SHUFFLED_SHARDS = 4
+"""So many shards are read at a time, and their images shuffled."""
 
 
 class CropIndex(NamedTuple):
@@ -59,6 +65,9 @@ class Schedule:
             order = np.argsort(np.concatenate(progress), kind="stable")
             self._stages, self._within = self._stages[order], self._within[order]
 
+        batches = np.array([stage.batch for stage in options.stages])
+        self._crops = np.concatenate([[0], np.cumsum(batches[self._stages])])
+
     def position(self, step: int) -> Position:
         """Find the stage of a step, and its place in it.
 
@@ -74,10 +83,12 @@ class Schedule:
         """Return the learning rate of a step: a linear warm-up into cosine annealing."""
         options = self.options
         cosine = (1 + math.cos(math.pi * step / self.steps)) / 2
-        rate = options.final_learning_rate + cosine * (
-            options.learning_rate - options.final_learning_rate
-        )
+        rate = FINAL_LEARNING_RATE + cosine * (options.learning_rate - FINAL_LEARNING_RATE)
         return rate * min(1.0, (step + 1) / (options.warm_up + 1))
+
+    def crops_until(self, step: int) -> int:
+        """Return how many crops the steps before this one have."""
+        return int(self._crops[step])
 
     def milestones(self, count: int) -> set[int]:
         """Return the numbers of steps done at `count` evenly spaced points, the end among them."""
@@ -91,8 +102,9 @@ class CropSampler(Sampler[list[CropIndex]]):
         schedule: the steps.
         shard_sizes: number of images in each shard, whose images are read together; None if
             images can be read in any order.
-        context: this process; it gets its part of each batch.
         first_step, last_step: from which step on, and before which; default: all.
+        rank, world_size: number of this process, which gets its part of each batch, and how many
+            there are.
 
     Raises:
         OptionError: a batch cannot be divided evenly among the processes.
@@ -107,13 +119,19 @@ class CropSampler(Sampler[list[CropIndex]]):
         self,
         schedule: Schedule,
         shard_sizes: Sequence[int] | None = None,
-        context: DistributedContext = DistributedContext(),
         first_step: int = 0,
         last_step: int | None = None,
+        *,
+        rank: int = 0,
+        world_size: int = 1,
     ) -> None:
         for stage in schedule.options.stages:
-            context.local_slice(stage.batch)
-        self.schedule, self.context = schedule, context
+            if stage.batch % world_size:
+                raise OptionError(
+                    f"a batch of {stage.batch} cannot be divided evenly among {world_size} "
+                    "processes: choose `stages` whose batches are multiples of that number"
+                )
+        self.schedule, self.rank, self.world_size = schedule, rank, world_size
         self.shard_sizes = None if shard_sizes is None else tuple(shard_sizes)
         self.steps = range(first_step, schedule.steps if last_step is None else last_step)
 
@@ -128,34 +146,29 @@ class CropSampler(Sampler[list[CropIndex]]):
         position, count = self.schedule.position(step), self.schedule.images
         stage = position.stage
         batch = []
-        for sample in range(stage.batch)[self.context.local_slice(stage.batch)]:
+        part = stage.batch // self.world_size
+        for sample in range(self.rank * part, (self.rank + 1) * part):
             epoch, place = divmod(position.sample + sample, count)
             epoch += position.first_epoch
-            options = self.schedule.options
-            shards = self.shard_sizes, options.shuffle_buffer_shards
-            order = epoch_order(options.seed, epoch, count, *shards)
+            order = epoch_order(self.schedule.options.seed, epoch, count, self.shard_sizes)
             batch.append(CropIndex(int(order[place]), epoch, place, stage))
         return batch
 
 
 @functools.lru_cache(maxsize=16)  # interleaved stages are in epochs of their own
 def epoch_order(
-    seed: int,
-    epoch: int,
-    count: int,
-    shard_sizes: tuple[int, ...] | None = None,
-    shuffle_buffer_shards: int = 4,
+    seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
 ) -> np.ndarray:
     """Return the numbers of the images in the order of an epoch, each once.
 
-    With shards, the images of `shuffle_buffer_shards` of them are shuffled at a time.
+    With shards, the images of `SHUFFLED_SHARDS` of them are shuffled at a time.
     """
     if shard_sizes is None:
         return np.random.default_rng([seed, 1, epoch]).permutation(count)
     shards = np.split(np.arange(count), np.cumsum(shard_sizes)[:-1])
     order = np.random.default_rng([seed, 3, epoch]).permutation(len(shards))
     groups = []
-    for k, first in enumerate(range(0, len(order), shuffle_buffer_shards)):
-        group = np.concatenate([shards[s] for s in order[first : first + shuffle_buffer_shards]])
+    for k, first in enumerate(range(0, len(order), SHUFFLED_SHARDS)):
+        group = np.concatenate([shards[s] for s in order[first : first + SHUFFLED_SHARDS]])
         groups.append(np.random.default_rng([seed, 4, epoch, k]).permutation(group))
     return np.concatenate(groups)

@@ -8,7 +8,6 @@ sampler reads a few shards at a time, so that a disk or a network delivers each 
 from __future__ import annotations
 
 import bisect
-import dataclasses
 import functools
 import hashlib
 import io
@@ -27,6 +26,7 @@ from .._shared.errors import BatchError, ImageError, OptionError
 from .._shared.options import suggest_keywords
 from .._shared.parallel import TaskMap, map_in_processes
 from .._shared.progress import progress
+from .._shared.records import check_same, key, plain
 from .._shared.text_files import read_json
 from ..io.image import load_image
 from ..io.masks import encode_mask, load_mask
@@ -76,8 +76,7 @@ class Shards:
     @property
     def digest(self) -> str:
         """A digest of which images there are, and how they are packed."""
-        rows = [[path.name, count] for path, count in self.training + self.validation]
-        return hashlib.sha256(json.dumps(rows).encode()).hexdigest()[:16]
+        return key([[path.name, count] for path, count in self.training + self.validation])[:16]
 
 
 class ShardSource:
@@ -225,10 +224,11 @@ class _ShardTask:
     @property
     def digest(self) -> str:
         """A digest of everything the shard's content depends on."""
-        parts = [settings_digest(self.options)]
-        for image in self.images:
-            parts += [self.name(image), image.digest, *(view.name for view in self.views(image))]
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+        rows = [
+            (self.name(image), image.digest, *(view.name for view in self.views(image)))
+            for image in self.images
+        ]
+        return key(settings_digest(self.options), rows)[:12]
 
 
 def _deal(images: Sequence[SourceImage], root: Path, shard_size: int) -> list[list[SourceImage]]:
@@ -281,7 +281,7 @@ def _files_of(image: SourceImage, task: _ShardTask) -> dict[str, bytes]:
         raise ImageError(str(error).replace("the image", str(path), 1)) from None
     files = {"name.txt": task.name(image).encode(), f"image{path.suffix.lower()}": content}
     for view in task.views(image):
-        mask = label_view(rgb, view, task.options)
+        mask = label_view(render(rgb, view), view, task.options)
         files[f"label.{view.name}.png"] = encode_mask(mask)
     return files
 
@@ -323,21 +323,11 @@ def _damaged(path: Path, reason: object) -> ImageError:
 
 def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
     """Return what of a recipe is fixed once the labels are made, as JSON would give it back."""
-    names = ("short_sides", "square", "max_images", "val_fraction", "dark_variants")
-    fixed = {name: getattr(options, name) for name in (*names, "augmentations")}
-    for name in ("darkening", "augmentation_ranges"):
-        fixed[name] = dataclasses.asdict(getattr(options, name))
-    fixed["labels"] = settings_digest(options.labels)
-    return dict(json.loads(json.dumps(fixed)))
+    names = ("short_sides", "square", "max_images", "val_fraction", "augmentations")
+    fixed = {name: plain(getattr(options, name)) for name in names}
+    return {**fixed, "labels": settings_digest(options.labels)}
 
 
 def _check_options(folder: Path, index: dict[str, Any], options: TrainingOptions) -> None:
-    fixed, found = _fixed_options(options), index.get("options")
-    if not isinstance(found, dict):
-        raise _damaged(folder / INDEX, "it has no options")
-    other = [f"`{name}`" for name in fixed if found.get(name) != fixed[name]]
-    if other:
-        raise OptionError(
-            f"the shards in {folder} were made with other options ({', '.join(other)}): "
-            "make the shards and train with the same, or write to another folder"
-        )
+    advice = "make the shards and train with the same, or write to another folder"
+    check_same(folder / INDEX, index.get("options"), _fixed_options(options), advice)

@@ -1,54 +1,108 @@
-"""Training the network on a folder of images (paper, Section III-B)."""
+"""One training run, of whatever is trained: its steps, validations, files, and how it resumes."""
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
+from torch import nn
+from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
-from .._shared.errors import OptionError, WeightsError
+from .._shared.errors import WeightsError
 from .._shared.progress import progress
 from .._shared.provenance import provenance
-from ..detector.network.espnet import ESPNet
-from ..detector.network.onnx_export import export_onnx
-from ..detector.network.weights import (
-    average_weights,
-    load_network,
-    read_notes,
-    save_weights,
-    weights_digest,
-)
-from ..detector.pretrained import resolve_weights
-from ..evaluation.metrics.masks import MaskScore, mean_score
+from .._shared.records import check_same, key
 from .checkpoint import (
-    Checkpoint,
+    Point,
     TrainingState,
     read_checkpoint,
     read_point,
     restore,
     save_checkpoint,
 )
-from .dataset import CropDataset, TrainingData, ValidationDataset, loading, prepare_data
-from .learner import Learner
-from .model_card import CurvePoint, save_curves, write_model_card
-from .recipe import DeviceOptions, InitWeights, TrainingOptions
-from .sampler import CropSampler, Schedule
+from .dataset import loading
+from .model_card import save_curves, write_model_card
 
 CHECKPOINT = "checkpoint.safetensors"
-BEST = "best.safetensors"
-ONNX = "deepdetect.onnx"
 CARD = "MODEL_CARD.md"
 FULL_IMAGE_PIXELS = 480 * 480
 
-SAME_RUN = ("options", "start", "photographs", "photographs_digest")
-"""Notes of weights that tell their run."""
+CHECKPOINT_INTERVAL_S = 60.0
+"""A killed run loses at most this much time."""
+
+
+class Task(abc.ABC):
+    """What is trained, how a step is made and how it is measured.
+
+    Attributes:
+        network: all of the state that is trained.
+        optimizers: what trains it.
+        inputs: the recipe, the images and the initial weights, as `plain` returns them: a run is
+            resumed with the same only.
+        notes: where the weights come from, which is written into them.
+        steps: of the whole run.
+        milestones: numbers of steps done after which it is validated.
+        columns: of a point of the curves, besides "step" and "training_loss".
+        objective: the column that the best weights are chosen by.
+        sign: 1 if the lowest value is the best, -1 if the highest.
+        weights_file: name of the file of the best weights.
+        is_main: whether this process writes the files.
+    """
+
+    network: nn.Module
+    optimizers: list[Optimizer]
+    inputs: dict[str, Any]
+    notes: dict[str, str]
+    steps: int
+    milestones: set[int]
+    columns: tuple[str, ...]
+    objective: str
+    sign: int
+    weights_file: str
+    is_main: bool = True
+
+    @abc.abstractmethod
+    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
+        """Return the loader of the batches of some steps."""
+
+    @abc.abstractmethod
+    def training_step(self, batch: Any, step: int) -> float:
+        """Make one optimiser step, and return the loss.
+
+        Raises:
+            OptionError: the loss or its gradients are not finite.
+        """
+
+    @abc.abstractmethod
+    def pixels(self, batch: Any) -> int:
+        """Return the number of pixels in a batch, over all processes."""
+
+    @abc.abstractmethod
+    def validate(self, step: int) -> dict[str, float]:
+        """Measure the weights after a number of steps; by `columns`."""
+
+    @abc.abstractmethod
+    def save(self, path: Path, notes: Mapping[str, Any]) -> None:
+        """Write the weights that are measured."""
+
+    @abc.abstractmethod
+    def read_notes(self, path: Path) -> Mapping[str, Any]:
+        """Read the notes of a file of weights; a WeightsError where it is missing or damaged."""
+
+    @abc.abstractmethod
+    def card(self, best: Point) -> tuple[str, list[str]]:
+        """Say in the model card what the network is, and how good it is."""
+
+    def export(self, folder: Path) -> Path | None:
+        """Write the best weights in another form; return the file."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -56,304 +110,128 @@ class TrainingResult:
     """The results of a run.
 
     Attributes:
-        weights: safetensors file of the weights with the lowest validation loss.
-        onnx: the same weights as ONNX, for `DeepDetect(weights=...)`.
-        points: the loss curves.
+        weights: the weights that the validation found best, safetensors or npz.
+        onnx: the same weights as ONNX, for `DeepDetect(weights=...)`; None for a ranker.
+        points: the curves: losses and measures by name, for each validation.
         best: the point of those weights.
         images_per_second: mean rate, in 480x480 images' worth of pixels.
     """
 
     weights: Path
-    onnx: Path
-    points: list[CurvePoint]
-    best: CurvePoint
+    onnx: Path | None
+    points: list[Point]
+    best: Point
     images_per_second: float
 
 
-def make_trainer(
-    images: str | Path,
-    output: str | Path,
-    options: TrainingOptions,
-    validation: str | Path | None,
-    labels: str | Path | None,
-    init_weights: InitWeights | None,
-    device: DeviceOptions,
-    workers: int | None,
-    log: Callable[[str], None] | None,
-    resume: bool = True,
-) -> Trainer:
-    """Make the labels, and a trainer where its last checkpoint left off; arguments of `train`."""
-    options, network = _initial_network(options, init_weights)  # before the labels, for its errors
-    data = prepare_data(
-        images,
-        options,
-        output,
-        validation=validation,
-        labels=labels,
-        workers=workers,
-        device=device,
-        quiet=log is None,
-    )
-    return Trainer(data, Path(output), options, device, network, log, resume)
-
-
 class Trainer:
-    """One training run: its data, network, files and state; arguments as of `train`.
+    """One training run in a folder; with a checkpoint there it goes on from it.
 
     Raises:
-        OptionError: the folder holds a run with other options.
+        OptionError: the folder holds a run with other options, images or initial weights.
         WeightsError: its checkpoint is damaged.
     """
 
-    def __init__(
-        self,
-        data: TrainingData,
-        folder: Path,
-        options: TrainingOptions,
-        device: DeviceOptions,
-        network: ESPNet,
-        log: Callable[[str], None] | None = None,
-        resume: bool = True,
-    ) -> None:
-        self.data, self.folder, self.options = data, folder, options
-        init_digest = weights_digest(network)
-        self.schedule = Schedule(options, len(data.training))
-        self.learner = Learner(network, device, options)
-        self.engine, self.network = self.learner.engine, self.learner.network
-        self.context = self.engine.context
-        self.device = device
-        self.log = log if self.context.is_main else None
-        self.run = {
-            "options": options.to_json(),
-            "photographs": data.digest,
-            "start": init_digest,
-        }
-        self.metadata = {**provenance(), "run_on": self.engine.describe()}
+    def __init__(self, task: Task, folder: Path, log: Callable[[str], None] | None = None) -> None:
+        self.task, self.folder = task, folder
+        self.log = log if task.is_main else None
+        self.columns = ("step", "training_loss", *task.columns)
         self.state = TrainingState()
-        self.best: CurvePoint | None = None
-        if any(run != self.run for run in self.engine.all_gather(self.run)):
-            raise OptionError(
-                "the processes do not train on the same images with the same options: "
-                "every machine needs the same files and the same command"
-            )
-        if resume:
+        self.best: Point | None = None
+        if (folder / CHECKPOINT).exists():
             self._resume()
-
-    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return the loader of the batches of some steps: (images, masks), see `CropDataset`."""
-        sampler = CropSampler(self.schedule, self.data.shard_sizes, self.context, first, last)
-        dataset = CropDataset(self.data.training, self.options)
-        return self._loader(dataset, batch_sampler=sampler)
-
-    def _loader(self, dataset: Any, **batches: Any) -> DataLoader[Any]:
-        return DataLoader(
-            dataset,
-            num_workers=self.device.worker_count(self.context.local_world_size),
-            pin_memory=self.engine.device.type == "cuda",
-            generator=torch.Generator(),  # not torch's own, whose state is the user's
-            **batches,
-        )
 
     def fit(self) -> TrainingResult:
         """Train to the last step."""
-        state, milestones = self.state, self.schedule.milestones(self.options.val_count)
+        task, state = self.task, self.state
+        measured = {point["step"] for point in state.points}
+        if state.step in task.milestones and state.step not in measured:
+            self._validate()  # a run of no steps, or one that was interrupted while it validated
+        if state.step == task.steps and self.best is None:
+            self._keep(state.points[-1])  # they were damaged, and no further validation comes
         started, pixels = time.monotonic(), 0
         saved = started
-        if state.step < self.schedule.steps and self.log is not None:
-            self.log(f"training on {self.engine.describe()}")
-            if self.engine.compiled:
-                self.log(
-                    "the first step of each stage compiles the network, which takes minutes on two "
-                    "cores; --no-compile starts at once, and each step takes longer"
-                )
-        if state.step in milestones and state.step not in {point.step for point in state.points}:
-            self._validate()  # the run was interrupted while it validated
-        if state.step == self.schedule.steps and self.best is None and self.context.is_main:
-            self._keep(state.points[-1])  # they were damaged, and no further validation comes
-        bar = progress(self.schedule.steps, "training", "step", self.log is None, state.step)
-        with bar, loading(self.loader(state.step)) as batches:
-            for images, masks in batches:
-                rate = self.schedule.learning_rate(state.step)
-                state.loss_sum += self.learner.training_step(images, masks, rate, state.step)
+        bar = progress(task.steps, "training", "step", self.log is None, state.step)
+        with bar, loading(task.loader(state.step)) as batches:
+            for batch in batches:
+                state.loss_sum += task.training_step(batch, state.step)
                 state.loss_count += 1
                 state.step += 1
-                batch = len(masks) * self.context.world_size
-                state.images += batch
-                pixels += batch * masks[0].numel()
+                pixels += task.pixels(batch)
                 bar.update(1)
                 speed = pixels / FULL_IMAGE_PIXELS / (time.monotonic() - started)
                 loss = state.loss_sum / state.loss_count
-                bar.set_postfix_str(f"loss {loss:.4f}, {speed:.1f} images/s", False)
-                if state.step in milestones:
+                best = "" if self.best is None else f"best {self.best[task.objective]:.4f}, "
+                bar.set_postfix_str(f"loss {loss:.4f}, {best}{speed:.1f} images/s", False)
+                if state.step in task.milestones:
                     self._save()  # the validation takes its time, too
                     self._validate()
-                interval = self.device.checkpoint_interval_s
-                if state.step in milestones or time.monotonic() - saved >= interval:
+                if time.monotonic() - saved >= CHECKPOINT_INTERVAL_S:
                     self._save()
                     saved = time.monotonic()
         speed = pixels / FULL_IMAGE_PIXELS / max(time.monotonic() - started, 1e-9)
-        return self._result(speed)
+        if self.best is None:
+            raise WeightsError(f"{self._weights} is missing or damaged: train into another folder")
+        onnx = None
+        if task.is_main:
+            onnx = task.export(self.folder)
+            notes = task.read_notes(self._weights)
+            write_model_card(self.folder / CARD, self._weights, task.card, notes, state.points)
+        return TrainingResult(self._weights, onnx, state.points, self.best, speed)
 
-    def _result(self, images_per_second: float) -> TrainingResult:
-        best = self.engine.fabric.broadcast(self.best)
-        if best is None:
-            raise WeightsError(
-                f"{self.folder / BEST} is missing or damaged: train into another folder"
-            )
-        if self.context.is_main:
-            export_onnx(load_network(self.folder / BEST), self.folder / ONNX)
-            metadata = read_notes(self.folder / BEST)
-            write_model_card(self.folder / CARD, self.folder / BEST, metadata, self.state.points)
-        return TrainingResult(
-            weights=self.folder / BEST,
-            onnx=self.folder / ONNX,
-            points=self.state.points,
-            best=best,
-            images_per_second=images_per_second,
-        )
+    @property
+    def _weights(self) -> Path:
+        return self.folder / self.task.weights_file
 
     def _validate(self) -> None:
-        """Compute the validation losses; keep the weights if they are the best so far."""
-        dataset = ValidationDataset(self.data.validation, self.context)
-        with loading(self._loader(dataset, batch_size=None)) as pairs:
-            scores = self.learner.score(pairs)
-        normal = self._mean_score(scores[: len(scores) // 2])
-        dark = self._mean_score(scores[len(scores) // 2 :])
-        fraction, state = self.options.dark_fraction, self.state
-        point = CurvePoint(
-            step=state.step,
-            epoch=state.images / self.schedule.images,
-            images=state.images,
-            learning_rate=self.schedule.learning_rate(state.step - 1),
-            training_loss=state.loss_sum / state.loss_count,
-            validation_loss=(1 - fraction) * normal.loss + fraction * dark.loss,
-            normal_loss=normal.loss,
-            normal_iou=normal.iou,
-            dark_loss=dark.loss,
-            dark_iou=dark.iou,
-        )
+        """Measure the weights, keep them if they are the best so far, and save the state."""
+        task, state = self.task, self.state
+        loss = state.loss_sum / max(state.loss_count, 1)
+        point = {"step": state.step, "training_loss": loss, **task.validate(state.step)}
         state.loss_sum, state.loss_count = 0.0, 0
         state.points.append(point)
-        if not self.context.is_main:
-            return
-        if self.best is None or point.validation_loss < self.best.validation_loss:
+        name, sign = task.objective, task.sign
+        if self.best is None or sign * point[name] < sign * self.best[name]:
             self._keep(point)
-        save_curves(state.points, self.folder)
+        if task.is_main:
+            save_curves(state.points, self.columns, self.folder)
+        self._save()
 
-    def _keep(self, point: CurvePoint) -> None:
+    def _keep(self, point: Point) -> None:
         """Write the weights as the best so far."""
         self.best = point
-        notes = {**self._notes(), "point": json.dumps(dataclasses.asdict(point))}
-        save_weights(self.network, self.folder / BEST, notes)
-
-    def _notes(self) -> dict[str, str]:
-        """Return what is written into the weights, but for their point of the loss curves."""
-        return {
-            **self.run,
-            **self.metadata,
-            "photographs": str(self.schedule.images),
-            "photographs_digest": self.data.digest,
-        }
-
-    def _mean_score(self, scores: list[MaskScore]) -> MaskScore:
-        """Average over the images of all processes."""
-        mine = mean_score(scores) if scores else MaskScore(0.0, 0.0, 0)
-        return mean_score(self.engine.all_gather(mine))
+        if self.task.is_main:
+            notes = {**self.task.notes, **provenance(), "run": key(self.task.inputs)}
+            self.task.save(self._weights, notes | {"point": json.dumps(point)})
 
     def _save(self) -> None:
-        if self.context.is_main:
-            metadata = {**dataclasses.asdict(self.state), **self.run, **self.metadata}
+        if self.task.is_main:
+            metadata = {**dataclasses.asdict(self.state), "inputs": self.task.inputs}
+            metadata |= self.task.notes | provenance()
             path = self.folder / CHECKPOINT
-            save_checkpoint(path, self.network, self.learner.optimizers, metadata)
+            save_checkpoint(path, self.task.network, self.task.optimizers, metadata)
 
     def _resume(self) -> None:
-        """Resume from the checkpoint that the main process finds."""
-        found: Checkpoint | WeightsError | None = None
-        if self.context.is_main and (self.folder / CHECKPOINT).exists():
-            try:
-                found = read_checkpoint(self.folder / CHECKPOINT)
-            except WeightsError as error:
-                found = error
-        found = self.engine.fabric.broadcast(found)
-        if isinstance(found, WeightsError):
-            raise found  # by all processes, so that none waits for another
-        if found is None:
-            return
-        self._check_same_run(found)
+        task = self.task
+        found = read_checkpoint(self.folder / CHECKPOINT)
+        advice = "use the same to resume the run, or another `output`"
+        check_same(self.folder, found.metadata.get("inputs"), task.inputs, advice)
         try:
-            state = TrainingState.from_json(found.metadata, self.schedule.steps)
+            state = TrainingState.from_json(found.metadata, task.steps, self.columns)
         except ValueError as error:
             raise found.unfit(error) from None
-        restore(found, self.network, self.learner.optimizers)
+        if state.step:  # before the first step optimisers have no moments
+            restore(found, task.network, task.optimizers)
         self.state = state
-        self.best = self._read_best()
+        try:
+            notes = task.read_notes(self._weights)
+            if notes["run"] == key(task.inputs):
+                self.best = read_point(json.loads(notes["point"]), self.columns)
+        except (WeightsError, KeyError, TypeError, ValueError, RecursionError):
+            pass  # as if there were none
         if self.best is None and state.points and self.log is not None:
-            at_end = state.step == self.schedule.steps
+            at_end = state.step == task.steps
             self.log(
-                f"{self.folder / BEST} is missing or damaged: it is written again "
+                f"{self._weights} is missing or damaged: it is written again "
                 f"{'with the last weights' if at_end else 'at the next validation'}"
             )
-
-    def _read_best(self) -> CurvePoint | None:
-        """Return the point of the best weights so far; None where these are missing or damaged."""
-        own = self._notes()
-        try:
-            tensors = load_network(self.folder / BEST).state_dict().values()
-            notes = read_notes(self.folder / BEST)
-            point = read_point(json.loads(notes["point"]))
-        except (WeightsError, KeyError, ValueError, RecursionError):
-            return None
-        same_run = all(notes.get(name) == own[name] for name in SAME_RUN)
-        whole = own.keys() <= notes.keys() and all(value.isfinite().all() for value in tensors)
-        return point if same_run and whole else None
-
-    def _check_same_run(self, checkpoint: Checkpoint) -> None:
-        before = checkpoint.metadata
-        try:
-            others = _different_options(json.loads(before["options"]), self.options)
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-            raise checkpoint.unfit(error) from None
-        other_start = before.get("start") != self.run["start"]
-        names = ", ".join(f"`{name}`" for name in others)
-        # Whether the statistics are frozen follows from the initial weights, which come last.
-        if others and not (other_start and others == ["frozen_batch_norm"]):
-            raise OptionError(
-                f"{self.folder} holds a run with other options ({names}): "
-                "use the same options to resume it, or another `output`"
-            )
-        if before.get("photographs") != self.data.digest:
-            raise OptionError(
-                f"{self.folder} holds a run over other images: use the same ones, to train "
-                "on and to validate with, or another `output`"
-            )
-        if other_start:
-            raise OptionError(
-                f"{self.folder} holds a run that started from other weights: "
-                "start from the same ones to resume it, or use another `output`"
-            )
-
-
-def _different_options(before: dict[str, Any], options: TrainingOptions) -> list[str]:
-    """Name the options that differ between a checkpoint and this run."""
-    now = json.loads(options.to_json())
-    return sorted(name for name in {**before, **now} if before.get(name) != now.get(name))
-
-
-def _initial_network(
-    options: TrainingOptions, init_weights: InitWeights | None
-) -> tuple[TrainingOptions, ESPNet]:
-    """Make the network with its initial weights, and resolve the options that depend on them."""
-    if init_weights is not None:
-        if options.frozen_batch_norm is None:
-            options = dataclasses.replace(options, frozen_batch_norm=True)
-        chosen = [init_weights] if isinstance(init_weights, (str, Path)) else list(init_weights)
-        return options, average_weights([resolve_weights(name, ".safetensors") for name in chosen])
-    for name, what in (("frozen_batch_norm", "batch statistics"), ("freeze_encoder", "encoder")):
-        if getattr(options, name):
-            raise OptionError(
-                f"`{name}` would keep the {what} of random weights: "
-                "give trained ones as `init_weights`, or leave it out"
-            )
-    with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
-        torch.default_generator.manual_seed(options.seed)
-        return dataclasses.replace(options, frozen_batch_norm=False), ESPNet()

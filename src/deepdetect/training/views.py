@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy as np
 from .._shared.errors import ImageError
 from .._shared.opencv import cv2
 from ..io.image import find_images, load_image, scale_short_side
-from .augmentation import AUGMENTATION_VERSION, AugmentationRanges, Darkening, augment, darken
+from .augmentation import AUGMENTATION_VERSION, Darkening, augment, darken, draw_darkening
 from .recipe import TrainingOptions
 
 DIGEST_BYTES = 65536
@@ -30,14 +29,12 @@ class View:
         darkening: the darkening, or None for normal light.
         square: squashed to a square instead of scaled evenly.
         augmentation: seed of an augmented square (`augment`), or None for the whole image.
-        ranges: what the augmentation is drawn from.
     """
 
     short_side: int
     darkening: Darkening | None = None
     square: bool = False
     augmentation: int | None = None
-    ranges: AugmentationRanges = field(default_factory=AugmentationRanges)
 
     @property
     def name(self) -> str:
@@ -48,8 +45,6 @@ class View:
         shape = "x" * self.square
         if self.augmentation is not None:
             shape = f"v{AUGMENTATION_VERSION}-{self.augmentation:08x}"
-            if self.ranges != AugmentationRanges():
-                shape += f"-{zlib.crc32(repr(self.ranges).encode()):08x}"
         return f"{self.short_side}{shape}_{light}"
 
 
@@ -82,17 +77,14 @@ def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tup
     generator = np.random.default_rng(zlib.crc32(name.encode()))
     normal = tuple(View(side, None, options.square) for side in options.short_sides)
     dark = tuple(
-        View(side, options.darkening.draw(generator), options.square)
-        for side in options.short_sides
-        for _ in range(options.dark_variants)
+        View(side, draw_darkening(generator), options.square) for side in options.short_sides
     )
     generator = np.random.default_rng([zlib.crc32(name.encode()), 1])
     side = options.short_sides[0]
     for _ in range(options.augmentations):
         seed = int(generator.integers(2**32))
-        view = View(side, None, False, seed, options.augmentation_ranges)
-        normal += (view,)
-        dark += (dataclasses.replace(view, darkening=options.darkening.draw(generator)),)
+        normal += (View(side, augmentation=seed),)
+        dark += (View(side, draw_darkening(generator), augmentation=seed),)
     return normal, dark
 
 
@@ -100,7 +92,7 @@ def render(image: object, view: View) -> np.ndarray:
     """Make a view, (H, W, 3) uint8 RGB, of anything `load_image` takes."""
     rgb = load_image(image)
     if view.augmentation is not None:
-        rgb = augment(rgb, view.short_side, view.augmentation, view.ranges)
+        rgb = augment(rgb, view.short_side, view.augmentation)
     elif not view.square:
         rgb = scale_short_side(rgb, view.short_side)
     elif rgb.shape[:2] != (view.short_side, view.short_side):

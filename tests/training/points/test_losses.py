@@ -7,17 +7,22 @@ import pytest
 import torch
 
 from deepdetect.detector.points.candidate_features import FEATURES
-from deepdetect.training.points.losses import choose_softly, mutual_pairs, pair_loss
+from deepdetect.training.points import losses, pairs
+from deepdetect.training.points.losses import mutual_pairs, pair_loss, soft_top_k
 from deepdetect.training.points.pairs import (
     CandidatePair,
     Correspondences,
     Side,
     candidate_pair,
 )
-from deepdetect.training.points.recipe import PointsTrainingOptions
 from deepdetect.training.points.views import ViewPair
 
-OPTIONS = PointsTrainingOptions(temperature=3.0)
+
+@pytest.fixture(autouse=True)
+def soft(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(losses, "TEMPERATURE", 3.0)
+
+
 COUNT, REPEATED, AREA = 60, 30, 10_000
 
 
@@ -46,13 +51,13 @@ def known_pair(distance_px: float = 0.3) -> CandidatePair:
     return CandidatePair((side, side), (way, way), AREA)
 
 
-def value(ranker, pair, density=0.002, options=OPTIONS) -> float:
-    return pair_loss(ranker, pair, density, options).item()
+def value(ranker, pair, density=0.002, match_weight=0.0) -> float:
+    return pair_loss(ranker, pair, density, match_weight).item()
 
 
 def test_the_soft_choice_sums_to_the_budget() -> None:
     logits = torch.linspace(-50, 50, 101)
-    chosen = choose_softly(logits, 20, 3.0)
+    chosen = soft_top_k(logits, 20, 3.0)
     assert float(chosen.sum()) == pytest.approx(20, abs=0.01)
     assert (chosen.diff() >= 0).all()
 
@@ -64,7 +69,7 @@ def test_training_brings_repeated_candidates_to_the_top() -> None:
     before = value(ranker, pair, density)
     for _ in range(300):
         optimizer.zero_grad()
-        loss = pair_loss(ranker, pair, density, OPTIONS)
+        loss = pair_loss(ranker, pair, density, 0.0)
         loss.backward()
         optimizer.step()
     assert before > -0.6
@@ -84,15 +89,14 @@ def test_the_loss_does_not_see_the_scale_of_the_logits() -> None:
 def test_close_partners_are_worth_more() -> None:
     ranker = FirstFeature()
     close, near = (value(ranker, known_pair(d)) for d in (0.5, 2.0))
-    assert near == pytest.approx(close * (1 - OPTIONS.close_share), rel=0.01)
+    assert near == pytest.approx(close * (1 - losses.CLOSE_SHARE), rel=0.01)
 
 
 def test_matchable_partners_are_worth_more() -> None:
     ranker, pair = FirstFeature(), known_pair()
     way = dataclasses.replace(pair.ways[0], matchable=np.zeros(REPEATED, bool))
     other = dataclasses.replace(pair, ways=(way, way))
-    options = dataclasses.replace(OPTIONS, match_weight=1.0)
-    first, second = (value(ranker, p, options=options) for p in (pair, other))
+    first, second = (value(ranker, p, match_weight=1.0) for p in (pair, other))
     assert second == pytest.approx(first / 2, rel=0.01)
 
 
@@ -112,12 +116,15 @@ def test_mutual_pairs_are_each_others_nearest() -> None:
 
 
 @pytest.mark.parametrize("with_descriptors", [False, True])
-def test_candidates_of_the_same_view_see_each_other(photo, with_descriptors) -> None:
+def test_candidates_of_the_same_view_see_each_other(
+    photo, with_descriptors, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pairs, "MAX_CANDIDATES", 300)
     side = 128
     image, valid = photo[:side, :side], np.ones((side, side), bool)
     valid[:, :20] = False
     pair = candidate_pair(
-        ViewPair((image, image), (valid, valid), np.eye(3), "light"), 300, with_descriptors
+        ViewPair((image, image), (valid, valid), np.eye(3), "light"), with_descriptors
     )
     assert len(pair.sides[0].xy) == 300
     assert pair.sides[0].xy[:, 0].min() > 19
@@ -135,7 +142,7 @@ def test_a_shift_is_followed(photo) -> None:
     images = photo[:side, :side], photo[5 : side + 5, 9 : side + 9]
     valid = np.ones((side, side), bool)
     shift = np.array([[1, 0, -9], [0, 1, -5], [0, 0, 1.0]])
-    pair = candidate_pair(ViewPair(images, (valid, valid), shift, "light"), 2000, False)
+    pair = candidate_pair(ViewPair(images, (valid, valid), shift, "light"), False)
     way = pair.ways[0]
     seen = pair.sides[0].xy - (9, 5)
     inside = ((seen > -0.5) & (seen < side - 0.5)).all(1)

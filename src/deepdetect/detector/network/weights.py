@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -36,15 +36,19 @@ def save_weights(network: nn.Module, path: str | Path, notes: dict[str, str]) ->
             raise OSError(str(error)) from None
 
 
-def load_network(path: str | Path) -> ESPNet:
-    """Make the network from a weights file, in evaluation mode.
+def load_network(path: str | Path, make: Callable[[], nn.Module] = ESPNet) -> nn.Module:
+    """Make a network from a weights file, in evaluation mode.
+
+    Args:
+        path: the file.
+        make: makes the network with any weights.
 
     Raises:
         WeightsError: the file is missing, damaged or does not fit the network.
     """
     if not Path(path).is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
-    network = ESPNet()
+    network = make()
     try:
         with safe_open(path, framework="pt") as file:
             names = list(file.keys())
@@ -60,8 +64,10 @@ def load_network(path: str | Path) -> ESPNet:
     return network.eval()
 
 
-def average_weights(paths: Sequence[str | Path]) -> ESPNet:
-    """Make the network from the mean of several weights files.
+def average_weights(
+    paths: Sequence[str | Path], make: Callable[[], nn.Module] = ESPNet
+) -> nn.Module:
+    """Make a network, as `load_network` does, from the mean of several weights files.
 
     The mean of runs that went on from one another is often better than each of them
     (Wortsman et al., "Model soups", 2022). Counts, which have no mean, are the first file's.
@@ -69,7 +75,7 @@ def average_weights(paths: Sequence[str | Path]) -> ESPNet:
     Raises:
         WeightsError: a file is missing, damaged or does not fit the network.
     """
-    networks = [load_network(path) for path in paths]
+    networks = [load_network(path, make) for path in paths]
     states = [network.state_dict() for network in networks]
     mean = {
         name: sum(state[name] for state in states) / len(states)

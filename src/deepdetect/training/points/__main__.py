@@ -29,7 +29,7 @@ def main(
     seed: int,
     threads: int,
 ) -> None:
-    """Print the hard measure of the rivals and of trained rankers."""
+    """Print the validation metric of the rivals and of trained rankers."""
     import torch
 
     from ...detector.points.ranker import load_ranker

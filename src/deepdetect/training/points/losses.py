@@ -15,9 +15,18 @@ from torch import Tensor
 from ...detector.points.detection import least_distances
 from ...features.suppression import suppress_neighbors
 from .pairs import CandidatePair, Correspondences, Side
-from .recipe import PointsTrainingOptions
 
 CLOSE_PX, NEAR_PX = 1.0, 3.0
+
+SHARPNESS = 25.0
+"""Standard deviation of the logits over the keypoints of a view, to which they are scaled before
+the loss: it cannot be lowered by sharper logits."""
+
+TEMPERATURE = 0.6
+"""Of the soft choice of the best, in units of those logits."""
+
+CLOSE_SHARE = 0.7
+"""Of the reward of a keypoint that is found again within 3 px, what it gets only within 1 px."""
 
 MIN_CHOICE = 0.1
 """Candidates that are chosen with less than this have and are no partners."""
@@ -41,10 +50,7 @@ class Chosen:
 
 
 def pair_loss(
-    ranker: torch.nn.Module,
-    pair: CandidatePair,
-    density: float,
-    options: PointsTrainingOptions,
+    ranker: torch.nn.Module, pair: CandidatePair, density: float, match_weight: float
 ) -> Tensor:
     """Return the loss of a pair of views, seen in both directions.
 
@@ -56,17 +62,17 @@ def pair_loss(
         ranker: from (N, F) features to (N,) logits.
         pair: the candidates of both views, and which see the same place.
         density: keypoints per pixel.
-        options: settings of the loss.
+        match_weight: as of `PointsTrainingOptions`.
     """
     chosen = [
-        _choose(ranker, side, way, density * pair.area, options)
+        _choose(ranker, side, way, density * pair.area)
         for side, way in zip(pair.sides, pair.ways, strict=True)
     ]
     mass = min(float(each.share.detach()[each.visible].sum()) for each in chosen)
     total = chosen[0].share.sum() * 0
     for way, here, there in zip(pair.ways, chosen, chosen[::-1], strict=True):
         share = here.share.detach()
-        reward = _rewards(way, share, there.share.detach(), options)
+        reward = _rewards(way, share, there.share.detach(), match_weight)
         border = share * (1 - share) * here.visible
         level = (reward * border).sum() / border.sum().clamp(min=1e-6)
         value = (share * reward * here.visible).sum() / max(mass, 1.0)
@@ -75,26 +81,18 @@ def pair_loss(
     return total / 2
 
 
-def _choose(
-    ranker: torch.nn.Module,
-    side: Side,
-    way: Correspondences,
-    budget: float,
-    options: PointsTrainingOptions,
-) -> Chosen:
+def _choose(ranker: torch.nn.Module, side: Side, way: Correspondences, budget: float) -> Chosen:
     logits = ranker(torch.from_numpy(side.features))
     radii = least_distances(side.sigma_px)  # as at run time
     kept = torch.from_numpy(suppress_neighbors(side.xy, logits.detach().numpy(), radii))
     fixed = logits[kept].detach()
     spread = fixed.std() if len(fixed) > 1 else fixed.new_ones(())
-    scaled = (logits[kept] - fixed.mean()) * (options.sharpness / spread.clamp(min=MIN_SPREAD))
-    share = torch.zeros(len(logits)).index_put(
-        (kept,), choose_softly(scaled, budget, options.temperature)
-    )
+    scaled = (logits[kept] - fixed.mean()) * (SHARPNESS / spread.clamp(min=MIN_SPREAD))
+    share = torch.zeros(len(logits)).index_put((kept,), soft_top_k(scaled, budget, TEMPERATURE))
     return Chosen(share, torch.from_numpy(way.visible))
 
 
-def choose_softly(logits: Tensor, budget: float, temperature: float) -> Tensor:
+def soft_top_k(logits: Tensor, budget: float, temperature: float) -> Tensor:
     """Return sigmoid((logits - tau) / temperature), tau so that they sum to the budget."""
     fixed = logits.detach().double()
     if len(fixed) <= budget:
@@ -109,9 +107,7 @@ def choose_softly(logits: Tensor, budget: float, temperature: float) -> Tensor:
     return torch.sigmoid((logits - low.float()) / temperature)
 
 
-def _rewards(
-    way: Correspondences, here: Tensor, there: Tensor, options: PointsTrainingOptions
-) -> Tensor:
+def _rewards(way: Correspondences, here: Tensor, there: Tensor, match_weight: float) -> Tensor:
     """Return what a candidate is worth: its partner's choice, by the distances of the measure.
 
     One to one, as it is measured, and among those that may be chosen: with a sum over all near
@@ -120,8 +116,8 @@ def _rewards(
     possible = [each.numpy() > MIN_CHOICE for each in (here, there)]
     pairs = mutual_pairs(way, NEAR_PX, possible[0], possible[1])
     close = way.distance_px[pairs] <= CLOSE_PX
-    worth = 1 - options.close_share + options.close_share * close
-    worth *= (1 + options.match_weight * way.matchable[pairs]) / (1 + options.match_weight)
+    worth = 1 - CLOSE_SHARE + CLOSE_SHARE * close
+    worth *= (1 + match_weight * way.matchable[pairs]) / (1 + match_weight)
     reward = torch.zeros(len(here))
     partner = torch.from_numpy(way.second[pairs])
     reward[torch.from_numpy(way.first[pairs])] = torch.from_numpy(worth).float() * there[partner]

@@ -1,8 +1,8 @@
-"""The hard measure: what a ranking is judged and chosen by, on photographs not trained on.
+"""The validation metric: what a ranking is judged and chosen by, on images not trained on.
 
 One-to-one repeatability at fixed budgets, and correct matches by upright descriptors, on a fixed,
 seeded set of synthetic pairs, as many of each kind, by the functions of the benchmark. Points
-outside the photograph are dropped before the best are taken, for every detector alike.
+outside the image are dropped before the best are taken, for every detector alike.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Detect = Callable[[np.ndarray], Keypoints]
 
 
 @dataclass(frozen=True)
-class HardMeasure:
+class ValidationMetric:
     """Repeatability and matches by kind of pair.
 
     Attributes:
@@ -87,7 +87,7 @@ class HardMeasure:
 def validation_pairs(
     folder: Path, pairs_per_kind: int = 16, side: int = SIDE_PX, seed: int = 0
 ) -> list[ViewPair]:
-    """Draw the fixed set of pairs, each of another photograph of the folder where they suffice.
+    """Draw the fixed set of pairs, each of another image of the folder where they suffice.
 
     Raises:
         ImageError: the folder is missing or empty.
@@ -97,12 +97,12 @@ def validation_pairs(
     pairs = []
     for number in range(pairs_per_kind * len(KINDS)):
         generator = np.random.default_rng([seed, 2, number])
-        photo = luma(load_image(files[order[number % len(files)]]))
-        pairs.append(draw_pair(photo, KINDS[number % len(KINDS)], side, generator))
+        gray = luma(load_image(files[order[number % len(files)]]))
+        pairs.append(draw_pair(gray, KINDS[number % len(KINDS)], side, generator))
     return pairs
 
 
-def measure(detect: Detect, pairs: Sequence[ViewPair]) -> HardMeasure:
+def measure(detect: Detect, pairs: Sequence[ViewPair]) -> ValidationMetric:
     """Measure a detector."""
     found: dict[str, list[np.ndarray]] = {}
     correct: dict[str, list[float]] = {}
@@ -122,7 +122,7 @@ def measure(detect: Detect, pairs: Sequence[ViewPair]) -> HardMeasure:
             if budget == MATCHING_BUDGET:
                 correct.setdefault(pair.kind, []).append(_correct(pair, best, sizes) / count)
         found.setdefault(pair.kind, []).append(np.array(rows))
-    return HardMeasure(
+    return ValidationMetric(
         {kind: np.mean(values, axis=0) for kind, values in found.items()},
         {kind: float(np.mean(values)) for kind, values in correct.items()},
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from torch import Tensor, nn
 from ..._shared.atomic import atomic_path
 from ...detector.points.ranker import MAX_DEVIATIONS, Ranker
 
+HIDDEN_UNITS = (48, 32)
 MIN_DEVIATION = 1e-3
 INITIAL_OUTPUT = 0.01
 """The last layer starts at almost nothing: an untrained ranker ranks as |det Hessian| does."""
@@ -24,18 +24,17 @@ class RankerModule(nn.Module):
 
     Args:
         mean, deviation: (F,) of the features.
-        hidden: units of the two hidden layers.
     """
 
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, mean: np.ndarray, deviation: np.ndarray, hidden: Sequence[int]) -> None:
+    def __init__(self, mean: np.ndarray, deviation: np.ndarray) -> None:
         super().__init__()
         self.register_buffer("mean", torch.from_numpy(mean.astype(np.float32)))
         spread = np.maximum(deviation, MIN_DEVIATION).astype(np.float32)
         self.register_buffer("deviation", torch.from_numpy(spread))
-        first, second = hidden
+        first, second = HIDDEN_UNITS
         self.first = nn.Linear(len(mean), first)
         self.second = nn.Linear(first, second)
         self.output = nn.Linear(second, 1)

@@ -1,15 +1,27 @@
-"""Pairs of views as the ranker sees them: candidates, features, and which see the same place."""
+"""Pairs of views as the ranker sees them: candidates, features, and which see the same place.
+
+`PairDataset` draws them from images.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from torch.utils.data import Dataset
 
 from ...detector.points.candidate_features import describe_candidates
 from ...detector.points.hessian_scales import build_scale_space, find_candidates
 from ...features.sift import root_sift_descriptors
-from .views import ViewPair
+from ...io.image import load_image, luma
+from ..recipe import PointsTrainingOptions
+from .views import KINDS, ViewPair, draw_pair
+
+MAX_CANDIDATES = 2000
+"""Of each view; the strongest are ranked."""
 
 REACH_PX = 3.0
 DESCRIPTOR_SIZE_PX = 4.0
@@ -52,7 +64,7 @@ class Correspondences:
 
 @dataclass(frozen=True, eq=False)
 class CandidatePair:
-    """Two views of one photograph.
+    """Two views of one image.
 
     Attributes:
         sides: candidates of the first and the second view.
@@ -65,12 +77,11 @@ class CandidatePair:
     area: int
 
 
-def candidate_pair(pair: ViewPair, max_candidates: int, with_descriptors: bool) -> CandidatePair:
+def candidate_pair(pair: ViewPair, with_descriptors: bool) -> CandidatePair:
     """Find the candidates of both views, and which see the same place.
 
     Args:
         pair: the views.
-        max_candidates: of each view; the strongest are kept.
         with_descriptors: find out which are matchable; else all are said to be.
     """
     sides, described = [], []
@@ -79,7 +90,7 @@ def candidate_pair(pair: ViewPair, max_candidates: int, with_descriptors: bool) 
         candidates = find_candidates(space)
         features = describe_candidates(space, candidates)
         rows = np.flatnonzero(valid[candidates.row, candidates.column])
-        strongest = np.argsort(-features[rows, 0], kind="stable")[:max_candidates]
+        strongest = np.argsort(-features[rows, 0], kind="stable")[:MAX_CANDIDATES]
         rows = rows[np.sort(strongest)]
         sides.append(Side(candidates.xy[rows], candidates.sigma_px[rows], features[rows]))
         if with_descriptors:
@@ -129,3 +140,67 @@ def _correspondences(
         unlike = np.sqrt(np.maximum(0, 2 - 2 * similarity[first, second]))
         matchable = unlike < RATIO * np.sqrt(np.maximum(0, 2 - 2 * others.max(1)))[first]
     return Correspondences(first, second, distance, visible, matchable)
+
+
+MIN_OVERLAP = 0.04
+"""Of the second view: pairs that share less are drawn again."""
+
+ATTEMPTS = 5
+
+
+class PairIndex(NamedTuple):
+    """What a pair depends on besides the seed: the step, and its place in the step."""
+
+    step: int
+    position: int
+
+
+class PairSample(NamedTuple):
+    """A pair of views, and the budget that it is trained for.
+
+    Attributes:
+        pair: candidates of both views.
+        density: keypoints per pixel.
+    """
+
+    pair: CandidatePair
+    density: float
+
+
+class PairDataset(Dataset[PairSample]):
+    """Pairs of views of images; each a pure function of its index and the seed."""
+
+    def __init__(self, files: Sequence[Path], options: PointsTrainingOptions) -> None:
+        self.files, self.options = list(files), options
+
+    def __len__(self) -> int:
+        return self.options.steps * self.options.pairs
+
+    def __getitem__(self, index: PairIndex) -> PairSample:
+        options = self.options
+        generator = np.random.default_rng([options.seed, 3, index.step, index.position])
+        kind = KINDS[int(generator.choice(len(KINDS), p=np.full(len(KINDS), 1 / len(KINDS))))]
+        for _ in range(ATTEMPTS):
+            file = self.files[int(generator.integers(len(self.files)))]
+            gray = luma(load_image(file))
+            pair = draw_pair(gray, kind, options.side, generator)
+            if min(overlaps(pair)) > MIN_OVERLAP and np.ptp(pair.images[0]) > 20:
+                break
+        # Upright descriptors cannot match turned and zoomed views: there all count as matchable.
+        described = options.match_weight > 0 and kind != "zoom"
+        candidates = candidate_pair(pair, described)
+        low, high = np.log([options.min_density, options.max_density])
+        return PairSample(candidates, float(np.exp(generator.uniform(low, high))))
+
+
+def overlaps(pair: ViewPair) -> tuple[float, float]:
+    """Return which fraction of each view shows what the other one shows, on a coarse grid."""
+    side = pair.images[0].shape[0]
+    ticks = np.linspace(0, side - 1, 24)
+    grid = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
+    found = []
+    for matrix in (pair.homography, np.linalg.inv(pair.homography)):
+        mapped = np.column_stack([grid, np.ones(len(grid))]) @ matrix.T
+        xy = mapped[:, :2] / mapped[:, 2:]
+        found.append(float(((xy > 0) & (xy < side - 1)).all(1).mean()))
+    return found[0], found[1]

@@ -1,0 +1,261 @@
+"""The training of the network: crops with labels, the loss of each pixel, the validation."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits, pad
+from torch.utils.data import DataLoader
+
+from .._shared.errors import OptionError, WeightsError
+from .._shared.records import plain
+from .._shared.registry import look_up
+from ..detector.network.espnet import ESPNet
+from ..detector.network.onnx_export import export_onnx
+from ..detector.network.weights import (
+    average_weights,
+    load_network,
+    read_notes,
+    save_weights,
+    weights_digest,
+)
+from ..detector.pretrained import resolve_weights
+from ..evaluation.metrics.masks import score_heatmap
+from ..io.image import luma
+from ..labels import visibility_of
+from .checkpoint import Point
+from .dataset import CropDataset, TrainingData, ValidationDataset, loading
+from .engine import Engine, freeze_batch_norm
+from .optim import make_optimizers
+from .recipe import DeviceOptions, InitWeights, TrainingOptions
+from .sampler import CropSampler, Schedule
+from .trainer import Task
+
+NETWORKS: dict[str, Callable[[], nn.Module]] = {"espnet": ESPNet}
+"""What can be trained: from (B, 3, H, W) float32 RGB in [0, 1], sides multiples of 8, to logits."""
+
+ONNX = "deepdetect.onnx"
+
+
+def initial_network(
+    options: TrainingOptions, init_weights: InitWeights | None
+) -> tuple[TrainingOptions, nn.Module]:
+    """Make the network with its initial weights, and resolve the options that depend on them.
+
+    Raises:
+        OptionError: parts of random weights are to be kept, or the network is unknown.
+        WeightsError: the weights are missing or do not fit.
+    """
+    make = look_up("network", options.network, NETWORKS)
+    if init_weights is not None:
+        if options.frozen_batch_norm is None:
+            options = dataclasses.replace(options, frozen_batch_norm=True)
+        chosen = [init_weights] if isinstance(init_weights, (str, Path)) else list(init_weights)
+        paths = [resolve_weights(name, ".safetensors") for name in chosen]
+        return options, average_weights(paths, make)
+    for name, what in (("frozen_batch_norm", "batch statistics"), ("freeze_encoder", "encoder")):
+        if getattr(options, name):
+            raise OptionError(
+                f"`{name}` would keep the {what} of random weights: "
+                "give trained ones as `init_weights`, or leave it out"
+            )
+    with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
+        torch.default_generator.manual_seed(options.seed)
+        return dataclasses.replace(options, frozen_batch_norm=False), make()
+
+
+class DenseTask(Task):
+    """A network that maps images to heat maps, and its labelled images.
+
+    Args:
+        network: with its initial weights.
+        options: the recipe.
+        data: the images with labels.
+        device: how the network is run.
+        fabric: of `engine.launch`.
+    """
+
+    columns = (
+        *("epoch", "images", "learning_rate", "validation_loss"),
+        *("normal_loss", "normal_iou", "dark_loss", "dark_iou"),
+    )
+    objective, sign = "validation_loss", 1
+    weights_file = "best.safetensors"
+
+    def __init__(
+        self,
+        network: nn.Module,
+        options: TrainingOptions,
+        data: TrainingData,
+        device: DeviceOptions,
+        fabric: Any,
+    ) -> None:
+        self.options, self.data, self.device = options, data, device
+        initial_weights = weights_digest(network)
+        if options.freeze_encoder:  # before it is compiled, which then leaves its gradients out
+            network.get_submodule("encoder").requires_grad_(False)
+        self.engine = Engine(network, device, fabric)
+        self.network, self.fabric, self.is_main = network, fabric, fabric.is_global_zero
+        if fabric.world_size > 1 and device.accelerator == "cpu" and not options.frozen_batch_norm:
+            raise OptionError(
+                "several processes need GPUs, or `frozen_batch_norm`: batch normalisation over "
+                "several CPUs is not there"
+            )
+        self.optimizers = make_optimizers(options.optimizer, network)
+        self.schedule = Schedule(options, len(data.training))
+        self.steps = self.schedule.steps
+        self.milestones = self.schedule.milestones(options.val_count)
+        origin = {"images_digest": data.digest, "initial_weights": initial_weights}
+        self.inputs = {**plain(options), **origin}
+        self.notes = {
+            "options": json.dumps(dataclasses.asdict(options), sort_keys=True),
+            "images": str(len(data.training)),
+            **origin,
+            "run_on": self.engine.describe(),
+        }
+
+    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
+        """Return the loader of the batches of some steps: (images, masks), see `CropDataset`."""
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        steps = self.schedule, self.data.shard_sizes, first, last
+        sampler = CropSampler(*steps, rank=rank, world_size=world)
+        return self._loader(CropDataset(self.data.training, self.options), batch_sampler=sampler)
+
+    def _loader(self, dataset: Any, **batches: Any) -> DataLoader[Any]:
+        return DataLoader(
+            dataset,
+            num_workers=self.device.worker_count(),
+            pin_memory=self.engine.device.type == "cuda",
+            generator=torch.Generator(),  # not torch's own, whose state is the user's
+            **batches,
+        )
+
+    def pixels(self, batch: tuple[Tensor, Tensor]) -> int:
+        """Return the number of pixels in a batch, over all processes."""
+        return batch[1].numel() * self.fabric.world_size
+
+    def training_step(self, batch: tuple[Tensor, Tensor], step: int) -> float:
+        """Make one optimiser step, and return the loss over the whole batch.
+
+        Args:
+            batch: (B, crop, crop, 3) uint8 RGB images, this process's part of the batch, and
+                (B, crop, crop) bool labels.
+            step: steps done before.
+
+        Raises:
+            OptionError: the loss or its gradients are not finite.
+        """
+        images, masks = batch
+        self.network.train()
+        if self.options.frozen_batch_norm:
+            freeze_batch_norm(self.network)
+        elif self.options.freeze_encoder:
+            freeze_batch_norm(self.network.get_submodule("encoder"))
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+            for group in optimizer.param_groups:
+                group["lr"] = self.schedule.learning_rate(step)
+        truth = self.engine.to_device(masks)[:, None].float()
+        logits = self.engine.logits(self.engine.to_float(images))
+        weight = self._pos_weight(images)
+        if self.options.pos_weight_uncertain and weight is not None:
+            probability = logits.detach().sigmoid()
+            weight = 1 + (weight - 1) * 4 * probability * (1 - probability)
+        loss = binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
+        self.fabric.backward(loss)
+        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
+        value = self.fabric.all_reduce(loss.detach(), reduce_op="mean").item()
+        # A finite loss can have gradients that are not, in bfloat16.
+        if not (math.isfinite(value) and torch.nn.utils.get_total_norm(gradients).isfinite()):
+            raise OptionError(
+                f"the loss or its gradients are not finite at step {step}: start again with "
+                "`precision=float32`, or with a lower `learning_rate`"
+            )
+        for optimizer in self.optimizers:
+            optimizer.step()
+        return float(value)
+
+    def _pos_weight(self, images: Tensor) -> Tensor | None:
+        """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
+        normal, dark = self.options.pos_weight, self.options.low_light_pos_weight
+        if dark is None or dark == normal:  # the images need not be looked at
+            return None if normal == 1 else self.engine.to_device(torch.tensor([normal]))
+        weights = {"normal": normal, "low": dark}
+        each = [weights[visibility_of(luma(image))] for image in images.numpy()]
+        return self.engine.to_device(torch.tensor(each)[:, None, None, None])
+
+    def validate(self, step: int) -> dict[str, float]:
+        """Return the losses and the intersections over union on the validation images."""
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        dataset = ValidationDataset(self.data.validation, rank, world)
+        sums = torch.zeros(2, 3, device=self.engine.device, dtype=torch.float64)
+        self.network.eval()
+        with loading(self._loader(dataset, batch_size=None)) as pairs:
+            for number, (image, mask) in enumerate(pairs):
+                score = score_heatmap(self.heatmap(image), mask.numpy())
+                sums[int(number >= len(dataset) // 2)] += torch.tensor(
+                    [score.loss, score.iou, 1.0], dtype=torch.float64
+                )
+        sums = self.fabric.all_reduce(sums, reduce_op="sum")
+        (normal_loss, normal_iou), (dark_loss, dark_iou) = (sums[:, :2] / sums[:, 2:]).tolist()
+        fraction, crops = self.options.dark_fraction, self.schedule.crops_until(step)
+        return {
+            "epoch": crops / self.schedule.images,
+            "images": crops,
+            "learning_rate": self.schedule.learning_rate(step - 1),
+            "validation_loss": (1 - fraction) * normal_loss + fraction * dark_loss,
+            "normal_loss": normal_loss,
+            "normal_iou": normal_iou,
+            "dark_loss": dark_loss,
+            "dark_iou": dark_iou,
+        }
+
+    @torch.inference_mode()
+    def heatmap(self, image: Tensor) -> np.ndarray:
+        """Run the network, in evaluation mode, in float32 on (H, W, 3) uint8 of any size."""
+        height, width = image.shape[:2]
+        batch = self.engine.to_float(image[None])
+        batch = pad(batch, (0, -width % 8, 0, -height % 8), mode="replicate")
+        batch = batch.contiguous(memory_format=torch.channels_last)
+        logits = self.network(batch)[0, 0, :height, :width]
+        return torch.sigmoid(logits.float()).cpu().numpy()
+
+    def save(self, path: Path, notes: Mapping[str, Any]) -> None:
+        """Write the weights."""
+        save_weights(self.network, path, dict(notes))
+
+    def read_notes(self, path: Path) -> Mapping[str, Any]:
+        """Read the notes of whole, finite weights of this network."""
+        tensors = load_network(path, NETWORKS[self.options.network]).state_dict().values()
+        if not all(value.isfinite().all() for value in tensors):
+            raise WeightsError(f"{path} is not finite")
+        return read_notes(path)
+
+    def export(self, folder: Path) -> Path:
+        """Write the best weights as ONNX."""
+        best = load_network(folder / self.weights_file, NETWORKS[self.options.network])
+        export_onnx(best, folder / ONNX)
+        return folder / ONNX
+
+    def card(self, best: Point) -> tuple[str, list[str]]:
+        """Say in the model card what the network is, and how good it is."""
+        count = sum(parameter.numel() for parameter in self.network.parameters())
+        network = (
+            f"{type(self.network).__name__}, {count:,} parameters. Input: RGB in [0, 1]; output: "
+            "the\nprobability that a pixel is a keypoint or an edge for one of the label detectors."
+        )
+        return network, [
+            "On the validation images, by which these weights were chosen (mean binary",
+            "cross-entropy per pixel / intersection over union at threshold 0.5):",
+            "",
+            f"- normal: {best['normal_loss']:.4f} / {best['normal_iou']:.3f}",
+            f"- darkened: {best['dark_loss']:.4f} / {best['dark_iou']:.3f}",
+        ]

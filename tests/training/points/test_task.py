@@ -1,0 +1,170 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from deepdetect._shared.errors import OptionError, WeightsError
+from deepdetect.detector.points.ranker import load_ranker, notes_of
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.training import PointsTrainingOptions, TrainingResult, train_points
+from deepdetect.training.checkpoint import read_checkpoint
+from deepdetect.training.points.measure import measure, points_detector, validation_pairs
+from deepdetect.training.points.task import RankerTask
+from deepdetect.training.trainer import CHECKPOINT
+
+BEST = RankerTask.weights_file
+OPTIONS = PointsTrainingOptions(steps=4, pairs=1, side=96, val_count=2, val_pairs=1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_statistics() -> Iterator[None]:
+    """Take mean and deviation of the features from a few pairs, which is faster."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("deepdetect.training.points.task.STATISTICS_PAIRS", 4)
+        patch.setattr("deepdetect.training.trainer.CHECKPOINT_INTERVAL_S", 0)
+        yield
+
+
+def run(textures: Path, folder: Path, options=OPTIONS, log: Any = None) -> TrainingResult:
+    return train_points(textures, textures, folder, options, log=log)
+
+
+@pytest.fixture(scope="module")
+def whole(textures: Path, tmp_path_factory) -> TrainingResult:
+    return run(textures, tmp_path_factory.mktemp("whole"))
+
+
+def interrupted(monkeypatch: pytest.MonkeyPatch, count: int) -> Any:
+    calls = iter(range(count))
+    step = RankerTask.training_step
+
+    def training_step(*arguments: Any) -> float:
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+        return step(*arguments)
+
+    monkeypatch.setattr(RankerTask, "training_step", training_step)
+    return pytest.raises(KeyboardInterrupt)
+
+
+def same_state(a: Path, b: Path) -> bool:
+    first, second = (load_file(folder / CHECKPOINT) for folder in (a, b))
+    return first.keys() == second.keys() and all(torch.equal(first[k], second[k]) for k in first)
+
+
+def test_training_changes_the_weights_and_measures(whole: TrainingResult, textures: Path) -> None:
+    torch.manual_seed(3)
+    expected = torch.rand(4)
+    torch.manual_seed(3)
+    start = RankerTask(textures, textures, OPTIONS)
+    assert torch.equal(torch.rand(4), expected), "the caller keeps its random numbers"
+    after = load_file(whole.weights.parent / CHECKPOINT)
+    assert all(
+        (after[f"network.ranker.{n}"] != p).any() for n, p in start.ranker.named_parameters()
+    )
+    assert [point["step"] for point in whole.points] == [0, 2, 4]
+    assert whole.best["score"] == max(point["score"] for point in whole.points)
+    assert "perceptron of" in (whole.weights.parent / "MODEL_CARD.md").read_text()
+    assert "| zoom |" in (whole.weights.parent / "MODEL_CARD.md").read_text()
+
+
+def test_an_interrupted_run_ends_with_the_same_weights(
+    whole: TrainingResult, textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch, interrupted(patch, 3):
+        run(textures, tmp_path)
+    assert read_checkpoint(tmp_path / CHECKPOINT).metadata["step"] == 3
+    assert run(textures, tmp_path).points == whole.points
+    assert same_state(tmp_path, whole.weights.parent)
+
+
+def test_the_best_weights_are_those_of_the_best_measure(
+    whole: TrainingResult, textures: Path
+) -> None:
+    ranker = load_ranker(whole.weights)
+    found = measure(points_detector(ranker), validation_pairs(textures, 1))
+    assert found.score == pytest.approx(whole.best["score"], abs=1e-6)
+    notes = notes_of(ranker)
+    assert notes["images"] == "4"
+    assert json.loads(notes["point"]) == whole.best
+
+
+def test_an_untrained_ranker_ranks_by_the_first_feature(textures: Path) -> None:
+    module = RankerTask(textures, textures, OPTIONS).ranker
+    features = module.mean + module.deviation * torch.randn(
+        200, len(module.mean), generator=torch.Generator().manual_seed(1)
+    )
+    logits = module(features)
+    correlation = torch.corrcoef(torch.stack([logits.detach(), features[:, 0]]))[0, 1]
+    assert correlation > 0.999
+    exported = module.export({"a": 1})
+    np.testing.assert_allclose(exported.rank(features.numpy()), logits.detach().numpy(), atol=1e-5)
+
+
+def test_other_options_do_not_resume(whole: TrainingResult, textures: Path) -> None:
+    with pytest.raises(OptionError, match=r"other settings \(`seed`\)"):
+        run(textures, whole.weights.parent, dataclasses.replace(OPTIONS, seed=1))
+
+
+def test_the_measure_of_a_blind_detector(textures: Path) -> None:
+    pairs = validation_pairs(textures, 2, side=96)
+    assert {pair.kind for pair in pairs} == {"zoom", "blur", "viewpoint", "light"}
+    generator = np.random.default_rng(0)
+
+    def blind(image: np.ndarray) -> Keypoints:
+        return Keypoints(generator.uniform(0, 95, (500, 2)), generator.random(500), (96, 96))
+
+    found = measure(blind, pairs)
+    assert found.mean.shape == (3, 2)
+    assert found.score < 0.3
+    assert found.mean_correct < 0.05
+    assert (found.mean[:, 1] >= found.mean[:, 0]).all()
+
+
+def test_an_altered_checkpoint_is_one_sentence(
+    whole: TrainingResult, textures: Path, tmp_path: Path, one_line
+) -> None:
+    found = read_checkpoint(whole.weights.parent / CHECKPOINT)
+    moment = "optimizer.exp_avg_sq.ranker.first.weight"
+    for state, tensors, told in (
+        ({"step": None}, {}, "step"),
+        ({"points": [{"step": 0}]}, {}, "columns"),
+        ({}, {moment: torch.zeros(3)}, moment),
+    ):
+        save_file(
+            {**found.tensors, **tensors},
+            tmp_path / CHECKPOINT,
+            metadata={"state": json.dumps({**found.metadata, **state})},
+        )
+        with pytest.raises(WeightsError, match="delete it, or train into another") as caught:
+            run(textures, tmp_path)
+        assert str(tmp_path / CHECKPOINT) in one_line(caught.value)
+        assert told in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"damaged", None])
+def test_damaged_best_weights_do_not_stop_a_run(
+    content, whole: TrainingResult, textures: Path, tmp_path: Path, monkeypatch
+) -> None:
+    with monkeypatch.context() as patch, interrupted(patch, 3):
+        run(textures, tmp_path)
+    if content is None:  # without what is known of it
+        with np.load(tmp_path / BEST) as file:
+            arrays = dict(file)
+        np.savez(tmp_path / BEST, **{**arrays, "notes": np.array("{}")})
+    else:
+        (tmp_path / BEST).write_bytes(content)
+    lines: list[str] = []
+    resumed = run(textures, tmp_path, log=lines.append)
+    assert f"{tmp_path / BEST} is missing or damaged" in lines[0]
+    assert json.loads(notes_of(load_ranker(tmp_path / BEST))["point"])["step"] == 4
+    assert resumed.best == whole.points[-1]
+    assert same_state(tmp_path, whole.weights.parent)
