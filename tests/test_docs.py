@@ -19,9 +19,9 @@ PAGES = {
     for page in (*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *CARDS.glob("*/*CARD.md"))
 }
 PRESENT = {
-    name: text.partition("### Old and new names")[0] if name == "CHANGELOG.md" else text
+    name: text
     for name, text in PAGES.items()
-    if name != "docs/history.md"  # of files and modules as they were
+    if name not in ("CHANGELOG.md", "docs/history.md")  # of names as they were
 }
 WITH_COMMANDS = {**PRESENT, "docs/history.md": PAGES["docs/history.md"]}
 FOLDERS = "src|tests|benchmarks|docs|requirements"
@@ -55,7 +55,7 @@ def anchors(text: str) -> set[str]:
 @pytest.mark.parametrize("page", PRESENT)
 def test_paths_exist(page: str) -> None:
     for part in code(PRESENT[page]):
-        for path in re.findall(rf"(?<![\w/.-])(?:{FOLDERS})/[\w./-]+", part):
+        for path in re.findall(rf"(?<![\w/.:-])(?:{FOLDERS})/[\w./-]+", part):
             assert (ROOT / path).exists(), path
 
 
