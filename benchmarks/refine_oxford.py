@@ -27,13 +27,14 @@ from deepdetect.evaluation.metrics.homography import project_visible
 from deepdetect.evaluation.report import Column, Report, Section, Table
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.geometry import GeometryOptions, estimate_geometry, transform_points
-from deepdetect.geometry.homography_refinement import Refinement, refine_homography
+from deepdetect.geometry.homography_refinement import refine_homography
 from deepdetect.geometry.zncc import (
     BLUR_SIGMA_PX,
     WINDOW_PX,
     erode_mask,
     gaussian_blur,
     local_zncc,
+    median_local_zncc,
     warp_to_reference,
 )
 from deepdetect.io.image import load_image, luma
@@ -61,7 +62,8 @@ class RefinedPair:
     Attributes:
         pair: as published.
         published: median local correlation of the images under the published homography.
-        refinement: the best found, from either start.
+        homography: the best found, from either start.
+        zncc: the correlation under it.
         moved: how far points of the overlap move from the published place: median and largest,
             in pixels.
         risen: fraction of the windows, side by side, in which the correlation rises.
@@ -73,7 +75,8 @@ class RefinedPair:
 
     pair: PlanarPair
     published: float
-    refinement: Refinement
+    homography: np.ndarray
+    zncc: float
     moved: tuple[float, float]
     risen: float
     starts_apart: tuple[float, float] | None
@@ -87,7 +90,7 @@ class RefinedPair:
         It gains much correlation; or the correlation rises in a clear majority of the windows, and
         both starts lead to the same place.
         """
-        if self.refinement.zncc - self.published > CLEAR_GAIN:
+        if self.zncc - self.published > CLEAR_GAIN:
             return True
         same = self.starts_apart is not None and self.starts_apart[0] < MAX_APART * self.moved[0]
         return same and self.risen > CLEAR_MAJORITY
@@ -134,23 +137,26 @@ def _refine(pair: PlanarPair, path: Path) -> RefinedPair:
     start = sift_homography(gray0, gray1)
     if start is not None:
         found.append(refine_homography(gray0, gray1, start))
-    best = max(found, key=lambda refinement: refinement.zncc)
-    published = found[0].initial_zncc
+    published, *refined = (
+        median_local_zncc(gray0, gray1, homography) for homography in (pair.homography, *found)
+    )
+    zncc = max(refined)
+    best = found[refined.index(zncc)]
     size0, size1 = ((gray.shape[1], gray.shape[0]) for gray in (gray0, gray1))
-    moved = displacement(best.homography, pair.homography, size0, size1)
+    moved = displacement(best, pair.homography, size0, size1)
     there = pair.first.with_name(path.name)  # read before it may be written over
     apart = None
     if there.exists():
-        apart = displacement(best.homography, read_homography(there), size0, size1)
+        apart = displacement(best, read_homography(there), size0, size1)
     starts_apart = None
     if len(found) > 1:
-        starts_apart = displacement(*(one.homography for one in found), size0, size1)
-    risen = risen_fraction(gray0, gray1, pair.homography, best.homography)
-    result = RefinedPair(pair, published, best, moved, risen, starts_apart, apart, None)
+        starts_apart = displacement(*found, size0, size1)
+    risen = risen_fraction(gray0, gray1, pair.homography, best)
+    result = RefinedPair(pair, published, best, zncc, moved, risen, starts_apart, apart, None)
     if not result.better:
         return result
     with atomic_path(path) as temporary:
-        np.savetxt(temporary, best.homography, fmt="%.12e")
+        np.savetxt(temporary, best, fmt="%.12e")
     return replace(result, written=path)
 
 
@@ -232,7 +238,7 @@ def refinement_table(results: list[RefinedPair]) -> Table:
         (
             result.pair.name,
             result.published,
-            result.refinement.zncc,
+            result.zncc,
             *result.moved,
             result.risen,
             result.starts_apart[0] if result.starts_apart else None,

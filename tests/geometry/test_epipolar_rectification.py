@@ -6,11 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import OptionError
 from deepdetect.geometry.epipolar_rectification import (
     PlanarFrame,
     PolarFrame,
-    RectificationFrameOptions,
     RectifiedFrame,
     rectified_frame,
 )
@@ -95,9 +93,3 @@ def test_a_pixel_of_the_warped_view_shows_its_place(motion, view: int) -> None:
 def test_too_few_matches_give_no_frame() -> None:
     points0, points1, fundamental = two_views(SIDEWAYS)
     assert rectified_frame(points0[:7], points1[:7], fundamental, SIZE, SIZE) is None
-
-
-@pytest.mark.parametrize("wrong", [{"max_stretch": 0}, {"resolved_quantile": 2}, {"max_area": -1}])
-def test_options_out_of_range_are_refused(wrong: dict) -> None:
-    with pytest.raises(OptionError):
-        RectificationFrameOptions(**wrong)

@@ -8,89 +8,74 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect._shared.errors import OptionError
 from deepdetect.datasets.types import read_homography
 from deepdetect.evaluation.metrics.homography import corner_error
-from deepdetect.geometry.homography_refinement import (
-    RefinementOptions,
-    aligned_fraction,
-    fit_homography_irls,
-    refine_homography,
-    refine_homography_irls,
-)
-from deepdetect.geometry.residuals import transform_points
-from deepdetect.geometry.zncc import warp_to_reference
+from deepdetect.geometry import transform_points
+from deepdetect.geometry.homography_refinement import fit_homography_irls, refine_homography
 from deepdetect.io.image import load_image, luma
 
-TRUE = np.array([[0.95, 0.06, 9.0], [-0.04, 1.02, 5.0], [8e-5, -5e-5, 1.0]])
+TRUE = np.array([[0.97, 0.05, 8.3], [-0.04, 1.02, -5.6], [4e-5, -3e-5, 1.0]])
+OFF = np.array([[1.0, 0.004, 2.4], [-0.003, 1.0, -1.7], [0, 0, 1.0]])
+
+
+def warped(gray: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    size = (gray.shape[1], gray.shape[0])
+    return cv2.warpPerspective(gray, homography, size, flags=cv2.INTER_CUBIC)
+
+
+def error(found: np.ndarray, true: np.ndarray, shape: tuple[int, ...]) -> float:
+    """Return the mean distance of both over the image, in pixels."""
+    x, y = np.meshgrid(np.arange(20, shape[1] - 20, 10), np.arange(20, shape[0] - 20, 10))
+    points = np.column_stack([x.ravel(), y.ravel()]).astype(float)
+    gaps = transform_points(points, found) - transform_points(points, true)
+    return float(np.linalg.norm(gaps, axis=1).mean())
 
 
 @pytest.fixture(scope="module")
-def pair(photo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A photograph, and the same seen through `TRUE` in other light."""
-    gray = luma(photo)
-    moved = cv2.warpPerspective(gray, TRUE, (256, 256), flags=cv2.INTER_CUBIC)
-    return gray, np.clip(moved * 0.6 + 30, 0, 255).astype(np.uint8)
+def gray(photo: np.ndarray) -> np.ndarray:
+    return luma(photo)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_finds_the_true_homography_from_some_pixels_away(
-    pair: tuple[np.ndarray, np.ndarray], seed: int
-) -> None:
-    generator = np.random.default_rng(seed)
-    start = TRUE.copy()
-    start[:2, 2] += generator.uniform(-4, 4, 2)
-    start[:2, :2] += generator.uniform(-0.01, 0.01, (2, 2))
-    assert corner_error(start, TRUE, (256, 256)) > 1
-    found = refine_homography(*pair, start)
-    assert corner_error(found.homography, TRUE, (256, 256)) < 0.25
-    assert found.zncc > found.initial_zncc
-    assert found.steps >= 1
-    assert found.homography[2, 2] == 1
+def test_a_homography_that_is_off_by_pixels_is_found(gray: np.ndarray) -> None:
+    second = warped(gray, TRUE)
+    start = TRUE @ OFF
+    assert error(start, TRUE, gray.shape) > 2
+    assert error(refine_homography(gray, second, start), TRUE, gray.shape) < 0.1
 
 
-def test_never_makes_it_worse(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    found = refine_homography(*pair, TRUE)
-    assert found.zncc >= found.initial_zncc
-    assert corner_error(found.homography, TRUE, (256, 256)) < 0.25
+def test_other_light_does_not_matter(gray: np.ndarray) -> None:
+    second = np.clip(0.5 * warped(gray, TRUE).astype(float) + 60, 0, 255).astype(np.uint8)
+    found = refine_homography(gray, second, TRUE @ OFF)
+    assert error(found, TRUE, gray.shape) < 0.15
 
 
-def test_keeps_what_it_is_given_where_nothing_can_be_tracked() -> None:
-    flat = np.full((64, 64), 90, np.uint8)
-    start = np.array([[1.0, 0, 2], [0, 1, 0], [0, 0, 1]])
-    found = refine_homography(flat, flat, start)
-    np.testing.assert_array_equal(found.homography, start)
-    assert found.steps == 0
+def test_what_is_right_stays(gray: np.ndarray) -> None:
+    found = refine_homography(gray, warped(gray, TRUE), TRUE)
+    assert error(found, TRUE, gray.shape) < 0.1
 
 
-def test_the_callers_random_numbers_are_left_alone(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    cv2.setRNGSeed(5)
-    expected = cv2.randu(np.zeros(4), 0, 1).copy()
-    cv2.setRNGSeed(5)
-    refine_homography(*pair, TRUE @ np.array([[1.0, 0, 2], [0, 1, -1], [0, 0, 1]]))
-    np.testing.assert_array_equal(cv2.randu(np.zeros(4), 0, 1), expected)
+def test_a_plane_that_fills_most_of_the_image_is_not_pulled_off_it(gray: np.ndarray) -> None:
+    """A third of the image moves by two pixels more: the compromise would be wrong everywhere."""
+    second = warped(gray, TRUE)
+    other = warped(gray, np.array([[1, 0, 2.0], [0, 1, 0], [0, 0, 1]]) @ TRUE)
+    third = gray.shape[1] // 3
+    second[:, :third] = other[:, :third]
+    found = refine_homography(gray, second, TRUE @ OFF)
+    x, y = np.meshgrid(np.arange(gray.shape[1] // 2, gray.shape[1] - 30, 10), [60, 120, 180])
+    points = np.column_stack([x.ravel(), y.ravel()]).astype(float)
+    gaps = transform_points(points, found) - transform_points(points, TRUE)
+    assert np.linalg.norm(gaps, axis=1).mean() < 0.3
 
 
-def test_is_the_same_on_repetition(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    start = TRUE @ np.array([[1.0, 0, 2], [0, 1, -1], [0, 0, 1]])
-    first, second = (refine_homography(*pair, start).homography for _ in range(2))
-    np.testing.assert_array_equal(first, second)
+def test_noise_gives_no_refinement() -> None:
+    rng = np.random.default_rng(0)
+    first, second = (rng.integers(0, 256, (120, 160), np.uint8) for _ in range(2))
+    np.testing.assert_allclose(refine_homography(first, second, TRUE), TRUE)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"max_rounds": 0},
-        {"max_corners": 5},
-        {"windows_px": ()},
-        {"windows_px": (3,)},
-        {"blur_sigmas_px": (0,)},
-        {"ignored_fraction": 1},
-    ],
-)
-def test_options_out_of_range_are_refused(wrong: dict) -> None:
-    with pytest.raises(OptionError):
-        RefinementOptions(**wrong)
+def test_flat_images_keep_the_start() -> None:
+    flat = np.full((120, 160), 90, np.uint8)
+    np.testing.assert_allclose(refine_homography(flat, flat, TRUE), TRUE)
 
 
 def displacement(
@@ -121,18 +106,9 @@ def test_agrees_with_the_refined_homographies_of_oxford(
     expected = read_homography(folder / f"H1to{number}p.refined")
     found = refine_homography(*map(luma, images), published)
     assert displacement(expected, published, *images)[0] > median
-    found_median, found_largest = displacement(expected, found.homography, *images)
+    found_median, found_largest = displacement(expected, found, *images)
     assert found_median < median
     assert found_largest < largest
-
-
-def test_moving_parts_are_ignored(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    first, second = pair
-    moved = second.copy()
-    moved[60:160, 70:150] = np.roll(second[60:160, 70:150], 2, axis=1)
-    start = TRUE @ np.array([[1.0, 0, 0.6], [0, 1, -0.5], [0, 0, 1]])
-    found = refine_homography(first, moved, start, RefinementOptions(windows_px=(21,)))
-    assert corner_error(found.homography, TRUE, (256, 256)) < 0.3
 
 
 NEARLY = np.array([[1.004, 0.006, 2.0], [-0.005, 0.997, -1.5], [8e-6, -5e-6, 1.0]])
@@ -141,11 +117,6 @@ NEARLY = np.array([[1.004, 0.006, 2.0], [-0.005, 0.997, -1.5], [8e-6, -5e-6, 1.0
 
 def moved(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
     return transform_points(points, homography)
-
-
-@pytest.fixture(scope="module")
-def gray(photo: np.ndarray) -> np.ndarray:
-    return cv2.resize(luma(photo), (512, 512), interpolation=cv2.INTER_CUBIC)
 
 
 @given(
@@ -202,90 +173,3 @@ def test_points_that_give_no_homography_give_none() -> None:
         assert fit_homography_irls(points, points) is None
     found = fit_homography_irls(line, line + 1)
     assert found is None or np.allclose(moved(line, found), line + 1, atol=1e-6)
-
-
-def test_the_same_image_is_all_in_place_and_a_moved_one_is_not(gray: np.ndarray) -> None:
-    seen = np.ones(gray.shape, bool)
-    assert aligned_fraction(gray, gray, seen) == 1
-    shares = []
-    for shift in (0.1, 0.4, 0.7, 1.5):
-        matrix = np.float32([[1, 0, shift], [0, 1, 0]])
-        other = cv2.warpAffine(gray, matrix, gray.shape[::-1], flags=cv2.INTER_CUBIC)
-        shares.append(aligned_fraction(gray, other, seen))
-    assert shares == sorted(shares, reverse=True)
-    assert shares[0] > 0.99
-    assert shares[1] > 0.6 > 0.35 > shares[2]
-    assert shares[3] < 0.2
-    assert aligned_fraction(gray, gray, ~seen) == 0
-
-
-def test_only_what_is_seen_counts(gray: np.ndarray) -> None:
-    other = gray.copy()
-    other[:, :256] = np.roll(gray, 2, axis=1)[:, :256]
-    seen = np.ones(gray.shape, bool)
-    right = seen.copy()
-    right[:, :300] = False
-    assert aligned_fraction(gray, other, seen) < 0.75
-    assert aligned_fraction(gray, other, right) > 0.98
-
-
-def test_light_does_not_matter(gray: np.ndarray) -> None:
-    darker = np.clip(gray * 0.6 + 30, 0, 255).astype(np.uint8)
-    assert aligned_fraction(gray, darker, np.ones(gray.shape, bool)) > 0.85
-
-
-def test_a_right_homography_is_left_alone(gray: np.ndarray) -> None:
-    other = cv2.warpPerspective(gray, TRUE, (512, 512), flags=cv2.INTER_CUBIC)
-    np.testing.assert_array_equal(refine_homography_irls(gray, other, TRUE), TRUE)
-
-
-def bent(gray: np.ndarray, width: int) -> np.ndarray:
-    """Move the left part of an image 3 pixels to the right."""
-    y, x = np.indices(gray.shape, np.float32)
-    return cv2.remap(gray, np.where(x < width, x - 3, x), y, cv2.INTER_CUBIC)
-
-
-def compromise(width: int) -> np.ndarray:
-    """What fits all pixels in least squares: that part pulls everything along."""
-    grid = np.stack(np.meshgrid(np.arange(0, 512, 8.0), np.arange(0, 512, 8.0)), -1).reshape(-1, 2)
-    there = moved(grid + [3, 0] * (grid[:, :1] < width), TRUE)
-    return cv2.findHomography(grid, there, 0)[0]
-
-
-def test_one_that_a_minority_pulled_off_is_mended(gray: np.ndarray) -> None:
-    other = cv2.warpPerspective(bent(gray, 64), TRUE, (512, 512), flags=cv2.INTER_CUBIC)
-    start = compromise(64)
-    rest = np.array([[100, 0], [511, 0], [511, 511], [100, 511.0]])
-
-    def off(homography: np.ndarray) -> float:
-        return float(np.linalg.norm(moved(rest, homography) - moved(rest, TRUE), axis=1).max())
-
-    def share(homography: np.ndarray) -> float:
-        return aligned_fraction(gray, *warp_to_reference(other, homography, (512, 512)))
-
-    found = refine_homography_irls(gray, other, start)
-    assert off(start) > 0.7
-    assert off(found) < 0.6
-    assert share(found) > 1.3 * share(start)
-    assert share(found) > 0.98 * share(TRUE)
-    assert found[2, 2] == 1
-
-
-def test_what_would_be_no_better_is_not_taken(gray: np.ndarray) -> None:
-    """A whole quarter that moved is too many for the fit: it stays with what it was given."""
-    other = cv2.warpPerspective(bent(gray, 128), TRUE, (512, 512), flags=cv2.INTER_CUBIC)
-    start = compromise(128)
-    np.testing.assert_array_equal(refine_homography_irls(gray, other, start), start)
-
-
-def test_images_without_corners_give_back_what_was_given() -> None:
-    flat = np.full((64, 64), 90, np.uint8)
-    given_one = np.array([[1.0, 0, 2], [0, 1, 0], [0, 0, 1]])
-    np.testing.assert_array_equal(refine_homography_irls(flat, flat, given_one), given_one)
-
-
-def test_irls_is_the_same_on_repetition(gray: np.ndarray) -> None:
-    other = bent(gray, 64)
-    start = np.array([[1.0, 0, 1.2], [0, 1, 0], [0, 0, 1]])
-    first, second = (refine_homography_irls(gray, other, start) for _ in range(2))
-    np.testing.assert_array_equal(first, second)

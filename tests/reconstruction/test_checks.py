@@ -16,17 +16,11 @@ from deepdetect import DeepDetect, MatchingOptions, SelectionOptions, match_imag
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
-from deepdetect.geometry import Geometry, GeometryOptions, estimate_geometry
 from deepdetect.geometry.camera import Calibration, Camera, calibration_from_focal
 from deepdetect.geometry.relative_pose import RelativePose, estimate_relative_pose
+from deepdetect.geometry.two_view import TwoViewModel, fit_model, has_foreground, is_planar
 from deepdetect.io.image import load_image, luma
-from deepdetect.reconstruction.calibration_checks import check_focal, check_pose
-from deepdetect.reconstruction.checks import (
-    check_images,
-    check_matches,
-    has_foreground,
-    is_planar,
-)
+from deepdetect.reconstruction.checks import check_focal, check_images, check_matches, check_pose
 from deepdetect.reconstruction.subpixel import refine_matches
 
 SIZE = (370, 250)
@@ -75,13 +69,13 @@ def test_one_picture_twice(photo: np.ndarray, level: Any, one_line) -> None:
     again = io.BytesIO()
     Image.fromarray(photo).save(again, "JPEG", quality=100)
     for other in (photo, load_image(again.getvalue())):
-        with pytest.raises(ReconstructionError, match="the same picture") as error:
+        with pytest.raises(ReconstructionError, match="images are the same") as error:
             check_images(luma(photo), luma(other))
         one_line(error.value)
     check_images(*level.grays)
     check_images(luma(photo), luma(photo)[:-1])
     for grey in (0, 200):
-        with pytest.raises(ReconstructionError, match="the same picture"):
+        with pytest.raises(ReconstructionError, match="images are the same"):
             check_images(*np.full((2, 40, 40), grey, np.uint8))
 
 
@@ -90,7 +84,7 @@ def test_dark_pairs_are_two_pictures(level: Any, photo: np.ndarray, mean: float,
     factor = mean / level.left.mean()
     dark = [luma(np.rint(view * factor).astype(np.uint8)) for view in (level.left, level.right)]
     check_images(*dark)
-    with pytest.raises(ReconstructionError, match="the same picture"):
+    with pytest.raises(ReconstructionError, match="images are the same"):
         check_images(dark[0], dark[0])
 
 
@@ -98,7 +92,7 @@ def test_a_dark_picture_saved_again_is_the_same(level: Any) -> None:
     dark = np.rint(level.left * (6 / level.left.mean())).astype(np.uint8)
     again = io.BytesIO()
     Image.fromarray(dark).save(again, "JPEG", quality=100)
-    with pytest.raises(ReconstructionError, match="the same picture"):
+    with pytest.raises(ReconstructionError, match="images are the same"):
         check_images(luma(dark), luma(load_image(again.getvalue())))
 
 
@@ -211,10 +205,10 @@ def test_no_overlap(level: Any, one_line) -> None:
 def test_scenes_with_depth_pass(shared: Path, name: str) -> None:
     folder = shared / "data" / "middlebury" / name
     points = sparse(*(load_image(folder / f"{side}.png") for side in ("left", "right")))
-    evidence = check_matches(*points, SIZE)
-    assert evidence.explained.mean() > 0.8
-    assert evidence.by_homography < 0.6
-    assert evidence.log10_nfa < -50
+    _, scene = check_matches(*points, SIZE)
+    assert scene.epipolar.inliers.mean() > 0.8
+    assert scene.plane.inliers.mean() < 0.6
+    assert scene.epipolar.log10_nfa < -50
 
 
 def test_a_good_pair_passes_with_its_pose_and_focal_length(turned: Any, refined: Any) -> None:
@@ -223,10 +217,10 @@ def test_a_good_pair_passes_with_its_pose_and_focal_length(turned: Any, refined:
 
 
 def check_all(points: Any, calibration: Calibration) -> None:
-    evidence = check_matches(*points, SIZE, calibration)
-    pose = estimate_relative_pose(*points, calibration)
-    check_pose(pose, evidence, calibration)
-    check_focal(*points, pose, evidence, calibration)
+    cells, scene = check_matches(*points, SIZE, calibration)
+    pose = check_pose(estimate_relative_pose(*points, calibration), cells, scene, calibration)
+    used = cells[scene.epipolar.inliers]
+    check_focal(points[0][used], points[1][used], pose.errors[used], calibration)
 
 
 @pytest.mark.parametrize("factor", [0.2, 0.3, 0.5])
@@ -256,10 +250,12 @@ def test_too_long_a_focal_length_is_seen_where_the_camera_turned_more(
 
 def test_the_right_focal_length_is_named(turned: Any, refined: Any) -> None:
     calibration = scaled(turned.calibration, 0.5)
-    evidence = check_matches(*refined, SIZE, calibration)
+    cells, scene = check_matches(*refined, SIZE, calibration)
+    used = cells[scene.epipolar.inliers]
+    points = refined[0][used], refined[1][used]
     pose = estimate_relative_pose(*refined, calibration)
     with pytest.raises(ReconstructionError, match=r"one of about (4[5-9]\d|5[0-4]\d) px"):
-        check_focal(*refined, pose, evidence, calibration)
+        check_focal(*points, pose.errors[used], calibration)
 
 
 def test_lenses_that_bend_a_little_pass(turned: Any, refined: Any) -> None:
@@ -275,7 +271,7 @@ def test_lenses_that_bend_a_little_pass(turned: Any, refined: Any) -> None:
 
 def test_no_pose_and_points_behind(turned: Any, refined: Any, one_line) -> None:
     calibration = turned.calibration
-    evidence = check_matches(*refined, SIZE, calibration)
+    cells, scene = check_matches(*refined, SIZE, calibration)
     pose = estimate_relative_pose(*refined, calibration)
     behind = replace(pose, cheirality_ratio=0.4)
     for one, message in (
@@ -284,7 +280,7 @@ def test_no_pose_and_points_behind(turned: Any, refined: Any, one_line) -> None:
         (_worse(pose), "matches fit one pose of the cameras"),
     ):
         with pytest.raises(ReconstructionError, match=message) as error:
-            check_pose(one, evidence, calibration)
+            check_pose(one, cells, scene, calibration)
         one_line(error.value)
 
 
@@ -313,12 +309,10 @@ def test_a_plane_is_one_also_among_wrong_matches_and_depth_is_none(wrong: int) -
         points1[:nearer, 0] += np.linspace(8, 40, nearer)
         points1[300:] = np.random.default_rng(1).uniform(0, 500, (wrong, 2))
         plane, epipolar = (
-            estimate_geometry(
-                points0, points1, model, options=GeometryOptions(inlier_threshold=threshold)
-            )
+            fit_model(points0, points1, model, (500, 500), threshold)
             for model, threshold in (("homography", 2), ("fundamental", 1.5))
         )
-        planar = is_planar(points0, points1, plane, epipolar, min_ratio=0.5)
+        planar = is_planar(points0, points1, plane, epipolar)
         assert planar is expected
-    nothing = Geometry("homography", None, np.zeros(len(points0), bool))
+    nothing = TwoViewModel("none", None, np.zeros(len(points0), bool), np.inf)
     assert not is_planar(points0, points1, nothing, epipolar)

@@ -12,9 +12,8 @@ from deepdetect.datasets import load_stereo_pair
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.io.image import load_image, luma
-from deepdetect.matching.guided import tentative_matches
+from deepdetect.matching.guided import find_tentative_matches
 from deepdetect.reconstruction.rectification import (
-    RectificationOptions,
     detect_rectification,
     find_rectification,
 )
@@ -188,7 +187,7 @@ def test_small_copies_of_large_images_decide_alone(motorcycle: Any) -> None:
     assert not found.swapped
     assert initial is None
     size = left.shape[::-1]
-    fine = tentative_matches(left, right)
+    fine = find_tentative_matches(left, right)
     expected = detect_rectification(fine.points0, fine.points1, size, size)
     for own, other in zip(found.disparities[::2], expected.disparities[::2], strict=True):
         assert own == pytest.approx(other, rel=0.1)
@@ -246,10 +245,12 @@ def test_where_small_copies_show_no_depth_larger_ones_decide(motorcycle: Any) ->
     assert initial is not None
 
 
-def test_small_images_and_images_of_two_sizes_are_looked_at_once(motorcycle: Any) -> None:
+def test_small_images_and_images_of_two_sizes_are_looked_at_once(
+    motorcycle: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     left, right = motorcycle
-    own = RectificationOptions(first_side_px=741)
-    found, initial = find_rectification(left, right, options=own)
+    monkeypatch.setattr("deepdetect.reconstruction.rectification.COARSE_SIDE_PX", 741)
+    found, initial = find_rectification(left, right)
     assert found.rectified
     assert initial is not None
     found, initial = find_rectification(left, right[:, :-4])

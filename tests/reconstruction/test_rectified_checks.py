@@ -15,7 +15,6 @@ from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
 from deepdetect.matching.stereo import DENSE, DisparityOptions, disparity_map
 from deepdetect.reconstruction.rectified_checks import (
-    RectifiedCheckOptions,
     check_cameras,
     check_depths,
     check_disparities,
@@ -193,11 +192,3 @@ def test_a_photograph_of_a_rotated_camera(
             continue
         with pytest.raises(ReconstructionError, match="a rotation of the camera explains"):
             check_pure_rotation(*matches, calibration)
-
-
-def test_thresholds_are_options() -> None:
-    check_matched(1, 10_000, options=RectifiedCheckOptions(min_unique_fraction=0))
-    check_disparities(np.full(100, 7.0), RectifiedCheckOptions(min_disparity_spread_px=0))
-    left = Camera((640, 480), 500.0)
-    cameras = Calibration(left, replace(left, focal_px=600.0))
-    check_cameras(cameras, RectifiedCheckOptions(max_focal_difference_fraction=0.3))

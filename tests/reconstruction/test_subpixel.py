@@ -10,7 +10,6 @@ from deepdetect import OptionError
 from deepdetect.io.image import luma
 from deepdetect.reconstruction import subpixel
 from deepdetect.reconstruction.subpixel import (
-    SubpixelOptions,
     local_affinities,
     refine_matches,
     similarity,
@@ -134,12 +133,13 @@ def test_bands_of_rows_do_not_matter(
 
 
 def test_of_very_many_matches_some_tell_how_patches_are_deformed(
-    gray: np.ndarray, pixels: np.ndarray
+    gray: np.ndarray, pixels: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     second = moved(gray, 0.4, -0.3)
     start = pixels.astype(float)
     every = refine_matches(gray, second, pixels, start)
-    some = refine_matches(gray, second, pixels, start, SubpixelOptions(min_pixels_of_lattice=0))
+    monkeypatch.setattr(subpixel, "MIN_MATCHES_OF_LATTICE", 0)
+    some = refine_matches(gray, second, pixels, start)
     both = every.converged & some.converged
     assert both.mean() > 0.9 * every.converged.mean()
     assert np.median(np.abs(some.points1 - every.points1)[both]) < 0.01
@@ -189,15 +189,6 @@ def test_what_is_wrong_is_said(gray: np.ndarray) -> None:
     for points in ([[0.5, 3]], [[-1, 3]], [[256, 3]]):
         with pytest.raises(OptionError, match="whole pixels of the image"):
             refine_matches(gray, gray, np.array(points), np.array(points))
-    for options in (
-        {"patch_radius_px": 0},
-        {"sigma_px": 0},
-        {"max_iterations": 0},
-        {"max_shift_px": -1},
-        {"min_correlation": 2},
-    ):
-        with pytest.raises(OptionError):
-            SubpixelOptions(**options)
 
 
 def test_wrong_matches_around_do_not_bend_an_affinity() -> None:

@@ -19,7 +19,7 @@ MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 
 
 def log10_nfa(
-    errors: np.ndarray,
+    inliers: np.ndarray,
     model: str,
     inlier_threshold: float,
     image_size: tuple[int, int],
@@ -28,9 +28,9 @@ def log10_nfa(
     """Return the decimal logarithm of the number of false alarms.
 
     Args:
-        errors: (M,) distances of all matches from the model, in pixels of the second image.
+        inliers: (M,) bool, which of all matches are near the model.
         model: "homography", "fundamental" or "essential".
-        inlier_threshold: in pixels; matches nearer than this are the inliers.
+        inlier_threshold: that they are nearer than, in pixels of the second image.
         image_size: (width, height) of the second image.
         models_per_sample: that were tried for each minimal sample.
 
@@ -38,15 +38,14 @@ def log10_nfa(
         Below 0 for what chance does not explain; infinite when there are too few inliers.
 
     Example:
-        >>> near, far = np.zeros(30), np.full(70, 50.0)
-        >>> log10_nfa(np.concatenate([near, far]), "homography", 3, (640, 480)) < -50
+        >>> log10_nfa(np.arange(100) < 30, "homography", 3, (640, 480)) < -50
         True
-        >>> log10_nfa(np.concatenate([near[:6], far]), "homography", 3, (640, 480)) > -6
+        >>> log10_nfa(np.arange(76) < 6, "homography", 3, (640, 480)) > -6
         True
     """
     sample = MINIMAL_SAMPLE_SIZE[model]
-    count, inliers = len(errors), int(np.count_nonzero(errors < inlier_threshold))
-    if inliers <= sample:
+    count, agreeing = len(inliers), int(np.count_nonzero(inliers))
+    if agreeing <= sample:
         return float("inf")
     width, height = image_size
     if model == "homography":
@@ -54,8 +53,8 @@ def log10_nfa(
     else:  # a band along a line through the image
         chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
     tests = log(models_per_sample * (count - sample))
-    tests += log_binomial(count, inliers) + log_binomial(inliers, sample)
-    return (tests + (inliers - sample) * log(min(chance, 1.0))) / log(10)
+    tests += log_binomial(count, agreeing) + log_binomial(agreeing, sample)
+    return (tests + (agreeing - sample) * log(min(chance, 1.0))) / log(10)
 
 
 def log_binomial(count: int, chosen: int) -> float:

@@ -12,48 +12,31 @@ In both frames the match of (x, y) in the first view is (x - disparity, y) in th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges, suggest_keywords
 from .residuals import transform_points
 
 Size = tuple[int, int]
 
 
-@suggest_keywords
-@dataclass(frozen=True)
-class RectificationFrameOptions:
-    """Which frame is taken, and how fine it is.
+MAX_STRETCH = 2.0
+"""A planar frame may stretch or shrink a part of a view by this factor, relative to its middle;
+beyond it the epipole is too near, and the frame is polar."""
 
-    Attributes:
-        max_stretch: a planar frame may stretch or shrink a part of a view by this factor, relative
-            to its middle; beyond it the epipole is too near, and the frame is polar.
-        max_area: of a planar frame, relative to the larger view.
-        resolved_quantile: quantile of the distances of the pixels from the epipole at which a polar
-            frame has the resolution of the first view: it is finer nearer to the epipole, and
-            coarser farther away.
-        min_radius_px: nearer to the epipole nothing is rectified: nothing moves there, and few
-            pixels fill many rows.
+MAX_AREA = 3.0
+"""Of a planar frame, relative to the larger view."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+RESOLVED_QUANTILE = 0.6
+"""Of the distances of the pixels from the epipole, at which a polar frame has the resolution of the
+first view: it is finer nearer to the epipole, and coarser farther away."""
 
-    max_stretch: float = 2.0
-    max_area: float = 3.0
-    resolved_quantile: float = 0.6
-    min_radius_px: float = 8.0
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("max_stretch", "max_area", "min_radius_px"),
-            fractions=("resolved_quantile",),
-        )
+MIN_RADIUS_PX = 8.0
+"""Nearer to the epipole nothing is rectified: nothing moves there, and few pixels fill many
+rows."""
 
 
 class RectifiedFrame(Protocol):
@@ -120,7 +103,6 @@ class PolarFrame:
         step: between rows in radians, and between columns in natural logarithms of the radius.
         min_radius_px: radius of the first column.
         size: (width, height) of the frame.
-        wrapped: whether the rows go around the epipole, and begin again after the last one.
     """
 
     fundamental: np.ndarray
@@ -131,7 +113,6 @@ class PolarFrame:
     step: float
     min_radius_px: float
     size: Size
-    wrapped: bool = field(default=False)
 
     def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
         """Take positions of a view into the frame; not finite for those at the epipole."""
@@ -188,7 +169,6 @@ def rectified_frame(
     fundamental: np.ndarray,
     size0: Size,
     size1: Size,
-    options: RectificationFrameOptions = RectificationFrameOptions(),
 ) -> RectifiedFrame | None:
     """Choose a frame in which the matches of two views lie on rows.
 
@@ -196,7 +176,6 @@ def rectified_frame(
         points0, points1: (N, 2) matches that fit the fundamental matrix.
         fundamental: (3, 3) with x1^T F x0 = 0.
         size0, size1: (width, height) of the views.
-        options: which frame, and how fine.
 
     Returns:
         A planar frame where one distorts the views little, else a polar one; None where neither is
@@ -214,10 +193,8 @@ def rectified_frame(
     points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
     if len(points0) < 8:
         return None
-    planar = _planar_frame(points0, points1, fundamental, size0, size1, options)
-    if planar is not None:
-        return planar
-    return _polar_frame(points0, points1, fundamental, size0, size1, options)
+    pair = points0, points1, fundamental, size0, size1
+    return _planar_frame(*pair) or _polar_frame(*pair)
 
 
 def _planar_frame(
@@ -226,7 +203,6 @@ def _planar_frame(
     fundamental: np.ndarray,
     size0: Size,
     size1: Size,
-    options: RectificationFrameOptions,
 ) -> PlanarFrame | None:
     """Rectify by homographies, or return None where they distort too much."""
     found, *matrices = cv2.stereoRectifyUncalibrated(
@@ -239,7 +215,7 @@ def _planar_frame(
     for matrix, border, middle in zip(matrices, corners, middles, strict=True):
         depth = (border @ matrix[2, :2] + matrix[2, 2]) / (middle @ matrix[2, :2] + matrix[2, 2])
         # Lengths across the line at infinity change with the square of this.
-        if depth.min() <= 0 or max(depth.max(), 1 / depth.min()) ** 2 > options.max_stretch**2:
+        if depth.min() <= 0 or max(depth.max(), 1 / depth.min()) ** 2 > MAX_STRETCH**2:
             return None
     jacobian = _jacobian(matrices[0], middles[0])
     if np.linalg.det(jacobian) <= 0 or np.linalg.det(_jacobian(matrices[1], middles[1])) <= 0:
@@ -257,7 +233,7 @@ def _planar_frame(
     right = max(frame[:, 0].max() for frame in frames)
     width, height = int(np.ceil(right - left)) + 1, int(np.ceil(bottom - top)) + 1
     largest = max(np.prod(size0), np.prod(size1))
-    if height < 2 or width * height > options.max_area * largest:
+    if height < 2 or width * height > MAX_AREA * largest:
         return None
     shift = _translation(-np.floor(left), -np.floor(top))
     return PlanarFrame((shift @ first, shift @ second), (width, height))
@@ -269,7 +245,6 @@ def _polar_frame(
     fundamental: np.ndarray,
     size0: Size,
     size1: Size,
-    options: RectificationFrameOptions,
 ) -> PolarFrame | None:
     """Rectify about the epipoles, or return None where one lies at infinity."""
     left, _, right = np.linalg.svd(fundamental)
@@ -291,32 +266,19 @@ def _polar_frame(
         first_angle, last_angle = float(relative.min()), float(relative.max())
     pixels = np.mgrid[0 : size0[0] : 16, 0 : size0[1] : 16].reshape(2, -1).T - epipoles[0]
     radii = np.hypot(*pixels.T)
-    step = 1 / max(float(np.quantile(radii, options.resolved_quantile)), 1.0)
+    step = 1 / max(float(np.quantile(radii, RESOLVED_QUANTILE)), 1.0)
     farthest = max(
         np.hypot(*(_corners(size) - epipole).T).max()
         for size, epipole in zip((size0, size1), epipoles, strict=True)
     )
-    nearest = options.min_radius_px if wrapped else max(float(radii.min()), options.min_radius_px)
+    nearest = MIN_RADIUS_PX if wrapped else max(float(radii.min()), MIN_RADIUS_PX)
     width = int(np.ceil(np.log(farthest / nearest) / step)) + 1
-    height = int(np.ceil((last_angle - first_angle) / step)) + 1
-    made = [
-        PolarFrame(
-            fundamental,
-            epipoles,
-            sign,
-            middle,
-            first_angle,
-            step,
-            nearest,
-            (width, height),
-            wrapped,
-        )
-        for sign in (1.0, -1.0)
-    ]
+    size = width, int(np.ceil((last_angle - first_angle) / step)) + 1
+    frame = PolarFrame(fundamental, epipoles, 1.0, middle, first_angle, step, nearest, size)
     # The half-line on which the matches lie.
     angles = np.arctan2(*(points0 - epipoles[0]).T[::-1])
-    along = (made[0]._directions(angles, 1) * (points1 - epipoles[1])).sum(axis=1)
-    return made[0] if np.median(np.sign(along)) >= 0 else made[1]
+    along = (frame._directions(angles, 1) * (points1 - epipoles[1])).sum(axis=1)
+    return frame if np.median(np.sign(along)) >= 0 else replace(frame, orientation=-1.0)
 
 
 def _corners(size: Size) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from .._shared.errors import OptionError, unknown_name
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
-from .model_selection import measure_parallax
+from .parallax import measure_parallax
 from .residuals import epipolar_errors, transfer_errors
 
 ESTIMATORS = ("magsac", "ransac")
@@ -155,7 +155,7 @@ def estimate_geometry(
         if plane.matrix is None or depth.matrix is None:
             return depth if plane.matrix is None else plane
         parallax = measure_parallax(points0, points1, plane.matrix, seed=seed)
-        return depth if parallax.is_depth() else plane
+        return depth if parallax.shows_depth else plane
     fitting = MODELS[model]
     nothing = Geometry(model, None, np.zeros(len(points0), bool))
     if len(points0) < fitting.min_matches:

@@ -1,322 +1,192 @@
-"""Refinement of a homography by the images themselves.
+"""Refinement of a homography on the images in a fraction of a second, each step cross-validated.
 
-`refine_homography` repeats two kinds of steps on the second image, warped by the current estimate.
-One tracks thousands of corners over the few pixels that are left, forth and back (Lucas-Kanade),
-and fits a homography to the tracks: blur and foliage need larger windows than sharp walls, so
-several sizes are tried in turn. The other uses all pixels: it maximises the correlation of the
-images after local contrast normalisation (Evangelidis and Psarakis, "Parametric image alignment
-using enhanced correlation coefficient maximization", 2008; OpenCV's). A step is kept only when the
-median local ZNCC rises, so by this measure it cannot make things worse.
-
-What uses all pixels is the best compromise. A lens that bends lines, or a wall that is not quite
-flat, can make that wrong by a pixel nearly everywhere. `refine_homography_irls` is a robust fit to
-tracked corners, which is right on most of the image and further off on the rest; the better of the
-two is measured by the fraction of aligned pixels.
+Corners are tracked over the pixels that are left between the first image and the warped second one,
+forth and back, and a homography is fitted to them; then all pixels of a smaller copy are aligned,
+by the correlation after local contrast normalisation (Evangelidis and Psarakis, "Parametric image
+alignment using enhanced correlation coefficient maximization", 2008; OpenCV's). The image is
+divided into squares, in turn of two halves. A step is kept only if, on each half, what it finds
+*without* that half correlates the images better than the homography before: where it holds on what
+it was not fitted to.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
-from .._shared.errors import OptionError
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges, suggest_keywords
+from .optical_flow import equalise, track_round_trip
+from .rescaling import downscale, scaled_homography
 from .residuals import transform_points
 from .zncc import (
+    BLUR_SIGMA_PX,
     WINDOW_PX,
     erode_mask,
     gaussian_blur,
     local_zncc,
-    median_local_zncc,
     normalise_local_contrast,
     warp_to_reference,
 )
 
+TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
+"""Side of the tracked windows in pixels, corners, and levels of the pyramid, for each round. The
+first one starts the furthest off: its tracks move further, and half as many corners do."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class RefinementOptions:
-    """How a homography is refined.
+MIN_TRACKS = 15
+"""That a homography is fitted to."""
 
-    Attributes:
-        max_rounds: each takes one step with every window and every blur.
-        max_corners: tracked in each step.
-        min_tracks: that a homography is fitted to.
-        windows_px: sides of the tracked windows in pixels.
-        blur_sigmas_px: of the blur before the steps that use all pixels.
-        pyramid_levels: above the image; each doubles how far a track can move.
-        tracking_iterations: of each track and level, at most.
-        tracking_step_px: a track that moves by less than this has arrived.
-        max_round_trip_px: a track counts when it ends this near to its start, forth and back.
-        inlier_threshold: of MAGSAC, in pixels.
-        ignored_fraction: of the pixels, those that agree least, are ignored by the steps that use
-            all pixels: they moved, or are not in the plane.
-        min_track_gain: of ZNCC, for a step by tracks that is kept; less is noise.
-        min_pixel_gain: the same for a step that uses all pixels, which has less noise.
+TRACKING_ITERATIONS = 15
+TRACKING_STEP_PX = 0.02
+"""A track that moves by less than this has arrived."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+MAX_ROUND_TRIP_PX = 0.3
+"""A track counts when it ends this near to its start, forth and back."""
 
-    max_rounds: int = 4
-    max_corners: int = 4000
-    min_tracks: int = 30
-    windows_px: tuple[int, ...] = (21, 31, 41)
-    blur_sigmas_px: tuple[float, ...] = (2.0, 1.0)
-    pyramid_levels: int = 3
-    tracking_iterations: int = 50
-    tracking_step_px: float = 0.005
-    max_round_trip_px: float = 0.3
-    inlier_threshold: float = 1.0
-    ignored_fraction: float = 0.2
-    min_track_gain: float = 0.001
-    min_pixel_gain: float = 0.0001
+CAUCHY_SCALE_PX = 1.0
+"""A track with this residual has half the weight of an exact one."""
 
-    def __post_init__(self) -> None:
-        if not self.windows_px or self.max_corners < self.min_tracks:
-            raise OptionError("windows_px must not be empty, nor max_corners below min_tracks")
-        check_ranges(
-            self,
-            positive=(
-                *("tracking_iterations", "tracking_step_px"),
-                *("max_round_trip_px", "inlier_threshold"),
-            ),
-            not_negative=("pyramid_levels", "min_track_gain", "min_pixel_gain"),
-            between={
-                "max_rounds": (1, math.inf),
-                "min_tracks": (4, math.inf),
-                "max_corners": (4, math.inf),
-                "windows_px": (5, math.inf),
-                "ignored_fraction": (0, 0.99),
-            },
-        )
-        if self.blur_sigmas_px:
-            check_ranges(self, positive=("blur_sigmas_px",))
+IRLS_ITERATIONS = 30
+
+ALIGNMENT_SIDE_PX = 480
+"""Longer side of the copies on which all pixels are aligned, where the images are larger."""
+
+ALIGNMENT_SIGMA_PX = 1.0
+"""Of the blur of these copies."""
+
+ALIGNMENT_ITERATIONS = 15
+
+SQUARES = 8
+"""Along the longer side of the image."""
+
+STEP_PX = WINDOW_PX // 3
+"""Between the windows in which images are compared."""
+
+Fit = Callable[[np.ndarray], "np.ndarray | None"]
+"""From the (H, W) bool mask of the pixels that may be used to a correction, (3, 3)."""
 
 
-@suggest_keywords
-@dataclass(frozen=True)
-class IrlsOptions:
-    """How a homography is fitted to most of the image.
-
-    Attributes:
-        window_px: side of the tracked windows in pixels.
-        cauchy_scale_px: a track with this residual has half the weight of an exact one.
-        max_iterations: of reweighted least squares.
-        max_alignment_error_px: up to which a pixel counts as aligned.
-        alignment_window_px: side of the window around a pixel by which its error is measured.
-        min_gain: the fit is taken when it aligns this many times as many pixels.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    window_px: int = 31
-    cauchy_scale_px: float = 1.0
-    max_iterations: int = 30
-    max_alignment_error_px: float = 0.5
-    alignment_window_px: int = 41
-    min_gain: float = 1.1
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("cauchy_scale_px", "max_alignment_error_px"),
-            not_negative=("max_iterations", "min_gain"),
-            odd=("alignment_window_px",),
-            between={"window_px": (5, math.inf)},
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Refinement:
-    """A refined homography.
-
-    Attributes:
-        homography: (3, 3) from the first image to the second, its last element 1.
-        zncc: median local ZNCC of the images under it.
-        initial_zncc: the same under the initial homography.
-        steps: number of steps that were kept.
-    """
-
-    homography: np.ndarray
-    zncc: float
-    initial_zncc: float
-    steps: int
-
-
-def refine_homography(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    homography: np.ndarray,
-    options: RefinementOptions = RefinementOptions(),
-) -> Refinement:
-    """Refine a homography by the two images.
+def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Refine a homography, keeping what holds on parts of the image that it was not fitted to.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
         homography: (3, 3) from the first to the second, right within some ten pixels.
-        options: how.
 
     Returns:
-        The best homography found; the initial one when no step improved it.
+        (3, 3), its last element 1; the initial one where nothing better was found.
+
+    Example:
+        >>> scene = np.random.default_rng(0).integers(0, 256, (40, 40)).astype(np.uint8)
+        >>> scene = cv2.resize(scene, (240, 240), interpolation=cv2.INTER_CUBIC)
+        >>> start = np.array([[1, 0, -12], [0, 1, 1], [0, 0, 1.0]])
+        >>> found = refine_homography(scene[:, :200], scene[:, 10:210], start)
+        >>> bool(np.abs(found[:2, 2] - (-10, 0)).max() < 0.1)
+        True
     """
-    current = np.asarray(homography, np.float64)
-    initial = best = median_local_zncc(gray0, gray1, current)
-    steps = [
-        *(
-            (partial(_track, gray0, window_px=side, options=options), options.min_track_gain)
-            for side in options.windows_px
-        ),
-        *(
-            (partial(_align, gray0, sigma_px=sigma, options=options), options.min_pixel_gain)
-            for sigma in options.blur_sigmas_px
-        ),
+    size = (gray0.shape[1], gray0.shape[0])
+    blurred = gaussian_blur(gray0, BLUR_SIGMA_PX)
+    half, inner = _halves(size)
+
+    def correlation(warped: np.ndarray, valid_mask: np.ndarray) -> np.ndarray:
+        known = erode_mask(valid_mask, BLUR_SIGMA_PX)
+        return local_zncc(blurred, gaussian_blur(warped, BLUR_SIGMA_PX), known, step_px=STEP_PX)
+
+    equalised = equalise(gray0)
+    steps: list[Callable[[np.ndarray, np.ndarray], Fit | None]] = [
+        partial(_fit_to_corners, equalised, *settings) for settings in TRACKING_ROUNDS
     ]
-    kept = 0
-    for _ in range(options.max_rounds):
-        kept_before = kept
-        for step, min_gain in steps:
-            correction = step(*warp_to_reference(gray1, current, (gray0.shape[1], gray0.shape[0])))
-            if correction is None:
-                continue
-            candidate = current @ correction
-            zncc = median_local_zncc(gray0, gray1, candidate)
-            if zncc > best + min_gain:
-                current, best, kept = candidate, zncc, kept + 1
-        if kept == kept_before:
-            break
-    return Refinement(current / current[2, 2], best, initial, kept)
+    steps.append(partial(_fit_to_pixels, gray0))
+    current = np.asarray(homography, np.float64)
+    for step in steps:
+        warped, valid_mask = warp_to_reference(gray1, current, size)
+        fit = step(warped, valid_mask)
+        halves = [fit(half), fit(~half)] if fit is not None else [None]
+        views = [warp_to_reference(gray1, current @ one, size) for one in halves if one is not None]
+        if fit is None or len(views) < 2:
+            continue
+        (mixed, mixed_mask), (other, other_mask) = views
+        np.copyto(mixed, other, where=half)
+        np.copyto(mixed_mask, other_mask, where=half)
+        gain = correlation(mixed, mixed_mask) - correlation(warped, valid_mask)
+        # On how many more windows it is better than worse. Not the mean: a compromise between a
+        # plane and what lies off it raises that, too.
+        gain = gain[inner & np.isfinite(gain)]
+        correction = fit(valid_mask) if np.sign(gain).sum() > 0 else None
+        if correction is not None:
+            current = current @ correction
+    return current / current[2, 2]
 
 
-def _align(
-    gray0: np.ndarray,
+def _fit_to_corners(
+    equalised: np.ndarray,
+    window_px: int,
+    max_corners: int,
+    levels: int,
     warped: np.ndarray,
     valid_mask: np.ndarray,
-    *,
-    sigma_px: float,
-    options: RefinementOptions,
-) -> np.ndarray | None:
-    """Return the homography from the first image to the warped second one, by all pixels (ECC)."""
-    # Blur first, then windows reach over the border.
-    inside = erode_mask(erode_mask(valid_mask, sigma_px), WINDOW_PX / 6)
-    first, second = (gaussian_blur(gray, sigma_px) for gray in (gray0, warped))
-    zncc = local_zncc(first, second, inside)
-    if not np.isfinite(zncc).any():
-        return None
-    inside = zncc > np.nanquantile(zncc, options.ignored_fraction)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-6)
-    try:
-        _, correction = cv2.findTransformECC(
-            normalise_local_contrast(first),
-            normalise_local_contrast(second),
-            np.eye(3, dtype=np.float32),
-            cv2.MOTION_HOMOGRAPHY,
-            criteria,
-            inside.astype(np.uint8),
-            1,
-        )
-    except cv2.error:  # it does not converge, or there is nothing to correlate
-        return None
-    return correction.astype(np.float64)
+) -> Fit | None:
+    """Track corners, and return the fit to those in a part of the image.
 
-
-def _track(
-    gray0: np.ndarray,
-    warped: np.ndarray,
-    valid_mask: np.ndarray,
-    *,
-    window_px: int,
-    options: RefinementOptions,
-) -> np.ndarray | None:
-    """Return the homography from the first image to the warped second one, by corners."""
-    equalised = equalise(gray0), equalise(warped)
-    corners = track_corners(*equalised, valid_mask, window_px, options)
-    if corners is None:
-        return None
-    return cv2.findHomography(
-        *corners,
-        cv2.USAC_MAGSAC,
-        options.inlier_threshold,
-        maxIters=5000,
-        confidence=0.9999,
-    )[0]
-
-
-def track_corners(
-    first: np.ndarray,
-    second: np.ndarray,
-    valid_mask: np.ndarray,
-    window_px: int,
-    options: RefinementOptions = RefinementOptions(),
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Track corners from one image to another in the same frame, and back.
-
-    Args:
-        first, second: (H, W) uint8, after `equalise`.
-        valid_mask: (H, W) bool, where the second has content.
-        window_px: side of the tracked windows.
-        options: of the tracking.
-
-    Returns:
-        (N, 2) float32 positions in both; None with fewer than `min_tracks`.
+    Least squares with weights: right on most of an image that no single homography fits (a lens
+    that bends lines, a wall that is not quite flat), where a consensus is another one each time.
     """
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
-    corners = cv2.goodFeaturesToTrack(first, options.max_corners, 0.001, 5, mask=inside)
-    if corners is None or len(corners) < options.min_tracks:
+    corners = cv2.goodFeaturesToTrack(equalised, max_corners, 0.001, 5, mask=inside)
+    if corners is None or len(corners) < MIN_TRACKS:
         return None
-    parameters = {
-        "winSize": (window_px, window_px),
-        "maxLevel": options.pyramid_levels,
-        "criteria": (
-            cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT,
-            options.tracking_iterations,
-            options.tracking_step_px,
-        ),
-    }
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, **parameters)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, **parameters)
-    gap = np.linalg.norm((back - corners).reshape(-1, 2), axis=1)
-    good = (found.ravel() > 0) & (found_back.ravel() > 0) & (gap < options.max_round_trip_px)
-    if good.sum() < options.min_tracks:
+    start = corners.reshape(-1, 2)
+    end, gaps = track_round_trip(
+        equalised,
+        equalise(warped),
+        start,
+        window_px,
+        levels=levels,
+        iterations=TRACKING_ITERATIONS,
+        step_px=TRACKING_STEP_PX,
+    )
+    good = gaps < MAX_ROUND_TRIP_PX
+    if np.count_nonzero(good) < MIN_TRACKS:
         return None
-    return corners.reshape(-1, 2)[good], there.reshape(-1, 2)[good]
+    start, end = start[good], end[good]
+    x, y = np.rint(start).astype(np.int64).T
+
+    def least_squares(used: np.ndarray) -> np.ndarray | None:
+        chosen = used[y, x]
+        if np.count_nonzero(chosen) < MIN_TRACKS:
+            return None
+        return fit_homography_irls(start[chosen], end[chosen])
+
+    return least_squares
 
 
-def refine_homography_irls(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    homography: np.ndarray,
-    options: IrlsOptions = IrlsOptions(),
-) -> np.ndarray:
-    """Return a homography that aligns clearly more pixels, or the initial one.
+def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray) -> Fit:
+    """Return the alignment of all pixels (ECC), which has the least noise."""
+    (first, scale), (second, _) = (downscale(gray, ALIGNMENT_SIDE_PX) for gray in (gray0, warped))
+    normalised = [
+        normalise_local_contrast(gaussian_blur(gray, ALIGNMENT_SIGMA_PX))
+        for gray in (first, second)
+    ]
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ALIGNMENT_ITERATIONS, 1e-5)
 
-    Returns:
-        (3, 3), its last element 1.
-    """
-    size = (gray0.shape[1], gray0.shape[0])
-    warped, valid_mask = warp_to_reference(gray1, homography, size)
-    equalised = equalise(gray0), equalise(warped)
-    corners = track_corners(*equalised, valid_mask, options.window_px)
-    if corners is None:
-        return homography
-    correction = fit_homography_irls(*corners, options)
-    if correction is None:
-        return homography
-    candidate = homography @ correction
-    before = aligned_fraction(gray0, warped, valid_mask, options)
-    after = aligned_fraction(gray0, *warp_to_reference(gray1, candidate, size), options)
-    return candidate / candidate[2, 2] if after > options.min_gain * before else homography
+    def align(used: np.ndarray) -> np.ndarray | None:
+        mask = (used & valid_mask).astype(np.uint8)
+        mask = cv2.resize(mask, first.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        start = np.eye(3, dtype=np.float32)
+        try:
+            found = cv2.findTransformECC(
+                *normalised, start, cv2.MOTION_HOMOGRAPHY, criteria, mask, 1
+            )[1]
+        except cv2.error:  # it does not converge, or there is nothing to correlate
+            return None
+        return scaled_homography(found.astype(np.float64), 1 / scale, 1 / scale)
+
+    return align
 
 
-def fit_homography_irls(
-    points0: np.ndarray, points1: np.ndarray, options: IrlsOptions = IrlsOptions()
-) -> np.ndarray | None:
+def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
     """Fit a homography by iteratively reweighted least squares with Cauchy weights.
 
     Returns:
@@ -336,11 +206,11 @@ def fit_homography_irls(
     inwards = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, spread]]) / spread
     first, second = ((points - middle) / spread for points in (points0, points1))
     homography = np.eye(3)
-    for _ in range(options.max_iterations):
+    for _ in range(IRLS_ITERATIONS):
         depth = first @ homography[2, :2] + 1
         mapped = transform_points(first, homography)
         gaps = second - mapped
-        weight = 1 / (1 + (gaps**2).sum(axis=1) * (spread / options.cauchy_scale_px) ** 2)
+        weight = 1 / (1 + (gaps**2).sum(axis=1) * (spread / CAUCHY_SCALE_PX) ** 2)
         place = np.column_stack([first, np.ones(len(first))]) / depth[:, None]
         none = np.zeros_like(place)
         across = np.column_stack([place, none, -mapped[:, :1] * place[:, :2]])
@@ -360,32 +230,17 @@ def fit_homography_irls(
     return found / found[2, 2]
 
 
-def aligned_fraction(
-    gray0: np.ndarray,
-    warped: np.ndarray,
-    valid_mask: np.ndarray,
-    options: IrlsOptions = IrlsOptions(),
-) -> float:
-    """Return the fraction of the valid pixels that are aligned, in [0, 1].
+def _halves(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Divide an image into squares, as those of a chessboard.
 
-    The error of a pixel is the length of one Lucas-Kanade step over the window around it, after
-    both images are equalised.
+    Returns:
+        Which pixels lie on squares of the second colour, (H, W) bool, and whether the blurred
+        windows of `local_zncc` lie within their squares, (H // STEP_PX, W // STEP_PX) bool.
     """
-    if not valid_mask.any():
-        return 0.0
-    first, second = (gaussian_blur(equalise(gray), 1) for gray in (gray0, warped))
-    x, y = (cv2.Scharr(first, cv2.CV_32F, *order) / 32 for order in ((1, 0), (0, 1)))
-    window = (options.alignment_window_px, options.alignment_window_px)
-    change = second - first
-    change -= cv2.blur(change, window)
-    xx, xy, yy, xt, yt = (
-        cv2.blur(product, window) for product in (x * x, x * y, y * y, x * change, y * change)
-    )
-    determinant = xx * yy - xy * xy + 1e-3
-    error_px = np.hypot(yy * xt - xy * yt, xx * yt - xy * xt) / determinant
-    return float((error_px[valid_mask] <= options.max_alignment_error_px).mean())
-
-
-def equalise(gray: np.ndarray) -> np.ndarray:
-    """Equalise an image locally, so that changes of light are not taken for motion."""
-    return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)
+    margin = WINDOW_PX // 2 + int(np.ceil(3 * BLUR_SIGMA_PX))
+    side = max(max(size) / SQUARES, 4 * margin)
+    row, column = np.ogrid[: size[1], : size[0]]
+    half = (column // side + row // side) % 2 == 1
+    near = [np.minimum(line % side, side - line % side) for line in (row, column)]
+    inner = np.minimum(*near)[STEP_PX // 2 :: STEP_PX, STEP_PX // 2 :: STEP_PX] > margin
+    return half, inner[: size[1] // STEP_PX, : size[0] // STEP_PX]

@@ -7,43 +7,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges, suggest_keywords
 from .camera import Calibration
 from .estimation import GeometryOptions, estimate_geometry
 from .residuals import epipolar_errors, signed_epipolar_errors
 from .triangulation import fundamental_matrix, triangulate
 
+MAX_ITERATIONS = 10
+"""Of Gauss-Newton."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class PoseRefinementOptions:
-    """How a pose is refined.
+DERIVATIVE_STEP = 1e-6
+"""By which the pose is varied for its derivatives, in radians."""
 
-    Attributes:
-        max_iterations: of Gauss-Newton.
-        derivative_step: by which the pose is varied for its derivatives, in radians.
-        min_change: a smaller change of the pose, in radians, ends the refinement.
-        max_refits: how often the pose is fitted to its own inliers again ...
-        min_inlier_gain: ... while that gives this fraction of further inliers.
-        max_matches: that are used, sampled evenly: more do not improve the pose.
+MIN_CHANGE = 1e-9
+"""A smaller change of the pose, in radians, ends the refinement."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+MAX_REFITS = 4
+"""How often the pose is fitted to its own inliers again ..."""
 
-    max_iterations: int = 10
-    derivative_step: float = 1e-6
-    min_change: float = 1e-9
-    max_refits: int = 4
-    min_inlier_gain: float = 0.01
-    max_matches: int = 50_000
+MIN_INLIER_GAIN = 0.01
+"""... while that gives this fraction of further inliers."""
 
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("derivative_step", "max_matches"),
-            not_negative=("max_iterations", "min_change", "max_refits", "min_inlier_gain"),
-        )
+MAX_MATCHES = 50_000
+"""That are used, sampled evenly: more do not improve the pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +73,6 @@ def estimate_relative_pose(
     inlier_threshold: float = 1.0,
     seed: int = 0,
     refine: bool = True,
-    options: PoseRefinementOptions = PoseRefinementOptions(),
 ) -> RelativePose | None:
     """Estimate the pose: essential matrix by MAGSAC, then the best of its four poses (cheirality).
 
@@ -98,7 +82,6 @@ def estimate_relative_pose(
         inlier_threshold: Sampson distance in pixels.
         seed: of the random samples.
         refine: fit the pose to all inliers afterwards (`refine_pose`).
-        options: of the refinement.
 
     Returns:
         The pose, or None when there are too few matches or it cannot be estimated.
@@ -113,7 +96,7 @@ def estimate_relative_pose(
     )
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    every = -(-len(points0) // options.max_matches) if refine and len(points0) else 1
+    every = -(-len(points0) // MAX_MATCHES) if refine and len(points0) else 1
     geometry = estimate_geometry(
         points0[::every], points1[::every], "essential", seed=seed, options=essential
     )
@@ -122,21 +105,21 @@ def estimate_relative_pose(
     kept = np.zeros(len(points0), bool)
     kept[::every] = geometry.inliers
     inliers = points0[kept], points1[kept]
-    pose = best_of_four(geometry.matrix, *inliers, calibration, options.max_matches)
-    for _ in range(options.max_refits if refine else 0):
+    pose = best_of_four(geometry.matrix, *inliers, calibration, MAX_MATCHES)
+    for _ in range(MAX_REFITS if refine else 0):
         inliers = points0[kept], points1[kept]
-        pose = refine_pose(*inliers, calibration, *pose, scale_px=inlier_threshold, options=options)
+        pose = refine_pose(*inliers, calibration, *pose, scale_px=inlier_threshold)
         before = np.count_nonzero(kept)
         errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
         kept = errors < inlier_threshold
-        if np.count_nonzero(kept) <= before * (1 + options.min_inlier_gain):
+        if np.count_nonzero(kept) <= before * (1 + MIN_INLIER_GAIN):
             break
     errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
     kept = errors < inlier_threshold
     if not kept.any():
         return None
     sample = np.flatnonzero(kept)
-    sample = sample[:: -(-len(sample) // options.max_matches)]
+    sample = sample[:: -(-len(sample) // MAX_MATCHES)]
     ratio = _cheirality_ratio(points0[sample], points1[sample], calibration, *pose)
     return RelativePose(*pose, inliers=kept, errors=errors, cheirality_ratio=ratio)
 
@@ -148,7 +131,6 @@ def refine_pose(
     rotation: np.ndarray,
     translation: np.ndarray,
     scale_px: float = 1.0,
-    options: PoseRefinementOptions = PoseRefinementOptions(),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit a pose to matches: Sampson distances with a Cauchy loss, by Gauss-Newton.
 
@@ -159,12 +141,11 @@ def refine_pose(
         calibration: of both cameras.
         rotation, translation: initial pose.
         scale_px: a match with half this error has half the weight of an exact one.
-        options: of the refinement.
 
     Returns:
         (3, 3) rotation and (3,) translation of length 1; never worse than the initial pose.
     """
-    every = -(-len(points0) // options.max_matches)
+    every = -(-len(points0) // MAX_MATCHES)
     points0, points1 = points0[::every], points1[::every]
 
     def residuals(pose: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -176,14 +157,13 @@ def refine_pose(
     pose = rotation, translation / np.linalg.norm(translation)
     here = residuals(pose)
     best = cost(here)
-    for _ in range(options.max_iterations):
-        step = options.derivative_step
-        varied = (residuals(moved_pose(pose, axis)) for axis in np.eye(5) * step)
-        slopes = np.column_stack([(there - here) / step for there in varied])
+    for _ in range(MAX_ITERATIONS):
+        varied = (residuals(moved_pose(pose, axis)) for axis in np.eye(5) * DERIVATIVE_STEP)
+        slopes = np.column_stack([(there - here) / DERIVATIVE_STEP for there in varied])
         weights = 1 / (1 + (here / (scale_px / 2)) ** 2)
         normal = slopes.T @ (slopes * weights[:, None])
         change = -np.linalg.lstsq(normal, slopes.T @ (weights * here), rcond=None)[0]
-        while np.abs(change).max() > options.min_change:
+        while np.abs(change).max() > MIN_CHANGE:
             there = moved_pose(pose, change)
             values = residuals(there)
             if cost(values) < best:

@@ -20,7 +20,6 @@ from functools import cached_property
 import numpy as np
 
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges, suggest_keywords
 from .acontrario import log10_nfa
 from .camera import Calibration, Camera
 from .relative_pose import best_of_four, moved_pose
@@ -39,49 +38,33 @@ MIN_MATCHES = 6
 """One more than give an essential matrix."""
 
 
-@suggest_keywords
-@dataclass(frozen=True)
-class SemiCalibratedOptions:
-    """What is assumed of both cameras.
+FOCAL_LENGTHS = (0.7, 1.4)
+"""That are tried, in units of the longer side of the image: as good as all from a wide angle of 90
+degrees to a telephoto lens of 28."""
 
-    Attributes:
-        focal_lengths: that are tried, in units of the longer side of the image: as good as all from
-            a wide angle of 90 degrees to a telephoto lens of 28.
-        confidence: desired probability that a model is the best one.
-        iterations: maximum number for each focal length.
-        focal_spread: standard deviation of the focal length from one longer side, as a factor's
-            natural logarithm.
-        focal_difference: the same of one camera's focal length from the other's.
-        principal_point_spread: standard deviation of the principal point from the middle of the
-            image, in units of the longer side.
-        match_sigma_px: standard deviation of right matches from their epipolar lines.
-        max_fits: how often pose and cameras are fitted to the matches that agree with them.
-        max_iterations: of each fit (Levenberg-Marquardt).
+CONFIDENCE = 0.9999
+"""Desired probability that a model is the best one."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+ITERATIONS = 5000
+"""Maximum number for each focal length."""
 
-    focal_lengths: tuple[float, ...] = (0.7, 1.4)
-    confidence: float = 0.9999
-    iterations: int = 5000
-    focal_spread: float = 0.7
-    focal_difference: float = 0.03
-    principal_point_spread: float = 0.03
-    match_sigma_px: float = 0.5
-    max_fits: int = 4
-    max_iterations: int = 20
+FOCAL_SPREAD = 0.7
+"""Standard deviation of the focal length from one longer side, as a factor's natural logarithm."""
 
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=(
-                *("focal_lengths", "iterations", "focal_spread", "focal_difference"),
-                *("principal_point_spread", "match_sigma_px"),
-            ),
-            not_negative=("max_fits", "max_iterations"),
-            between={"confidence": (0, 1)},
-        )
+FOCAL_DIFFERENCE = 0.03
+"""The same of one camera's focal length from the other's."""
+
+PRINCIPAL_POINT_SPREAD = 0.03
+"""Standard deviation of the principal point from the middle of the image, in longer sides."""
+
+MATCH_SIGMA_PX = 0.5
+"""Standard deviation of right matches from their epipolar lines."""
+
+MAX_FITS = 4
+"""How often pose and cameras are fitted to the matches that agree with them."""
+
+MAX_ITERATIONS = 20
+"""Of each fit (Levenberg-Marquardt)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +88,6 @@ def estimate_semi_calibrated(
     sizes: tuple[Size, Size],
     inlier_threshold: float = 1.5,
     seed: int = 0,
-    options: SemiCalibratedOptions = SemiCalibratedOptions(),
 ) -> SemiCalibratedGeometry | None:
     """Estimate a fundamental matrix from matches, many of which may be wrong.
 
@@ -114,7 +96,6 @@ def estimate_semi_calibrated(
         sizes: (width, height) of both images.
         inlier_threshold: Sampson distance in pixels.
         seed: of the random samples.
-        options: what is assumed of the cameras.
 
     Returns:
         The geometry; None with too few matches, or where nothing could be estimated.
@@ -136,14 +117,12 @@ def estimate_semi_calibrated(
     # OpenCV draws the same samples every time; another order of the matches draws others.
     order = np.random.default_rng(seed).permutation(len(points0))
     best = start = None
-    for focal in options.focal_lengths:
+    for focal in FOCAL_LENGTHS:
         cameras = _Cameras.guess(sizes, focal)
-        matrix = _fit_essential(points0[order], points1[order], cameras, inlier_threshold, options)
+        matrix = _fit_essential(points0[order], points1[order], cameras, inlier_threshold)
         if matrix is None:
             continue
-        found = _judge(
-            _fundamental(matrix, cameras), sizes, points0, points1, inlier_threshold, options
-        )
+        found = _judge(_fundamental(matrix, cameras), sizes, points0, points1, inlier_threshold)
         if best is None or found.log10_nfa < best.log10_nfa:
             best, start = found, (matrix, cameras)
     if best is None or start is None or np.count_nonzero(best.inliers) < MIN_MATCHES:
@@ -151,10 +130,10 @@ def estimate_semi_calibrated(
     essential, cameras = start
     inliers = points0[best.inliers], points1[best.inliers]
     here = _View(best_of_four(essential, *inliers, cameras.calibration, len(order)), cameras)
-    for _ in range(options.max_fits):
+    for _ in range(MAX_FITS):
         inliers = points0[best.inliers], points1[best.inliers]
-        here = _fit(here, *inliers, np.full(len(inliers[0]), options.match_sigma_px), options)
-        found = _judge(here.fundamental, sizes, points0, points1, inlier_threshold, options)
+        here = _fit(here, *inliers, np.full(len(inliers[0]), MATCH_SIGMA_PX))
+        found = _judge(here.fundamental, sizes, points0, points1, inlier_threshold)
         if found.log10_nfa > best.log10_nfa:
             break
         hopeless = best.log10_nfa == found.log10_nfa > 0
@@ -170,7 +149,6 @@ def refine_fundamental(
     fundamental: np.ndarray,
     sizes: tuple[Size, Size],
     match_sigmas_px: np.ndarray,
-    options: SemiCalibratedOptions = SemiCalibratedOptions(),
 ) -> np.ndarray:
     """Fit a fundamental matrix to matches that are mostly right, and to what cameras usually are.
 
@@ -181,7 +159,6 @@ def refine_fundamental(
         fundamental: (3, 3) with x1^T F x0 = 0, to begin with.
         sizes: (width, height) of both images.
         match_sigmas_px: (M,) standard deviations of the matches from their epipolar lines.
-        options: what is assumed of the cameras; `match_sigma_px` has no effect.
 
     Returns:
         (3, 3) fundamental matrix of norm 1; the given one with too few matches.
@@ -191,7 +168,7 @@ def refine_fundamental(
     cameras, essential = _nearest_cameras(fundamental, sizes)
     pose = best_of_four(essential, points0, points1, cameras.calibration, len(points0))
     start = _View(pose, cameras)
-    matrix = _fit(start, points0, points1, match_sigmas_px, options).fundamental
+    matrix = _fit(start, points0, points1, match_sigmas_px).fundamental
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
@@ -247,11 +224,11 @@ class _Cameras:
         offsets = self.offsets + change[2:].reshape(2, 2)
         return _Cameras(self.sizes, self.log_focal + change[:2], offsets)
 
-    def deviations(self, options: SemiCalibratedOptions) -> np.ndarray:
+    def deviations(self) -> np.ndarray:
         """Return by how many standard deviations they are unusual, (6,)."""
         mean, difference = self.log_focal.mean(), self.log_focal[0] - self.log_focal[1]
-        of_focal = [mean / options.focal_spread, difference / options.focal_difference]
-        return np.append(of_focal, self.offsets / options.principal_point_spread)
+        of_focal = [mean / FOCAL_SPREAD, difference / FOCAL_DIFFERENCE]
+        return np.append(of_focal, self.offsets / PRINCIPAL_POINT_SPREAD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +253,6 @@ def _fit_essential(
     points1: np.ndarray,
     cameras: _Cameras,
     inlier_threshold: float,
-    options: SemiCalibratedOptions,
 ) -> np.ndarray | None:
     """Return an essential matrix by MAGSAC."""
     calibration = cameras.calibration
@@ -292,9 +268,9 @@ def _fit_essential(
             second,
             np.diag([focal, focal, 1.0]),
             method=cv2.USAC_MAGSAC,
-            prob=options.confidence,
+            prob=CONFIDENCE,
             threshold=inlier_threshold,
-            maxIters=options.iterations,
+            maxIters=ITERATIONS,
         )
     except cv2.error:  # degenerate input, as all points in one place
         return None
@@ -315,13 +291,12 @@ def _judge(
     points0: np.ndarray,
     points1: np.ndarray,
     inlier_threshold: float,
-    options: SemiCalibratedOptions,
 ) -> SemiCalibratedGeometry:
     """Count the matches that agree, and how likely that is by chance."""
-    errors = epipolar_errors(points0, points1, fundamental)
-    tried = MODELS_PER_SAMPLE * len(options.focal_lengths)
-    alarms = log10_nfa(errors, "essential", inlier_threshold, sizes[1], tried)
-    return SemiCalibratedGeometry(fundamental, errors < inlier_threshold, alarms)
+    inliers = epipolar_errors(points0, points1, fundamental) < inlier_threshold
+    tried = MODELS_PER_SAMPLE * len(FOCAL_LENGTHS)
+    alarms = log10_nfa(inliers, "essential", inlier_threshold, sizes[1], tried)
+    return SemiCalibratedGeometry(fundamental, inliers, alarms)
 
 
 def _fit(
@@ -329,13 +304,12 @@ def _fit(
     points0: np.ndarray,
     points1: np.ndarray,
     sigmas: np.ndarray,
-    options: SemiCalibratedOptions,
 ) -> _View:
     """Fit pose and cameras to matches, with a Cauchy loss, and to what is usual (MAP estimate)."""
 
     def residuals(view: _View) -> np.ndarray:
         errors = signed_epipolar_errors(points0, points1, view.fundamental)
-        return np.append(errors / sigmas, view.cameras.deviations(options))
+        return np.append(errors / sigmas, view.cameras.deviations())
 
     def cost(values: np.ndarray) -> float:
         matches, usual = values[: len(points0)], values[len(points0) :]
@@ -344,7 +318,7 @@ def _fit(
     step, damping = 1e-6, 1e-3
     here = residuals(view)
     best = cost(here)
-    for _ in range(options.max_iterations):
+    for _ in range(MAX_ITERATIONS):
         varied = (residuals(view.moved(axis)) for axis in np.eye(11) * step)
         slopes = np.column_stack([(there - here) / step for there in varied])
         weights = np.ones(len(here))

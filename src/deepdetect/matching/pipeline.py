@@ -88,7 +88,7 @@ def match_images(
             the same matches whichever image comes first.
         tentative_matches: a few matches of any other matcher (LightGlue, LoFTR, a person's clicks),
             two (K, 2) arrays of positions, row by row; they take the place of our own SIFT matches
-            that guide, and some may be wrong. Or what `tentative_matches` has made already.
+            that guide, and some may be wrong. Or what `find_tentative_matches` has made already.
         seed: of all random choices.
         options: all else.
         progress: called with the name of each stage when it ends.

@@ -1,1 +1,1 @@
-"""Two photographs in, points in space out: calibration, pose, triangulation, what is wrong."""
+"""Two images in, points in space out: calibration, pose, triangulation, what is wrong."""

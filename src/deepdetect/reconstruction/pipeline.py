@@ -1,4 +1,4 @@
-"""Two photographs in, coloured 3D points out (paper, Figure 8).
+"""Two images in, coloured 3D points out (paper, Figure 8).
 
 General pairs: keypoints -> matches -> pose -> triangulation -> checks. Rectified pairs: a dense
 disparity map, from which the keypoints of the left image take their points.
@@ -28,9 +28,8 @@ from ..matching.pipeline import LoadedPair, match_pair
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .checks import check_images
 from .outliers import PointFilterOptions, sor_inliers_on_grid
-from .rectification import Rectification, RectificationOptions, find_rectification
+from .rectification import Rectification, find_rectification
 from .rectified_checks import (
-    RectifiedCheckOptions,
     check_cameras,
     check_depths,
     check_disparities,
@@ -39,7 +38,7 @@ from .rectified_checks import (
     check_pure_rotation,
 )
 from .result import Reconstruction
-from .two_view import TwoViewOptions, reconstruct_two_view
+from .two_view import reconstruct_two_view
 
 
 @suggest_keywords
@@ -48,18 +47,12 @@ class ReconstructionOptions:
     """How a pair becomes points.
 
     Attributes:
-        rectification: when a pair counts as rectified.
         disparity: the disparity map of rectified pairs; None: `DENSE` for a density of 1, else the
             strict default.
-        rectified_checks: thresholds of the checks of rectified pairs.
-        two_view: all stages of pairs that are not rectified, with their checks.
         point_filter: which points are kept.
     """
 
-    rectification: RectificationOptions = field(default_factory=RectificationOptions)
     disparity: DisparityOptions | None = None
-    rectified_checks: RectifiedCheckOptions = field(default_factory=RectifiedCheckOptions)
-    two_view: TwoViewOptions = field(default_factory=TwoViewOptions)
     point_filter: PointFilterOptions = field(default_factory=PointFilterOptions)
 
 
@@ -79,7 +72,7 @@ def reconstruct(
     options: ReconstructionOptions = ReconstructionOptions(),
     progress: Callable[[str], object] | None = None,
 ) -> Reconstruction:
-    """Reconstruct a scene from two photographs.
+    """Reconstruct a scene from two images.
 
     For a rectified pair the detector only chooses which pixels of a dense disparity map become
     points; `disparity_map` gives that map without a detector.
@@ -126,15 +119,13 @@ def reconstruct(
     images, grays = loaded.rgb, loaded.gray
     sizes = (images[0].shape[1], images[0].shape[0]), (images[1].shape[1], images[1].shape[0])
     known = _calibration(calibration, focal_px, (left, right), sizes)
-    check_images(*grays, options.two_view.checks.copy)
+    check_images(*grays)
     timer = StageTimer(progress)
-    initial = rectification = None
+    tentative = rectification = None
     is_rectified = rectified
     if is_rectified is None:
         with timer.stage("rectified or not"):
-            rectification, initial = find_rectification(
-                *grays, known.disparity_offset_px, seed, options.rectification
-            )
+            rectification, tentative = find_rectification(*grays, known.disparity_offset_px, seed)
         is_rectified = rectification.rectified
         if rectification.swapped:
             offset = known.disparity_offset_px
@@ -146,7 +137,7 @@ def reconstruct(
         detector = DeepDetect("dense")
     masks = ignore_masks(ignore, 2)
     pair = _Pair(
-        loaded, detector, selection, masks, known, seed, options, initial, rectification, timer
+        loaded, detector, selection, masks, known, seed, options, tentative, rectification, timer
     )
     return _reconstruct_rectified(pair) if is_rectified else _reconstruct_general(pair)
 
@@ -165,7 +156,7 @@ class _Pair:
     calibration: Calibration
     seed: int
     options: ReconstructionOptions
-    initial: TentativeMatches | None
+    tentative: TentativeMatches | None
     rectification: Rectification | None
     timer: StageTimer
 
@@ -174,11 +165,11 @@ def _reconstruct_rectified(pair: _Pair) -> Reconstruction:
     """Take the keypoints of the left image from the disparity map of the pair."""
     image, options = pair.loaded.rgb[0], pair.options
     calibration, timer = pair.calibration, pair.timer
-    checks, disparity_options = options.rectified_checks, options.disparity
+    disparity_options = options.disparity
     if disparity_options is None:
         every_pixel = pair.selection is not None and pair.selection.density == 1
         disparity_options = DENSE if every_pixel else DisparityOptions()
-    check_cameras(calibration, checks)
+    check_cameras(calibration)
     with timer.stage("keypoints"):
         keypoints = find_keypoints(pair.detector, image, _whole_pixels(pair), pair.masks[0])
         # Disparities are those of pixels.
@@ -188,11 +179,11 @@ def _reconstruct_rectified(pair: _Pair) -> Reconstruction:
         found = compute_disparity(*pair.loaded.gray, disparity_options).at(keypoints)
     matched = found.matched
     unique = disparity_options.uniqueness_ratio > 1
-    check_matched(int(np.count_nonzero(matched)), len(keypoints), unique, checks)
-    check_disparities(found.disparity, checks)
+    check_matched(int(np.count_nonzero(matched)), len(keypoints), unique)
+    check_disparities(found.disparity)
     pixels, disparity = keypoints.xy[found.indices], found.disparity
-    check_pure_rotation(pixels[matched], disparity[matched], calibration, checks.rotation)
-    check_depths(disparity, calibration, checks)
+    check_pure_rotation(pixels[matched], disparity[matched], calibration)
+    check_depths(disparity, calibration)
     size = (image.shape[1], image.shape[0])
     with timer.stage("triangulation"):
         depth = calibration.depth_mm(disparity)
@@ -257,14 +248,13 @@ def _reconstruct_general(pair: _Pair) -> Reconstruction:
             model="none",
             options=MatchingOptions(two_view_model="fundamental"),
             seed=pair.seed,
-            tentative_matches=pair.initial,
+            tentative_matches=pair.tentative,
         )
     made = reconstruct_two_view(
         found.points0,
         found.points1,
         pair.calibration,
         pair.loaded.gray,
-        options.two_view,
         options.point_filter,
         pair.seed,
         timer,
@@ -303,7 +293,7 @@ def _calibration(
     images: tuple[Any, Any],
     sizes: tuple[Size, Size],
 ) -> Calibration:
-    """Return the calibration that is given, or the one the photographs carry."""
+    """Return the calibration that is given, or the one the images carry."""
     if given is not None and focal_px is not None:
         raise ReconstructionError("give `calibration` or `focal_px`, not both")
     if isinstance(given, Calibration):

@@ -4,83 +4,55 @@ The rows are a model without any parameter. A pair is rectified when they explai
 matches as the best models with parameters do: a robust fundamental matrix, and rows that are
 shifted, tilted and scaled. What fraction of all matches that is does not matter: many may be wrong.
 
-Of large images small copies are looked at first. They decide where the answer is the same whatever
-they are too coarse to show; else larger copies do.
+Of large images small copies decide in a coarse pass where the answer is the same whatever they are
+too coarse to show; else larger copies do.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import grid_subsample
-from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
-from ..matching.guided import TentativeMatches, tentative_matches
-from ..matching.guided.options import InitialGeometryOptions
-from .checks import StaticOptions, is_planar, is_static
+from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_planar, is_static
+from ..matching.guided import TentativeMatches, find_tentative_matches
+
+MAX_ROW_DISTANCE_PX = 1.0
+"""Rows by which a match of a rectified pair may be off."""
+
+MIN_INLIER_RATIO = 0.9
+"""Matches on rows per match that the best other model explains."""
+
+MIN_DISPARITY_SPREAD_PX = 2.0
+"""Between the 5th and 95th percentile of the disparities of a pair with depth; whole pixels differ
+by one for no reason."""
+
+MIN_PLANAR_SPREAD_PX = 8.0
+"""The same for a pair that one homography explains: a slanted plane has as much, a camera that
+rotated a little does not."""
+
+GRID_SIZE_PX = 8
+"""Cells of the left image of this size give one match each."""
+
+ITERATIONS = 500
+"""Samples of three matches, for the rows that are shifted, tilted and scaled."""
 
 SAMPLES_AT_ONCE = 100
-"""Of three matches whose rows are computed together, which bounds the memory."""
+"""Of these, whose rows are computed together, which bounds the memory."""
 
+COARSE_SIDE_PX, COARSE_KEYPOINTS = 480, 1000
+"""Longer side of the copies of the coarse pass, and keypoints of each."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class RectificationOptions:
-    """When a pair counts as rectified.
+MIN_COARSE_INLIERS = 50
+"""Matches of the coarse pass that a fundamental matrix explains, with fewer of which it does not
+decide."""
 
-    Attributes:
-        max_row_distance_px: rows by which a match of a rectified pair may be off.
-        min_inlier_ratio: matches on rows per match that the best other model explains.
-        min_disparity_spread_px: between the 5th and 95th percentile of the disparities of a pair
-            with depth; whole pixels differ by one for no reason.
-        min_planar_spread_px: the same for a pair that one homography explains: a slanted plane has
-            as much, a camera that rotated a little does not.
-        max_transfer_error_px: within which a match agrees with the homography.
-        min_planar_ratio: matches of the homography per match of the fundamental matrix, of a plane.
-        grid_size_px: cells of the left image of this size give one match each.
-        iterations: samples of three matches, for the rows that are shifted, tilted and scaled.
-        static: when nothing moves.
-        first_side_px: longer sides are scaled down to this for a first look.
-        first_max_keypoints: of each image in the first look.
-        min_first_inliers: matches of the first look that a fundamental matrix explains, with fewer
-            of which it does not decide.
-        max_first_row_error_px: a pair is rectified after the first look only where its rows are off
-            by less than this at `min_inlier_ratio` of the matches. It is in pixels of the images
-            themselves: many matches show together what each is too coarse for.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    max_row_distance_px: float = 1.0
-    min_inlier_ratio: float = 0.9
-    min_disparity_spread_px: float = 2.0
-    min_planar_spread_px: float = 8.0
-    max_transfer_error_px: float = 2.0
-    min_planar_ratio: float = 0.75
-    grid_size_px: int = 8
-    iterations: int = 500
-    static: StaticOptions = field(default_factory=StaticOptions)
-    first_side_px: int = 480
-    first_max_keypoints: int = 1000
-    min_first_inliers: int = 50
-    max_first_row_error_px: float = 0.6
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=(
-                *("max_row_distance_px", "max_transfer_error_px", "grid_size_px", "iterations"),
-                *("first_side_px", "first_max_keypoints", "min_first_inliers"),
-            ),
-            not_negative=(
-                *("min_inlier_ratio", "min_planar_ratio", "max_first_row_error_px"),
-                *("min_disparity_spread_px", "min_planar_spread_px"),
-            ),
-        )
+MAX_COARSE_ROW_ERROR_PX = 0.6
+"""A pair is rectified after the coarse pass only where its rows are off by less than this at
+`MIN_INLIER_RATIO` of the matches. In pixels of the images themselves: many matches show together
+what each is too coarse for."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +93,6 @@ def find_rectification(
     gray1: np.ndarray,
     offset_px: float = 0.0,
     seed: int = 0,
-    options: RectificationOptions = RectificationOptions(),
 ) -> tuple[Rectification, TentativeMatches | None]:
     """Decide whether a pair of images is rectified, by the least effort that it takes.
 
@@ -129,10 +100,9 @@ def find_rectification(
         gray0, gray1: (H, W) uint8 luma.
         offset_px: what is added to a disparity before it gives the depth (calibration).
         seed: of the random samples.
-        options: the thresholds.
 
     Returns:
-        The decision, and the sparse matches of larger copies where they were needed for it.
+        The decision, and the tentative matches of larger copies where they were needed for it.
 
     Example:
         >>> import cv2
@@ -145,41 +115,37 @@ def find_rectification(
     size0, size1 = gray0.shape[::-1], gray1.shape[::-1]
     if size0 != size1:
         nowhere = np.empty((0, 2))
-        return detect_rectification(nowhere, nowhere, size0, size1, offset_px, seed, options), None
-    if max(size0) > options.first_side_px:
-        found = _first_look(gray0, gray1, offset_px, seed, options)
+        return detect_rectification(nowhere, nowhere, size0, size1, offset_px, seed), None
+    if max(size0) > COARSE_SIDE_PX:
+        found = _coarse_pass(gray0, gray1, offset_px, seed)
         if found is not None:
             return found, None
-    initial = tentative_matches(gray0, gray1)
-    points = initial.points0, initial.points1
-    return detect_rectification(*points, size0, size1, offset_px, seed, options), initial
+    tentative = find_tentative_matches(gray0, gray1)
+    points = tentative.points0, tentative.points1
+    return detect_rectification(*points, size0, size1, offset_px, seed), tentative
 
 
-def _first_look(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    offset_px: float,
-    seed: int,
-    options: RectificationOptions,
+def _coarse_pass(
+    gray0: np.ndarray, gray1: np.ndarray, offset_px: float, seed: int
 ) -> Rectification | None:
     """Decide from small copies of two images of one size; None where they leave it open."""
-    coarse = InitialGeometryOptions(max_side_px=options.first_side_px)
-    coarse = replace(coarse, sift=replace(coarse.sift, max_keypoints=options.first_max_keypoints))
-    initial = tentative_matches(gray0, gray1, options=coarse)
-    scale, size = initial.scales[0], initial.views[0].shape[::-1]
+    coarse = find_tentative_matches(
+        gray0, gray1, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
+    )
+    scale, size = coarse.scales[0], coarse.views[0].shape[::-1]
     # The thresholds are pixels of the copies: what they decide holds with a margin.
-    found = detect_rectification(*initial.matched, size, size, offset_px * scale, seed, options)
-    if found.by_fundamental < options.min_first_inliers:
+    found = detect_rectification(*coarse.matched, size, size, offset_px * scale, seed)
+    if found.by_fundamental < MIN_COARSE_INLIERS:
         return None
     if found.rectified:
-        on_rows = abs(found.disparities[1] + offset_px * scale) > options.max_row_distance_px
-        limit = options.max_first_row_error_px * scale
-        decided = on_rows and _row_error(*initial.matched, seed, options) < limit
+        on_rows = abs(found.disparities[1] + offset_px * scale) > MAX_ROW_DISTANCE_PX
+        limit = MAX_COARSE_ROW_ERROR_PX * scale
+        decided = on_rows and _row_error(*coarse.matched, seed) < limit
     else:
         best = max(found.by_fundamental, found.by_other_rows)
-        ratio = options.min_inlier_ratio
         # By three standard deviations of a binomial distribution.
-        decided = found.on_rows < ratio * best - 3 * np.sqrt(best * ratio * abs(1 - ratio))
+        deviation = np.sqrt(best * MIN_INLIER_RATIO * (1 - MIN_INLIER_RATIO))
+        decided = found.on_rows < MIN_INLIER_RATIO * best - 3 * deviation
     if not decided:
         return None
     low, median, high = (value / scale for value in found.disparities)
@@ -188,23 +154,21 @@ def _first_look(
     )
 
 
-def _row_error(
-    points0: np.ndarray, points1: np.ndarray, seed: int, options: RectificationOptions
-) -> float:
+def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
     """Return by how much the rows of a pair that looks rectified are off at most of its matches.
 
     Not by the distance of each match from its row, which is as coarse as the matches, but by what
     all of them have in common: how that distance depends on the place (views that are turned, or
     bent by a lens) and on the disparity (a camera that moved up or down as well).
     """
-    indices = grid_subsample(points0, options.grid_size_px, seed)
+    indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
     off, disparity = second[:, 1] - first[:, 1], first[:, 0] - second[:, 0]
-    near = np.abs(off) <= options.max_row_distance_px
+    near = np.abs(off) <= MAX_ROW_DISTANCE_PX
     x, y = ((first[near] - first[near].mean(axis=0)) / np.ptp(first[near], axis=0).max()).T
     design = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y, disparity[near]])
     predicted = design @ np.linalg.lstsq(design, off[near], rcond=None)[0]
-    return float(np.quantile(np.abs(predicted), min(options.min_inlier_ratio, 1)))
+    return float(np.quantile(np.abs(predicted), MIN_INLIER_RATIO))
 
 
 def detect_rectification(
@@ -214,7 +178,6 @@ def detect_rectification(
     size1: tuple[int, int],
     offset_px: float = 0.0,
     seed: int = 0,
-    options: RectificationOptions = RectificationOptions(),
 ) -> Rectification:
     """Decide from matches whether a pair is rectified.
 
@@ -223,7 +186,6 @@ def detect_rectification(
         size0, size1: (width, height) of the images.
         offset_px: what is added to a disparity before it gives the depth (calibration).
         seed: of the random samples.
-        options: the thresholds.
 
     Example:
         >>> left = np.random.default_rng(0).uniform(0, (640, 480), (900, 2))
@@ -235,15 +197,13 @@ def detect_rectification(
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    indices = grid_subsample(points0, options.grid_size_px, seed)
+    indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
-    limit = options.max_row_distance_px
+    limit = MAX_ROW_DISTANCE_PX
     on_rows = np.abs(second[:, 1] - first[:, 1]) <= limit
     # Of a rectified pair Sampson's distance is that in rows over the root of 2.
-    epipolar = estimate_geometry(
-        first, second, seed=seed, options=GeometryOptions(inlier_threshold=limit / np.sqrt(2))
-    )
-    other_rows = _best_other_rows(first, second, size0, seed, options)
+    epipolar = fit_model(first, second, "fundamental", size1, limit / np.sqrt(2), seed)
+    other_rows = _best_other_rows(first, second, size0, seed)
     disparity = (first - second)[on_rows, 0]
     spread = np.quantile(disparity, [0.05, 0.5, 0.95]) if len(disparity) else np.full(3, np.nan)
     vertical_offset = np.nan
@@ -251,24 +211,19 @@ def detect_rectification(
         vertical_offset = float(np.median((second - first)[epipolar.inliers, 1]))
     counts = tuple(int(np.count_nonzero(part)) for part in (on_rows, epipolar.inliers, other_rows))
     # Rows are a line in every point; nothing was sampled, so this is on the safe side.
-    alarms = log10_nfa(np.where(on_rows, 0, np.inf), "fundamental", limit, size1)
+    alarms = log10_nfa(on_rows, "fundamental", limit, size1)
     if size0 != size1:
         reason = "the images differ in size"
     elif alarms > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
     else:
-        reason = _reason(counts, vertical_offset, spread, options)
-    if not reason and is_static(disparity, options.static):
+        reason = _reason(counts, vertical_offset, spread)
+    if not reason and is_static(disparity):
         reason = "nothing moves between the images"
-    if not reason and spread[2] - spread[0] < options.min_planar_spread_px:
-        plane = estimate_geometry(
-            first,
-            second,
-            "homography",
-            seed=seed,
-            options=GeometryOptions(inlier_threshold=options.max_transfer_error_px),
-        )
-        if is_planar(first, second, plane, epipolar, options.min_planar_ratio, seed):
+    if not reason and spread[2] - spread[0] < MIN_PLANAR_SPREAD_PX:
+        threshold_px = SCENE_THRESHOLDS_PX["homography"]
+        plane = fit_model(first, second, "homography", size1, threshold_px, seed)
+        if is_planar(first, second, plane, epipolar, seed):
             reason = "one homography explains all the matches: all move nearly the same"
     on_rows_count, by_fundamental, by_other_rows = counts
     return Rectification(
@@ -289,17 +244,16 @@ def _reason(
     counts: tuple[int, ...],
     vertical_offset: float,
     spread: np.ndarray,
-    options: RectificationOptions,
 ) -> str:
     """Return why rows are not the geometry of the pair; empty when they may be."""
     on_rows, by_fundamental, by_other_rows = counts
     best = max(by_fundamental, by_other_rows)
-    if on_rows < options.min_inlier_ratio * best:
+    if on_rows < MIN_INLIER_RATIO * best:
         return (
             f"only {on_rows:,} of {best:,} matches that agree are on the same row in both images "
             f"(median offset {vertical_offset:+.1f} px)"
         )
-    if spread[2] - spread[0] < options.min_disparity_spread_px:
+    if spread[2] - spread[0] < MIN_DISPARITY_SPREAD_PX:
         return f"all matches on rows have about the same disparity ({spread[1]:.3g} px)"
     return ""
 
@@ -309,7 +263,6 @@ def _best_other_rows(
     points1: np.ndarray,
     size: tuple[int, int],
     seed: int,
-    options: RectificationOptions,
 ) -> np.ndarray:
     """Fit the vertical shift as a plane over the image, robustly; (M,) bool that agree with it.
 
@@ -323,10 +276,10 @@ def _best_other_rows(
     design = np.column_stack([points0 / max(size), np.ones(len(points0))])
 
     def agreeing(planes: np.ndarray) -> np.ndarray:
-        agree: np.ndarray = np.abs(planes @ design.T - shift) <= options.max_row_distance_px
+        agree: np.ndarray = np.abs(planes @ design.T - shift) <= MAX_ROW_DISTANCE_PX
         return agree
 
-    samples = np.random.default_rng(seed).integers(0, len(points0), (options.iterations, 3))
+    samples = np.random.default_rng(seed).integers(0, len(points0), (ITERATIONS, 3))
     samples = samples[np.abs(np.linalg.det(design[samples])) >= 1e-4]
     for start in range(0, len(samples), SAMPLES_AT_ONCE):
         chosen = samples[start : start + SAMPLES_AT_ONCE]

@@ -5,110 +5,59 @@ As `checks`, for disparities; in the order of this module.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from .._shared.errors import NoDepthError, ReconstructionError
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import SelectionOptions, grid_subsample
 from ..geometry.camera import Calibration
-from .checks import StaticOptions, is_static
+from ..geometry.two_view import is_static
+
+MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
+"""Of the focal lengths of both views. Rectified views have one; lengths given to three digits pass,
+and at 0.01 a row is off by 2 px at the edge of 400."""
+
+MAX_CY_DIFFERENCE_PX = 2.0
+"""Of cy of both views: twice what a match may be off its row."""
+
+MIN_UNIQUE_FRACTION = 0.1
+"""Of the keypoints with a match on their row, where only unique matches count: unrelated images
+gave up to 0.005, rectified pairs at least 0.35."""
+
+MIN_MATCHED_FRACTION = 0.25
+"""The same where all matches count: up to 0.16, and at least 0.64."""
+
+MIN_DISPARITY_SPREAD_PX = 0.5
+"""Between the 5th and 95th percentile, in a scene with depth."""
+
+MIN_DISPARITY_PX = -1.0
+"""With the offset; smaller ones put points behind the cameras."""
+
+MAX_BEHIND_FRACTION = 0.25
+"""Of the points, behind the cameras."""
+
+# When disparities are those of a camera that only rotated. Walls are planes in disparity, a
+# rotation bends them. Chosen on four views rotated by half a degree to two (fraction 0.64, ratio
+# 0.33 at worst) and as many drawn on slanted walls before two cameras (ratio 5.3 at least);
+# Motorcycle and seven scenes of Middlebury ask for rotations that would leave the rows.
+
+MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
+"""Within which the rotation explains a disparity, and the fraction of them that it must explain."""
+
+MAX_RATIO_TO_PLANE = 0.5
+"""Median error of the rotation over that of the best plane in disparity."""
+
+MAX_OFF_ROW_PX = 1.0
+"""Median distance by which the rotation moves matches off their rows: on rows they were found."""
+
+ROBUST_ITERATIONS = 12
+
+GRID_SIZE_PX, MIN_MATCHES, MAX_SAMPLES = 16, 30, 50_000
+"""Cells of this size give one match each; with fewer matches nothing is tried; more are not
+used."""
 
 
-@suggest_keywords
-@dataclass(frozen=True)
-class RotationOptions:
-    """When disparities are those of a camera that only rotated.
-
-    Walls are planes in disparity, a rotation bends them. Chosen on four views rotated by half a
-    degree to two (fraction 0.64, ratio 0.33 at worst) and as many drawn on slanted walls before two
-    cameras (ratio 5.3 at least); Motorcycle and seven scenes of Middlebury ask for rotations that
-    would leave the rows.
-
-    Attributes:
-        max_error_px: within which the rotation explains a disparity.
-        min_explained_fraction: of the disparities.
-        max_ratio_to_plane: median error of the rotation over that of the best plane in disparity.
-        max_off_row_px: median distance by which the rotation moves matches off their rows: on rows
-            they were found.
-        iterations: of the robust fits.
-        grid_size_px: cells of this size give one match each.
-        min_matches: one per cell, below which nothing is tried.
-        max_samples: matches that are used at the most.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    max_error_px: float = 0.3
-    min_explained_fraction: float = 0.5
-    max_ratio_to_plane: float = 0.5
-    max_off_row_px: float = 1.0
-    iterations: int = 12
-    grid_size_px: int = 16
-    min_matches: int = 30
-    max_samples: int = 50_000
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("max_error_px", "grid_size_px", "max_samples"),
-            not_negative=("max_ratio_to_plane", "max_off_row_px", "iterations", "min_matches"),
-            fractions=("min_explained_fraction",),
-        )
-
-
-@suggest_keywords
-@dataclass(frozen=True)
-class RectifiedCheckOptions:
-    """Thresholds of the checks of rectified pairs.
-
-    Attributes:
-        max_focal_difference_fraction: of the focal lengths of both views. Rectified views have one;
-            lengths given to three digits pass, and at 0.01 a row is off by 2 px at the edge of 400.
-        max_cy_difference_px: of cy of both views: twice what a match may be off its row.
-        min_unique_fraction: of the keypoints with a match on their row, where only unique matches
-            count: unrelated photographs gave up to 0.005, rectified pairs at least 0.35.
-        min_matched_fraction: the same where all matches count: up to 0.16, and at least 0.64.
-        min_disparity_spread_px: between the 5th and 95th percentile, in a scene with depth.
-        min_disparity_px: with the offset; smaller ones put points behind the cameras.
-        max_behind_fraction: of the points, behind the cameras.
-        static: when both images show the same view.
-        rotation: when the camera only rotated.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    max_focal_difference_fraction: float = 0.01
-    max_cy_difference_px: float = 2.0
-    min_unique_fraction: float = 0.1
-    min_matched_fraction: float = 0.25
-    min_disparity_spread_px: float = 0.5
-    min_disparity_px: float = -1.0
-    max_behind_fraction: float = 0.25
-    static: StaticOptions = field(default_factory=StaticOptions)
-    rotation: RotationOptions = field(default_factory=RotationOptions)
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            not_negative=("max_cy_difference_px", "min_disparity_spread_px"),
-            fractions=(
-                *("max_focal_difference_fraction", "min_unique_fraction"),
-                *("min_matched_fraction", "max_behind_fraction"),
-            ),
-            between={"min_disparity_px": (-math.inf, math.inf)},
-        )
-
-
-DEFAULTS = RectifiedCheckOptions()
-
-
-def check_cameras(calibration: Calibration, options: RectifiedCheckOptions = DEFAULTS) -> None:
+def check_cameras(calibration: Calibration) -> None:
     """Refuse a calibration that no rectified pair has.
 
     Raises:
@@ -126,13 +75,13 @@ are 500 and 600 px, those of a rectified pair are one: fix the calibration (give
     camera0, camera1 = calibration.camera0, calibration.camera1
     advice = f"fix the calibration ({calibration.source}), or pass `rectified=False`"
     for focal0, focal1 in zip(camera0.focal_px, camera1.focal_px, strict=True):
-        if abs(focal1 - focal0) > options.max_focal_difference_fraction * focal0:
+        if abs(focal1 - focal0) > MAX_FOCAL_DIFFERENCE_FRACTION * focal0:
             raise ReconstructionError(
                 f"the focal lengths of the left and the right view are {focal0:g} and {focal1:g} "
                 f"px, those of a rectified pair are one: {advice}"
             )
     cy0, cy1 = camera0.centre[1], camera1.centre[1]
-    if abs(cy1 - cy0) > options.max_cy_difference_px:
+    if abs(cy1 - cy0) > MAX_CY_DIFFERENCE_PX:
         raise ReconstructionError(
             f"cy of the left and the right view are {cy0:g} and {cy1:g} px, those of a rectified "
             f"pair are one: {advice}"
@@ -158,29 +107,26 @@ def check_keypoints(keypoints: int, selection: SelectionOptions) -> None:
     )
 
 
-def check_matched(
-    matched: int, keypoints: int, unique: bool = True, options: RectifiedCheckOptions = DEFAULTS
-) -> None:
+def check_matched(matched: int, keypoints: int, unique: bool = True) -> None:
     """Refuse a pair treated as rectified of which hardly any keypoint has a match on its row.
 
     Args:
         matched: number of keypoints with a match; those in filled occlusions have none.
         keypoints: number of keypoints.
         unique: whether only matches count that no other place on the row comes near to.
-        options: the thresholds.
 
     Raises:
         NoDepthError: there are too few.
     """
-    least = options.min_unique_fraction if unique else options.min_matched_fraction
+    least = MIN_UNIQUE_FRACTION if unique else MIN_MATCHED_FRACTION
     if matched < least * keypoints:
         raise NoDepthError(
             f"only {matched:,} of {keypoints:,} keypoints have a match on their row: the "
-            "photographs hardly overlap or show different scenes, or the pair is not rectified"
+            "images hardly overlap or show different scenes, or the pair is not rectified"
         )
 
 
-def check_disparities(disparity: np.ndarray, options: RectifiedCheckOptions = DEFAULTS) -> None:
+def check_disparities(disparity: np.ndarray) -> None:
     """Refuse disparities of a rectified pair that are all one value.
 
     Raises:
@@ -196,12 +142,12 @@ shifted sideways, or both show one plane, and there is no depth
     known = np.asarray(disparity)[np.isfinite(disparity)]
     if not len(known):
         raise NoDepthError("no disparity was found: the images do not overlap")
-    if is_static(known, options.static):
+    if is_static(known):
         raise NoDepthError(
             "all disparities are 0: both images were taken from one place, without a baseline"
         )
     low, middle, high = np.quantile(known, [0.05, 0.5, 0.95])
-    if high - low >= options.min_disparity_spread_px:
+    if high - low >= MIN_DISPARITY_SPREAD_PX:
         return
     raise NoDepthError(
         f"all disparities are {middle:.3g} px: one image is the other shifted sideways, or both "
@@ -213,7 +159,6 @@ def check_pure_rotation(
     pixels: np.ndarray,
     disparity: np.ndarray,
     calibration: Calibration,
-    options: RotationOptions = RotationOptions(),
 ) -> None:
     """Refuse disparities that a camera which only rotated explains.
 
@@ -226,34 +171,32 @@ def check_pure_rotation(
         NoDepthError: one rotation explains most disparities, and far better than a plane.
     """
     chosen = np.arange(len(pixels))
-    if len(chosen) > options.max_samples:
-        chosen = np.random.default_rng(0).choice(len(chosen), options.max_samples, replace=False)
-    chosen = chosen[grid_subsample(pixels[chosen], options.grid_size_px)]
-    if len(chosen) < options.min_matches:
+    if len(chosen) > MAX_SAMPLES:
+        chosen = np.random.default_rng(0).choice(len(chosen), MAX_SAMPLES, replace=False)
+    chosen = chosen[grid_subsample(pixels[chosen], GRID_SIZE_PX)]
+    if len(chosen) < MIN_MATCHES:
         return
     pixels, disparity = np.asarray(pixels, np.float64)[chosen], np.asarray(disparity)[chosen]
-    by_rotation = _rotation_errors(pixels, disparity, calibration, options)
-    by_plane = _plane_errors(pixels, disparity, options.iterations)
-    better = np.median(by_rotation) < options.max_ratio_to_plane * np.median(by_plane)
-    explained = np.mean(by_rotation < options.max_error_px)
-    if better and explained > options.min_explained_fraction:
+    by_rotation = _rotation_errors(pixels, disparity, calibration)
+    by_plane = _plane_errors(pixels, disparity)
+    better = np.median(by_rotation) < MAX_RATIO_TO_PLANE * np.median(by_plane)
+    explained = np.mean(by_rotation < MAX_ROTATION_ERROR_PX)
+    if better and explained > MIN_ROTATION_FRACTION:
         raise NoDepthError(
             "a rotation of the camera explains most disparities and there is no depth: move it "
-            "sideways between the photographs"
+            "sideways between the images"
         )
 
 
-def check_depths(
-    disparity: np.ndarray, calibration: Calibration, options: RectifiedCheckOptions = DEFAULTS
-) -> None:
+def check_depths(disparity: np.ndarray, calibration: Calibration) -> None:
     """Refuse disparities of a rectified pair of which many would lie behind the cameras.
 
     Raises:
         ReconstructionError: left and right are exchanged, or the offset is wrong.
     """
     offset = calibration.disparity_offset_px
-    behind = float(np.mean(disparity + offset < options.min_disparity_px))
-    if behind > options.max_behind_fraction:
+    behind = float(np.mean(disparity + offset < MIN_DISPARITY_PX))
+    if behind > MAX_BEHIND_FRACTION:
         raise ReconstructionError(
             f"{behind:.0%} of the points would lie behind the cameras: left and right are "
             f"exchanged, or the disparity offset of {offset:g} px ({calibration.source}) is wrong"
@@ -261,7 +204,7 @@ def check_depths(
 
 
 def _rotation_errors(
-    pixels: np.ndarray, disparity: np.ndarray, calibration: Calibration, options: RotationOptions
+    pixels: np.ndarray, disparity: np.ndarray, calibration: Calibration
 ) -> np.ndarray:
     """Fit a rotation to disparities robustly; (N,) what it leaves unexplained, in pixels.
 
@@ -275,27 +218,27 @@ def _rotation_errors(
     angle = np.median(np.arctan(wanted) - np.arctan(rays[:, 0]))
     rotation = cv2.Rodrigues(np.array([0, angle, 0]))[0]
     error = np.empty(0)
-    for iteration in range(options.iterations + 1):
+    for iteration in range(ROBUST_ITERATIONS + 1):
         rotated = rays @ rotation.T
         if (rotated[:, 2] <= 0).any():  # only with a focal length that cannot be
             return np.full(len(pixels), np.inf)
         x, y = (rotated[:, :2] / rotated[:, 2:]).T
         error = wanted - x
-        if iteration < options.iterations:
+        if iteration < ROBUST_ITERATIONS:
             slopes = np.column_stack([1 + x * x, -y])
             angles = _robust_step(slopes, error, camera.focal_px[0])
             rotation = cv2.Rodrigues(np.array([0, *angles]))[0] @ rotation
     off_row = y * camera.focal_px[1] + camera.centre[1] - pixels[:, 1]
-    if np.median(np.abs(off_row)) > options.max_off_row_px:
+    if np.median(np.abs(off_row)) > MAX_OFF_ROW_PX:
         return np.full(len(pixels), np.inf)
     return np.abs(error) * camera.focal_px[0]
 
 
-def _plane_errors(pixels: np.ndarray, disparity: np.ndarray, iterations: int) -> np.ndarray:
+def _plane_errors(pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
     """Fit disparities linear in x and y robustly; (N,) what they leave unexplained, in pixels."""
     design = np.column_stack([pixels / max(pixels.max(), 1), np.ones(len(pixels))])
     plane = np.array([0, 0, np.median(disparity)])
-    for _ in range(iterations):
+    for _ in range(ROBUST_ITERATIONS):
         plane = plane + _robust_step(design, disparity - design @ plane, 1.0)
     return np.abs(disparity - design @ plane)
 

@@ -1,4 +1,4 @@
-"""What two photographs gave: 3D points, and all that is known about them."""
+"""What two images gave: 3D points, and all that is known about them."""
 
 from __future__ import annotations
 

@@ -20,61 +20,39 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import parallel_for
 from ..geometry.windows import window_sums
 
+PATCH_RADIUS_PX = 4
+"""The patch has 2 radius + 1 pixels a side."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class SubpixelOptions:
-    """How matches are refined.
+PATCH_SIGMA_PX = 2.0
+"""Of the Gaussian weight of its pixels."""
 
-    Attributes:
-        patch_radius_px: the patch has 2 radius + 1 pixels a side.
-        sigma_px: of the Gaussian weight of its pixels.
-        max_iterations: of each of the two alignments.
-        max_shift_px: that a match may move in each of the two alignments.
-        min_correlation: of both patches at the end; a match below it has not converged.
-        convergence_px: a smaller step ends the alignment.
-        coarse_convergence_px: the same in the first alignment, which only serves the second.
-        min_pixels_of_lattice: with more matches than this only those in every second row and column
-            are aligned before.
-        affinity_window_px: side of the window whose matches give a patch its affinity.
-        affinity_regularization: matches spread over the window that the similarity of all counts
-            for beside those in it: few, or those on one line, give no affinity of their own.
-        max_similarity_samples: matches that the similarity is estimated from.
+MAX_ITERATIONS = 15
+"""Of each of the two alignments."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+MAX_SHIFT_PX = 2.0
+"""That a match may move in each of the two alignments."""
 
-    patch_radius_px: int = 4
-    sigma_px: float = 2.0
-    max_iterations: int = 15
-    max_shift_px: float = 2.0
-    min_correlation: float = 0.8
-    convergence_px: float = 0.01
-    coarse_convergence_px: float = 0.05
-    min_pixels_of_lattice: int = 1_000_000
-    affinity_window_px: int = 15
-    affinity_regularization: float = 20.0
-    max_similarity_samples: int = 5000
+MIN_CORRELATION = 0.8
+"""Of both patches at the end; a match below it has not converged."""
 
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=(
-                *("sigma_px", "max_iterations", "max_shift_px", "convergence_px"),
-                *("coarse_convergence_px", "affinity_window_px", "affinity_regularization"),
-                "max_similarity_samples",
-            ),
-            not_negative=("min_pixels_of_lattice",),
-            between={"patch_radius_px": (1, 31), "min_correlation": (-1, 1)},
-        )
+CONVERGENCE_PX, COARSE_CONVERGENCE_PX = 0.01, 0.05
+"""A smaller step ends the alignment; the first one only serves the second."""
 
+MIN_MATCHES_OF_LATTICE = 1_000_000
+"""With more matches than this only those in every second row and column are aligned before."""
 
-DEFAULTS = SubpixelOptions()
+AFFINITY_WINDOW_PX = 15
+"""Side of the window whose matches give a patch its affinity."""
+
+AFFINITY_REGULARIZATION = 20.0
+"""Matches spread over the window that the similarity of all counts for beside those in it: few, or
+those on one line, give no affinity of their own."""
+
+MAX_SIMILARITY_SAMPLES = 5000
+"""Matches that the similarity is estimated from."""
 
 MATCHES_OF_BAND = 500_000
 """At a time, to bound the memory."""
@@ -108,7 +86,6 @@ def refine_matches(
     gray1: np.ndarray,
     points0: np.ndarray,
     points1: np.ndarray,
-    options: SubpixelOptions = DEFAULTS,
 ) -> RefinedMatches:
     """Refine the second positions of matches.
 
@@ -116,7 +93,6 @@ def refine_matches(
         gray0, gray1: (H, W) uint8 luma.
         points0: (N, 2) whole pixels of the first image.
         points1: (N, 2) positions in the second, accurate to a pixel or two.
-        options: of the alignment.
 
     Returns:
         The refined positions. Flat patches, those that extend over the border, those that move
@@ -124,7 +100,7 @@ def refine_matches(
         on the number of threads.
 
     Raises:
-        OptionError: a first position is not on a pixel of its image, or an option is out of range.
+        OptionError: a first position is not on a pixel of its image.
 
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (60, 60)).astype(np.uint8)
@@ -145,7 +121,7 @@ def refine_matches(
     known = np.asarray(np.isfinite(start).all(1))
     known[known] = ((start[known] >= 0) & (start[known] < gray1.shape[::-1])).all(1)
     if not known.all():
-        found = refine_matches(gray0, gray1, pixels0[known], start[known], options)
+        found = refine_matches(gray0, gray1, pixels0[known], start[known])
         result = RefinedMatches(start.copy(), known.copy(), np.zeros(len(start), np.float32))
         result.points1[known], result.converged[known] = found.points1, found.converged
         result.correlation[known] = found.correlation
@@ -153,18 +129,18 @@ def refine_matches(
     if not len(pixels0):
         return RefinedMatches(start, known, np.zeros(0, np.float32))
     images = gray0.astype(np.float32), gray1.astype(np.float32)
-    overall = similarity(pixels0, start, options.max_similarity_samples)
+    overall = similarity(pixels0, start)
     result = RefinedMatches(start.copy(), np.zeros(len(start), bool), np.zeros(len(start), "f4"))
-    step = COARSE_STEP_PX if len(pixels0) > options.min_pixels_of_lattice else 1
+    step = COARSE_STEP_PX if len(pixels0) > MIN_MATCHES_OF_LATTICE else 1
     # In bands of rows, for which the memory is small; neighbours beyond their edges are seen, too.
     rows = pixels0[:, 1]
     edges = np.quantile(rows, np.linspace(0, 1, -(-len(rows) // MATCHES_OF_BAND) + 1))
     edges[-1] += 1
     for top, bottom in pairwise(np.ceil(edges).astype(np.int64).tolist()):
-        reach = options.affinity_window_px // 2
+        reach = AFFINITY_WINDOW_PX // 2
         near = np.flatnonzero((rows >= top - reach) & (rows < bottom + reach))
         own = (rows[near] >= top) & (rows[near] < bottom)
-        found = _refine_band(images, pixels0[near], start[near], own, overall, step, options)
+        found = _refine_band(images, pixels0[near], start[near], own, overall, step)
         result.points1[near[own]] = found.points1
         result.converged[near[own]] = found.converged
         result.correlation[near[own]] = found.correlation
@@ -178,19 +154,17 @@ def _refine_band(
     own: np.ndarray,
     overall: np.ndarray,
     step_px: int,
-    options: SubpixelOptions,
 ) -> RefinedMatches:
     """Refine those of the matches, (N,) bool, that a band of the image owns."""
     # How patches are deformed can be seen on some of them, where they are many.
     some = np.flatnonzero((pixels0 % step_px == 0).all(axis=1))
     affinities = np.broadcast_to(overall, (len(some), 2, 2))
-    coarse = options.coarse_convergence_px
-    found = _align(images, pixels0[some], start[some], affinities, options, coarse)
+    found = _align(images, pixels0[some], start[some], affinities, COARSE_CONVERGENCE_PX)
     start, converged = start.copy(), np.zeros(len(start), bool)
     start[some], converged[some] = found.points1, found.converged
     shape = images[0].shape
-    affinities = local_affinities(pixels0, start, converged, shape, overall, options)[own]
-    return _align(images, pixels0[own], start[own], affinities, options, options.convergence_px)
+    affinities = local_affinities(pixels0, start, converged, shape, overall)[own]
+    return _align(images, pixels0[own], start[own], affinities, CONVERGENCE_PX)
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
@@ -219,13 +193,9 @@ def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarr
     return np.sort(order[np.flatnonzero(np.diff(cell[order], prepend=-1))])
 
 
-def similarity(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    max_samples: int = DEFAULTS.max_similarity_samples,
-) -> np.ndarray:
+def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     """Return how all matches together rotate and scale the first image, (2, 2) float64."""
-    every = -(-len(points0) // max_samples)
+    every = -(-len(points0) // MAX_SIMILARITY_SAMPLES)
     first, second = (
         np.ascontiguousarray(points[::every], np.float64) for points in (points0, points1)
     )
@@ -242,7 +212,6 @@ def local_affinities(
     converged: np.ndarray,
     shape: tuple[int, ...],
     overall: np.ndarray,
-    options: SubpixelOptions = DEFAULTS,
 ) -> np.ndarray:
     """Fit an affinity to the converged matches in the window around each.
 
@@ -252,7 +221,6 @@ def local_affinities(
         converged: (N,) bool, those that count.
         shape: (H, W) of the first image.
         overall: (2, 2), what few or badly spread matches fall back on.
-        options: the window and the regularization.
 
     Returns:
         (N, 2, 2) float32, derivatives of the second position by the first.
@@ -262,14 +230,14 @@ def local_affinities(
     # Sums of squares are of differences: keep the numbers small.
     across, down = column - shape[1] / 2, row - shape[0] / 2
     rest = points1 - np.column_stack([across, down]) @ overall.T
-    size = options.affinity_window_px
+    size = AFFINITY_WINDOW_PX
 
     def sums(values: np.ndarray) -> np.ndarray:
         return window_sums(pixels0[converged], values[converged], shape, size, at=pixels0)
 
     count, sum_x, sum_y = sums(np.ones(len(row))), sums(across), sums(down)
     count = np.maximum(np.rint(count), 1)
-    ridge = options.affinity_regularization * (size**2 - 1) / 12
+    ridge = AFFINITY_REGULARIZATION * (size**2 - 1) / 12
     xx = sums(across**2) - sum_x**2 / count + ridge
     yy = sums(down**2) - sum_y**2 / count + ridge
     xy = sums(across * down) - sum_x * sum_y / count
@@ -289,14 +257,13 @@ def _align(
     pixels0: np.ndarray,
     start: np.ndarray,
     affinities: np.ndarray,
-    options: SubpixelOptions,
     convergence_px: float,
 ) -> RefinedMatches:
     """Align the patches, each warped by its affinity, in threads."""
     from .subpixel_kernel import align
 
-    offsets = np.arange(-options.patch_radius_px, options.patch_radius_px + 1)
-    window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * options.sigma_px**2))
+    offsets = np.arange(-PATCH_RADIUS_PX, PATCH_RADIUS_PX + 1)
+    window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * PATCH_SIGMA_PX**2))
     window, affinities = window.astype(np.float32), np.ascontiguousarray(affinities, np.float32)
     refined = np.empty((len(pixels0), 2))
     converged = np.empty(len(pixels0), bool)
@@ -311,10 +278,10 @@ def _align(
             start,
             affinities,
             window,
-            int(options.max_iterations),
+            MAX_ITERATIONS,
             convergence_px,
-            float(options.max_shift_px),
-            np.float32(options.min_correlation),
+            MAX_SHIFT_PX,
+            np.float32(MIN_CORRELATION),
             refined,
             converged,
             correlation,

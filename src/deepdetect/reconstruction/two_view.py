@@ -10,49 +10,29 @@ a sample of corners, each refined by itself, and the points are those of the mat
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from .._shared.errors import ReconstructionError
-from .._shared.options import check_ranges, suggest_keywords
 from .._shared.timing import StageTimer
 from ..geometry import epipolar_errors
 from ..geometry.camera import Calibration
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
 from ..geometry.triangulation import fundamental_matrix, triangulate
-from .calibration_checks import check_focal, check_pose
-from .checks import CheckOptions, check_images, check_matches
+from .checks import check_focal, check_images, check_matches, check_pose
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
-from .subpixel import SubpixelOptions, refine_matches, spread_corners
+from .subpixel import refine_matches, spread_corners
 
+MAX_EPIPOLAR_DISTANCE_PX = 1.0
+"""Within which a match agrees with the pose (Sampson's distance)."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class TwoViewOptions:
-    """How matches become points.
+MAX_REPROJECTION_ERROR_PX = 0.5
+"""Of a point that is kept (root mean square of both images)."""
 
-    Attributes:
-        max_epipolar_distance_px: within which a match agrees with the pose (Sampson's distance).
-        max_reprojection_error_px: of a point that is kept (root mean square of both images).
-        subpixel: how matches are refined, or None: they are taken as they are.
-        pose_cells: of matches that are sub-pixel already, the best corner of each of this many
-            cells is refined, for the pose.
-        checks: thresholds of the checks.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    max_epipolar_distance_px: float = 1.0
-    max_reprojection_error_px: float = 0.5
-    subpixel: SubpixelOptions | None = field(default_factory=SubpixelOptions)
-    pose_cells: int = 10_000
-    checks: CheckOptions = field(default_factory=CheckOptions)
-
-    def __post_init__(self) -> None:
-        limits = "max_epipolar_distance_px", "max_reprojection_error_px"
-        check_ranges(self, positive=(*limits, "pose_cells"))
+POSE_CELLS = 10_000
+"""Of matches that are sub-pixel already, the best corner of each of this many cells is refined, for
+the pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +73,6 @@ def reconstruct_two_view(
     points1: np.ndarray,
     calibration: Calibration,
     images: tuple[np.ndarray, np.ndarray] | None = None,
-    options: TwoViewOptions = TwoViewOptions(),
     point_filter: PointFilterOptions = PointFilterOptions(),
     seed: int = 0,
     timer: StageTimer | None = None,
@@ -106,7 +85,6 @@ def reconstruct_two_view(
             those of the left lie on whole pixels.
         calibration: of both cameras.
         images: (H, W) uint8 luma of both, for the refinement; None leaves it out.
-        options: of all stages.
         point_filter: which points are kept.
         seed: of all random choices.
         timer: of the stages; None: a new one.
@@ -136,53 +114,48 @@ def reconstruct_two_view(
     indices = pose_indices = np.arange(len(points0))
     pose_points1 = points1
     dropped: dict[str, int] = {}
-    checks = options.checks
     if images is not None:
         calibration.check_sizes(*((image.shape[1], image.shape[0]) for image in images))
-        check_images(*images, checks.copy)
-        if options.subpixel is not None:
-            with timer.stage("sub-pixel"):
-                if refined:
-                    pose_indices = spread_corners(images[0], points0, options.pose_cells)
-                start = points0[pose_indices], points1[pose_indices]
-                aligned = refine_matches(*images, *start, options.subpixel)
-            pose_indices = pose_indices[aligned.converged]
-            pose_points1 = aligned.points1[aligned.converged]
-            if not refined:
-                indices, points1 = pose_indices, aligned.points1
-                dropped["not refined"] = len(points0) - len(indices)
+        check_images(*images)
+        with timer.stage("sub-pixel"):
+            if refined:
+                pose_indices = spread_corners(images[0], points0, POSE_CELLS)
+            aligned = refine_matches(*images, points0[pose_indices], points1[pose_indices])
+        pose_indices = pose_indices[aligned.converged]
+        pose_points1 = aligned.points1[aligned.converged]
+        if not refined:
+            indices, points1 = pose_indices, aligned.points1
+            dropped["not refined"] = len(points0) - len(indices)
     evident = points0[pose_indices], pose_points1
     with timer.stage("checks"):
-        evidence = check_matches(*evident, calibration.camera1.size, calibration, seed, checks)
+        cells, scene = check_matches(*evident, calibration.camera1.size, calibration, seed)
     with timer.stage("pose"):
-        pose = check_pose(
-            estimate_relative_pose(*evident, calibration, options.max_epipolar_distance_px, seed),
-            evidence,
-            calibration,
-            checks,
-        )
+        found = estimate_relative_pose(*evident, calibration, MAX_EPIPOLAR_DISTANCE_PX, seed)
+        pose = check_pose(found, cells, scene, calibration)
     with timer.stage("focal length"):
-        check_focal(*evident, pose, evidence, calibration, seed, checks)
+        explained = cells[scene.epipolar.inliers]
+        on_lines = evident[0][explained], evident[1][explained]
+        check_focal(*on_lines, pose.errors[explained], calibration, seed)
     baseline = 1.0 if calibration.baseline_mm is None else calibration.baseline_mm
     used = points0[indices], points1[indices]
     with timer.stage("triangulation"):
-        found = triangulate(*used, calibration, pose.rotation, pose.translation * baseline)
+        made = triangulate(*used, calibration, pose.rotation, pose.translation * baseline)
     fundamental = fundamental_matrix(calibration, pose.rotation, pose.translation)
-    near_line = epipolar_errors(*used, fundamental) < options.max_epipolar_distance_px
+    near_line = epipolar_errors(*used, fundamental) < MAX_EPIPOLAR_DISTANCE_PX
     focal = calibration.camera0.focal_px[0]
     kept = np.ones(len(indices), bool)
     for reason, passed in (
         ("far from its epipolar line", near_line),
-        ("behind a camera", found.cheirality),
-        ("reprojection error", found.reprojection_errors < options.max_reprojection_error_px),
-        ("parallax", found.triangulation_angle * focal >= point_filter.min_parallax_px),
+        ("behind a camera", made.cheirality),
+        ("reprojection error", made.reprojection_errors < MAX_REPROJECTION_ERROR_PX),
+        ("parallax", made.triangulation_angle * focal >= point_filter.min_parallax_px),
     ):
         dropped[reason] = int(np.count_nonzero(kept & ~passed))
         kept &= passed
     if point_filter.sor_neighbors:
         with timer.stage("outlier removal"):
             space = disparity_space(
-                found.points[kept], focal, baseline, point_filter.sor_disparity_weight
+                made.points[kept], focal, baseline, point_filter.sor_disparity_weight
             )
             inliers = sor_inliers(space, point_filter.sor_neighbors, point_filter.sor_std_ratio)
         dropped["statistical outlier"] = int(np.count_nonzero(~inliers))
@@ -191,17 +164,17 @@ def reconstruct_two_view(
         counts = ", ".join(f"{reason}: {count:,}" for reason, count in dropped.items() if count)
         raise ReconstructionError(
             f"none of the {len(points0):,} matches gives a point ({counts}): take "
-            "photographs that overlap more, or check the calibration"
+            "images that overlap more, or check the calibration"
         )
     return TwoViewReconstruction(
-        points=found.points[kept].astype(np.float32),
+        points=made.points[kept].astype(np.float32),
         unit="baseline" if calibration.baseline_mm is None else "mm",
         indices=indices[kept],
         points1=points1[indices[kept]],
         pose=pose,
         pose_indices=pose_indices,
-        reprojection_errors=found.reprojection_errors[kept].astype(np.float32),
-        triangulation_angles=np.degrees(found.triangulation_angle[kept]).astype(np.float32),
+        reprojection_errors=made.reprojection_errors[kept].astype(np.float32),
+        triangulation_angles=np.degrees(made.triangulation_angle[kept]).astype(np.float32),
         dropped=dropped,
         seconds=timer.seconds,
     )

@@ -128,7 +128,7 @@ def dense_points(
             _scaled(neighbour.points0, scale),
             _scaled(neighbour.points1, its_scale),
             relative_fundamental(view, its_view),
-            options.matching,
+            exact=True,
         )
         if found is None:
             continue

@@ -7,24 +7,18 @@ projects nearest to all of their matches.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from .._shared.options import check_ranges, suggest_keywords
 from ..geometry.posed_view import PosedView
-from ..matching.guided.options import RectifiedMatchingOptions
 
 BLOCK = 50_000
 """Pixels that are triangulated at once, which bounds the memory."""
 
 REWEIGHTINGS = 2
 """Of the linear triangulation, after which it minimises distances in pixels."""
-
-
-def _known_poses() -> RectifiedMatchingOptions:
-    """The epipolar geometry is known: it is not estimated again, nor doubted."""
-    return RectifiedMatchingOptions(max_refits=0, min_agreement=0.0)
 
 
 @suggest_keywords
@@ -44,7 +38,6 @@ class DenseOptions:
         min_triangulation_deg: smallest angle between two of the lines of sight.
         duplicate_depth: of a point that another reference has given already, the relative
             difference of the depths; it is left out.
-        matching: of the rows.
 
     Raises:
         OptionError: a value is out of its range.
@@ -60,7 +53,6 @@ class DenseOptions:
     max_error_px: float = 1.0
     min_triangulation_deg: float = 1.0
     duplicate_depth: float = 0.01
-    matching: RectifiedMatchingOptions = field(default_factory=_known_poses)
 
     def __post_init__(self) -> None:
         check_ranges(

@@ -1,22 +1,12 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import cv2
 import numpy as np
 import pytest
 
-from deepdetect.features.keypoints import Keypoints
-from deepdetect.features.sift_detector import SiftOptions, detect_sift
+from deepdetect.features.sift_detector import detect_sift
 from deepdetect.io.image import luma
-from deepdetect.matching.guided.asift import simulate_view, simulated_views
-from deepdetect.matching.guided.options import InitialGeometryOptions
-
-TILTS = InitialGeometryOptions().tilts
-
-
-def views(gray: np.ndarray, tilt: float, max_keypoints: int) -> Iterator[Keypoints]:
-    return simulated_views(gray, tilt, 72, SiftOptions(max_keypoints=max_keypoints))
+from deepdetect.matching.guided.asift import TILTS, simulate_view, simulated_views
 
 
 def blob(x: float, y: float, across: float, down: float) -> np.ndarray:
@@ -90,7 +80,7 @@ def test_fine_stripes_are_blurred_before_they_are_shortened(tilt: float) -> None
 def test_keypoints_lie_at_their_positions_in_the_image_itself(tilt: float) -> None:
     """A spot as many times wider than high is round in the view without a turn."""
     gray = blob(110, 70, 3 * tilt, 3)
-    found = next(views(gray, tilt, 100))
+    found = next(simulated_views(gray, tilt, 100))
     gaps = found.xy - [110, 70]
     near = gaps[np.argmin(np.linalg.norm(gaps, axis=1))]
     assert abs(near[0]) < 0.15 * tilt
@@ -100,7 +90,7 @@ def test_keypoints_lie_at_their_positions_in_the_image_itself(tilt: float) -> No
 @pytest.mark.parametrize("tilt", TILTS)
 def test_keypoints_are_within_the_image_and_described(photo: np.ndarray, tilt: float) -> None:
     gray = luma(photo)[:100]
-    for found in views(gray, tilt, 100):
+    for found in simulated_views(gray, tilt, 100):
         assert (found.xy > 0).all()
         assert (found.xy < (255, 99)).all()
         assert found.descriptors.shape == (len(found.xy), 128)
@@ -108,7 +98,7 @@ def test_keypoints_are_within_the_image_and_described(photo: np.ndarray, tilt: f
 
 def test_larger_tilts_are_seen_from_more_directions(photo: np.ndarray) -> None:
     gray = luma(photo)[:64, :64]
-    counts = [len(list(views(gray, tilt, 10))) for tilt in TILTS]
+    counts = [len(list(simulated_views(gray, tilt, 10))) for tilt in TILTS]
     assert counts == sorted(counts)
     assert counts[0] == 5  # every 36 degrees of 180
     assert counts[-1] == 10
@@ -116,7 +106,7 @@ def test_larger_tilts_are_seen_from_more_directions(photo: np.ndarray) -> None:
 
 def test_no_view_has_more_keypoints_than_asked_for(photo: np.ndarray) -> None:
     gray = luma(photo)
-    found = [len(view) for view in views(gray, 2.0, 30)]
+    found = [len(view) for view in simulated_views(gray, 2.0, 30)]
     assert max(found) <= 30
     assert min(found) > 10
     assert len(detect_sift(gray)) > 30
@@ -126,6 +116,6 @@ def test_no_view_has_more_keypoints_than_asked_for(photo: np.ndarray) -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (5, 5), (1, 40), (40, 1)])
 def test_tiny_images_have_views_without_keypoints(shape: tuple[int, int], tilt: float) -> None:
     gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    for found in views(gray, tilt, 50):
+    for found in simulated_views(gray, tilt, 50):
         assert found.xy.shape == (len(found), 2)
         assert found.descriptors.shape == (len(found), 128)

@@ -10,13 +10,13 @@ from scipy.spatial import KDTree
 from deepdetect.geometry import transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.homography import (
+    MAX_DISTANCE_PX as REACH,
+)
+from deepdetect.matching.guided.homography import (
     ImagePair,
     match_by_homography,
     nearest_keypoint,
 )
-from deepdetect.matching.guided.options import HomographyMatchingOptions
-
-REACH = HomographyMatchingOptions().max_distance_px
 
 SHIFT = np.array([[1.0, 0, 9], [0, 1, -6], [0, 0, 1]])
 MILD = np.array([[0.95, -0.06, 15.0], [0.08, 0.97, -5.0], [1e-4, -1e-4, 1.0]])

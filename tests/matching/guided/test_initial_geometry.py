@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,17 +10,20 @@ import pytest
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.geometry import epipolar_errors, transfer_errors, transform_points
 from deepdetect.geometry.acontrario import MAX_LOG10_NFA
+from deepdetect.geometry.two_view import GUIDING_THRESHOLDS_PX
 from deepdetect.io.image import load_image, luma
+from deepdetect.matching.guided import initial_geometry as module
 from deepdetect.matching.guided.initial_geometry import (
     InitialGeometry,
     estimate_initial_geometry,
     find_initial_geometry,
-    tentative_matches,
 )
-from deepdetect.matching.guided.options import InitialGeometryOptions
-
-OPTIONS = InitialGeometryOptions()
-LONGEST = OPTIONS.max_side_px
+from deepdetect.matching.guided.tentative_matches import (
+    MAX_SIDE_PX as LONGEST,
+)
+from deepdetect.matching.guided.tentative_matches import (
+    find_tentative_matches,
+)
 
 MILD = np.array([[0.9, -0.12, 25.0], [0.15, 0.95, -8.0], [2e-4, -1e-4, 1.0]])
 ODD = [
@@ -60,7 +62,8 @@ def art(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 def initial_geometry(
     gray0: np.ndarray, gray1: np.ndarray, model: str = "auto", seed: int = 0
 ) -> InitialGeometry:
-    return estimate_initial_geometry(tentative_matches(gray0, gray1), model, seed)
+    tentative = find_tentative_matches(gray0, gray1)
+    return estimate_initial_geometry(tentative, model, seed, view_keypoints=2000)
 
 
 def corners(gray: np.ndarray) -> np.ndarray:
@@ -103,7 +106,7 @@ def check_agreeing(found: InitialGeometry) -> None:
     assert 0 < len(found.points0) == len(found.points1) <= found.num_matches
     measure = transfer_errors if found.model == "homography" else epipolar_errors
     errors = measure(found.points0, found.points1, found.matrix)
-    assert errors.max() < OPTIONS.threshold_px(found.model)
+    assert errors.max() < GUIDING_THRESHOLDS_PX[found.model]
     assert found.log10_nfa < MAX_LOG10_NFA
 
 
@@ -189,17 +192,17 @@ def test_matches_that_are_there_already_are_not_made_again(
     gray = luma(photo)
     other = warped(gray, MILD, (256, 256))
     expected = initial_geometry(gray, other)
-    initial = tentative_matches(gray, other)
-    monkeypatch.setattr("deepdetect.matching.guided.sparse_matches.detect_sift", None)
-    found = estimate_initial_geometry(initial)
+    tentative = find_tentative_matches(gray, other)
+    monkeypatch.setattr("deepdetect.matching.guided.tentative_matches.detect_sift", None)
+    found = estimate_initial_geometry(tentative)
     np.testing.assert_array_equal(found.matrix, expected.matrix)
 
 
 @pytest.mark.slow
-def test_initial_matches_of_a_large_pair_are_at_its_own_size(photo: np.ndarray) -> None:
+def test_tentative_matches_of_a_large_pair_are_at_its_own_size(photo: np.ndarray) -> None:
     gray = cv2.resize(luma(photo), (2400, 2400), interpolation=cv2.INTER_CUBIC)
     shift = np.array([[1.0, 0, 40], [0, 1, -20], [0, 0, 1]])
-    found = tentative_matches(gray, warped(gray, shift, (2400, 2400)))
+    found = find_tentative_matches(gray, warped(gray, shift, (2400, 2400)))
     assert found.scales == (0.5, 0.5)
     np.testing.assert_allclose(
         np.median(found.points1 - found.points0, axis=0), [40, -20], atol=0.2
@@ -233,13 +236,13 @@ def test_two_images_of_different_things_have_no_geometry(
 
 
 def test_stronger_tilts_are_tried_where_something_hints_at_a_geometry(
-    picture: Callable[..., np.ndarray],
+    picture: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = picture("camera", (200, 150))
-    never = InitialGeometryOptions(max_log10_nfa=-1e9)
-    for options, tried in ((never, 30), (replace(never, max_hint_log10_nfa=-1e9), 10)):
-        initial = tentative_matches(image, image, options=options)
-        found = estimate_initial_geometry(initial, options=options)
+    monkeypatch.setattr(module, "MAX_LOG10_NFA", -1e9)
+    for hint, tried in ((0.0, 30), (-1e9, 10)):
+        monkeypatch.setattr(module, "MAX_HINT_LOG10_NFA", hint)
+        found = initial_geometry(image, image)
         assert found.matrix is None
         assert found.num_views == tried
 
@@ -262,23 +265,29 @@ def test_a_scene_with_depth_has_a_fundamental_matrix(art: tuple) -> None:
     assert np.median(np.abs(found.points0[:, 1] - found.points1[:, 1])) < 0.5
 
 
-def test_clear_depth_is_decided_on_small_copies(art: tuple) -> None:
+def test_clear_depth_is_decided_on_small_copies(
+    art: tuple, monkeypatch: pytest.MonkeyPatch
+) -> None:
     left, right, points0, points1 = art
-    small = replace(OPTIONS, first_side_px=400, min_first_depth_inliers=50)
-    found = find_initial_geometry(left, right, options=small)
+    monkeypatch.setattr(module, "COARSE_SIDE_PX", 400)
+    monkeypatch.setattr(module, "MIN_COARSE_DEPTH_INLIERS", 50)
+    found = find_initial_geometry(left, right)
     assert found.model == "fundamental"
-    assert found.initial is None  # larger copies were not looked at
+    assert found.tentative is None  # larger copies were not looked at
     errors = epipolar_errors(points0, points1, found.matrix)
     assert np.quantile(errors, 0.95) < 1.5
-    limit = OPTIONS.fundamental_threshold_px * left.shape[1] / 400
+    limit = GUIDING_THRESHOLDS_PX["fundamental"] * left.shape[1] / 400
     assert epipolar_errors(found.points0, found.points1, found.matrix).max() < limit
 
 
-def test_depth_that_few_matches_show_is_decided_on_larger_copies(art: tuple) -> None:
-    options = replace(OPTIONS, first_side_px=400, min_first_depth_inliers=10_000)
-    found = find_initial_geometry(*art[:2], options=options)
+def test_depth_that_few_matches_show_is_decided_on_larger_copies(
+    art: tuple, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "COARSE_SIDE_PX", 400)
+    monkeypatch.setattr(module, "MIN_COARSE_DEPTH_INLIERS", 10_000)
+    found = find_initial_geometry(*art[:2])
     assert found.model == "fundamental"
-    assert found.initial is not None
+    assert found.tentative is not None
 
 
 def test_the_homography_of_a_scene_with_depth_is_given_when_asked_for(art: tuple) -> None:
@@ -313,7 +322,7 @@ def test_a_large_image_is_shrunk_and_its_matrix_comes_back_at_its_own_size(
     assert found.matrix[2, 2] == pytest.approx(1)
     assert found.points0.max() > LONGEST
     errors = transfer_errors(found.points0, found.points1, found.matrix)
-    assert errors.max() < OPTIONS.homography_threshold_px * 1500 / LONGEST + 1e-6
+    assert errors.max() < GUIDING_THRESHOLDS_PX["homography"] * 1500 / LONGEST + 1e-6
 
 
 @pytest.mark.slow
@@ -322,7 +331,7 @@ def test_the_fundamental_matrix_of_large_images_comes_back_at_their_own_size(art
     (large, up), (other, also_up) = resized(left, 1389, 1110), resized(right, 926, 740)
     found = initial_geometry(large, other)
     if found.model == "homography":  # the images decide
-        assert found.parallax.is_seen()
+        assert found.parallax.exceeds(0)
         found = initial_geometry(large, other, "fundamental")
     assert found.model == "fundamental"
     errors = epipolar_errors(
@@ -330,7 +339,7 @@ def test_the_fundamental_matrix_of_large_images_comes_back_at_their_own_size(art
     )
     assert np.quantile(errors, 0.95) < 2
     errors = epipolar_errors(found.points0, found.points1, found.matrix)
-    assert errors.max() < OPTIONS.fundamental_threshold_px * 1389 / LONGEST + 1e-6
+    assert errors.max() < GUIDING_THRESHOLDS_PX["fundamental"] * 1389 / LONGEST + 1e-6
 
 
 def test_is_the_same_on_repetition_and_leaves_its_input_alone(photo: np.ndarray) -> None:
@@ -370,14 +379,14 @@ def test_features_that_are_there_are_taken(photo: np.ndarray) -> None:
     gray = luma(photo)
     second = warped(gray, MILD, (256, 240))
     features = detect_sift(gray), detect_sift(second)
-    found = estimate_initial_geometry(tentative_matches(gray, second, features), "homography")
+    found = estimate_initial_geometry(find_tentative_matches(gray, second, features), "homography")
     whole = initial_geometry(gray, second, "homography")
     assert (found.model, whole.model, whole.num_views) == ("homography", "homography", 0)
     np.testing.assert_allclose(found.matrix, whole.matrix)
     np.testing.assert_array_equal(found.points1, whole.points1)
     assert found.log10_nfa == whole.log10_nfa
     fewest = detect_sift(second, SiftOptions(max_keypoints=100))
-    fewer = tentative_matches(gray, second, (features[0], fewest))
+    fewer = find_tentative_matches(gray, second, (features[0], fewest))
     assert 0 < len(fewer.points0) <= 100
 
 
@@ -385,7 +394,6 @@ def test_views_are_simulated_only_where_they_are_wanted(photo: np.ndarray) -> No
     gray = luma(photo)
     noise = np.random.default_rng(0).integers(0, 256, (240, 256)).astype(np.uint8)
     for other in (noise, np.zeros((64, 64), np.uint8)):
-        initial = tentative_matches(gray, other)
-        found = estimate_initial_geometry(initial, "homography", simulate_views=False)
+        found = estimate_initial_geometry(find_tentative_matches(gray, other), "homography")
         assert_nothing(found)
         assert found.num_views == 0

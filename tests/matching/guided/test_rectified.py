@@ -12,8 +12,8 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.matches import GuidedMatches
 from deepdetect.geometry import epipolar_errors, transform_points
 from deepdetect.io.image import luma
+from deepdetect.matching.guided import rectified, rectified_view
 from deepdetect.matching.guided.initial_geometry import find_initial_geometry
-from deepdetect.matching.guided.options import RectifiedMatchingOptions
 from deepdetect.matching.guided.rectified import match_by_rectification
 
 TURNED = cv2.getRotationMatrix2D((225, 190), 30, 1.0)
@@ -25,15 +25,10 @@ def cones(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return luma(pair.left), luma(pair.right), pair.disparity
 
 
-def match(
-    gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray, **changes: object
-) -> GuidedMatches | None:
+def match(gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray) -> GuidedMatches | None:
     first = find_initial_geometry(gray0, gray1, "fundamental")
     assert first.matrix is not None
-    options = RectifiedMatchingOptions(**changes)  # type: ignore[arg-type]
-    found = match_by_rectification(
-        gray0, gray1, xy0, first.points0, first.points1, first.matrix, options
-    )
+    found = match_by_rectification(gray0, gray1, xy0, first.points0, first.points1, first.matrix)
     return None if found is None else found[1]
 
 
@@ -73,11 +68,13 @@ def test_most_keypoints_are_matched_and_right(cones, move: np.ndarray, precision
     assert (np.diff(found.indices0) > 0).all()
 
 
-def test_low_correlation_is_kept_where_little_is_found_by_chance(cones) -> None:
+def test_low_correlation_is_kept_where_little_is_found_by_chance(cones, monkeypatch) -> None:
     """Smooth surfaces: what is kept beyond the bounds is right nearly as often."""
     left, right, _ = cones
     xy0 = every_second(left)
-    strict, lenient = (match(left, right, xy0, false_discovery_rate=rate) for rate in (0.0, 0.01))
+    lenient = match(left, right, xy0)
+    monkeypatch.setattr(rectified_view, "FALSE_DISCOVERY_RATE", 0.0)
+    strict = match(left, right, xy0)
     assert strict is not None
     assert lenient is not None
     assert set(strict.indices0) < set(lenient.indices0)
@@ -85,10 +82,11 @@ def test_low_correlation_is_kept_where_little_is_found_by_chance(cones) -> None:
     assert within(lenient, xy0, cones, np.eye(2, 3)) > 0.97
 
 
-def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(cones) -> None:
+def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(cones, monkeypatch) -> None:
     left, right, _ = cones
     xy0 = every_second(left)
-    found = match(left, right, xy0, max_volume=3e6)
+    monkeypatch.setattr(rectified_view, "MAX_VOLUME", 3e6)
+    found = match(left, right, xy0)
     assert found is not None
     assert len(found) > 0.25 * len(xy0)
     move = np.float64([[1, 0, 0], [0, 1, 0]])
@@ -104,10 +102,9 @@ def test_a_matrix_that_is_off_is_corrected(cones) -> None:
     wrong = np.linalg.inv(turn).T @ first.matrix
     xy0 = every_second(left)
     counts = []
-    for rounds in (0, 1):
+    for exact in (True, False):
         found = match_by_rectification(
-            *(left, right, xy0, first.points0, first.points1, wrong),
-            RectifiedMatchingOptions(max_refits=rounds),
+            *(left, right, xy0, first.points0, first.points1, wrong), exact=exact
         )
         assert found is not None
         matrix, matches = found
@@ -127,14 +124,15 @@ def test_matches_that_the_sparse_ones_contradict_do_not_count(cones) -> None:
     astray[::2, 0] -= 8
     given = left, right, every_second(left), first.points0, astray, first.matrix
     assert match_by_rectification(*given) is None
-    assert match_by_rectification(*given, RectifiedMatchingOptions(min_agreement=0.2)) is not None
+    assert match_by_rectification(*given, exact=True) is not None
 
 
-def test_without_tracked_corners_no_match_counts(cones) -> None:
+def test_without_tracked_corners_no_match_counts(cones, monkeypatch) -> None:
     gray0, gray1, _ = cones
     xy = every_second(gray0)
     assert match(gray0, gray1, xy) is not None
-    assert match(gray0, gray1, xy, min_tracks=1_000_000) is None
+    monkeypatch.setattr(rectified, "MIN_TRACKS", 1_000_000)
+    assert match(gray0, gray1, xy) is None
 
 
 def test_too_few_sparse_matches_give_no_frame(cones) -> None:

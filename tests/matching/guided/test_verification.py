@@ -11,18 +11,18 @@ import pytest
 from deepdetect.features.dense_sift import dense_sift
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided import verification
-from deepdetect.matching.guided.options import VerificationOptions
 from deepdetect.matching.guided.verification import (
     DESCRIPTOR_REACH,
+    FALSE_POSITIVE_RATE,
+    KEYPOINT_SIZES_PX,
+    NULL_SHIFTS,
     NullPairs,
     dissimilarity,
     index_map,
     sample_null_pairs,
-    verify_matches,
 )
 
-OPTIONS = VerificationOptions()
-BLOCK, BLOCKS = OPTIONS.null_block_px, OPTIONS.max_null_blocks
+BLOCK, BLOCKS = verification.NULL_BLOCK_PX, verification.MAX_NULL_BLOCKS
 
 HALF = 128
 REACH = 16
@@ -39,6 +39,10 @@ def picture() -> Callable[..., np.ndarray]:
         return cv2.resize(gray, (side, side), interpolation=cv2.INTER_AREA)
 
     return read
+
+
+def same_patches(*arguments: Any, **named: Any) -> np.ndarray:
+    return dissimilarity(*arguments, **named) < 1
 
 
 def every_pixel(gray: np.ndarray) -> np.ndarray:
@@ -65,8 +69,8 @@ def everywhere(gray: np.ndarray) -> np.ndarray:
 def test_the_same_image_agrees_nearly_everywhere(photo: np.ndarray) -> None:
     gray = luma(photo)
     pixels = every_pixel(gray)
-    assert verify_matches(gray, gray, everywhere(gray), pixels).mean() > 0.99
-    assert verify_matches(gray, seen_again(gray), everywhere(gray), pixels).mean() > 0.95
+    assert same_patches(gray, gray, everywhere(gray), pixels).mean() > 0.99
+    assert same_patches(gray, seen_again(gray), everywhere(gray), pixels).mean() > 0.95
 
 
 @pytest.mark.parametrize(
@@ -89,7 +93,7 @@ def test_under_another_photograph_next_to_nothing_agrees(
     for top, left in ((0, 0), (0, HALF), (HALF, 0), (HALF, HALF)):
         second = seen_again(gray)
         second[top : top + HALF, left : left + HALF] = strange
-        agreed = verify_matches(gray, second, everywhere(gray), pixels)
+        agreed = same_patches(gray, second, everywhere(gray), pixels)
         pasted = np.zeros(gray.shape, np.uint8)
         pasted[top : top + HALF, left : left + HALF] = 1
         kernel = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
@@ -98,7 +102,7 @@ def test_under_another_photograph_next_to_nothing_agrees(
         under_it.append(agreed[inner[row, column] > 0])
         others.append(agreed[outer[row, column] == 0])
     assert np.concatenate(others).mean() > 0.95
-    assert np.concatenate(under_it).mean() < OPTIONS.false_positive_rate
+    assert np.concatenate(under_it).mean() < FALSE_POSITIVE_RATE
 
 
 @pytest.mark.parametrize("name", ["astronaut", pytest.param("coffee", marks=pytest.mark.slow)])
@@ -108,17 +112,17 @@ def test_few_null_pairs_pass(picture: Callable[..., np.ndarray], name: str) -> N
     shares = []
     for across, down in ((0.25, 0.4), (0.4, 0.75), (0.6, 0.2), (0.75, 0.6)):
         moved = np.roll(seen_again(gray), (round(256 * down), round(256 * across)), (0, 1))
-        shares.append(verify_matches(gray, moved, everywhere(gray), edges(gray)).mean())
-    assert np.mean(shares) < 2 * OPTIONS.false_positive_rate
+        shares.append(same_patches(gray, moved, everywhere(gray), edges(gray)).mean())
+    assert np.mean(shares) < 2 * FALSE_POSITIVE_RATE
 
 
 def test_an_image_moved_by_more_than_a_descriptor_does_not_agree(photo: np.ndarray) -> None:
     gray = luma(photo)
     moved = np.roll(gray, (25, 20), (0, 1))
     pixels = edges(gray)
-    assert verify_matches(gray, moved, everywhere(gray), pixels).mean() < 0.1
+    assert same_patches(gray, moved, everywhere(gray), pixels).mean() < 0.1
     nearly = np.roll(gray, 1, 1)
-    assert verify_matches(gray, nearly, everywhere(gray), pixels).mean() > 0.95
+    assert same_patches(gray, nearly, everywhere(gray), pixels).mean() > 0.95
 
 
 def test_what_is_not_seen_does_not_agree(photo: np.ndarray) -> None:
@@ -126,10 +130,10 @@ def test_what_is_not_seen_does_not_agree(photo: np.ndarray) -> None:
     pixels = every_pixel(gray)
     seen = everywhere(gray)
     seen[:, 150:] = False
-    agreed = verify_matches(gray, gray, seen, pixels).reshape(gray.shape)
+    agreed = same_patches(gray, gray, seen, pixels).reshape(gray.shape)
     assert not agreed[:, 150:].any()
     assert agreed[:, :150].mean() > 0.98
-    assert not verify_matches(gray, gray, np.zeros(gray.shape, bool), pixels).any()
+    assert not same_patches(gray, gray, np.zeros(gray.shape, bool), pixels).any()
 
 
 def test_dissimilarity_is_one_at_the_bound_and_infinite_where_nothing_is_seen(
@@ -141,7 +145,6 @@ def test_dissimilarity_is_one_at_the_bound_and_infinite_where_nothing_is_seen(
     found = dissimilarity(gray, seen_again(gray), seen, pixels)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(np.isinf(found), pixels[:, 0] >= 150)
-    np.testing.assert_array_equal(found < 1, verify_matches(gray, seen_again(gray), seen, pixels))
     assert np.median(found[pixels[:, 0] < 150]) < np.median(
         dissimilarity(gray, np.roll(gray, 25, 1), seen, pixels)[pixels[:, 0] < 150]
     )
@@ -153,10 +156,10 @@ def test_follows_the_order_of_the_points(photo: np.ndarray) -> None:
     order = np.random.default_rng(0).permutation(len(pixels))
     second = seen_again(gray)
     second[:HALF, :HALF] = gray[HALF:, HALF:]
-    agreed = verify_matches(gray, second, everywhere(gray), pixels)
+    agreed = same_patches(gray, second, everywhere(gray), pixels)
     assert 0.1 < agreed.mean() < 0.95
     np.testing.assert_array_equal(
-        verify_matches(gray, second, everywhere(gray), pixels[order]), agreed[order]
+        same_patches(gray, second, everywhere(gray), pixels[order]), agreed[order]
     )
 
 
@@ -164,7 +167,7 @@ def test_takes_keypoints_in_single_precision(photo: np.ndarray) -> None:
     gray = luma(photo)
     pixels = edges(gray)
     first, second = (
-        verify_matches(gray, seen_again(gray), everywhere(gray), pixels.astype(kind))
+        same_patches(gray, seen_again(gray), everywhere(gray), pixels.astype(kind))
         for kind in (np.int64, np.float32)
     )
     np.testing.assert_array_equal(first, second)
@@ -177,7 +180,7 @@ def test_the_seed_decides_and_hardly_matters(photo: np.ndarray) -> None:
     pixels = every_pixel(gray)[::31]
     assert len(np.unique(pixels // BLOCK, axis=0)) > BLOCKS
     found = [
-        verify_matches(gray, seen_again(gray), everywhere(gray), pixels, seed=seed)
+        same_patches(gray, seen_again(gray), everywhere(gray), pixels, seed=seed)
         for seed in (0, 0, 5)
     ]
     np.testing.assert_array_equal(found[0], found[1])
@@ -225,14 +228,14 @@ def test_what_is_known_of_the_unmoved_image_is_not_described_again_and_the_same(
 def test_no_points_give_no_answers(photo: np.ndarray) -> None:
     gray = luma(photo)
     for nothing in (np.empty((0, 2)), np.empty((0, 2), np.int64)):
-        found = verify_matches(gray, gray, everywhere(gray), nothing)
+        found = same_patches(gray, gray, everywhere(gray), nothing)
         assert found.shape == (0,)
         assert found.dtype == bool
 
 
 def test_one_point_is_taken(photo: np.ndarray) -> None:
     gray = luma(photo)
-    found = verify_matches(gray, gray, everywhere(gray), np.array([[80, 60]]))
+    found = same_patches(gray, gray, everywhere(gray), np.array([[80, 60]]))
     assert found.tolist() == [True]
 
 
@@ -240,12 +243,9 @@ def test_flat_images_tell_nothing(photo: np.ndarray) -> None:
     """No place is more similar to another than to any unrelated one."""
     flat = np.full((70, 90), 90, np.uint8)
     pixels = every_pixel(flat)
-    assert not verify_matches(flat, flat, everywhere(flat), pixels).any()
+    assert not same_patches(flat, flat, everywhere(flat), pixels).any()
     for pair in ((luma(photo)[:70, :90], flat), (flat, luma(photo)[:70, :90])):
-        assert (
-            verify_matches(*pair, everywhere(flat), pixels).mean()
-            < 1.5 * OPTIONS.false_positive_rate
-        )
+        assert same_patches(*pair, everywhere(flat), pixels).mean() < 1.5 * FALSE_POSITIVE_RATE
 
 
 @pytest.mark.slow
@@ -264,7 +264,7 @@ def test_images_that_are_flat_for_a_large_part_tell_nothing(width: int) -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (5, 5), (1, 30), (16, 16)])
 def test_tiny_images_are_taken(shape: tuple[int, int]) -> None:
     gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    found = verify_matches(gray, gray, everywhere(gray), every_pixel(gray))
+    found = same_patches(gray, gray, everywhere(gray), every_pixel(gray))
     assert found.shape == (gray.size,)
     assert found.dtype == bool
 
@@ -293,7 +293,7 @@ def test_it_changes_little_which_points_are_described(photo: np.ndarray) -> None
     pixels = every_pixel(gray)
     even, odd = (pixels[pixels.sum(axis=1) % 2 == parity] for parity in (0, 1))
     second = seen_again(gray)
-    shares = [verify_matches(gray, second, everywhere(gray), part).mean() for part in (even, odd)]
+    shares = [same_patches(gray, second, everywhere(gray), part).mean() for part in (even, odd)]
     assert abs(shares[0] - shares[1]) < 0.03
 
 
@@ -319,7 +319,7 @@ def test_under_a_point_of_the_shifted_image_lies_its_null_partner(
     gray: np.ndarray, points: np.ndarray
 ) -> None:
     chosen = sample_null_pairs(points, gray, everywhere(gray))
-    assert len(chosen) == len(OPTIONS.null_shifts)
+    assert len(chosen) == len(NULL_SHIFTS)
     for null in chosen:
         left_out = np.setdiff1d(np.arange(len(points)), null.rows)
         assert 0 < len(left_out) < 0.4 * len(points)  # their partners alone lie at an edge
@@ -335,7 +335,7 @@ def test_under_a_point_of_the_shifted_image_lies_its_null_partner(
         assert apart.min() >= min(gray.shape) // 3
 
 
-@pytest.mark.parametrize("size", OPTIONS.keypoint_sizes_px)
+@pytest.mark.parametrize("size", KEYPOINT_SIZES_PX)
 def test_interior_descriptors_are_those_of_the_image_that_is_not_shifted(
     gray: np.ndarray, points: np.ndarray, size: float
 ) -> None:

@@ -2,16 +2,14 @@
 
 from ...features.matches import GuidedMatches
 from .initial_geometry import InitialGeometry
-from .options import GuidedOptions
 from .pipeline import guided_matches, guiding_geometry
-from .sparse_matches import TentativeMatches, tentative_matches
+from .tentative_matches import TentativeMatches, find_tentative_matches
 
 __all__ = [
     "GuidedMatches",
-    "GuidedOptions",
     "InitialGeometry",
     "TentativeMatches",
+    "find_tentative_matches",
     "guided_matches",
     "guiding_geometry",
-    "tentative_matches",
 ]

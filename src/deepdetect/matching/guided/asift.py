@@ -22,11 +22,15 @@ BLUR = 0.8
 
 GRAY_OUTSIDE = 128
 
+TILTS = (2.0, 4.0)
+"""Of the simulated views: how many times shorter one direction is seen."""
 
-def simulated_views(
-    gray: np.ndarray, tilt: float, rotation_step_deg: float, sift: SiftOptions
-) -> Iterator[Keypoints]:
-    """Detect keypoints of an image seen from the side; the rotation step is that of a tilt of 1.
+ROTATION_STEP_DEG = 72.0
+"""Between the directions of the views for a tilt of 1; it is inversely proportional to the tilt."""
+
+
+def simulated_views(gray: np.ndarray, tilt: float, max_keypoints: int) -> Iterator[Keypoints]:
+    """Detect keypoints of an image seen from the side, at most so many in each view.
 
     Yields:
         The described keypoints of each view, at their positions in the image itself.
@@ -34,7 +38,7 @@ def simulated_views(
 
     def see(rotation_deg: float) -> Keypoints:
         view, to_view = simulate_view(gray, tilt, rotation_deg)
-        found = detect_sift(view, sift)
+        found = detect_sift(view, SiftOptions(max_keypoints=max_keypoints))
         back = cv2.invertAffineTransform(to_view)
         xy = found.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
         inside = ((xy > 0) & (xy < np.array(gray.shape[::-1]) - 1)).all(1)
@@ -46,7 +50,7 @@ def simulated_views(
             descriptors=found.descriptors[inside],
         )
 
-    directions = round(180 * tilt / rotation_step_deg)
+    directions = round(180 * tilt / ROTATION_STEP_DEG)
     rotations = np.linspace(0, 180, directions, endpoint=False).tolist()
     with ThreadPoolExecutor(processor_count()) as pool:
         yield from pool.map(see, rotations)

@@ -8,12 +8,28 @@ import numpy as np
 
 from ..._shared.parallel import parallel_for
 from ...features.matchers import DescriptorMatches
+from ...geometry.homography_refinement import refine_homography
 from ...geometry.rescaling import downscale, scaled_homography
 from ...geometry.residuals import transform_points
-from ...geometry.validated_refinement import refine_homography_validated
 from ...geometry.zncc import warp_to_reference
-from .options import HomographyMatchingOptions, VerificationOptions
 from .verification import dissimilarity
+
+MAX_DISTANCE_PX = 1.0
+"""From where the homography takes a keypoint to its partner."""
+
+MIN_PROPOSED_FRACTION = 0.25
+"""Where fewer of the keypoints that the second image shows under the homography have a partner
+there, keypoints are few, and all of them are verified."""
+
+MAX_VERIFIED_MEGAPIXELS = 6.0
+"""Larger images are compared at this size, which bounds memory and time."""
+
+MAX_REFINED_SIDE_PX = 1600
+"""Longer sides are scaled down to this while the homography is refined."""
+
+MAX_SCALE_RATIO = 1.5
+"""Of the two images; where one shows the scene finer by more than this, it is scaled down to the
+other for the refinement."""
 
 MIN_SCALE = 1 / 16
 """Of one image in the other; beyond it a homography shows nothing that could be refined."""
@@ -37,8 +53,6 @@ class ImagePair:
 def match_by_homography(
     pair: ImagePair,
     homography: np.ndarray,
-    options: HomographyMatchingOptions = HomographyMatchingOptions(),
-    verification: VerificationOptions = VerificationOptions(),
     seed: int = 0,
 ) -> tuple[DescriptorMatches, float]:
     """Match keypoints by a homography, and keep those whose patches are the same.
@@ -54,15 +68,15 @@ def match_by_homography(
     rows1, distances = nearest_keypoint(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
     with np.errstate(invalid="ignore"):
         shown = (places > -0.5) & (places < np.array(gray1.shape[::-1]) - 0.5)
-    near = distances < options.max_distance_px
+    near = distances < MAX_DISTANCE_PX
     rows0 = np.flatnonzero(shown.all(axis=1))
     proposed = np.flatnonzero(near)
     # Where keypoints are few it is chance which of them have another there: all are judged.
-    if len(proposed) >= options.min_proposed_fraction * len(rows0):
+    if len(proposed) >= MIN_PROPOSED_FRACTION * len(rows0):
         rows0 = proposed
     if not len(rows0):
         return DescriptorMatches(rows0, rows0, np.empty(0, np.float32)), 0.0
-    ratios = _compare(pair, homography, rows0, verification, seed)
+    ratios = _compare(pair, homography, rows0, seed)
     same = ratios < 1
     kept = same & near[rows0]
     matched = rows0[kept]
@@ -73,12 +87,11 @@ def _compare(
     pair: ImagePair,
     homography: np.ndarray,
     rows0: np.ndarray,
-    options: VerificationOptions,
     seed: int,
 ) -> np.ndarray:
     """Return the `dissimilarity` of keypoints, of large images on smaller copies."""
     (gray0, scale0), (gray1, scale1) = (
-        downscale(gray, round(max(gray.shape) * min(1, np.sqrt(options.max_megapixels / area))))
+        downscale(gray, round(max(gray.shape) * min(1, np.sqrt(MAX_VERIFIED_MEGAPIXELS / area))))
         for gray, area in ((each, each.size / 1e6) for each in (pair.gray0, pair.gray1))
     )
     pixels = pair.xy0[rows0]
@@ -87,42 +100,40 @@ def _compare(
         last = np.array(gray0.shape[::-1], np.float32) - 1
         pixels = np.clip(np.rint((pixels + np.float32(0.5)) * scale0 - 0.5), 0, last)
     warped, valid = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
-    return dissimilarity(gray0, warped, valid, pixels, options, seed)
+    return dissimilarity(gray0, warped, valid, pixels, seed)
 
 
 def refine_guiding_homography(
-    gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray, options: HomographyMatchingOptions
+    gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray
 ) -> np.ndarray:
     """Refine a homography on the images, scaled down to what that needs; (3, 3).
 
     Where one image shows the scene much finer it is scaled down to the other: corners of different
     scales are not at the same place.
     """
-    coarser0, coarser1 = _scales_at_centre(homography, gray0.shape, options.max_scale_ratio)
+    coarser0, coarser1 = _scales_at_centre(homography, gray0.shape)
     (small0, scale0), (small1, scale1) = (
-        downscale(gray, min(options.max_side_px, round(max(gray.shape) * scale)))
+        downscale(gray, min(MAX_REFINED_SIDE_PX, round(max(gray.shape) * scale)))
         for gray, scale in ((gray0, coarser0), (gray1, coarser1))
     )
     start = scaled_homography(homography, scale0, scale1)
-    found = refine_homography_validated(small0, small1, start, options.refinement)
+    found = refine_homography(small0, small1, start)
     return scaled_homography(found, 1 / scale0, 1 / scale1)
 
 
-def _scales_at_centre(
-    homography: np.ndarray, shape: tuple[int, ...], max_ratio: float
-) -> tuple[float, float]:
+def _scales_at_centre(homography: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float]:
     """Return the scales of both images at which the finer one is as coarse as the other.
 
-    Finer: in every direction, by more than `max_ratio`, in the middle of the first image.
+    Finer: in every direction, by more than `MAX_SCALE_RATIO`, in the middle of the first image.
     """
     centre = np.array([shape[1] / 2, shape[0] / 2])
     places = transform_points(centre + [[0, 0], [1, 0], [0, 1]], homography)
     if not np.isfinite(places).all():
         return 1.0, 1.0
     largest, smallest = np.linalg.svd(places[1:] - places[0], compute_uv=False)
-    if largest * max_ratio < 1:
+    if largest * MAX_SCALE_RATIO < 1:
         return max(float(largest), MIN_SCALE), 1.0
-    if smallest > max_ratio:
+    if smallest > MAX_SCALE_RATIO:
         return 1.0, max(1 / float(smallest), MIN_SCALE)
     return 1.0, 1.0
 

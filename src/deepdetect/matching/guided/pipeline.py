@@ -20,14 +20,29 @@ from .homography import (
     refine_guiding_homography,
 )
 from .initial_geometry import (
+    MIN_COARSE_INLIERS,
+    MIN_PARALLAX_FRACTION,
     InitialGeometry,
     estimate_initial_geometry,
     find_initial_geometry,
     geometry_of_points,
 )
-from .options import GuidedOptions
 from .rectified import match_by_rectification
-from .sparse_matches import Points, TentativeMatches, matches_of_points
+from .tentative_matches import Points, TentativeMatches, matches_of_points
+
+MIN_VERIFIED_FRACTION = 0.5
+"""Of what a homography proposes, this must be the same patches: with less, little of the scene lies
+on the plane."""
+
+MIN_VERIFIED_FRACTION_OF_DEPTH = 0.6
+"""The same where matches off the plane agree on an epipole."""
+
+MIN_MATCHED_FRACTION = 0.02
+"""With a smaller fraction of the keypoints of a scene with depth matched, only the sparse matches
+that agree with its geometry are taken."""
+
+MIN_MATCHES = 8
+"""With fewer the geometry is not trusted after all."""
 
 
 def guided_matches(
@@ -37,8 +52,7 @@ def guided_matches(
     xy1: np.ndarray,
     model: str = "auto",
     seed: int = 0,
-    tentative: Points | TentativeMatches | None = None,
-    options: GuidedOptions = GuidedOptions(),
+    tentative: TentativeMatches | Points | None = None,
     points: tuple[Keypoints, Keypoints] | None = None,
     first: InitialGeometry | None = None,
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
@@ -49,9 +63,8 @@ def guided_matches(
         xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
         model: "homography", "fundamental" or "auto".
         seed: of all random choices.
-        tentative: matches of the pair, where `tentative_matches` has made them already; or two
-            (K, 2) arrays of positions, which take the place of these.
-        options: all tuned numbers.
+        tentative: sparse matches of the pair, where `find_tentative_matches` has made them
+            already, or (K, 2) positions in both images that take the place of our own.
         points: keypoints of both images, best first; where they have sizes and angles and are
             enough, the sparse matches are made of them.
         first: the geometry to begin with, where `guiding_geometry` has found it already.
@@ -60,30 +73,36 @@ def guided_matches(
         The geometry that guided, and the matches; None when no geometry could be trusted.
 
     Raises:
-        OptionError: the model is unknown, or the tentative matches are none.
+        OptionError: the model is unknown, or the positions are no matches.
     """
     if first is None:
-        first = guiding_geometry(gray0, gray1, model, seed, tentative, options, points)
+        first = guiding_geometry(gray0, gray1, model, seed, tentative, points)
     if first.matrix is None:
         return first.as_two_view_geometry(), None
     pair = ImagePair(gray0, gray1, xy0, xy1)
-    matrix, found = first.matrix, None
+    enough = MIN_MATCHED_FRACTION * min(len(xy0), len(xy1))
+    matrix: np.ndarray = first.matrix
+    found = None
     if first.model == "homography":
-        matrix, found = _match_plane(pair, first, options, seed)
+        matrix, found = _match_plane(pair, first, seed)
         if found is None:
-            views = first.num_views
-            known = first.initial if tentative is None else tentative
-            first = guiding_geometry(gray0, gray1, "fundamental", seed, known, options, points)
-            first = replace(first, num_views=first.num_views + views)
+            known = first.tentative if tentative is None else tentative
+            depth = guiding_geometry(gray0, gray1, "fundamental", seed, known, points)
+            first = replace(depth, num_views=depth.num_views + first.num_views)
             if first.matrix is None:
-                return _no_guide(first), None
-    enough = options.min_matched_fraction * min(len(xy0), len(xy1))
-    if found is not None and len(found) < enough:
-        return _no_guide(first), None
+                return first.untrusted().as_two_view_geometry(), None
+        elif len(found) < enough:
+            return first.untrusted().as_two_view_geometry(), None
     if found is None:
-        matrix, found = _match_scene_with_depth(pair, first, options, seed)
-    if len(found) < options.min_matches:
-        return _no_guide(first), None
+        assert first.matrix is not None
+        made = match_by_rectification(gray0, gray1, xy0, first.points0, first.points1, first.matrix)
+        if made is None or len(made[1]) < enough:
+            # Too little around the sparse matches is alike, but they are distinct, and agree.
+            matrix, found = first.matrix, _sparse_matches(pair, first)
+        else:
+            matrix, found = made
+    if len(found) < MIN_MATCHES:
+        return first.untrusted().as_two_view_geometry(), None
     return replace(first, matrix=matrix).as_two_view_geometry(), found
 
 
@@ -92,68 +111,38 @@ def guiding_geometry(
     gray1: np.ndarray,
     model: str = "auto",
     seed: int = 0,
-    tentative: Points | TentativeMatches | None = None,
-    options: GuidedOptions = GuidedOptions(),
+    tentative: TentativeMatches | Points | None = None,
     points: tuple[Keypoints, Keypoints] | None = None,
 ) -> InitialGeometry:
-    """Return the geometry to begin with: of given matches, of enough points, else of SIFT's.
+    """Return the geometry to begin with: of given matches, of points where enough, else of SIFT.
 
     Arguments and errors are those of `guided_matches`.
     """
-    chosen = options.initial_geometry
-    if isinstance(tentative, tuple):
+    if tentative is not None and not isinstance(tentative, TentativeMatches):
         sizes = gray0.shape[::-1], gray1.shape[::-1]
-        return geometry_of_points(tentative, sizes, model, seed, chosen)
+        return geometry_of_points(tentative, sizes, model, seed)
     if tentative is None and points is not None:
-        matches = matches_of_points(gray0, gray1, points, chosen)
+        matches = matches_of_points(gray0, gray1, points)
         if matches is not None:
-            found = estimate_initial_geometry(matches, model, seed, chosen, simulate_views=False)
-            if len(found.points0) >= chosen.min_first_inliers:
+            found = estimate_initial_geometry(matches, model, seed)
+            if len(found.points0) >= MIN_COARSE_INLIERS:
                 return found
-    return find_initial_geometry(gray0, gray1, model, seed, chosen, tentative)
+    return find_initial_geometry(gray0, gray1, model, seed, tentative)
 
 
 def _match_plane(
-    pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
+    pair: ImagePair, first: InitialGeometry, seed: int
 ) -> tuple[np.ndarray, GuidedMatches | None]:
     """Match by a homography; None where the images show that the scene is no plane."""
     assert first.matrix is not None
-    plane = options.homography_matching
-    matrix = refine_guiding_homography(pair.gray0, pair.gray1, first.matrix, plane)
-    matches, verified = match_by_homography(pair, matrix, plane, options.verification, seed)
-    found = _at_keypoints(pair, matches)
+    matrix = refine_guiding_homography(pair.gray0, pair.gray1, first.matrix)
+    matches, verified = match_by_homography(pair, matrix, seed)
     parallax = first.parallax
-    if parallax is None:  # a homography was asked for
-        return matrix, found
-    seen = parallax.is_seen(options.initial_geometry.model_selection)
-    agree = parallax.agreeing >= plane.min_parallax_fraction * parallax.on_plane
-    least = plane.min_verified_fraction
-    if seen and agree:
-        least = max(least, plane.min_verified_fraction_of_depth)
-    return matrix, found if verified >= least else None
-
-
-def _match_scene_with_depth(
-    pair: ImagePair, first: InitialGeometry, options: GuidedOptions, seed: int
-) -> tuple[np.ndarray, GuidedMatches]:
-    """Match by rectification; where that finds too little, return the sparse matches that agree.
-
-    Then too little around them is alike, but they themselves are distinct, and agree.
-    """
-    assert first.matrix is not None
-    found = match_by_rectification(
-        pair.gray0,
-        pair.gray1,
-        pair.xy0,
-        first.points0,
-        first.points1,
-        first.matrix,
-        options.rectified_matching,
-    )
-    enough = options.min_matched_fraction * min(len(pair.xy0), len(pair.xy1))
-    if found is None or len(found[1]) < enough:
-        return first.matrix, _sparse_matches(pair, first)
-    return found
+    least = 0.0  # a homography was asked for
+    if parallax is not None:
+        doubtful = parallax.exceeds(MIN_PARALLAX_FRACTION)
+        least = MIN_VERIFIED_FRACTION_OF_DEPTH if doubtful else MIN_VERIFIED_FRACTION
+    return matrix, _at_keypoints(pair, matches) if verified >= least else None
 
 
 def _sparse_matches(pair: ImagePair, first: InitialGeometry) -> GuidedMatches:
@@ -162,20 +151,11 @@ def _sparse_matches(pair: ImagePair, first: InitialGeometry) -> GuidedMatches:
     rows, distances = nearest_keypoint(first.points0, pair.xy0, (width, height))
     near = np.isfinite(distances)
     moved = first.points1[near] + pair.xy0[rows[near]] - first.points0[near]
-    found = GuidedMatches(
-        rows[near].astype(np.int64), moved, np.full(np.count_nonzero(near), 0.5, np.float32)
-    )
-    order = np.unique(found.indices0, return_index=True)[1]
-    return GuidedMatches(found.indices0[order], found.points1[order], found.scores[order])
+    rows, order = np.unique(rows[near].astype(np.int64), return_index=True)
+    return GuidedMatches(rows, moved[order], np.full(len(rows), 0.5, np.float32))
 
 
 def _at_keypoints(pair: ImagePair, found: DescriptorMatches) -> GuidedMatches:
     scores = np.clip(1 - found.ratios, 0, 1)
     places = pair.xy1[found.indices1].astype(np.float64)
     return GuidedMatches(found.indices0, places, scores, indices1=found.indices1)
-
-
-def _no_guide(first: InitialGeometry) -> TwoViewGeometry:
-    return replace(
-        first, model="none", matrix=None, points0=first.points0[:0]
-    ).as_two_view_geometry()

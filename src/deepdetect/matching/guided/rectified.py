@@ -19,12 +19,42 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ...features.matches import GuidedMatches
-from ...geometry.homography_refinement import equalise
+from ...geometry.optical_flow import equalise, track_round_trip
 from ...geometry.rescaling import scaled_points
 from ...geometry.residuals import epipolar_errors
 from ...geometry.semi_calibrated import refine_fundamental
-from .options import RectifiedMatchingOptions
 from .rectified_view import RectifiedView, range_with_margin, rectified_view
+
+MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
+"""Where this fraction of the tracked corners has its rows nearer than this to the lines of the new
+matrix, the old rows are good enough, and the images are not rectified again."""
+
+MAX_RANGE_EXCESS = 1.25
+"""Images that were scaled down are rectified again, too, where more was searched than this times
+the range of what was found."""
+
+MIN_SIGMA_PX = 0.1
+"""A track or a sparse match is never counted as more exact than this."""
+
+TRACKED_CORNERS = 2000
+TRACKED_WINDOW_PX = 15
+"""Side of the windows in which they are tracked."""
+
+MAX_ROUND_TRIP_PX = 0.3
+"""A track counts when it ends this near to its start, forth and back."""
+
+MAX_TRACK_PX = 4.0
+"""A track that moves further than this from its match is wrong."""
+
+MIN_TRACKS = 50
+"""That a matrix is estimated from; where fewer corners can be tracked to where they are matched, no
+match counts."""
+
+MAX_DISAGREEMENT_PX = 3.0
+"""By which the disparity of a right sparse match, found in images of another scale, may differ."""
+
+MIN_AGREEMENT = 0.75
+"""This fraction of the sparse matches must lie where the disparities say."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +78,7 @@ def match_by_rectification(
     points0: np.ndarray,
     points1: np.ndarray,
     fundamental: np.ndarray,
-    options: RectifiedMatchingOptions = RectifiedMatchingOptions(),
+    exact: bool = False,
 ) -> tuple[np.ndarray, GuidedMatches] | None:
     """Match keypoints of the first image by rectifying the pair.
 
@@ -57,7 +87,8 @@ def match_by_rectification(
         xy0: (N, 2) keypoints of the first image.
         points0, points1: (K, 2) sparse matches that fit the fundamental matrix.
         fundamental: (3, 3) with x1^T F x0 = 0.
-        options: how.
+        exact: whether the matrix is known: the images are not rectified again by a better one, and
+            sparse matches that contradict do not matter.
 
     Returns:
         The refined fundamental matrix and the matches, which fit it exactly; None where the pair
@@ -66,23 +97,20 @@ def match_by_rectification(
     """
     sizes = (gray0.shape[::-1], gray1.shape[::-1])
     sparse = points0, points1
-    view = rectified_view(gray0, gray1, *sparse, fundamental, options)
-    tracks = None if view is None else _track(view, options)
+    view = rectified_view(gray0, gray1, *sparse, fundamental)
+    tracks = None if view is None else _track(view)
     if view is None or tracks is None:
         return None
-    fundamental = _refine(fundamental, sparse, tracks, sizes, options)
-    near = _are_near(tracks, fundamental, options)
-    wide = _is_range_too_wide(view, options)
-    for _ in range(options.max_refits):
-        if near and not wide:
-            break
-        again = rectified_view(gray0, gray1, *tracks.positions, fundamental, options)
-        found = None if again is None else _track(again, options)
-        if again is None or found is None or _matched(again) < _matched(view):
-            break
-        view, tracks, near, wide = again, found, True, False
-        fundamental = _refine(fundamental, sparse, tracks, sizes, options)
-    if _agreement(view, sparse, options.max_disagreement_px) < options.min_agreement:
+    fundamental = _refine(fundamental, sparse, tracks, sizes)
+    near = _are_near(tracks, fundamental)
+    wide = _is_range_too_wide(view)
+    if (wide or not near) and not exact:
+        again = rectified_view(gray0, gray1, *tracks.positions, fundamental)
+        found = None if again is None else _track(again)
+        if again is not None and found is not None and _matched(again) >= _matched(view):
+            view, tracks, near = again, found, True
+            fundamental = _refine(fundamental, sparse, tracks, sizes)
+    if not exact and _agreement(view, sparse) < MIN_AGREEMENT:
         return None
     # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
     disparity = view.kept if near else view.disparities.disparity
@@ -98,23 +126,18 @@ def _refine(
     sparse: tuple[np.ndarray, np.ndarray],
     tracks: Tracks,
     sizes: tuple[tuple[int, int], tuple[int, int]],
-    options: RectifiedMatchingOptions,
 ) -> np.ndarray:
     """Fit the fundamental matrix to tracks and sparse matches, as exact as each of them are."""
     sigmas = []
     for points0, points1 in (sparse, tracks.positions):
         errors = epipolar_errors(points0, points1, fundamental)
-        sigma = max(1.4826 * float(np.median(errors)), options.min_sigma_px)
+        sigma = max(1.4826 * float(np.median(errors)), MIN_SIGMA_PX)
         sigmas.append(np.full(len(points0), sigma))
     points0, points1 = (np.concatenate([sparse[side], tracks.positions[side]]) for side in (0, 1))
-    return refine_fundamental(
-        points0, points1, fundamental, sizes, np.concatenate(sigmas), options.semi_calibrated
-    )
+    return refine_fundamental(points0, points1, fundamental, sizes, np.concatenate(sigmas))
 
 
-def _agreement(
-    view: RectifiedView, sparse: tuple[np.ndarray, np.ndarray], max_disagreement_px: float
-) -> float:
+def _agreement(view: RectifiedView, sparse: tuple[np.ndarray, np.ndarray]) -> float:
     """Return the fraction of the sparse matches with a disparity that lie where it says.
 
     They know nothing of each other: where most contradict, what looks alike on the rows is another
@@ -131,23 +154,23 @@ def _agreement(
     column, row = nearest[inside].T
     errors = places[0][inside, 0] - places[1][inside, 0] - disparity[row, column]
     errors = np.abs(errors[np.isfinite(errors)])
-    return float((errors < max_disagreement_px).mean()) if len(errors) else 0.0
+    return float((errors < MAX_DISAGREEMENT_PX).mean()) if len(errors) else 0.0
 
 
-def _are_near(tracks: Tracks, fundamental: np.ndarray, options: RectifiedMatchingOptions) -> bool:
+def _are_near(tracks: Tracks, fundamental: np.ndarray) -> bool:
     """Whether the rows that were matched are near the lines of a matrix."""
     errors = epipolar_errors(*tracks.on_rows, fundamental)
-    return float(np.quantile(errors, options.row_quantile)) < options.max_row_error_px
+    return float(np.quantile(errors, ROW_QUANTILE)) < MAX_ROW_ERROR_PX
 
 
-def _is_range_too_wide(view: RectifiedView, options: RectifiedMatchingOptions) -> bool:
+def _is_range_too_wide(view: RectifiedView) -> bool:
     """Whether less had to be searched than was, so that larger images could have been matched."""
     searched = view.disparities.disparity_range
     if view.scale == 1 or searched is None:
         return False
-    low, high = range_with_margin(view.disparities.disparity[view.disparities.matched], options)
+    low, high = range_with_margin(view.disparities.disparity[view.disparities.matched])
     width = searched[1] - searched[0]
-    return width > options.max_range_excess * (high - low)
+    return width > MAX_RANGE_EXCESS * (high - low)
 
 
 def _moved_to_lines(
@@ -165,34 +188,24 @@ def _matched(view: RectifiedView) -> int:
     return int(np.count_nonzero(view.disparities.matched))
 
 
-def _track(view: RectifiedView, options: RectifiedMatchingOptions) -> Tracks | None:
-    """Track corners around their matches; None with fewer than `min_tracks`."""
+def _track(view: RectifiedView) -> Tracks | None:
+    """Track corners around their matches; None with fewer than `MIN_TRACKS`."""
     first, second = equalise(view.first), equalise(view.second)
     mask = view.disparities.matched.astype(np.uint8)
-    corners = cv2.goodFeaturesToTrack(first, options.refit_corners, 0.001, 5, mask=mask)
-    if corners is None or len(corners) < options.min_tracks:
+    corners = cv2.goodFeaturesToTrack(first, TRACKED_CORNERS, 0.001, 5, mask=mask)
+    if corners is None or len(corners) < MIN_TRACKS:
         return None
     start = corners.reshape(-1, 2)
     column, row = np.rint(start).astype(np.int64).T
     expected = start - np.column_stack(
         [view.disparities.disparity[row, column], np.zeros(len(start))]
     ).astype(np.float32)
-    window = {
-        "winSize": (options.refit_window_px, options.refit_window_px),
-        "maxLevel": 1,
-        "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-    }
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
-        first, second, corners, expected[:, None].copy(), **window
+    there, gaps = track_round_trip(
+        first, second, start, TRACKED_WINDOW_PX, levels=1, expected=expected
     )
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        second, first, there, (there.reshape(-1, 2) + start - expected)[:, None].copy(), **window
-    )
-    there, back = there.reshape(-1, 2), back.reshape(-1, 2)
-    good = (found.ravel() > 0) & (found_back.ravel() > 0)
-    good &= np.linalg.norm(back - start, axis=1) < options.max_round_trip_px
-    good &= np.abs(there - expected).max(axis=1) < options.max_track_px
-    if np.count_nonzero(good) < options.min_tracks:
+    good = gaps < MAX_ROUND_TRIP_PX
+    good &= np.abs(there - expected).max(axis=1) < MAX_TRACK_PX
+    if np.count_nonzero(good) < MIN_TRACKS:
         return None
     on_rows = np.column_stack([there[good, 0], start[good, 1]])
     first_places, second_places, row_places = (

@@ -21,9 +21,44 @@ from ..stereo.matching import (
     compute_disparity,
     find_disparity_range,
 )
-from .options import RectifiedMatchingOptions
 
 Range = tuple[int, int]
+
+DISPARITY = DisparityOptions(discontinuity_margin_px=1)
+"""How rows are matched; the range is found."""
+
+MAX_VOLUME = 1e8
+"""Pixels of the frame times disparities; with more, the images are scaled down."""
+
+TAIL_FRACTION = 0.01
+"""Of the disparities of sparse matches at each end, which may be wrong."""
+
+MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
+"""Added to the range of disparities at both ends, in pixels, and as a fraction of it."""
+
+MIN_FRACTION_OF_ONE_SIGN = 0.8
+"""Where so many sparse matches grow about an epipole, or shrink, others do so by `MARGIN_PX` at
+most."""
+
+CORRELATION_WINDOW_PX = 9
+"""Side of the window in which both images are compared after matching."""
+
+CORRELATION_SIGMA_PX = 1.0
+"""Of the blur before that."""
+
+MIN_CORRELATION = 0.3
+"""A match whose windows correlate less is left out, unless `FALSE_DISCOVERY_RATE` allows it."""
+
+FALSE_POSITIVE_RATE = 0.01
+"""So many of the pixels may be matched by chance; matches whose windows correlate too little for
+that are left out. It is measured on rows that show something else."""
+
+FALSE_DISCOVERY_RATE = 0.01
+"""While no more than this fraction of the matches is found by chance, the two bounds above hold
+only for the matches that geometry relies on."""
+
+NULL_FRACTION = 0.25
+"""Of the rows, which are matched with others for that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,18 +89,17 @@ def rectified_view(
     points0: np.ndarray,
     points1: np.ndarray,
     fundamental: np.ndarray,
-    options: RectifiedMatchingOptions,
 ) -> RectifiedView | None:
     """Rectify both images, smaller where there would be too much to search, and match rows."""
     scale, sizes = 1.0, (gray0.shape[::-1], gray1.shape[::-1])
-    frame = rectified_frame(points0, points1, fundamental, *sizes, options.frame)
+    frame = rectified_frame(points0, points1, fundamental, *sizes)
     if frame is None:
         return None
-    low, high = _range_of_matches(frame, points0, points1, options)
+    low, high = _range_of_matches(frame, points0, points1)
     volume = float(np.prod(frame.size)) * (high - low + 1)
-    if volume > options.max_volume:
+    if volume > MAX_VOLUME:
         longest = max(*gray0.shape, *gray1.shape)
-        side = max(1, round(longest * (options.max_volume / volume) ** (1 / 3)))
+        side = max(1, round(longest * (MAX_VOLUME / volume) ** (1 / 3)))
         scale = side / longest
         gray0, gray1 = (
             downscale(gray, round(max(gray.shape) * scale))[0] for gray in (gray0, gray1)
@@ -73,11 +107,11 @@ def rectified_view(
         points0, points1 = scaled_points(points0, scale), scaled_points(points1, scale)
         fundamental = scaled_fundamental(fundamental, scale, scale)
         sizes = (gray0.shape[::-1], gray1.shape[::-1])
-        frame = rectified_frame(points0, points1, fundamental, *sizes, options.frame)
+        frame = rectified_frame(points0, points1, fundamental, *sizes)
         if frame is None:
             return None
     (first, valid0), (second, valid1) = frame.warp(gray0, 0), frame.warp(gray1, 1)
-    low, high = _range_of_matches(frame, points0, points1, options)
+    low, high = _range_of_matches(frame, points0, points1)
     # About an epipole everything grows, or everything shrinks: what small copies of the two views
     # agree on in the other direction is wrong.
     polar = isinstance(frame, PolarFrame)
@@ -85,19 +119,17 @@ def rectified_view(
     if seen is not None:
         low, high = min(low, seen[0]), max(high, seen[1])
         # What both views agree on may be far off where much of a frame shows nothing.
-        limit = int(options.max_volume / float(np.prod(frame.size)))
+        limit = int(MAX_VOLUME / float(np.prod(frame.size)))
         if high - low > limit:
-            low, high = _range_of_matches(frame, points0, points1, options)
+            low, high = _range_of_matches(frame, points0, points1)
     widest = frame.size[0] - 1
     low, high = max(low, -widest), min(high, widest)
     if low >= high:
         return None
-    chosen = replace(options.disparity, disparity_range=(low, high))
-    found, correlation = _match_rows(first, second, valid0, valid1, chosen, options)
-    chance = _match_by_chance(first, second, valid0, valid1, chosen, options)
-    bounds = _correlation_bounds(
-        correlation[found.matched], *chance, int(np.count_nonzero(valid0)), options
-    )
+    chosen = replace(DISPARITY, disparity_range=(low, high))
+    found, correlation = _match_rows(first, second, valid0, valid1, chosen)
+    chance = _match_by_chance(first, second, valid0, valid1, chosen)
+    bounds = _correlation_bounds(correlation[found.matched], *chance, int(np.count_nonzero(valid0)))
     relied, kept = (found.matched & (correlation >= bound) for bound in bounds)
     nan = np.float32(np.nan)
     return RectifiedView(
@@ -117,7 +149,6 @@ def _match_rows(
     valid0: np.ndarray,
     valid1: np.ndarray,
     disparity_options: DisparityOptions,
-    options: RectifiedMatchingOptions,
 ) -> tuple[DisparityMap, np.ndarray]:
     """Return the disparities where both views show something, and the correlation after them."""
     found = compute_disparity(first, second, disparity_options)
@@ -128,10 +159,10 @@ def _match_rows(
     shown = cv2.remap(valid1.astype(np.uint8), there, row, cv2.INTER_NEAREST) > 0
     known &= valid0 & shown
     correlation = local_zncc(
-        gaussian_blur(first, options.correlation_sigma_px),
-        gaussian_blur(aligned, options.correlation_sigma_px),
+        gaussian_blur(first, CORRELATION_SIGMA_PX),
+        gaussian_blur(aligned, CORRELATION_SIGMA_PX),
         np.ones(first.shape, bool),
-        options.correlation_window_px,
+        CORRELATION_WINDOW_PX,
     )
     matched = DisparityMap(found.disparity, known, found.disparity_range)
     return matched, np.where(known, np.nan_to_num(correlation), np.float32(-1))
@@ -143,7 +174,6 @@ def _match_by_chance(
     valid0: np.ndarray,
     valid1: np.ndarray,
     disparity_options: DisparityOptions,
-    options: RectifiedMatchingOptions,
 ) -> tuple[np.ndarray, int]:
     """Return the correlations of matches by chance, and for how many pixels they were sought.
 
@@ -151,14 +181,12 @@ def _match_by_chance(
     is found by chance, the best of as many disparities as everywhere.
     """
     height = len(first)
-    count = max(1, round(height * options.null_fraction))
+    count = max(1, round(height * NULL_FRACTION))
     start = (height - count) // 2
     rows = np.arange(start, start + count)
     others = (rows + height // 2) % height
     valid = valid0[rows], valid1[others]
-    found, correlation = _match_rows(
-        first[rows], second[others], *valid, disparity_options, options
-    )
+    found, correlation = _match_rows(first[rows], second[others], *valid, disparity_options)
     return correlation[found.matched], int(np.count_nonzero(valid[0]))
 
 
@@ -167,7 +195,6 @@ def _correlation_bounds(
     by_chance: np.ndarray,
     chance_pixels: int,
     pixels: int,
-    options: RectifiedMatchingOptions,
 ) -> tuple[float, float]:
     """Return the least correlation of a match that geometry relies on, and of one that is kept.
 
@@ -175,18 +202,17 @@ def _correlation_bounds(
         correlations: of the matches.
         by_chance: of matches by chance.
         chance_pixels, pixels: for how many pixels these and the matches were sought.
-        options: how many may be found by chance.
     """
     null = np.sort(by_chance)[::-1]
-    allowed = int(options.false_positive_rate * chance_pixels)
-    high = max(options.min_correlation, float(null[allowed]) if len(null) > allowed else -1.0)
+    allowed = int(FALSE_POSITIVE_RATE * chance_pixels)
+    high = max(MIN_CORRELATION, float(null[allowed]) if len(null) > allowed else -1.0)
     # Where nearly nothing is found by chance and nearly all else is, low correlation is no reason
     # to doubt: smooth surfaces are matched by what surrounds them.
     ordered = np.sort(correlations)
     bounds = np.append(-1.0, null[::-1])
     matches = len(ordered) - np.searchsorted(ordered, bounds)
     wrong = (len(null) - np.searchsorted(null[::-1], bounds)) * pixels / max(chance_pixels, 1)
-    few = bounds[(wrong <= options.false_discovery_rate * matches) & (chance_pixels > 0)]
+    few = bounds[(wrong <= FALSE_DISCOVERY_RATE * matches) & (chance_pixels > 0)]
     return high, min(high, float(few.min())) if len(few) else high
 
 
@@ -194,27 +220,23 @@ def _range_of_matches(
     frame: RectifiedFrame,
     points0: np.ndarray,
     points1: np.ndarray,
-    options: RectifiedMatchingOptions,
 ) -> Range:
     """Return the disparities of sparse matches, with a margin on both sides."""
     disparity = frame.to_frame(points0, 0)[:, 0] - frame.to_frame(points1, 1)[:, 0]
     disparity = disparity[np.isfinite(disparity)]
     if not len(disparity):
         return 0, 0
-    smallest, largest = range_with_margin(disparity, options)
+    smallest, largest = range_with_margin(disparity)
     if isinstance(frame, PolarFrame):
-        if np.mean(disparity > 0) > options.min_fraction_of_one_sign:
-            smallest = max(smallest, -options.margin_px)
-        if np.mean(disparity < 0) > options.min_fraction_of_one_sign:
-            largest = min(largest, options.margin_px)
+        if np.mean(disparity > 0) > MIN_FRACTION_OF_ONE_SIGN:
+            smallest = max(smallest, -MARGIN_PX)
+        if np.mean(disparity < 0) > MIN_FRACTION_OF_ONE_SIGN:
+            largest = min(largest, MARGIN_PX)
     return int(np.floor(smallest)), int(np.ceil(largest))
 
 
-def range_with_margin(
-    disparity: np.ndarray, options: RectifiedMatchingOptions
-) -> tuple[float, float]:
+def range_with_margin(disparity: np.ndarray) -> tuple[float, float]:
     """Return the range of most disparities, with a margin on both sides."""
-    tail = options.tail_fraction
-    low, high = np.quantile(disparity, [tail, 1 - tail])
-    margin = options.margin_px + options.margin_fraction * (high - low)
+    low, high = np.quantile(disparity, [TAIL_FRACTION, 1 - TAIL_FRACTION])
+    margin = MARGIN_PX + MARGIN_FRACTION * (high - low)
     return float(low - margin), float(high + margin)

@@ -7,7 +7,7 @@ descriptors have much in common, those of noise-like texture nearly everything.
 What unrelated patches look like is measured on the pair itself, by null pairs: the warped image is
 shifted by a third of its size and more, and what then lies under a point is unrelated to it, but of
 the same kind of scene and light. A point passes when its descriptors, averaged with those of its
-neighbours, are more similar than all but `false_positive_rate` of the null pairs, and when most
+neighbours, are more similar than all but `FALSE_POSITIVE_RATE` of the null pairs, and when most
 points around it pass, too. Only places on a lattice are described, those nearest to the points:
 neighbours have nearly the same descriptors.
 """
@@ -22,11 +22,38 @@ import numpy as np
 from ...features.dense_sift import dense_sift, sift_gradient
 from ...features.sift import correlation_distance, to_root_sift
 from ...geometry.windows import gaussian_means, window_sums
-from .options import VerificationOptions
 
 DESCRIPTOR_REACH = 36
 """Pixels that the largest descriptors see, with their gradient and blur. Further from all edges the
 descriptors of a shifted image are those of the image itself, described once for all shifts."""
+
+KEYPOINT_SIZES_PX = (3.0, 8.0)
+"""Diameters of the keypoints of the descriptors that are compared."""
+
+LATTICE_PX = 3
+"""Between the points that are described, along rows and columns."""
+
+FALSE_POSITIVE_RATE = 0.01
+"""Fraction of null pairs (unrelated patches of the two images) that pass. This bound and the sizes
+of the windows were chosen on nine pairs of Oxford, with parts of their second images covered."""
+
+SMOOTHING_SIGMA_PX = 2.5
+"""Of the Gaussian mean over neighbouring points."""
+
+WINDOW_PX = 101
+"""Side of the window around a point in which most points must pass."""
+
+MIN_SUPPORT = 0.5
+"""Fraction of the points in the window that must pass."""
+
+NULL_SHIFTS = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
+"""Between the patches of a null pair, in shares of width and height."""
+
+NULL_BLOCK_PX = 64
+"""Side of the blocks of the image that null pairs are taken from."""
+
+MAX_NULL_BLOCKS = 256
+"""At most this many for each shift, chosen at random: all of them up to a megapixel."""
 
 MIN_POINTS_OF_MEAN = 100
 """With fewer points no mean descriptor is subtracted: it would be close to their own."""
@@ -53,24 +80,11 @@ class NullPairs:
     shifted: np.ndarray
 
 
-def verify_matches(
-    gray0: np.ndarray,
-    warped: np.ndarray,
-    valid: np.ndarray,
-    pixels: np.ndarray,
-    options: VerificationOptions = VerificationOptions(),
-    seed: int = 0,
-) -> np.ndarray:
-    """Find the points whose patches are the same, (N,) bool; arguments as of `dissimilarity`."""
-    return dissimilarity(gray0, warped, valid, pixels, options, seed) < 1
-
-
 def dissimilarity(
     gray0: np.ndarray,
     warped: np.ndarray,
     valid: np.ndarray,
     pixels: np.ndarray,
-    options: VerificationOptions = VerificationOptions(),
     seed: int = 0,
 ) -> np.ndarray:
     """Compare the patches around points.
@@ -80,12 +94,11 @@ def dissimilarity(
         warped: (H, W) uint8, the second one in the frame of the first.
         valid: (H, W) bool, where that has content.
         pixels: (N, 2) whole pixels of the first image.
-        options: when patches count as the same.
         seed: of the null pairs.
 
     Returns:
         (N,) float32: 1 - correlation, averaged over neighbours, relative to the bound below which
-        the fraction `false_positive_rate` of null pairs is. Infinite where the second image has no
+        the fraction `FALSE_POSITIVE_RATE` of null pairs is. Infinite where the second image has no
         content, where most points around are dissimilar, and everywhere when all null pairs look
         the same.
     """
@@ -95,26 +108,26 @@ def dissimilarity(
     if not len(known):
         return result
     here, shape = pixels[known], gray0.shape
-    described = _lattice_near(here, shape, options.lattice_px)
+    described = _lattice_near(here, shape)
     described = described[valid[described[:, 1], described[:, 0]]]
-    null_pairs = sample_null_pairs(described, warped, valid, options, seed)
-    distances, null_distances = _distances(gray0, warped, described, null_pairs, options)
-    sigma = options.smoothing_sigma_px
+    null_pairs = sample_null_pairs(described, warped, valid, seed)
+    distances, null_distances = _distances(gray0, warped, described, null_pairs)
     null_means = []
     for null, values in zip(null_pairs, null_distances, strict=True):
         points = described[null.rows]
-        null_means.append(gaussian_means(points, values, shape, sigma, points))
+        null_means.append(gaussian_means(points, values, shape, SMOOTHING_SIGMA_PX, points))
     together = np.concatenate(null_means)
-    bound = np.quantile(together, options.false_positive_rate) if len(together) else 0
+    bound = np.quantile(together, FALSE_POSITIVE_RATE) if len(together) else 0
     if bound <= MIN_NULL_DISTANCE:  # all null pairs look the same: similarity says nothing
         return result
-    ratios = gaussian_means(described, distances, shape, sigma, here) / np.float32(bound)
-    window = options.window_px
+    ratios = gaussian_means(described, distances, shape, SMOOTHING_SIGMA_PX, here) / np.float32(
+        bound
+    )
     count, passed = (
-        window_sums(here, part, shape, window, dtype=np.float32) for part in (1, ratios < 1)
+        window_sums(here, part, shape, WINDOW_PX, dtype=np.float32) for part in (1, ratios < 1)
     )
     support = passed / np.maximum(count, 1)
-    result[known] = np.where(support >= options.min_support, ratios, np.inf)
+    result[known] = np.where(support >= MIN_SUPPORT, ratios, np.inf)
     return result
 
 
@@ -122,7 +135,6 @@ def sample_null_pairs(
     points: np.ndarray,
     warped: np.ndarray,
     valid: np.ndarray,
-    options: VerificationOptions = VerificationOptions(),
     seed: int = 0,
 ) -> list[NullPairs]:
     """Pair points of some blocks of the image with unrelated places of the second image.
@@ -131,7 +143,6 @@ def sample_null_pairs(
         points: (N, 2) int64 pixels of the first image.
         warped: (H, W) uint8, the second one in the frame of the first.
         valid: (H, W) bool, where that has content: partners lie there only.
-        options: shifts and blocks.
         seed: of the choice of blocks; up to a megapixel all blocks are taken, whatever the seed.
 
     Returns:
@@ -140,12 +151,12 @@ def sample_null_pairs(
     size = np.array(warped.shape[::-1])
     # Shifts by whole steps, also around the edge: most partners lie on the lattice, too, where a
     # descriptor is one for all shifts.
-    step = options.lattice_px
+    step = LATTICE_PX
     period = np.maximum(size // step, 1) * step
     rows_and_columns = [np.arange(length) for length in warped.shape]
     result = []
-    blocks = _sample_blocks(points, options, seed)
-    for rows, fraction in zip(blocks, options.null_shifts, strict=True):
+    blocks = _sample_blocks(points, seed)
+    for rows, fraction in zip(blocks, NULL_SHIFTS, strict=True):
         shift = np.rint(np.array(fraction) * period / step).astype(np.int64) * step
         places = (points[rows] - shift) % period
         inner, whole = (
@@ -177,53 +188,52 @@ def _distances(
     warped: np.ndarray,
     points: np.ndarray,
     null_pairs: Sequence[NullPairs],
-    options: VerificationOptions,
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return 1 - correlation of the points and of the null pairs, summed over the sizes."""
     # Each place of the second image is described once, however often it is part of a null pair.
     used = [points, *(null.places[null.interior] for null in null_pairs)]
-    step = options.lattice_px
     places, index = index_map(np.concatenate(used), warped.shape)
     own = index[points[:, 1], points[:, 0]]
     distances = np.zeros(len(points), np.float32)
     null_distances = [np.zeros(len(null.rows), np.float32) for null in null_pairs]
     gradients = [sift_gradient(gray) for gray in (gray0, warped)]
     shifted = [sift_gradient(null.shifted) for null in null_pairs]
-    for size in options.keypoint_sizes_px:
-        described = dense_sift(gray0, points, size, step, gradients[0])
+    for size in KEYPOINT_SIZES_PX:
+        described = dense_sift(gray0, points, size, LATTICE_PX, gradients[0])
         first = to_root_sift(described, overwrite=True)
         total = first.sum(axis=0, dtype=np.int64)  # exact: the order of the points does not matter
         enough = len(first) >= MIN_POINTS_OF_MEAN
         mean = (total / len(first) if enough else 0 * total).astype(np.float32)
-        described = dense_sift(warped, places, size, step, gradients[1])
+        described = dense_sift(warped, places, size, LATTICE_PX, gradients[1])
         second = to_root_sift(described, overwrite=True)
         distances += correlation_distance(first, np.arange(len(first)), second, own, mean)
         for values, null, gradient in zip(null_distances, null_pairs, shifted, strict=True):
             x, y = null.places[null.interior].T
             inner, outer = null.rows[null.interior], null.rows[~null.interior]
             values[null.interior] += correlation_distance(first, inner, second, index[y, x], mean)
-            described = dense_sift(null.shifted, points[outer], size, step, gradient)
+            described = dense_sift(null.shifted, points[outer], size, LATTICE_PX, gradient)
             others = to_root_sift(described, overwrite=True)
             rows = np.arange(len(outer))
             values[~null.interior] += correlation_distance(first, outer, others, rows, mean)
     return distances, null_distances
 
 
-def _lattice_near(pixels: np.ndarray, shape: Sequence[int], step_px: int) -> np.ndarray:
-    """Return the pixels in every `step_px`-th row and column that are nearest to some points."""
-    last = (np.array(shape[1::-1]) - 1 - step_px // 2) // step_px
-    index = np.clip(pixels // step_px, 0, np.maximum(last, 0))
+def _lattice_near(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    """Return the pixels of the lattice that are nearest to some points."""
+    last = (np.array(shape[1::-1]) - 1 - LATTICE_PX // 2) // LATTICE_PX
+    index = np.clip(pixels // LATTICE_PX, 0, np.maximum(last, 0))
     used = np.zeros(index.max(axis=0) + 1, bool)
     used[index[:, 0], index[:, 1]] = True
-    return np.minimum(np.argwhere(used) * step_px + step_px // 2, np.array(shape[1::-1]) - 1)
+    places = np.argwhere(used) * LATTICE_PX + LATTICE_PX // 2
+    return np.minimum(places, np.array(shape[1::-1]) - 1)
 
 
-def _sample_blocks(pixels: np.ndarray, options: VerificationOptions, seed: int) -> list[np.ndarray]:
+def _sample_blocks(pixels: np.ndarray, seed: int) -> list[np.ndarray]:
     """Choose the points of some blocks for each shift: whole blocks, as neighbours are averaged."""
-    block = pixels // options.null_block_px
+    block = pixels // NULL_BLOCK_PX
     number = block[:, 1] * 1_000_000 + block[:, 0]
     order = np.random.default_rng(seed).permutation(np.unique(number))
     # Other blocks for each shift where there are enough, the same ones where there are not.
-    most, shifts = options.max_null_blocks, range(len(options.null_shifts))
+    most, shifts = MAX_NULL_BLOCKS, range(len(NULL_SHIFTS))
     chosen = [np.roll(order, -shift * most)[:most] for shift in shifts]
     return [np.flatnonzero(np.isin(number, blocks)) for blocks in chosen]

@@ -15,7 +15,7 @@ from ..._shared.timing import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.rescaling import downscale, scaled_homography
 from ...io.image import load_image
-from ..guided import GuidedOptions
+from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .canvas import Canvas, least_distorted, plan_curved, plan_plane
 from .compositing import composite, crop_box
@@ -48,11 +48,10 @@ class StitchingOptions:
     registration_side: int = 640
 
     def __post_init__(self) -> None:
-        largest = GuidedOptions().initial_geometry.max_side_px
         check_ranges(
             self,
             positive=("scale", "max_canvas_megapixels"),
-            between={"registration_side": (100, largest)},
+            between={"registration_side": (100, MAX_SIDE_PX)},
         )
 
 

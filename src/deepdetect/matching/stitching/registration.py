@@ -21,7 +21,7 @@ from ...features.sift import describe_keypoints
 from ...features.sift_detector import SiftOptions, detect_sift
 from ...geometry.residuals import transform_points
 from ...io.image import luma
-from ..guided import TentativeMatches, guided_matches, tentative_matches
+from ..guided import TentativeMatches, find_tentative_matches, guided_matches
 from ..guided.initial_geometry import estimate_initial_geometry
 from .bundle_adjustment import (
     Correspondences,
@@ -172,8 +172,8 @@ def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair
     overlaps: list[tuple[int, int, int, TentativeMatches]] = []
     for first, second in combinations(range(len(views)), 2):
         a, b = views[first], views[second]
-        initial = tentative_matches(a.gray, b.gray, (a.features, b.features))
-        found = estimate_initial_geometry(initial, "homography", seed, simulate_views=False)
+        initial = find_tentative_matches(a.gray, b.gray, (a.features, b.features))
+        found = estimate_initial_geometry(initial, "homography", seed)
         if found.model != "none":
             overlaps.append((len(found.points0), first, second, initial))
     overlaps.sort(key=lambda overlap: -overlap[0])

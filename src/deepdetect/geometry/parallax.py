@@ -1,10 +1,10 @@
-"""Homography or fundamental matrix: whether the matches of a scene show depth.
+"""Plane and parallax: whether the matches of a scene show depth.
 
-Plane and parallax: what a homography leaves of the matches of a static scene moves along lines
-through one point, the epipole. Chum, Werner and Matas, "Two-view geometry estimation unaffected by
-a dominant plane", 2005. Wrong matches move anywhere, and those of a repeated pattern in one
-direction, but they are few beside what lies on the plane; whether more matches agree on an epipole
-than chance explains is decided a contrario (`acontrario`).
+What a homography leaves of the matches of a static scene moves along lines through one point, the
+epipole. Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane",
+2005. Wrong matches move anywhere, and those of a repeated pattern in one direction, but they are
+few beside what lies on the plane; whether more matches agree on an epipole than chance explains is
+decided a contrario (`acontrario`).
 """
 
 from __future__ import annotations
@@ -14,46 +14,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._shared.options import check_ranges, suggest_keywords
 from .acontrario import MAX_LOG10_NFA, log_binomial
 from .residuals import transfer_errors, transform_points
 
+MIN_PARALLAX_PX = 3.0
+"""Matches whose transfer error is at least this are off the plane."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class ModelSelectionOptions:
-    """When the matches of a scene show depth.
+MAX_EPIPOLE_DISTANCE_PX = 1.5
+"""By which one of them may miss the line through the epipole."""
 
-    Attributes:
-        min_parallax_px: matches whose transfer error is at least this are off the plane.
-        max_epipolar_distance_px: by which one of them may miss the line through the epipole.
-        max_log10_nfa: they agree when the logarithm of their number of false alarms is below this.
-        min_fraction_of_plane: as many of them must agree, relative to the matches on the plane: a
-            repeated pattern, or a thing that moved, gives few.
-        min_fraction_of_rest: this fraction of all matches off the plane must agree, where the
-            matches alone decide.
-        max_matches: off the plane; of more, so many are drawn at random.
-        samples: pairs of matches whose lines are intersected.
+MIN_FRACTION_OF_PLANE = 0.2
+"""As many of them must agree, relative to the matches on the plane, to show depth: a repeated
+pattern, or a thing that moved, gives few."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+MIN_FRACTION_OF_REST = 0.5
+"""This fraction of all matches off the plane must agree, where the matches alone decide."""
 
-    min_parallax_px: float = 3.0
-    max_epipolar_distance_px: float = 1.5
-    max_log10_nfa: float = MAX_LOG10_NFA
-    min_fraction_of_plane: float = 0.2
-    min_fraction_of_rest: float = 0.5
-    max_matches: int = 2000
-    samples: int = 1000
+MAX_MATCHES = 2000
+"""Off the plane; of more, so many are drawn at random."""
 
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("min_parallax_px", "max_epipolar_distance_px", "samples", "max_matches"),
-            fractions=("min_fraction_of_plane", "min_fraction_of_rest"),
-            between={"max_log10_nfa": (-math.inf, 0)},
-        )
+SAMPLES = 1000
+"""Pairs of matches whose lines are intersected."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,24 +55,22 @@ class Parallax:
     epipole: np.ndarray | None
     log10_nfa: float
 
-    def is_seen(self, options: ModelSelectionOptions = ModelSelectionOptions()) -> bool:
-        """Whether more agree than chance explains."""
-        return self.log10_nfa < options.max_log10_nfa
+    def exceeds(self, fraction_of_plane: float) -> bool:
+        """Whether more agree than chance explains, and as many relative to those on the plane."""
+        significant = self.log10_nfa < MAX_LOG10_NFA
+        return significant and self.agreeing >= fraction_of_plane * self.on_plane
 
-    def is_depth(self, options: ModelSelectionOptions = ModelSelectionOptions()) -> bool:
+    @property
+    def shows_depth(self) -> bool:
         """Whether these matches alone show that the scene has depth."""
-        return (
-            self.is_seen(options)
-            and self.agreeing >= options.min_fraction_of_plane * self.on_plane
-            and self.agreeing >= options.min_fraction_of_rest * self.off_plane
-        )
+        most = self.agreeing >= MIN_FRACTION_OF_REST * self.off_plane
+        return most and self.exceeds(MIN_FRACTION_OF_PLANE)
 
 
 def measure_parallax(
     points0: np.ndarray,
     points1: np.ndarray,
     homography: np.ndarray,
-    options: ModelSelectionOptions = ModelSelectionOptions(),
     seed: int = 0,
 ) -> Parallax:
     """Look for an epipole among the matches that a homography leaves.
@@ -99,23 +78,21 @@ def measure_parallax(
     Args:
         points0, points1: (M, 2) matches, some of them wrong.
         homography: (3, 3) from the first image to the second.
-        options: the thresholds.
         seed: of the random pairs of matches.
 
     Example:
         >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
         >>> depth = np.repeat([0, 1.0], 150) * np.linspace(8, 40, 300)  # half of it before a wall
         >>> moved = points + np.column_stack([depth, np.zeros(300)])
-        >>> measure_parallax(points, moved, np.eye(3)).is_depth()
+        >>> measure_parallax(points, moved, np.eye(3)).shows_depth
         True
         >>> wrong = np.random.default_rng(1).uniform(0, 500, (150, 2))
         >>> moved = np.concatenate([points[:150], wrong])
-        >>> measure_parallax(points, moved, np.eye(3)).is_depth()
+        >>> measure_parallax(points, moved, np.eye(3)).shows_depth
         False
     """
-    points0 = np.asarray(points0, np.float64).reshape(-1, 2)
-    points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    off = transfer_errors(points0, points1, homography) >= options.min_parallax_px
+    points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
+    off = transfer_errors(points0, points1, homography) >= MIN_PARALLAX_PX
     on_plane = len(off) - int(np.count_nonzero(off))
     predicted, found = transform_points(points0[off], homography), points1[off]
     finite = np.isfinite(predicted).all(axis=1)
@@ -125,8 +102,8 @@ def measure_parallax(
     if off_plane < 3:
         return nothing
     random = np.random.default_rng(seed)
-    if off_plane > options.max_matches:
-        drawn = random.choice(off_plane, options.max_matches, replace=False)
+    if off_plane > MAX_MATCHES:
+        drawn = random.choice(off_plane, MAX_MATCHES, replace=False)
         predicted, found = predicted[drawn], found[drawn]
     low, size = points1.min(axis=0), np.ptp(points1, axis=0)
     if not size.all():  # all on one row or column
@@ -137,21 +114,19 @@ def measure_parallax(
         for points in (predicted, found)
     )
     lines = np.cross(first, second)
-    chosen = random.integers(0, len(lines), (options.samples, 2))
+    chosen = random.integers(0, len(lines), (SAMPLES, 2))
     epipoles = np.cross(lines[chosen[:, 0]], lines[chosen[:, 1]])
     length = np.linalg.norm(epipoles, axis=1)
     epipoles = epipoles[length > 1e-12] / length[length > 1e-12, None]
     if not len(epipoles):
         return nothing
-    limit = options.max_epipolar_distance_px / scale
+    limit = MAX_EPIPOLE_DISTANCE_PX / scale
     counts = np.count_nonzero(_misses(epipoles, first, second) < limit, axis=1)
     best = int(np.argmax(counts))
     to_pixels = np.array(
         [[scale, 0, low[0] + scale / 2], [0, scale, low[1] + scale / 2], [0, 0, 1]]
     )
-    band = (
-        2 * options.max_epipolar_distance_px * float(np.hypot(*size)) / max(float(size.prod()), 1)
-    )
+    band = 2 * MAX_EPIPOLE_DISTANCE_PX * float(np.hypot(*size)) / max(float(size.prod()), 1)
     agreeing = int(counts[best])
     return Parallax(
         on_plane,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from deepdetect.features.keypoints import Keypoints
-from deepdetect.matching.guided.along_lines import (
-    LineSearchOptions,
+from deepdetect.matching.guided import epipolar_search as module
+from deepdetect.matching.guided.epipolar_search import (
     _poisson_tail,
-    log10_chance,
-    match_along_lines,
+    epipolar_search,
+    log10_p_value,
 )
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
@@ -36,48 +36,52 @@ def random_pair(count: int, seed: int = 0) -> tuple[Keypoints, Keypoints]:
     return keypoints(xy, described), keypoints(moved[order], noisy[order])
 
 
-def by_loops(first: Keypoints, second: Keypoints, options: LineSearchOptions) -> list[tuple]:
+def by_loops(first: Keypoints, second: Keypoints) -> list[tuple]:
     """Search as the documentation says it, one keypoint at a time; lines are the rows."""
     a, b = first.descriptors.astype(float), second.descriptors.astype(float)
     distance = np.linalg.norm(a[:, None] - b[None], axis=2)
-    near = np.abs(first.xy[:, None, 1] - second.xy[None, :, 1]) < options.max_distance_px
+    near = np.abs(first.xy[:, None, 1] - second.xy[None, :, 1]) < module.MAX_DISTANCE_PX
     inside, outside = np.where(near, distance, np.inf), np.where(near, np.inf, distance)
     found = []
     for row in range(len(a)):
         best = int(inside[row].argmin())
         if not near[row, best] or inside[:, best].argmin() != row:
             continue
-        apart = np.linalg.norm(second.xy - second.xy[best], axis=1) >= options.min_separation_px
+        apart = np.linalg.norm(second.xy - second.xy[best], axis=1) >= module.MIN_SEPARATION_PX
         rivals = [outside[row].min(), outside[:, best].min()]
-        passes = inside[row, best] < options.ratio_elsewhere * min(rivals)
+        passes = inside[row, best] < module.MAX_RATIO_ELSEWHERE * min(rivals)
         second_best = inside[row][apart].min(initial=np.inf)
-        if passes and inside[row, best] < options.ratio_near * second_best:
+        if passes and inside[row, best] < module.MAX_RATIO_NEAR * second_best:
             found.append((*first.xy[row], *second.xy[best]))
     return found
 
 
 @pytest.mark.parametrize("count", [60, 700])
 @pytest.mark.parametrize("ratio", [0.6, 0.95])
-def test_finds_what_plain_loops_find(count: int, ratio: float) -> None:
+def test_finds_what_plain_loops_find(
+    count: int, ratio: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first, second = random_pair(count)
-    options = LineSearchOptions(ratio_elsewhere=ratio)
-    found = match_along_lines(first, second, ROWS, options)
-    expected = by_loops(first, second, options)
+    monkeypatch.setattr(module, "MAX_RATIO_ELSEWHERE", ratio)
+    found = epipolar_search(first, second, ROWS)
+    expected = by_loops(first, second)
     assert len(expected) > 20
     np.testing.assert_allclose(np.column_stack(found), expected, atol=1e-6)
 
 
-def test_a_pattern_that_repeats_elsewhere_is_matched_on_its_line() -> None:
+def test_a_pattern_that_repeats_elsewhere_is_matched_on_its_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The same descriptor on every row: the best and the second-best are equally far."""
     descriptor = np.random.default_rng(0).integers(0, 256, 128)
     xy = np.array([[50.0, y] for y in range(10, 290, 40)])
     noise = np.random.default_rng(1).integers(-4, 5, (2, len(xy), 128))
     first = keypoints(xy, np.clip(descriptor + noise[0], 0, 255))
     second = keypoints(xy + [30, 0.5], np.clip(descriptor + noise[1], 0, 255))
-    strict = LineSearchOptions(ratio_elsewhere=0.5)
-    assert len(match_along_lines(first, second, ROWS, strict)[0]) == 0
-    lenient = LineSearchOptions(ratio_elsewhere=1)
-    points0, points1 = match_along_lines(first, second, ROWS, lenient)
+    monkeypatch.setattr(module, "MAX_RATIO_ELSEWHERE", 0.5)
+    assert len(epipolar_search(first, second, ROWS)[0]) == 0
+    monkeypatch.setattr(module, "MAX_RATIO_ELSEWHERE", 1)
+    points0, points1 = epipolar_search(first, second, ROWS)
     np.testing.assert_allclose(points1 - points0, np.tile([30, 0.5], (len(points0), 1)))
 
 
@@ -85,7 +89,7 @@ def test_what_is_off_the_line_is_no_partner() -> None:
     described = np.random.default_rng(0).integers(0, 256, (2, 128))
     first = keypoints(np.array([[50.0, 50.0], [90.0, 200.0]]), described)
     second = keypoints(np.array([[60.0, 54.0], [70.0, 202.0]]), described)
-    points0, points1 = match_along_lines(first, second, ROWS)
+    points0, points1 = epipolar_search(first, second, ROWS)
     assert points0.tolist() == [[90, 200]]
     assert points1.tolist() == [[70, 202]]
 
@@ -94,29 +98,29 @@ def test_without_keypoints_there_are_no_matches() -> None:
     first, _ = random_pair(10)
     none = keypoints(np.empty((0, 2)), np.empty((0, 128)))
     for pair in ((first, none), (none, first), (none, none)):
-        points0, points1 = match_along_lines(*pair, ROWS)
+        points0, points1 = epipolar_search(*pair, ROWS)
         assert points0.shape == points1.shape == (0, 2)
 
 
 def test_right_lines_find_more_than_chance() -> None:
     first, second = random_pair(300)
     nothing = np.empty((0, 2))
-    assert log10_chance(first, second, ROWS, nothing) < -10
+    assert log10_p_value(first, second, ROWS, nothing) < -10
     columns = np.array([[0, 0, 1.0], [0, 0, 0], [-1.0, 0, 0]])
-    assert log10_chance(first, second, columns, nothing) > -2
+    assert log10_p_value(first, second, columns, nothing) > -2
 
 
 def test_matches_that_a_geometry_came_from_are_no_evidence() -> None:
     first, second = random_pair(300)
-    used = match_along_lines(first, second, ROWS)[0]
-    assert log10_chance(first, second, ROWS, used) == 0
+    used = epipolar_search(first, second, ROWS)[0]
+    assert log10_p_value(first, second, ROWS, used) == 0
 
 
 def test_unrelated_keypoints_are_explained_by_chance() -> None:
     for seed in range(10):
         first, _ = random_pair(300, seed)
         _, second = random_pair(300, seed + 100)
-        assert log10_chance(first, second, ROWS, np.empty((0, 2))) > -3
+        assert log10_p_value(first, second, ROWS, np.empty((0, 2))) > -3
 
 
 @pytest.mark.parametrize("mean", [1.0, 3.25, 77.5, 3000.5])

@@ -7,63 +7,42 @@ known, a partner can only lie near a line; what is elsewhere tells how alike wro
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from ..._shared.options import check_ranges, suggest_keywords
 from ...features.keypoints import Keypoints
 
 BLOCK = 500
 """Keypoints of the first image that are compared at once."""
 
+MAX_DISTANCE_PX = 3.0
+"""Of each keypoint from the other's line."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class LineSearchOptions:
-    """When two keypoints match, given the epipolar lines.
+MAX_RATIO_ELSEWHERE = 0.95
+"""Of the distance of both descriptors to that of the most similar keypoint far from the line, which
+is wrong for sure."""
 
-    Attributes:
-        max_distance_px: of each from the other's line.
-        ratio_elsewhere: to be as different as this from the most similar keypoint far from the
-            line, which is wrong for sure: the ratio of both distances, at most.
-        ratio_near: the same for the second-best near the line.
-        min_separation_px: keypoints nearer than this to the best show the same, and are no
-            second-best.
-        null_shifts: by how much lines are moved, right, left, down and up, to count what matches by
-            chance, in units of the longer side of the image.
+MAX_RATIO_NEAR = 0.85
+"""The same for the second-best near the line."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+MIN_SEPARATION_PX = 5.0
+"""Keypoints nearer than this to the best show the same, and are no second-best."""
 
-    max_distance_px: float = 3.0
-    ratio_elsewhere: float = 0.95
-    ratio_near: float = 0.85
-    min_separation_px: float = 5.0
-    null_shifts: tuple[float, ...] = (0.05, 0.1)
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("max_distance_px", "null_shifts"),
-            not_negative=("min_separation_px",),
-            fractions=("ratio_elsewhere", "ratio_near"),
-        )
+NULL_SHIFTS = (0.05, 0.1)
+"""By how much lines are moved, right, left, down and up, to count what matches by chance, in units
+of the longer side of the image."""
 
 
-def match_along_lines(
+def epipolar_search(
     first: Keypoints,
     second: Keypoints,
     fundamental: np.ndarray,
-    options: LineSearchOptions = LineSearchOptions(),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Match keypoints near each other's epipolar lines, mutually.
 
     Args:
         first, second: keypoints with descriptors.
         fundamental: (3, 3) with x1^T F x0 = 0.
-        options: when two keypoints match.
 
     Returns:
         (M, 2) float64 positions in both images.
@@ -72,7 +51,7 @@ def match_along_lines(
         >>> rows = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # lines are the rows
         >>> xy = np.array([[5.0, 5.0], [50.0, 50.0]])
         >>> keypoints = Keypoints(xy, [1, 1], (99, 99), descriptors=np.eye(2, 128))
-        >>> match_along_lines(keypoints, keypoints, rows)[1].tolist()
+        >>> epipolar_search(keypoints, keypoints, rows)[1].tolist()
         [[5.0, 5.0], [50.0, 50.0]]
     """
     points0, points1 = first.xy.astype(np.float64), second.xy.astype(np.float64)
@@ -101,8 +80,8 @@ def match_along_lines(
         products = described0[rows] @ described1.T
         squares0 = (described0[rows] ** 2).sum(axis=1)[:, None]
         distance = np.sqrt(np.maximum(squares0 + squares1 - 2 * products, 0))
-        near = np.abs(lines1[rows] @ ones1.T) < options.max_distance_px
-        near &= np.abs(ones0[rows] @ lines0.T) < options.max_distance_px
+        near = np.abs(lines1[rows] @ ones1.T) < MAX_DISTANCE_PX
+        near &= np.abs(ones0[rows] @ lines0.T) < MAX_DISTANCE_PX
         inside, outside = np.where(near, distance, np.inf), np.where(near, np.inf, distance)
         elsewhere0[rows] = outside.min(axis=1)
         elsewhere1 = np.minimum(elsewhere1, outside.min(axis=0))
@@ -115,21 +94,20 @@ def match_along_lines(
         there = points1[own]
         apart = (
             np.hypot(points1[:, 0] - there[:, :1], points1[:, 1] - there[:, 1:])
-            >= options.min_separation_px
+            >= MIN_SEPARATION_PX
         )
         second_best[rows] = np.where(apart, inside, np.inf).min(axis=1)
     kept = np.isfinite(best) & (partner1[partner] == np.arange(count))
-    kept &= best < options.ratio_elsewhere * np.minimum(elsewhere0, elsewhere1[partner])
-    kept &= best < options.ratio_near * second_best
+    kept &= best < MAX_RATIO_ELSEWHERE * np.minimum(elsewhere0, elsewhere1[partner])
+    kept &= best < MAX_RATIO_NEAR * second_best
     return points0[kept], points1[partner[kept]]
 
 
-def log10_chance(
+def log10_p_value(
     first: Keypoints,
     second: Keypoints,
     fundamental: np.ndarray,
     used: np.ndarray,
-    options: LineSearchOptions = LineSearchOptions(),
 ) -> float:
     """Return how likely chance explains the matches along lines that a geometry did not come from.
 
@@ -141,7 +119,6 @@ def log10_chance(
         fundamental: (3, 3) with x1^T F x0 = 0.
         used: (K, 2) positions in the first image of the matches that it was estimated from, right
             or wrong: they are no evidence.
-        options: when two keypoints match.
 
     Returns:
         The decimal logarithm of the probability, at most 0. It is independent of the number of
@@ -150,12 +127,12 @@ def log10_chance(
     known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}
 
     def further(matrix: np.ndarray) -> int:
-        found = match_along_lines(first, second, matrix, options)[0].astype(np.float32)
+        found = epipolar_search(first, second, matrix)[0].astype(np.float32)
         return sum((float(x), float(y)) not in known for x, y in found)
 
     side = max(second.image_size)
     by_chance = []
-    for share in options.null_shifts:
+    for share in NULL_SHIFTS:
         for right, down in ((1, 0), (-1, 0), (0, 1), (0, -1)):
             back = np.eye(3)
             back[:2, 2] = -side * share * np.array([right, down])

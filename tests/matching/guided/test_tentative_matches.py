@@ -9,12 +9,17 @@ import pytest
 from deepdetect import Keypoints, PointDetector
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
-from deepdetect.matching.guided import GuidedOptions, guided_matches
-from deepdetect.matching.guided.options import InitialGeometryOptions
-from deepdetect.matching.guided.sparse_matches import matches_of_points, tentative_matches
+from deepdetect.matching.guided import guided_matches
+from deepdetect.matching.guided import tentative_matches as module
+from deepdetect.matching.guided.tentative_matches import find_tentative_matches, matches_of_points
 
 TURNED = np.vstack([cv2.getRotationMatrix2D((128, 128), 30, 1.2), [0, 0, 1]])
-FEW = InitialGeometryOptions(min_points=100)
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hundred points are enough."""
+    monkeypatch.setattr(module, "MIN_POINTS", 100)
 
 
 @pytest.fixture(scope="module")
@@ -31,40 +36,40 @@ def points(pair: tuple[np.ndarray, np.ndarray]) -> tuple[Keypoints, Keypoints]:
 
 
 def test_points_match_at_their_own_sizes_and_angles(pair, points) -> None:
-    found = matches_of_points(luma(pair[0]), luma(pair[1]), points, FEW)
+    found = matches_of_points(luma(pair[0]), luma(pair[1]), points)
     assert found is not None
     errors = np.linalg.norm(transform_points(found.points0, TURNED) - found.points1, axis=1)
     assert len(errors) > 60
     assert (errors < 3).mean() > 0.9
 
 
-def test_of_a_large_image_they_are_scaled(pair, points) -> None:
-    small = replace(FEW, max_side_px=128)
-    found = matches_of_points(luma(pair[0]), luma(pair[1]), points, small)
+def test_of_a_large_image_they_are_scaled(pair, points, monkeypatch) -> None:
+    grays = luma(pair[0]), luma(pair[1])
+    whole = matches_of_points(*grays, points)
+    monkeypatch.setattr(module, "MAX_SIDE_PX", 128)
+    found = matches_of_points(*grays, points)
     assert found is not None
     assert found.scales == (0.5, 0.5)
     assert found.features[0].xy.max() < 128
-    whole = matches_of_points(luma(pair[0]), luma(pair[1]), points, FEW)
     assert whole is not None
     kept = {tuple(row) for row in np.round(whole.points0, 2).tolist()}
     assert {tuple(row) for row in np.round(found.points0, 2).tolist()} <= kept
 
 
-def test_too_few_or_plain_keypoints_are_not_taken(pair, points) -> None:
+def test_too_few_or_plain_keypoints_are_not_taken(pair, points, monkeypatch) -> None:
     grays = luma(pair[0]), luma(pair[1])
-    assert matches_of_points(*grays, points, InitialGeometryOptions(min_points=401)) is None
     plain = tuple(replace(each, sizes=None) for each in points)
-    assert matches_of_points(*grays, plain, FEW) is None
+    assert matches_of_points(*grays, plain) is None
+    monkeypatch.setattr(module, "MIN_POINTS", 401)
+    assert matches_of_points(*grays, points) is None
 
 
 def test_guided_matching_begins_with_points(pair, points, monkeypatch) -> None:
-    options = GuidedOptions(initial_geometry=FEW)
     grays = luma(pair[0]), luma(pair[1])
     places = [np.rint(each.xy) for each in points]
-    module = "deepdetect.matching.guided.sparse_matches.detect_sift"
     with monkeypatch.context() as patched:
-        patched.setattr(module, None)
-        guide, found = guided_matches(*grays, *places, options=options, points=points)
+        patched.setattr(module, "detect_sift", None)
+        guide, found = guided_matches(*grays, *places, points=points)
     assert guide.model == "homography"
     assert found is not None
     errors = np.linalg.norm(
@@ -78,14 +83,13 @@ def test_where_points_give_nothing_sift_is_tried(pair, points) -> None:
     places = [np.rint(each.xy) for each in points]
     shuffled = np.random.default_rng(0).permutation(len(points[1]))
     wrong = replace(points[1], xy=points[1].xy[shuffled][:, ::-1])
-    options = GuidedOptions(initial_geometry=FEW)
-    guide, found = guided_matches(*grays, *places, options=options, points=(points[0], wrong))
-    plain, _ = guided_matches(*grays, *places, options=options)
+    guide, found = guided_matches(*grays, *places, points=(points[0], wrong))
+    plain, _ = guided_matches(*grays, *places)
     assert found is not None
     np.testing.assert_array_equal(guide.matrix, plain.matrix)
 
 
 def test_sparse_matches_of_sift_are_at_the_images_own_size(pair) -> None:
-    found = tentative_matches(luma(pair[0]), luma(pair[1]), options=replace(FEW, max_side_px=200))
+    found = find_tentative_matches(luma(pair[0]), luma(pair[1]), max_side_px=200)
     errors = np.linalg.norm(transform_points(found.points0, TURNED) - found.points1, axis=1)
     assert np.median(errors) < 1

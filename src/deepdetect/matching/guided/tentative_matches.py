@@ -1,4 +1,4 @@
-"""Sparse matches of a pair, which an initial geometry is estimated from."""
+"""Tentative matches of a pair: sparse, before any geometry."""
 
 from __future__ import annotations
 
@@ -10,11 +10,27 @@ import numpy as np
 from ...features.keypoints import Keypoints
 from ...features.matchers import get_matcher, match_descriptors
 from ...features.sift import describe_keypoints
-from ...features.sift_detector import detect_sift
+from ...features.sift_detector import SiftOptions, detect_sift
 from ...geometry.rescaling import downscale, scaled_points
-from .options import InitialGeometryOptions
 
 Points = tuple[np.ndarray, np.ndarray]
+
+MAX_SIDE_PX = 1200
+"""Longer sides are scaled down to this: the initial geometry need not be fine."""
+
+MAX_KEYPOINTS = 4000
+"""Of SIFT in each image."""
+
+MIN_POINTS = 1000
+"""Where both images have at least so many points of all scales (a budget was asked for), these take
+the place of SIFT's keypoints."""
+
+MAX_RATIOS = (0.85, 0.8)
+"""Of the ratio test, in the order in which they are tried: fewer matches, with fewer wrong ones
+among them, may show what more do not."""
+
+MIN_SEPARATION_PX = 2.0
+"""Matches that begin or end nearer together than this count as one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +72,13 @@ class TentativeMatches:
         )
 
 
-def tentative_matches(
+def find_tentative_matches(
     gray0: np.ndarray,
     gray1: np.ndarray,
     features: tuple[Keypoints, Keypoints] | None = None,
-    options: InitialGeometryOptions = InitialGeometryOptions(),
+    *,
+    max_side_px: int = MAX_SIDE_PX,
+    max_keypoints: int = MAX_KEYPOINTS,
 ) -> TentativeMatches:
     """Match sparse SIFT keypoints of two images, exactly, mutually and by the ratio test.
 
@@ -68,59 +86,55 @@ def tentative_matches(
         gray0, gray1: (H, W) uint8 luma.
         features: keypoints of both images, scaled down where they are large, with their
             descriptors; None: they are detected.
-        options: how many keypoints, at which size, and the ratio.
+        max_side_px: longer sides are scaled down to this.
+        max_keypoints: that are detected in each image.
 
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
-        >>> found = tentative_matches(image, image)
+        >>> found = find_tentative_matches(image, image)
         >>> bool((found.points0 == found.points1).all()), len(found.points0) > 10
         (True, True)
     """
-    view0, scale0 = downscale(gray0, options.max_side_px)
-    view1, scale1 = downscale(gray1, options.max_side_px)
+    (view0, scale0), (view1, scale1) = (downscale(gray, max_side_px) for gray in (gray0, gray1))
     if features is None:
+        sift = SiftOptions(max_keypoints=max_keypoints)
         with ThreadPoolExecutor(2) as pool:  # OpenCV's SIFT leaves a second processor idle
-            of_first = pool.submit(detect_sift, view0, options.sift)
-            of_second = detect_sift(view1, options.sift)
+            of_first = pool.submit(detect_sift, view0, sift)
+            of_second = detect_sift(view1, sift)
             features = of_first.result(), of_second
-    points0, points1, ratios = match_features(features[0], features[1], options)
+    points0, points1, ratios = match_sparse(*features)
     return TentativeMatches((view0, view1), (scale0, scale1), features, (points0, points1), ratios)
 
 
 def matches_of_points(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    points: tuple[Keypoints, Keypoints],
-    options: InitialGeometryOptions = InitialGeometryOptions(),
+    gray0: np.ndarray, gray1: np.ndarray, points: tuple[Keypoints, Keypoints]
 ) -> TentativeMatches | None:
     """Match points of all scales, described at their own sizes and angles, as sparse keypoints.
 
-    Of two photographs in unlike light, or of which one is blurred, they give two to five times as
-    many correct matches as SIFT's keypoints.
+    Of two images in unlike light, or of which one is blurred, they give two to five times as many
+    correct matches as SIFT's keypoints.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
         points: keypoints of both images, best first.
-        options: how many of them, and the ratio.
 
     Returns:
         The matches; None where there are too few points, or they have no sizes and angles.
     """
-    if min(len(each) for each in points) < options.min_points:
+    if min(len(each) for each in points) < MIN_POINTS:
         return None
     described = []
     for gray, each in zip((gray0, gray1), points, strict=True):
         if each.sizes is None or each.angles is None:
             return None
-        best = describe_keypoints(gray, each[: options.sift.max_keypoints])
-        scale = min(1.0, options.max_side_px / max(gray.shape))
+        best = describe_keypoints(gray, each[:MAX_KEYPOINTS])
+        scale = min(1.0, MAX_SIDE_PX / max(gray.shape))
         described.append(replace(best, xy=scaled_points(best.xy, scale)))
-    return tentative_matches(gray0, gray1, (described[0], described[1]), options)
+    features = described[0], described[1]
+    return find_tentative_matches(gray0, gray1, features, max_side_px=MAX_SIDE_PX)
 
 
-def match_features(
-    first: Keypoints, second: Keypoints, options: InitialGeometryOptions
-) -> tuple[np.ndarray, ...]:
+def match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
     """Return matched positions in both images, and the ratios of the ratio test."""
     assert first.descriptors is not None
     assert second.descriptors is not None
@@ -128,20 +142,19 @@ def match_features(
         first.descriptors,
         second.descriptors,
         get_matcher("exact"),
-        ratio=max(options.max_ratios),
+        ratio=max(MAX_RATIOS),
         mutual=True,
     )
-    points0, points1 = first.xy[found.indices0], second.xy[found.indices1]
-    return separate(points0, points1, found.ratios, min_separation_px=options.min_separation_px)
+    return separate(first.xy[found.indices0], second.xy[found.indices1], found.ratios)
 
 
-def separate(*matches: np.ndarray, min_separation_px: float) -> tuple[np.ndarray, ...]:
+def separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
     """Keep each place once in each image: one corner in many views is no further evidence.
 
     The first two arrays are the positions in both images; others are kept like them.
     """
     for side in (0, 1):
-        places = np.rint(matches[side] / min_separation_px)
+        places = np.rint(matches[side] / MIN_SEPARATION_PX)
         _, kept = np.unique(places, axis=0, return_index=True)
         kept.sort()
         matches = tuple(values[kept] for values in matches)

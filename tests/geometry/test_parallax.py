@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 
 from deepdetect import GeometryOptions, estimate_geometry
-from deepdetect.geometry.model_selection import (
-    ModelSelectionOptions,
-    measure_parallax,
-)
+from deepdetect.geometry.parallax import measure_parallax
 
 CAMERA = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], float)
 PLANE = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 30.0], [1e-4, 5e-5, 1.0]])
@@ -43,13 +40,13 @@ def test_depth_is_seen_among_wrong_matches(outliers: float) -> None:
     points0, points1 = matches(3.0, outliers)
     wall = np.array([[1, 0, -60], [0, 1, -4], [0, 0, 1.0]])  # what lies at a distance of 5
     found = measure_parallax(points0, points1, wall)
-    assert found.is_seen()
+    assert found.exceeds(0)
     # All parallax is along (300, 20): the epipole lies there, at infinity.
     direction = found.epipole[:2] / np.linalg.norm(found.epipole[:2])
     assert abs(direction @ (20, -300)) / np.hypot(300, 20) < 0.02
     right = (1 - outliers) * (found.on_plane + found.off_plane)
     assert found.agreeing > 0.85 * (right - found.on_plane)
-    assert found.is_depth() == (outliers < 0.6), "too many wrong ones: the images decide"
+    assert found.shows_depth == (outliers < 0.6), "too many wrong ones: the images decide"
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
@@ -57,8 +54,8 @@ def test_wrong_matches_on_a_plane_are_no_depth(outliers: float) -> None:
     points0, points1 = matches(0.0, outliers)
     wall = np.array([[1, 0, -60], [0, 1, -4], [0, 0, 1.0]])
     found = measure_parallax(points0, points1, wall)
-    assert not found.is_seen()
-    assert not found.is_depth()
+    assert not found.exceeds(0)
+    assert not found.shows_depth
 
 
 def test_a_pattern_that_is_matched_one_period_off_is_no_depth() -> None:
@@ -66,9 +63,9 @@ def test_a_pattern_that_is_matched_one_period_off_is_no_depth() -> None:
     moved = points + np.where(np.arange(540) < 500, 0, 25)[:, None] * (1, 0)
     found = measure_parallax(points, moved, np.eye(3))
     assert (found.on_plane, found.off_plane, found.agreeing) == (500, 40, 40)
-    assert found.is_seen()
-    assert not found.is_depth()
-    assert found.is_depth(ModelSelectionOptions(min_fraction_of_plane=0.05))
+    assert found.exceeds(0)
+    assert not found.shows_depth
+    assert found.exceeds(0.05)
 
 
 def test_parallax_is_the_same_wherever_the_origin_is_and_for_one_seed() -> None:
@@ -87,9 +84,9 @@ def test_parallax_is_the_same_wherever_the_origin_is_and_for_one_seed() -> None:
 def test_few_matches_show_nothing(count: int) -> None:
     points0, points1 = (points[:count] for points in matches(3.0))
     found = measure_parallax(points0, points1, np.eye(3))
-    assert not found.is_seen()
+    assert not found.exceeds(0)
 
 
 def test_matches_in_one_place_show_nothing() -> None:
     here = np.full((9, 2), 7.0)
-    assert not measure_parallax(here, here + 50, np.eye(3)).is_depth()
+    assert not measure_parallax(here, here + 50, np.eye(3)).shows_depth

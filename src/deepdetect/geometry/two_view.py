@@ -1,0 +1,266 @@
+"""What two images show: a plane, a rotation, depth, the same view, or nothing in common.
+
+The one decision of matching, reconstruction and stitching. It rests on a homography and a
+fundamental matrix of the same matches, how many agree with each and how likely that is by chance
+(`acontrario`), and on what the homography leaves (`parallax`). Pairs whose matches lie on rows are
+told apart from others in `reconstruction.rectification`, by the same evidence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .acontrario import MAX_LOG10_NFA, log10_nfa
+from .camera import Calibration
+from .estimation import GeometryOptions, estimate_geometry
+from .parallax import MIN_FRACTION_OF_PLANE, Parallax, measure_parallax
+from .residuals import transfer_errors
+from .semi_calibrated import estimate_semi_calibrated
+
+Size = tuple[int, int]
+
+GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
+"""Matches within this agree with a model that only guides: keypoints of small copies are coarse."""
+
+SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
+"""The same where a scene is judged by refined matches."""
+
+MIN_MATCHES = 30
+"""With fewer nothing is said of a scene."""
+
+MIN_PLANAR_RATIO = 0.75
+"""Matches of the homography per match of the fundamental matrix, below which a scene is no
+plane."""
+
+MAX_MEDIAN_MOTION_PX = 0.5
+"""Where nothing moves the median match moves less ..."""
+
+MAX_MOTION_PX, MOTION_QUANTILE = 3.0, 0.9
+"""... and this fraction of the matches moves less than this."""
+
+FOREGROUND_DISTANCE_PX = 6.0
+"""From the plane's homography, for a match to be clearly off it."""
+
+MIN_FOREGROUND_FRACTION = 0.05
+"""Of the matches that the fundamental matrix explains, clearly off a plane with something in front
+of it."""
+
+MIN_FOREGROUND_ON_LINES = 0.8
+"""Of the matches clearly off the plane, explained by the fundamental matrix. On planes wrong
+matches are this far off, and fewer lie on their lines: up to 0.65 of them on sixteen pairs of
+Oxford."""
+
+
+@dataclass(frozen=True, eq=False)
+class TwoViewModel:
+    """The model of a pair, and the evidence for it.
+
+    Attributes:
+        model: "homography", "fundamental", or "none" where nothing could be estimated.
+        matrix: (3, 3) float64, or None.
+        inliers: (M,) bool, the matches that agree with it.
+        log10_nfa: decimal logarithm of its number of false alarms.
+        parallax: of a homography that was chosen, not asked for: what it leaves.
+    """
+
+    model: str
+    matrix: np.ndarray | None
+    inliers: np.ndarray
+    log10_nfa: float
+    parallax: Parallax | None = None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether chance does not explain it."""
+        return self.log10_nfa < MAX_LOG10_NFA
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a pair shows, and the models that say so.
+
+    Attributes:
+        kind: "unrelated" (no model explains enough), "static" (nothing moves), "rotation" of the
+            camera, "plane" (or a rotation, where no calibration tells them apart), or "depth".
+        plane, epipolar: the homography and the fundamental matrix of the matches.
+    """
+
+    kind: str
+    plane: TwoViewModel
+    epipolar: TwoViewModel
+
+
+def fit_model(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    model: str,
+    size1: Size,
+    threshold_px: float,
+    seed: int = 0,
+) -> TwoViewModel:
+    """Fit a homography or a fundamental matrix to matches, trusted or not.
+
+    Args:
+        points0, points1: (M, 2) matched positions.
+        model: "homography" or "fundamental".
+        size1: (width, height) of the second image.
+        threshold_px: within which a match agrees.
+        seed: of the random samples.
+    """
+    options = GeometryOptions(inlier_threshold=threshold_px)
+    found = estimate_geometry(points0, points1, model, seed=seed, options=options)
+    if found.matrix is None:
+        return TwoViewModel("none", None, found.inliers, float("inf"))
+    alarms = log10_nfa(found.inliers, model, threshold_px, size1)
+    return TwoViewModel(model, found.matrix, found.inliers, alarms)
+
+
+def choose_model(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    sizes: tuple[Size, Size],
+    model: str = "auto",
+    seed: int = 0,
+    semi_calibrated: bool = True,
+) -> TwoViewModel:
+    """Return the model that may guide matching, trusted or not.
+
+    Args:
+        points0, points1: (M, 2) matched positions, many of which may be wrong.
+        sizes: (width, height) of both images.
+        model: "homography", "fundamental", or "auto": the homography, but the fundamental matrix
+            where the matches alone show depth (`Parallax.shows_depth`).
+        seed: of the random samples.
+        semi_calibrated: whether a fundamental matrix may be one of cameras as most are
+            (`semi_calibrated`), which few matches show but which takes longer.
+    """
+    plane = TwoViewModel("none", None, np.zeros(len(points0), bool), float("inf"))
+    if model != "fundamental":
+        threshold_px = GUIDING_THRESHOLDS_PX["homography"]
+        plane = fit_model(points0, points1, "homography", sizes[1], threshold_px, seed)
+    if plane.trusted and plane.matrix is not None:
+        if model == "homography":
+            return plane
+        plane = replace(plane, parallax=measure_parallax(points0, points1, plane.matrix, seed))
+        if plane.parallax is None or not plane.parallax.shows_depth:
+            return plane
+    if model == "homography":
+        return plane
+    threshold_px = GUIDING_THRESHOLDS_PX["fundamental"]
+    depth = fit_model(points0, points1, "fundamental", sizes[1], threshold_px, seed)
+    if semi_calibrated:
+        known = estimate_semi_calibrated(points0, points1, sizes, threshold_px, seed)
+        if known is not None and known.log10_nfa < depth.log10_nfa:
+            depth = TwoViewModel("fundamental", known.matrix, known.inliers, known.log10_nfa)
+    return depth if depth.trusted or depth.log10_nfa < plane.log10_nfa else plane
+
+
+def classify_scene(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    size1: Size,
+    calibration: Calibration | None = None,
+    seed: int = 0,
+) -> Scene:
+    """Say what a pair shows.
+
+    Args:
+        points0, points1: (M, 2) float64 matched positions, spread out: matches side by side are no
+            independent evidence.
+        size1: (width, height) of the second image.
+        calibration: tells a rotating camera from a plane, where it is known.
+        seed: of the random samples.
+
+    Example:
+        >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
+        >>> classify_scene(points, points + 5, (510, 510)).kind
+        'plane'
+    """
+    plane, epipolar = (
+        fit_model(points0, points1, model, size1, SCENE_THRESHOLDS_PX[model], seed)
+        for model in ("homography", "fundamental")
+    )
+    known = len(points0) >= MIN_MATCHES and epipolar.matrix is not None
+    if not known or min(plane.log10_nfa, epipolar.log10_nfa) > MAX_LOG10_NFA:
+        return Scene("unrelated", plane, epipolar)
+    agreeing = plane.inliers | epipolar.inliers
+    if is_static(np.linalg.norm(points1 - points0, axis=1)[agreeing]):
+        return Scene("static", plane, epipolar)
+    if plane.matrix is None or not is_planar(points0, points1, plane, epipolar, seed):
+        return Scene("depth", plane, epipolar)
+    if has_foreground(transfer_errors(points0, points1, plane.matrix), epipolar.inliers):
+        return Scene("depth", plane, epipolar)
+    on_plane = points0[plane.inliers], points1[plane.inliers]
+    rotated = calibration is not None and is_pure_rotation(*on_plane, calibration)
+    return Scene("rotation" if rotated else "plane", plane, epipolar)
+
+
+def is_planar(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    plane: TwoViewModel,
+    epipolar: TwoViewModel,
+    seed: int = 0,
+) -> bool:
+    """Return whether a homography explains all that can be explained, though many may be wrong.
+
+    Args:
+        points0, points1: (M, 2) matches, some of them wrong.
+        plane, epipolar: the homography and the fundamental matrix that were estimated from them.
+        seed: of the search for an epipole among the others.
+    """
+    least = MIN_PLANAR_RATIO * np.count_nonzero(epipolar.inliers)
+    if plane.matrix is None or np.count_nonzero(plane.inliers) < least:
+        return False
+    # Not `shows_depth`, which needs a share of all matches off the plane, wrong ones among them.
+    parallax = measure_parallax(points0, points1, plane.matrix, seed)
+    return not parallax.exceeds(MIN_FRACTION_OF_PLANE)
+
+
+def has_foreground(off_plane_px: np.ndarray, by_fundamental: np.ndarray) -> bool:
+    """Return whether something stands in front of the plane, small as it may be.
+
+    Args:
+        off_plane_px: (M,) transfer errors of the plane's homography.
+        by_fundamental: (M,) bool, the matches that the fundamental matrix explains.
+    """
+    clear = off_plane_px > FOREGROUND_DISTANCE_PX
+    foreground = np.count_nonzero(clear & by_fundamental)
+    needed = max(
+        MIN_FOREGROUND_ON_LINES * np.count_nonzero(clear),
+        MIN_FOREGROUND_FRACTION * np.count_nonzero(by_fundamental),
+    )
+    return bool(foreground > 0 and foreground >= needed)
+
+
+def is_static(motion_px: np.ndarray) -> bool:
+    """Return whether matches that move this far show the same view in both images.
+
+    Example:
+        >>> is_static(np.array([0.1, 0.0, 0.3])), is_static(np.array([0.1, 0.2, 7.0]))
+        (True, False)
+    """
+    motion = np.abs(motion_px)
+    return bool(
+        np.median(motion) < MAX_MEDIAN_MOTION_PX
+        and np.quantile(motion, MOTION_QUANTILE) < MAX_MOTION_PX
+    )
+
+
+def is_pure_rotation(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    calibration: Calibration,
+) -> bool:
+    """Return whether one rotation maps the rays of matches onto each other (Kabsch's method)."""
+    rays0, rays1 = (
+        rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        for rays in (calibration.camera0.rays(points0), calibration.camera1.rays(points1))
+    )
+    u, _, vt = np.linalg.svd(rays1.T @ rays0)
+    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    seen = calibration.camera1.project(rays0 @ rotation.T)
+    errors = np.linalg.norm(seen - points1, axis=1)
+    return bool(np.median(errors) < SCENE_THRESHOLDS_PX["fundamental"])
