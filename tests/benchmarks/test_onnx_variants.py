@@ -62,48 +62,6 @@ def test_half_precision_beside_the_whole(
         assert 0.3 < overlap < 1
 
 
-def test_parity(
-    script: ModuleType,
-    maps: Path,
-    photo: np.ndarray,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(script, "PARITY_SIZES", ((40, 56, 1), (33, 41, 2)))
-    rows = script.parity_table(maps, tmp_path, photo).rows
-    assert rows[0][0] == "ONNX Runtime, any size"
-    assert any("OpenCV" in name and "one size" in name for name, *_ in rows)
-    for _, logits, probability in rows:
-        assert logits < 1e-3
-        assert probability < 2e-4
-
-
-def test_keypoints(
-    script: ModuleType,
-    maps: Path,
-    samples: list[Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(script, "KEYPOINT_COUNTS", (2048,))
-    monkeypatch.setattr(script, "TIMED_SIZE", (64, 96))
-    rows = script.keypoint_table(maps, tmp_path, samples, rounds=1).rows
-    names = [(name, count) for name, count, *_ in rows]
-    assert names[0] == ("ONNX Runtime", 2048)
-    assert names[-1] == ("ONNX Runtime, asked for maps", 2048)
-    for name, _, same, ratio in rows:
-        assert ratio > 0
-        assert "asked" in name or same > 0.99
-    assert script.are_near(np.zeros((3, 2), np.float32), np.eye(2, dtype=np.float32)).sum() == 0
-
-
-def test_planes(script: ModuleType, photo: np.ndarray) -> None:
-    planes = script.planes_of(photo, *photo.shape[:2], 2)
-    assert planes.dtype == np.float32
-    expected = photo.transpose(2, 0, 1) / 255
-    np.testing.assert_allclose(planes, [expected, expected[:, ::-1]], atol=1e-6)
-
-
 def test_the_ratio_of_times(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [0.0]
     monkeypatch.setattr(script.time, "process_time", lambda: clock[0])

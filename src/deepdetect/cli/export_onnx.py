@@ -62,7 +62,7 @@ def export_onnx(
 
     \b
     deepdetect export onnx -o deepdetect.onnx
-    deepdetect export onnx dense -o dense-480x640.onnx --size 480x640
+    deepdetect export onnx dense -o dense-480x640.onnx --size 480x640 --max-keypoints 0
     deepdetect export onnx run/best.safetensors -o half.onnx --precision fp16
     deepdetect export onnx -o maps.onnx --max-keypoints 0
     deepdetect export onnx -o small.onnx --precision int8 --calibration photos/

@@ -321,7 +321,6 @@ def test_all_shipped_files_give_them(name: str, photo: np.ndarray) -> None:
         (OnnxOptions(), MAX_KEYPOINTS),
         (OnnxOptions(precision="fp16"), MAX_KEYPOINTS),
         (OnnxOptions(max_keypoints=0), 0),
-        (OnnxOptions((64, 96)), 0),  # OpenCV 4 refuses others
         (OnnxOptions((64, 96), max_keypoints=7), 7),
     ],
 )

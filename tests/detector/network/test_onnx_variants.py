@@ -14,7 +14,7 @@ import onnxruntime  # noqa: E402
 
 from deepdetect import DeepDetect, OptionError, WeightsError  # noqa: E402
 from deepdetect.detector.backends.onnx_parts import cut_onnx  # noqa: E402
-from deepdetect.detector.network.onnx_graph import fold_normalisation, read_metadata  # noqa: E402
+from deepdetect.detector.network.onnx_graph import read_metadata  # noqa: E402
 from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 
@@ -129,7 +129,7 @@ def test_opencv_at_one_size(
     network: onnxruntime.InferenceSession,
 ) -> None:
     path = tmp_path / "one.onnx"
-    write_onnx("default", path, OnnxOptions(size, batch))
+    write_onnx("default", path, OnnxOptions(size, batch, max_keypoints=0))
     model = onnx.load(path)
     onnx.checker.check_model(model, full_check=True)
     assert "Shape" not in {node.op_type for node in model.graph.node}
@@ -174,197 +174,6 @@ def test_numbers_for_each_channel_have_four_dimensions(name: str) -> None:
     ]
     assert not [each for each in shapes if len(each) == 3]
     assert sum(len(each) == 4 and each[1] > 1 for each in shapes) > 20
-
-
-def test_a_file_of_version_0_2_gets_them(tmp_path: Path) -> None:
-    """Exported again, it is the shipped file of today."""
-    model = onnx.load(pretrained_weights())
-    for one in model.graph.initializer:
-        if len(one.dims) == 4 and list(one.dims[:1] + one.dims[2:]) == [1, 1, 1]:
-            del one.dims[0]
-    onnx.save(model, tmp_path / "older.onnx")
-    write_onnx(tmp_path / "older.onnx", tmp_path / "again.onnx")
-    shipped = onnx.load(pretrained_weights()).graph
-    assert model.graph != shipped
-    assert onnx.load(tmp_path / "again.onnx").graph == shipped
-
-
-def normalised_network(nodes: list[onnx.NodeProto], outputs: list[str]) -> onnx.ModelProto:
-    """A network of these nodes, which read `image`, `kernel`, `offset` and the statistics."""
-    rng = np.random.default_rng(0)
-    arrays = {"kernel": rng.normal(size=(3, 3, 2, 2)), "offset": rng.normal(size=3)}
-    arrays |= dict(zip(STATISTICS, rng.uniform(0.5, 2, (4, 3)), strict=True))
-    used = {name for node in nodes for name in node.input}
-    graph = onnx.helper.make_graph(
-        nodes,
-        "one",
-        [onnx.helper.make_tensor_value_info("image", 1, ("b", 3, "h", "w"))],
-        [onnx.helper.make_tensor_value_info(name, 1, ("b", 3, None, None)) for name in outputs],
-        [
-            onnx.numpy_helper.from_array(array.astype(np.float32), name)
-            for name, array in arrays.items()
-            if name in used
-        ],
-    )
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    return model
-
-
-STATISTICS = ["weight", "bias", "mean", "variance"]
-
-
-def convolution(made: str, *more: str, kind: str = "Conv") -> onnx.NodeProto:
-    return onnx.helper.make_node(kind, ["image", "kernel", *more], [made], strides=[2, 2])
-
-
-def normalisation(read: str, made: str) -> onnx.NodeProto:
-    return onnx.helper.make_node("BatchNormalization", [read, *STATISTICS], [made], epsilon=0.25)
-
-
-def node(kind: str, *names: str) -> onnx.NodeProto:
-    return onnx.helper.make_node(kind, list(names[:-1]), [names[-1]])
-
-
-def check_that_folding_changes_no_answer(model: onnx.ModelProto, photo: np.ndarray) -> None:
-    images = {"image": images_of(photo, 6, 8, 2)}
-    expected = session_of(model.SerializeToString()).run(None, images)
-    fold_normalisation(model.graph)
-    onnx.checker.check_model(model, full_check=True)
-    assert "BatchNormalization" not in {one.op_type for one in model.graph.node}
-    for array, other in zip(
-        session_of(model.SerializeToString()).run(None, images), expected, strict=True
-    ):
-        np.testing.assert_allclose(array, other, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("last", [True, False])
-@pytest.mark.parametrize("kind", ["Conv", "ConvTranspose"])
-def test_batch_normalisation_is_folded_into_a_convolution(
-    kind: str, last: bool, photo: np.ndarray
-) -> None:
-    """In float64: the kernel is the exact one, rounded once."""
-    behind = [] if last else [node("Neg", "normalised", "logits")]
-    nodes = [convolution("made", kind=kind), normalisation("made", "normalised"), *behind]
-    model = normalised_network(nodes, ["normalised" if last else "logits"])
-    before = {one.name: onnx.numpy_helper.to_array(one) for one in model.graph.initializer}
-    check_that_folding_changes_no_answer(model, photo)
-    found = list(model.graph.node)
-    assert [one.op_type for one in found] == [kind, *(one.op_type for one in behind)]
-    # Its output keeps its name, by which `tiling` knows it, unless the network ends there.
-    assert list(found[0].output) == ["normalised" if last else "made"]
-    weight, bias, mean, variance = (before[name].astype(np.float64) for name in STATISTICS)
-    factor = weight / np.sqrt(variance + 0.25)
-    folded = {one.name: onnx.numpy_helper.to_array(one) for one in model.graph.initializer}
-    axes = (slice(None), *[None] * 3) if kind == "Conv" else (None, slice(None), None, None)
-    exact = before["kernel"] * factor[axes]
-    np.testing.assert_array_equal(folded["kernel.folded"], exact.astype(np.float32))
-    exact = bias - mean * factor
-    np.testing.assert_array_equal(folded["kernel.bias"], exact.astype(np.float32))
-
-
-@pytest.mark.parametrize(
-    ("nodes", "outputs"),
-    [
-        (
-            [
-                convolution("one"),
-                normalisation("one", "first"),
-                node("Neg", "image", "other"),
-                onnx.helper.make_node("Conv", ["other", "kernel"], ["two"], strides=[2, 2]),
-                normalisation("two", "second"),
-            ],
-            ["first", "second"],
-        ),
-        (
-            [
-                convolution("made"),
-                normalisation("made", "normalised"),
-                node("Add", "made", "normalised", "logits"),
-            ],
-            ["logits"],
-        ),
-        (
-            [
-                convolution("made"),
-                normalisation("made", "normalised"),
-                node("Neg", "made", "other"),
-                normalisation("other", "second"),
-            ],
-            ["normalised", "second"],
-        ),
-        (
-            [
-                convolution("made"),
-                normalisation("made", "first"),
-                normalisation("made", "second"),
-                node("Mul", "first", "second", "logits"),
-            ],
-            ["logits"],
-        ),
-        ([convolution("made"), normalisation("made", "normalised")], ["made", "normalised"]),
-        ([convolution("made", "offset"), normalisation("made", "normalised")], ["normalised"]),
-    ],
-    ids=[
-        "same kernel",
-        "read twice",
-        "read twice, apart",
-        "two of one",
-        "an output",
-        "with a bias",
-    ],
-)
-def test_batch_normalisation_that_does_not_fit_a_convolution(
-    nodes: list[onnx.NodeProto], outputs: list[str], photo: np.ndarray
-) -> None:
-    model = normalised_network(nodes, outputs)
-    check_that_folding_changes_no_answer(model, photo)
-    assert {"Conv", "Mul", "Add"} <= {one.op_type for one in model.graph.node}
-
-
-def test_batch_normalisation_of_an_older_file_is_folded(tmp_path: Path, photo: np.ndarray) -> None:
-    """Behind a sum: (x + x) normalised per channel, beside NumPy."""
-    rng = np.random.default_rng(0)
-    weight, bias, mean, variance = rng.uniform(0.5, 2, (4, 3)).astype(np.float32)
-    graph = onnx.helper.make_graph(
-        [
-            onnx.helper.make_node("Add", ["image", "image"], ["sum"]),
-            onnx.helper.make_node("Identity", ["weight"], ["same"]),
-            onnx.helper.make_node(
-                "BatchNormalization",
-                ["sum", "same", "bias", "mean", "variance"],
-                ["logits"],
-                epsilon=0.25,
-            ),
-        ],
-        "older",
-        [onnx.helper.make_tensor_value_info("image", 1, ("b", 3, "h", "w"))],
-        [onnx.helper.make_tensor_value_info("logits", 1, ("b", 3, "h", "w"))],
-        [
-            onnx.numpy_helper.from_array(array, name)
-            for name, array in (
-                ("weight", weight),
-                ("bias", bias),
-                ("mean", mean),
-                ("variance", variance),
-            )
-        ],
-    )
-    fold_normalisation(graph)
-    assert [node.op_type for node in graph.node if node.op_type != "Identity"] == [
-        "Add",
-        "Mul",
-        "Add",
-    ]
-    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    images = images_of(photo, 5, 7, 2)
-    (found,) = session_of(model.SerializeToString()).run(None, {"image": images})
-    scale, offset, middle, spread = (
-        array[:, None, None] for array in (weight, bias, mean, variance)
-    )
-    expected = (2 * images - middle) / np.sqrt(spread + 0.25) * scale + offset
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_metadata(tmp_path: Path) -> None:
@@ -425,32 +234,6 @@ def test_eight_bits(
     assert DeepDetect(path, backend="onnxruntime").heatmap(photo).shape == photo.shape[:2]
 
 
-def test_an_older_file_is_padded(tmp_path: Path, photo: np.ndarray) -> None:
-    """Files of trainings before the padding map multiples of 8, and say nothing of themselves."""
-    model = onnx.load_model_from_string(
-        cut_onnx(pretrained_weights().read_bytes(), ["padded_image"], ["padded_logits"])
-    )
-    for value, name in ((model.graph.input[0], "image"), (model.graph.output[0], "logits")):
-        old, value.name = value.name, name
-        for node in model.graph.node:
-            for names in (node.input, node.output):
-                names[:] = [name if each == old else each for each in names]
-    probability = onnx.helper.make_tensor_value_info("probability", 1, ("b", 1, "h", "w"))
-    model.graph.output.insert(0, probability)
-    model.graph.node.append(onnx.helper.make_node("Sigmoid", ["logits"], ["probability"]))
-    del model.metadata_props[:]
-    onnx.save(model, str(tmp_path / "old.onnx"))
-    metadata = write_onnx(tmp_path / "old.onnx", tmp_path / "new.onnx")
-    assert metadata["weights"] == "old.onnx"
-    assert "licence" not in metadata
-    images = images_of(photo, 45, 50, 1)
-    found, expected = (
-        session_of(path).run(["logits"], {"image": images})[0]
-        for path in (tmp_path / "new.onnx", pretrained_weights())
-    )
-    np.testing.assert_array_equal(found, expected)
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -459,7 +242,6 @@ def test_an_older_file_is_padded(tmp_path: Path, photo: np.ndarray) -> None:
         ({"size": (4, 64)}, "`size` must lie in"),
         ({"size": (64,)}, "height and width"),
         ({"size": (64, 64), "batch": 0}, "`batch` must lie in"),
-        ({"max_calibration_images": 0}, "`max_calibration_images` must lie in"),
     ],
 )
 def test_options_are_checked(values: dict[str, object], message: str) -> None:

@@ -5,7 +5,6 @@ The package `onnx` is needed, torch is not: files are made from files.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -103,13 +102,6 @@ def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
             value.type.tensor_type.shape.dim[axis].dim_value = length
 
 
-def is_padded(model: ModelProto) -> bool:
-    """Return whether a network has passed `add_padding`, and takes any size."""
-    return any(PADDED_LOGITS in node.output for node in model.graph.node) and any(
-        node.op_type == "Shape" for node in model.graph.node
-    )
-
-
 def check_graph(model: ModelProto, name: str) -> None:
     """Check that a graph maps `image` to `logits`.
 
@@ -179,22 +171,18 @@ _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
 
 
 def fold_normalisation(graph: GraphProto) -> None:
-    """Fold batch normalisation: into the convolution before it, or into one factor and one offset.
+    """Fold batch normalisation into the convolution before it, or into a factor and an offset.
 
     Computed in float64, so that the same weights give the same numbers everywhere: PyTorch's
     exporter, which folds those behind convolutions in float32, rounds differently by processor.
-    Into a convolution goes one that alone reads its output, and whose kernel no other node has;
-    the others become a multiplication and an addition: those behind a sum, a concatenation, or a
-    convolution that has a bias or several groups.
+    Those behind a sum or a concatenation become a multiplication and an addition.
 
     Args:
-        graph: of any network; changed in place. One without batch normalisation stays as it is.
+        graph: of an `ESPNet`, whose convolutions have no bias; changed in place.
     """
     from onnx import helper, numpy_helper
 
     values = {one.name: one for one in graph.initializer}
-    outputs = {value.name for value in graph.output}
-    read = Counter([*outputs, *(name for node in graph.node for name in node.input)])
     made = {name: node for node in graph.node for name in node.output}
     for node in graph.node:
         if node.op_type == "Identity" and node.input[0] in values:  # equal weights, written once
@@ -207,27 +195,19 @@ def fold_normalisation(graph: GraphProto) -> None:
         weight, bias, mean, variance = (
             numpy_helper.to_array(values[name]).astype(np.float64) for name in node.input[1:]
         )
-        epsilon = next((one.f for one in node.attribute if one.name == "epsilon"), 1e-5)
+        epsilon = next(one.f for one in node.attribute if one.name == "epsilon")
         factor = weight / np.sqrt(variance + epsilon)
         offset = bias - mean * factor
         source, target = node.input[0], node.output[0]
-        before = made.get(source)
-        if (
-            before is not None
-            and before.op_type in _FACTOR_SHAPES
-            and [read[source], *(read[name] for name in before.input[1:])] == [1, 1]
-            and all(one.i == 1 for one in before.attribute if one.name == "group")
-        ):
+        before = made[source]
+        if before.op_type in _FACTOR_SHAPES:
             name = before.input[1]
             shape = _FACTOR_SHAPES[before.op_type]
             kernel = numpy_helper.to_array(values[name]) * factor.reshape(shape)
             arrays = {f"{name}.folded": kernel, f"{name}.bias": offset}
             before.input[:] = [before.input[0], *arrays]
-            if target in outputs:
-                before.output[0] = target
-            else:  # tiling.py and other programs know the names that PyTorch's exporter leaves
-                for other in graph.node:
-                    rename(other, target, source)
+            for other in graph.node:  # `tiling` knows the names that PyTorch's exporter gives
+                rename(other, target, source)
         else:
             both = {f"{target}.factor": factor, f"{target}.offset": offset}
             arrays = {name: array[:, None, None] for name, array in both.items()}
@@ -246,7 +226,7 @@ def give_four_dimensions(graph: GraphProto) -> None:
     and after, which took a third of the time.
 
     Args:
-        graph: of any network; changed in place.
+        graph: changed in place.
     """
     from onnx import numpy_helper
 

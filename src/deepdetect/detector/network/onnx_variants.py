@@ -22,17 +22,7 @@ from ..._shared.errors import (
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.selection import check_max_keypoints
 from ..pretrained import resolve_weights
-from .onnx_graph import (
-    ANY_SIZE,
-    add_padding,
-    check_graph,
-    fix_size,
-    fold_normalisation,
-    give_four_dimensions,
-    is_padded,
-    read_metadata,
-    write_metadata,
-)
+from .onnx_graph import ANY_SIZE, check_graph, fix_size, read_metadata, write_metadata
 from .onnx_keypoints import MAX_KEYPOINTS, add_keypoints, remove_keypoints
 from .onnx_precision import to_float16, to_int8
 
@@ -40,6 +30,10 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 PRECISIONS = ("fp32", "fp16", "int8")
+
+
+MAX_CALIBRATION_IMAGES = 32
+"""At most this many images calibrate int8, evenly chosen."""
 
 
 @suggest_keywords
@@ -53,11 +47,9 @@ class OnnxOptions:
         batch: number of images that a file with a size takes; without a size it is free.
         precision: "fp32", "fp16" (half the bytes), or "int8" (quantised, for
             which it needs calibration images; it marks other pixels).
-        max_calibration_images: at most this many images calibrate int8, evenly chosen.
         max_keypoints: the file gives this many dense keypoints, too, the best ones: what
-            `DeepDetect.detect` finds with the same `max_keypoints`, `nms_radius=1`
-            and `subpixel=True`. 0: maps
-            only. None: 2048; with a size 0, as OpenCV 4 refuses files with keypoints.
+            `DeepDetect.detect` finds with the same `max_keypoints`, `nms_radius=1` and
+            `subpixel=True`. 0: maps only; OpenCV 4 refuses files with keypoints.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -66,45 +58,30 @@ class OnnxOptions:
     size: tuple[int, int] | None = None
     batch: int = 1
     precision: Literal["fp32", "fp16", "int8"] = "fp32"
-    max_calibration_images: int = 32
-    max_keypoints: int | None = None
+    max_keypoints: int = MAX_KEYPOINTS
 
     def __post_init__(self) -> None:
         if self.precision not in PRECISIONS:
             raise unknown_name("precision", self.precision, PRECISIONS)
         if self.size is not None and len(self.size) != 2:
             raise OptionError(f"`size` must be height and width, not {self.size}")
-        check_ranges(
-            self,
-            between={
-                "size": (8, 16384),
-                "batch": (1, 1024),
-                "max_calibration_images": (1, 10_000),
-                "max_keypoints": (0, 100_000),
-            },
-        )
+        ranges = {"size": (8, 16384), "batch": (1, 1024), "max_keypoints": (0, 100_000)}
+        check_ranges(self, between=ranges)
         if self.max_keypoints:
             check_max_keypoints(self.max_keypoints)
-        if self.batch != 1 and self.size is None:
+        if self.batch > 1 and self.size is None:
             raise OptionError("`batch` needs `size`: a file for any size takes any batch")
-
-    @property
-    def keypoints_in_file(self) -> int:
-        """How many keypoints the file gives: `max_keypoints`, or what is usual for its size."""
-        if self.max_keypoints is not None:
-            return int(self.max_keypoints)
-        return MAX_KEYPOINTS if self.size is None else 0
 
     @property
     def metadata(self) -> dict[str, str]:
         """What the file says of its options."""
-        found = {**ANY_SIZE, "precision": self.precision}
+        values = {**ANY_SIZE, "precision": self.precision}
         if self.size is not None:
             height, width = self.size
-            found |= {"size": f"{height}x{width}", "batch": str(self.batch)}
-        if self.keypoints_in_file:
-            found["max_keypoints"] = str(self.keypoints_in_file)
-        return found
+            values |= {"size": f"{height}x{width}", "batch": str(self.batch)}
+        if self.max_keypoints:
+            values["max_keypoints"] = str(self.max_keypoints)
+        return values
 
 
 def write_onnx(
@@ -122,7 +99,7 @@ def write_onnx(
             for any size; or a safetensors file, which needs torch.
         path: the file to be written, ending in .onnx.
         options: its size and precision, and whether it gives keypoints.
-        calibration: photographs for int8, like those that it will be used on.
+        calibration: images for int8, like those that it will be used on.
         licence: what the file says of the licence of the weights. None: that of the given file.
 
     Returns:
@@ -138,7 +115,7 @@ def write_onnx(
         raise OptionError(f"the name of an ONNX file ends in .onnx, not {Path(path).name}")
     if (options.precision == "int8") != bool(calibration):
         raise OptionError(
-            "int8 needs photographs to take the ranges of values from: give `calibration`"
+            "int8 needs images to take the ranges of values from: give `calibration`"
             if not calibration
             else f"`calibration` is for int8, not {options.precision}: leave one of them out"
         )
@@ -146,13 +123,13 @@ def write_onnx(
     model = _load(weights)
     values = options.metadata if licence is None else {**options.metadata, "licence": licence}
     if options.precision == "int8":
-        model = to_int8(model, _images(calibration, options.max_calibration_images))
+        model = to_int8(model, _images(calibration))
     if options.size is not None:
         fix_size(model, *options.size, options.batch)
     if options.precision == "fp16":
         to_float16(model)
-    if options.keypoints_in_file:
-        add_keypoints(model, options.keypoints_in_file)
+    if options.max_keypoints:
+        add_keypoints(model, options.max_keypoints)
     write_metadata(model, values)
     with atomic_path(path) as temporary:
         temporary.write_bytes(model.SerializeToString())
@@ -185,10 +162,6 @@ def _load(weights: str | Path) -> ModelProto:
             f"{path} has the size {found.get('size')} and the precision {found.get('precision')}: "
             "give the file that it was made from"
         )
-    if not is_padded(model):  # older files
-        add_padding(model)
-    fold_normalisation(model.graph)  # those of version 0.1 have some left
-    give_four_dimensions(model.graph)  # those of version 0.2.0 have three
     if "weights" not in found:
         write_metadata(model, {"weights": path.name})
     return model
@@ -212,12 +185,12 @@ def _from_torch(path: Path) -> ModelProto:
     return model
 
 
-def _images(paths: Sequence[Path], at_most: int) -> Iterator[np.ndarray]:
+def _images(paths: Sequence[Path]) -> Iterator[np.ndarray]:
     """Yield some of the images, evenly chosen, at the size that the network sees."""
     from ...io.image import load_image
 
-    step = max(1, len(paths) / at_most)
-    for k in range(min(len(paths), at_most)):
+    step = max(1, len(paths) / MAX_CALIBRATION_IMAGES)
+    for k in range(min(len(paths), MAX_CALIBRATION_IMAGES)):
         yield load_image(paths[int(k * step)])
 
 
