@@ -74,10 +74,11 @@ def test_a_model(tmp_path: Path) -> None:
     assert int(result.numbers["Points"].replace(",", "")) > 50_000
 
 
-def test_a_model_needs_the_focal_length(tmp_path: Path) -> None:
-    pytest.importorskip("numba")
-    with pytest.raises(DeepDetectError, match="focal"):
-        run("reconstruct", ["motorcycle-left.jpg", "motorcycle-right.jpg"], tmp_path)
+def test_a_focal_length_that_is_not_known_is_assumed_and_said(tmp_path: Path) -> None:
+    names = ["motorcycle-left.jpg", "motorcycle-right.jpg"]
+    result, _ = run("reconstruct", names, tmp_path)
+    width = load_image(EXAMPLES / names[0]).shape[1]
+    assert result.numbers["Focal length"] == f"assumed: {1.2 * width:.0f} px"
 
 
 def test_pictures_without_a_common_geometry(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ const tasksOf = ({ folder }) => readdirSync(folder).filter((name) => name.starts
 
 const openTasks = async (page, title, app) => {
   await openExample(page, title, app.address);
-  await page.getByRole("tab", { name: "Python" }).click();
+  await page.getByRole("tab", { name: "3D and more" }).click();
 };
 
 const startTask = (page, kind) => page.locator(`[data-kind="${kind}"]`).click();
@@ -53,7 +53,7 @@ test("guided matching finds many times as many, and nothing is kept", async ({ p
 test("a 3D model is shown, and can be turned", async ({ page, app }) => {
   await openTasks(page, "Motorcycle", app);
   await startTask(page, "reconstruct");
-  await expect(page.getByRole("alert")).toContainText("focal", { timeout: 120_000 });
+  await expect(page.locator("#job-numbers")).toContainText("assumed", { timeout: 120_000 });
   await page.locator("[name=focal_px]").fill("995");
   const framed = page.waitForResponse((response) => response.url().endsWith("/model.html")
     && response.request().isNavigationRequest());
@@ -189,7 +189,7 @@ test("a folder", async ({ page, app }, info) => {
 test("what has no geometry is said in one sentence", async ({ page, app }) => {
   await page.goto(app.address);
   await page.locator("#file").setInputFiles([join(examples, "coffee.jpg"), join(examples, "motorcycle-left.jpg")]);
-  await page.getByRole("tab", { name: "Python" }).click();
+  await page.getByRole("tab", { name: "3D and more" }).click();
   await startTask(page, "register");
   await expect(page.getByRole("alert")).toContainText("No homography can be trusted", { timeout: 120_000 });
 });

@@ -9,9 +9,9 @@ const NUMBERS = [10, 20, 50, 100, 200, 300, 500, 750, 1000, 1500, 2000, 3000]; /
 
 const POINTS = `
 import json, sys
-from deepdetect import DeepDetect
+from deepdetect import PointDetector
 path, options = sys.argv[1], json.loads(sys.argv[2])
-found = DeepDetect(backend="onnxruntime").detect(path, mode="points", **options)
+found = PointDetector(**options).detect(path)
 columns = zip(*found.xy.T.tolist(), *(each.tolist() for each in (found.scores, found.sizes, found.angles)))
 print(json.dumps([list(row) for row in columns]))
 `;
@@ -75,7 +75,7 @@ print("null")
     const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=json]"));
     const found = JSON.parse(content);
     expect(found).toMatchObject({ width, height, columns: ["x", "y", "score", "size", "angle"],
-                                  options: { max_keypoints: 2000, spread: "none", mode: "points" } });
+                                  options: { max_keypoints: 2000, spread: "none" } });
     // One pixel in ten thousand may be rounded otherwise when it is reduced, by one level of grey.
     expect(shared(found.keypoints, pointsOf(path, { max_keypoints: 2000 }))).toBeGreaterThan(least);
     const sizes = found.keypoints.map((row) => row[3]);
@@ -177,8 +177,6 @@ test("a turned picture is matched by points", async ({ page }, info) => {
   // By a quarter: (x, y) comes to (399 - y, x).
   const right = rows.filter(([x0, y0, x1, y1]) => Math.hypot(x1 - (399 - y0), y1 - x0) < 2).length;
   expect(right / rows.length).toBeGreaterThan(0.95);
-  await choose(page, "match-kind", "ranked");
-  await expect(page.locator("#match-hint")).toContainText("most may be wrong");
 });
 
 test.describe("while points are found", () => {
@@ -265,17 +263,6 @@ test("the ratio is moved while more keypoints are matched", async ({ page }) => 
   await slide(page, "match-number", 4000);
   await slide(page, "ratio", 0.7);
   await expect(page.locator("#busy")).toBeHidden();
-  await expect.poll(() => matchOptions(page)).toMatchObject({ mode: "points", keypoints: 4000, ratio: 0.7 });
+  await expect.poll(() => matchOptions(page)).toMatchObject({ keypoints: 4000, ratio: 0.7 });
   expect((await matchOptions(page)).worst).toBeLessThan(0.7);
-});
-
-test("a kind is chosen and left again while its keypoints are matched", async ({ page }) => {
-  await openExample(page, "Motorcycle");
-  const points = await page.locator("#match-count").textContent();
-  await choose(page, "match-kind", "ranked");
-  await expect(page.locator("#busy")).toBeVisible();
-  await choose(page, "match-kind", "points");
-  await expect(page.locator("#busy")).toBeHidden();
-  await expect(page.locator("#match-count")).toHaveText(points);
-  expect(await matchOptions(page)).toMatchObject({ mode: "points", keypoints: 2000 });
 });

@@ -10,7 +10,7 @@ const KEYPOINTS = `
 import json, sys
 from deepdetect import DeepDetect
 path, options = sys.argv[1], json.loads(sys.argv[2])
-found = DeepDetect(backend="onnxruntime").detect(path, mode="dense", **options)
+found = DeepDetect(backend="onnxruntime").detect(path, **options)
 print(json.dumps({"xy": found.xy.tolist(), "scores": found.scores.tolist()}))
 `;
 
@@ -41,7 +41,6 @@ const CASES = [
   { name: "dense", controls: {}, options: {} },
   { name: "threshold", controls: {}, slider: ["threshold", 0.8], options: { threshold: 0.8 } },
   { name: "density", controls: { by: "density" }, slider: ["density", 12.5], options: { density: 0.125 } },
-  { name: "ranked", controls: { kind: "ranked" }, slider: ["number", 9], options: { max_keypoints: 1500 } },
 ];
 
 for (const file of ["coffee.jpg", "motorcycle-left.jpg", "motorcycle-right.jpg", "coffee-turned.jpg"]) {
@@ -127,9 +126,6 @@ test("sliders answer at once, and do not run the network", async ({ page }) => {
   await chooseKeypoints(page, { by: "density" });
   await slide(page, "density", 10);
   expect(await count()).toBe(24_000);
-  await chooseKeypoints(page, { kind: "ranked" });
-  await slide(page, "number", 4);
-  expect(await count()).toBe(200);
   expect(await page.locator("body").getAttribute("data-network-runs")).toBe("1");
   const drawn = await page.locator("#view-keypoints .overlay").evaluate((canvas) =>
     canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value > 0));
@@ -161,11 +157,7 @@ test("matches of two views agree with the true disparity", async ({ page }) => {
   const fewer = async () => Number((await page.locator("#match-count").textContent()).replace(/\D/g, ""));
   await expect.poll(fewer).toBeLessThan(rows.length);
   const json = await downloaded(page, page.locator("#view-matches [data-download=json]"));
-  expect(JSON.parse(json.content)).toMatchObject({ model: "fundamental", options: { mode: "points", ratio: 0.6 } });
-  await choose(page, "match-kind", "ranked");
-  await expect(page.locator("body")).toHaveAttribute("data-network-runs", "2");
-  await expect(page.locator("#match-kind-hint")).toContainText("upright");
-  await expect(page.locator("#match-hint")).toContainText("epipolar geometry");
+  expect(JSON.parse(json.content)).toMatchObject({ model: "fundamental", options: { ratio: 0.6 } });
 });
 
 test("pictures that show different things have no geometry", async ({ page }) => {

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import json
+import multiprocessing
 import os
 import secrets
 import shutil
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -20,7 +18,10 @@ from typing import Any
 
 from .._shared.atomic import private_folder
 from .._shared.errors import DeepDetectError, OptionError
+from .._shared.signals import signals_held
+from . import worker
 from .options import AppOptions
+from .tasks import SentImage
 
 FOLDER_PREFIX = "deepdetect-app-"
 """Of the folder of a server, in the folder for temporary files."""
@@ -34,7 +35,7 @@ class Job:
     Args:
         folder: its own, with the images in it; removed by `remove`.
         kind: of the task.
-        images: pairs of a file's name in the folder and the name that the user knows it by.
+        images: in the folder.
         options: of the task.
         max_megapixels: larger images are refused.
 
@@ -49,7 +50,7 @@ class Job:
         self,
         folder: Path,
         kind: str,
-        images: Sequence[tuple[str, str]],
+        images: Sequence[SentImage],
         options: Mapping[str, float],
         max_megapixels: float,
     ) -> None:
@@ -58,32 +59,14 @@ class Job:
         self.started = self.asked = time.monotonic()
         self.state: dict[str, Any] = {"state": "running", "stage": "starting"}
         self._reason = NO_RESULT
-        task = {
-            "kind": kind,
-            "images": images,
-            "options": options,
-            "max_megapixels": max_megapixels,
-        }
-        (folder / "task.json").write_text(json.dumps(task), encoding="utf-8")
-        root = str(Path(__file__).parents[2])  # where the worker finds the package
-        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
-        self.process = subprocess.Popen(
-            # -P: no module is taken from the folder it is started in.
-            [sys.executable, "-P", "-m", f"{__package__}.worker", str(folder)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            cwd=folder,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-            start_new_session=True,  # so that all it starts can be ended
-        )
+        context = multiprocessing.get_context("spawn")
+        self._receiver, sender = context.Pipe(duplex=False)
+        task = (sender, folder, kind, images, options, max_megapixels)
+        self.process = context.Process(target=worker.main, args=task)
+        with signals_held(), sender:  # Ctrl+C is for the server, which ends its tasks
+            self.process.start()
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
-
-    @property
-    def running(self) -> bool:
-        """Whether the process is at work."""
-        return self.process.poll() is None
 
     def file(self, name: str) -> Path | None:
         """Return one of the files that the task has named; None for any other name."""
@@ -93,12 +76,9 @@ class Job:
     def stop(self, reason: str) -> None:
         """End the process with all that it has started."""
         self._reason = reason
-        if self.running:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                if hasattr(os, "killpg"):
-                    os.killpg(self.process.pid, signal.SIGKILL)
-                else:
-                    self.process.kill()
+        with contextlib.suppress(ProcessLookupError, PermissionError, AttributeError):
+            os.killpg(self.process.pid or 0, signal.SIGKILL)
+        self.process.kill()  # before it had a group, and on Windows
         self._listener.join()
 
     def remove(self) -> None:
@@ -107,17 +87,10 @@ class Job:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _listen(self) -> None:
-        with self.process:  # closes what it was held by, and waits for it
-            for line in self.process.stdout or ():
-                if not line.endswith(b"\n"):
-                    break  # it was ended while it wrote
-                told = json.loads(line)
-                if "result" in told:
-                    self.state = {"state": "done", **told["result"]}
-                elif "error" in told:
-                    self.state = {"state": "failed", "error": told["error"]}
-                else:
-                    self.state = {"state": "running", **told}
+        with contextlib.suppress(EOFError), self._receiver:
+            while True:
+                self.state = self._receiver.recv()
+        self.process.join()
         if self.state["state"] == "running":
             self.state = {"state": "failed", "error": self._reason}
 
@@ -157,7 +130,7 @@ class Jobs:
 
     def check_room(self) -> None:
         """Raise an OptionError where too many tasks are at work."""
-        if sum(job.running for job in self._jobs.values()) >= self.limits.max_tasks:
+        if sum(job.process.is_alive() for job in self._jobs.values()) >= self.limits.max_tasks:
             raise OptionError(
                 f"as many tasks as are allowed ({self.limits.max_tasks}) are at work: wait for one "
                 "of them, or cancel it"
@@ -167,7 +140,7 @@ class Jobs:
         self,
         folder: Path,
         kind: str,
-        images: Sequence[tuple[str, str]],
+        images: Sequence[SentImage],
         options: Mapping[str, float],
     ) -> Job:
         """Start a task with the images of a folder.
@@ -199,7 +172,7 @@ class Jobs:
         for job in list(self._jobs.values()):
             if now - job.asked > self.limits.abandoned_s:
                 self.remove(job.name)
-            elif job.running and now - job.started > self.limits.max_task_s:
+            elif job.process.is_alive() and now - job.started > self.limits.max_task_s:
                 minutes = self.limits.max_task_s / 60
                 job.stop(f"it took over {minutes:.3g} minutes: use fewer or smaller images")
 

@@ -38,7 +38,7 @@ from .._shared.signals import handle_signals
 from ..detector.pretrained import RANKER
 from .jobs import Jobs
 from .options import AppOptions
-from .tasks import TASKS
+from .tasks import TASKS, SentImage
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")
@@ -50,7 +50,10 @@ SLOWEST = 10
 
 DRAINED_BYTES = 16 << 20
 """Of a refused request that are read before it is answered: browsers look for the answer only when
-they have sent everything."""
+they have sent everything. What is not too large is read whole."""
+
+ACCEPTED = "deepdetect.accepted_bytes"
+"""Key of the length of a request that is not too large."""
 
 SHUTDOWN_S = 1
 """How long the end waits for requests that are being answered."""
@@ -284,12 +287,15 @@ class AppServer:
             raise HTTPException(400, "the images are not as long as is said")
         numbers = TASKS[kind].check(len(names), given)
         with self.jobs.new_folder() as folder:
-            files = [f"{number:04d}{_suffix(name)}" for number, name in enumerate(names)]
-            for file, bytes_ in zip(files, sizes, strict=True):
-                with (folder / file).open("xb") as opened:
+            images = [
+                SentImage(folder / f"{number:04d}{_suffix(name)}", name)
+                for number, name in enumerate(names)
+            ]
+            for image, bytes_ in zip(images, sizes, strict=True):
+                with image.path.open("xb") as file:
                     async for piece in body.pieces(bytes_):
-                        opened.write(piece)
-            job = self.jobs.start(folder, kind, list(zip(files, names, strict=True)), numbers)
+                        file.write(piece)
+            job = self.jobs.start(folder, kind, images, numbers)
         return JSONResponse({"job": job.name})
 
     def _job(self, request: Request) -> Any:
@@ -345,7 +351,7 @@ class _Guard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                left = DRAINED_BYTES
+                left = max(DRAINED_BYTES, scope.get(ACCEPTED, 0))
                 with contextlib.suppress(HTTPException):
                     while not whole and left > 0:
                         left -= len((await receive_in_time()).get("body", b""))
@@ -425,6 +431,7 @@ def _body_length(request: Request, largest: int) -> int:
         raise HTTPException(
             413, f"this is over {largest / 1e6:.3g} MB: give fewer or smaller images"
         )
+    request.scope[ACCEPTED] = int(text)
     return int(text)
 
 

@@ -7,23 +7,25 @@ shows beside them.
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from .._shared.errors import DeepDetectError, OptionError, install_command
-
-if TYPE_CHECKING:
-    from ..reconstruction.result import Reconstruction
+from .._shared.errors import DeepDetectError, OptionError, ReconstructionError, install_command
 
 FOLDER_KEYPOINTS = 2048
 """Best keypoints of each image of a folder."""
 
+MATCHING_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry", "files")
+
 MODEL_STAGES = 9
 """Of a 3D model at most, with its files."""
+
+ASSUMED_FOCAL = 1.2
+"""Times the longer side: the focal length of images that do not say theirs, as COLMAP has it."""
 
 Report = Callable[[str, int, int], None]
 """Is told the stage that begins, how many are done, and how many there are (0: not known)."""
@@ -114,9 +116,7 @@ def run_match(
     from ..matching.pipeline import match_images
     from ..viz.draw import add_caption, save_picture
 
-    stages = _stages(
-        ("initial geometry", "keypoints", "guided matching", "geometry", "files"), report
-    )
+    stages = _stages(MATCHING_STAGES, report)
     first, second = (load_image(one.path) for one in images)
     matches = match_images(first, second, progress=stages)
     if not matches.success:
@@ -146,9 +146,7 @@ def run_register(
     from ..matching.registration import register
     from ..viz.draw import save_picture
 
-    stages = _stages(
-        ("initial geometry", "keypoints", "guided matching", "geometry", "files"), report
-    )
+    stages = _stages(MATCHING_STAGES, report)
     found = register(images[0].path, images[1].path, progress=stages)
     pictures = {
         "checkerboard.png": found.checkerboard(),
@@ -193,21 +191,28 @@ def run_reconstruct(
 ) -> TaskResult:
     """Make a 3D model of two images."""
     from ..detector.detector import DeepDetect
+    from ..io.exif import calibration_from_exif
+    from ..io.image import load_image
     from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
     from ..reconstruction.pipeline import reconstruct
     from ..viz.draw import draw_depth, save_picture
 
-    done = 0
-
-    def stage(name: str) -> None:
-        nonlocal done
-        done += 1
-        report(f"after {name}", done, MODEL_STAGES)
-
+    done = itertools.count(1)
     report("starting", 0, MODEL_STAGES)
     left, right = (one.path for one in images)
+    height, width = load_image(left).shape[:2]
+    focal_px, assumed = options.get("focal_px"), False
+    if focal_px is None:
+        try:
+            calibration_from_exif(left, right, (width, height), (width, height))
+        except ReconstructionError:
+            focal_px, assumed = ASSUMED_FOCAL * max(height, width), True
     found = reconstruct(
-        left, right, DeepDetect("dense"), focal_px=options.get("focal_px"), progress=stage
+        left,
+        right,
+        DeepDetect("dense"),
+        focal_px=focal_px,
+        progress=lambda name: report(f"after {name}", next(done), MODEL_STAGES),
     )
     report("files", MODEL_STAGES - 1, MODEL_STAGES)
     title = " and ".join(one.name for one in images)
@@ -217,18 +222,15 @@ def run_reconstruct(
     save_picture(draw_depth(found.depth_map(), found.unit), folder / "depth.jpg")
     summary = json.dumps(found.summary(), indent=2, default=str)
     (folder / "model.json").write_text(summary + "\n", encoding="utf-8")
-    return TaskResult(_model_numbers(found), "model.html", (*names, "depth.jpg", "model.json"))
-
-
-def _model_numbers(found: Reconstruction) -> dict[str, str]:
-    summary = found.summary()
-    return {
+    focal = f"assumed: {focal_px:.0f} px" if assumed else found.calibration.source
+    numbers = {
         "Points": f"{len(found):,}",
         "Matches": f"{found.matches:,}",
         "Pair": "rectified" if found.rectified else "not rectified",
-        "Focal length": f"{found.calibration.source}",
-        "Scale": str(summary["scale"]),
+        "Focal length": focal,
+        "Scale": str(found.summary()["scale"]),
     }
+    return TaskResult(numbers, "model.html", (*names, "depth.jpg", "model.json"))
 
 
 def run_reconstruct_many(
@@ -259,12 +261,11 @@ def run_folder_keypoints(
     from ..io.tables import save_keypoints
     from ..viz.draw import save_picture
 
-    detector = PointDetector(int(options.get("max_keypoints", FOLDER_KEYPOINTS)))
+    detector = PointDetector(FOLDER_KEYPOINTS)
     table, failures = folder / "table.csv", []
     shown, total = "", 0
     with zipfile.ZipFile(folder / "keypoints.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        names = _entry_names(images)
-        for number, (one, name) in enumerate(zip(images, names, strict=True)):
+        for number, one in enumerate(images):
             report(one.name, number, len(images))
             try:
                 rgb = load_image(one.path)
@@ -273,7 +274,7 @@ def run_folder_keypoints(
                 continue
             keypoints = detector.detect(rgb)
             save_keypoints(keypoints, table)
-            archive.write(table, name)
+            archive.write(table, _entry_name(one.name, archive.namelist()))
             total += len(keypoints)
             if not shown:
                 shown = "keypoints.jpg"
@@ -290,56 +291,37 @@ def run_folder_keypoints(
     return TaskResult(numbers, shown, ("keypoints.zip",))
 
 
-def _entry_names(images: Sequence[SentImage]) -> list[str]:
-    """Return a name in the archive for each image, all different, none with a folder.
+def _entry_name(name: str, others: Sequence[str]) -> str:
+    """Return a name in the archive for an image, which no other has, and without a folder.
 
     Example:
-        >>> _entry_names([SentImage(Path("0"), name) for name in ("a/b.jpg", "b.png", "../c")])
-        ['b.csv', 'b_2.csv', 'c.csv']
+        >>> _entry_name("a/b.jpg", []), _entry_name("../b", ["b.csv"])
+        ('b.csv', 'b_2.csv')
     """
-    names: list[str] = []
-    for one in images:
-        stem = Path(one.name.replace("\\", "/")).name.rpartition(".")[0] or one.name
-        stem = "".join(c if c.isalnum() or c in "-_ " else "_" for c in Path(stem).name) or "photo"
-        name, number = f"{stem}.csv", 2
-        while name in names:
-            name, number = f"{stem}_{number}.csv", number + 1
-        names.append(name)
-    return names
+    stem = Path(name.replace("\\", "/")).stem
+    stem = "".join(c if c.isalnum() or c in "-_ " else "_" for c in stem) or "image"
+    names = (f"{stem}{end}.csv" for end in ("", *(f"_{k}" for k in range(2, len(others) + 3))))
+    return next(name for name in names if name not in others)
 
 
 def _stages(names: Sequence[str], report: Report) -> Callable[[str], None]:
     """Report the first stage; return what is called when a stage ends."""
-    done = 0
-    report(names[0], 0, len(names))
+    done = itertools.count()
 
     def ended(_: str) -> None:
-        nonlocal done
-        done = min(done + 1, len(names) - 1)
-        report(names[done], done, len(names))
+        number = min(next(done), len(names) - 1)
+        report(names[number], number, len(names))
 
+    ended("")
     return ended
 
 
 TASKS: dict[str, Task] = {
-    "match": Task(
-        "Guided matching",
-        "all matches that agree with one geometry",
-        run_match,
-        (2, 2),
-    ),
+    "match": Task("Guided matching", "all matches that agree with one geometry", run_match, (2, 2)),
     "register": Task(
-        "Registration",
-        "the second picture in the frame of the first",
-        run_register,
-        (2, 2),
+        "Registration", "the second picture in the frame of the first", run_register, (2, 2)
     ),
-    "stitch": Task(
-        "Panorama",
-        "of pictures that overlap",
-        run_stitch,
-        (2, None),
-    ),
+    "stitch": Task("Panorama", "of pictures that overlap", run_stitch, (2, None)),
     "reconstruct": Task(
         "3D model",
         "coloured points, and a depth map",
@@ -348,19 +330,9 @@ TASKS: dict[str, Task] = {
         options={"focal_px": "Focal length in pixels, where the pictures do not say it"},
     ),
     "folder-keypoints": Task(
-        "Keypoints",
-        "of each picture, as CSV files",
-        run_folder_keypoints,
-        (1, None),
-        folder=True,
+        "Keypoints", "of each picture, as CSV files", run_folder_keypoints, (1, None), folder=True
     ),
-    "folder-stitch": Task(
-        "Panorama",
-        "of all pictures",
-        run_stitch,
-        (2, None),
-        folder=True,
-    ),
+    "folder-stitch": Task("Panorama", "of all pictures", run_stitch, (2, None), folder=True),
     "folder-model": Task(
         "3D model",
         "of three or more pictures",

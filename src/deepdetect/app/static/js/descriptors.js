@@ -1,24 +1,12 @@
 // RootSIFT descriptors: 4x4 cells of 8 directions (Lowe, 2004; Arandjelovic and Zisserman, 2012).
-import { SIZE_PER_SIGMA, firstLayer, layersOf } from "./scale_space.js";
+import { SIZE_PER_SIGMA, layersOf } from "./scale_space.js";
 
 export const LENGTH = 128;
 const CELLS = 4;
 const DIRECTIONS = 8;
-const UPRIGHT_CELL_PX = 4;
 const CELL_PER_SIGMA = 3;
 const REACH = (CELLS + 1) / 2; // half the window, and half a cell for the interpolation, in cells
 const MAX_VALUE = 0.2;
-
-/** Describes upright keypoints of one size. @returns {Float32Array} rows of 128, length 1 */
-export function describe(gray, width, height, xy) {
-  const layer = { image: firstLayer(gray, width, height), width, height };
-  const result = new Float32Array(xy.length / 2 * LENGTH);
-  for (let k = 0; k < xy.length / 2; k++) {
-    const place = { x: xy[2 * k], y: xy[2 * k + 1], cell: UPRIGHT_CELL_PX, angle: 0 };
-    describeOne(result.subarray(k * LENGTH, (k + 1) * LENGTH), layer, place);
-  }
-  return result;
-}
 
 /**
  * Describes keypoints at their own sizes and angles.

@@ -1,13 +1,12 @@
 // Describes and matches keypoints of two pictures beside the page.
 import { answer } from "./background.js";
-import { describe, describeAtOwnSize } from "./descriptors.js";
+import { describeAtOwnSize } from "./descriptors.js";
 import { mutualMatches } from "./matching.js";
 import { estimateGeometry, project } from "./geometry.js";
 import { dominantAngles } from "./orientation.js";
 
-/** Descriptors of keypoints: at their own sizes and angles where they have sizes, else upright. */
+/** Descriptors of keypoints, at their own sizes and angles. */
 function described({ gray, width, height, xy, sizes }) {
-  if (!sizes) return describe(gray, width, height, xy);
   const angles = dominantAngles(gray, width, height, { xy, sizes });
   return describeAtOwnSize(gray, width, height, { xy, sizes, angles });
 }

@@ -54,7 +54,3 @@ function halved(image, width, height) {
   }
   return [result, newWidth, newHeight];
 }
-
-/** The first image, for keypoints that all have the same size. */
-export const firstLayer = (gray, width, height) =>
-  blur(gray, width, height, Math.sqrt(BASE_SIGMA_PX ** 2 - CAMERA_SIGMA_PX ** 2));

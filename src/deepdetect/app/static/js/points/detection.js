@@ -1,6 +1,5 @@
-// Points of all scales, chosen from the ranking of a picture as `deepdetect.detect(max_keypoints=N)`
+// Points of all scales, chosen from the ranking of a picture as `deepdetect.PointDetector(N)`
 // chooses them.
-import { sigmoid } from "../selection.js";
 import { spreadByDistance, spreadOverGrid, suppressNeighbors } from "./suppression.js";
 
 const CANDIDATES_PER_KEYPOINT = 6;
@@ -39,10 +38,13 @@ export function choosePoints(ranking, count, spread = "none") {
   }
   return {
     xy: Float32Array.from({ length: 2 * rows.length }, (_, k) => xy[2 * rows[k >> 1] + (k & 1)]),
-    scores: sigmoid(Float32Array.from(rows, (row) => ranking.logits[row])),
+    scores: Float32Array.from(rows, (row) => scoreOf(ranking.logits[row])),
     sizes: Float32Array.from(rows, (row) => SIZE_PER_SIGMA * sigmas[row]),
   };
 }
+
+/** A logit of the ranker as a score in (0, 1), without ties at its ends. */
+const scoreOf = (logit) => 0.5 + 0.5 * logit / (1 + Math.abs(logit));
 
 /** The candidates that are ranked where so many points are wanted: those of the strongest response. */
 function strongest({ strengthRanks }, count) {

@@ -5,27 +5,21 @@ import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
 import { activePicture, announce, counted, element, enlargement, onceAFrame, page, rescaled, showError,
          toOriginal } from "../page.js";
 import { choosePoints } from "../points/detection.js";
-import { positions, select } from "../selection.js";
+import { select } from "../selection.js";
 
 const NUMBERS = [10, 20, 50, 100, 200, 300, 500, 750, 1000, 1500, 2000, 3000, 4000, 5000, 7500,
                  10_000, 15_000, 20_000, 30_000, 50_000];
-const RANKED_RADIUS_PX = 3; // on the screen
 
 /** What a kind of keypoints needs of a picture, and what is said of it. */
 const KINDS = {
   dense: {
     find: findHeatMap, isFound: (picture) => picture.map, choose: chooseDense,
-    hint: "Every pixel that passes, as detect() gives them.",
+    hint: "Every pixel that passes, as DeepDetect gives them.",
   },
   points: {
     find: findPoints, isFound: (picture) => picture.ranking, choose: chooseOfAllScales,
     hint: "The best places of all scales to find again in another photograph, with their sizes, as "
-      + "detect(max_keypoints=N) gives them. The network is not run for them.",
-  },
-  ranked: {
-    find: findHeatMap, isFound: (picture) => picture.map, choose: chooseRanked,
-    hint: "The best pixels of the heat map, refined to fractions of a pixel, as "
-      + "detect(max_keypoints=N, mode=\"dense\") gives them. Points are found again more often.",
+      + "PointDetector(N) gives them. The network is not run for them.",
   },
 };
 const SPREADS = {
@@ -48,7 +42,7 @@ function options() {
     kind,
     threshold: Number(element("threshold").value),
     density: density ? Number(element("density").value) / 100 : null,
-    maxKeypoints: kind === "dense" ? null : NUMBERS[element("number").value],
+    maxKeypoints: NUMBERS[element("number").value],
     spread: chosen.get("spread"),
   };
 }
@@ -81,7 +75,7 @@ function showControls({ kind, density, threshold, spread }) {
  * @property {(overlay: HTMLCanvasElement, unit: number) => void} draw
  * @property {string[]} columns of its files
  * @property {() => number[][] | Promise<number[][]>} rows in the photograph's own pixels
- * @property {object} options of `DeepDetect.detect` that give the same
+ * @property {object} options of Python that give the same
  */
 
 /** @returns {Selection} */
@@ -92,32 +86,11 @@ function chooseDense(picture, chosen) {
     count: pixels.length,
     what: `${(100 * density).toFixed(1)} per 100 pixels`,
     draw: (overlay) => drawPixels(overlay, picture, pixels),
-    ...filesOfPixels(picture, pixels, chosen),
-  };
-}
-
-/** @returns {Selection} */
-function chooseRanked(picture, chosen) {
-  const pixels = select(picture.map, chosen);
-  const xy = positions(picture.map, pixels, chosen);
-  return {
-    count: pixels.length,
-    what: "the best pixels of the heat map",
-    draw: (overlay, unit) => drawCircles(overlay, picture, xy, () => RANKED_RADIUS_PX * unit, unit),
-    ...filesOfPixels(picture, pixels, chosen),
-  };
-}
-
-function filesOfPixels(picture, pixels, chosen) {
-  return {
     columns: ["x", "y", "score"],
-    rows: () => {
-      const xy = positions(picture.map, pixels, chosen);
-      return Array.from(pixels, (pixel, k) =>
-        [...toOriginal(picture, xy[2 * k], xy[2 * k + 1]), picture.map.probability[pixel]]);
-    },
-    options: { threshold: chosen.density === null ? chosen.threshold : null,
-               density: chosen.density, max_keypoints: chosen.maxKeypoints, mode: "dense" },
+    rows: () => Array.from(pixels, (pixel) => [
+      ...toOriginal(picture, pixel % picture.width, Math.floor(pixel / picture.width)),
+      picture.map.probability[pixel]]),
+    options: chosen.density === null ? { threshold: chosen.threshold } : { density: chosen.density },
   };
 }
 
@@ -142,7 +115,7 @@ function chooseOfAllScales(picture, { maxKeypoints, spread }) {
         ...rescaled(xy[2 * k], xy[2 * k + 1], ranking, picture.original), score,
         sizes[k] * enlarged, angles[k]]);
     },
-    options: { max_keypoints: maxKeypoints, spread, mode: "points" },
+    options: { max_keypoints: maxKeypoints, spread },
   };
 }
 

@@ -1,24 +1,16 @@
 // Matches of two pictures by descriptors, their lines, and the geometry that they agree with.
 import { Background } from "../background.js";
-import { findHeatMap, findPoints } from "../detection.js";
+import { findPoints } from "../detection.js";
 import { drawMatches, newCanvas } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
 import { announce, counted, during, element, onceAFrame, page, rescaled, showError, toOriginal } from "../page.js";
-import { luma } from "../pixels.js";
 import { choosePoints } from "../points/detection.js";
-import { positions, select } from "../selection.js";
 
 const NARROW_PX = 640; // below it the pictures stand above each other
 const SAVED_WIDTH_PX = 1600;
 const MODELS = {
   homography: "one homography: a plane, or a turn of the camera",
   fundamental: "one epipolar geometry: a scene with depth",
-};
-
-const KINDS = {
-  points: { describe: pointsOf, hint: "Points of all scales, described at their own sizes and angles." },
-  ranked: { describe: rankedOf, hint: "The best pixels of the heat map, described upright and at one size: "
-    + "not for turned pictures or other scales." },
 };
 
 const view = element("view-matches");
@@ -31,14 +23,12 @@ let [matchings, filterings] = [0, 0]; // how many were begun: only what the last
 
 export const matchingTask = (task, values) => background.call(task, values);
 
-const kind = () => new FormData(form).get("match-kind");
 const count = () => Number(element("match-number").value);
 const ratio = () => Number(element("ratio").value);
 
 function showControls() {
   form.querySelector('output[for="match-number"]').textContent = count().toLocaleString("en");
   form.querySelector('output[for="ratio"]').textContent = ratio().toFixed(2);
-  element("match-kind-hint").textContent = KINDS[kind()].hint;
 }
 
 /** The points of a picture, with the pixels that they were found in. */
@@ -49,20 +39,12 @@ async function pointsOf(picture, number) {
   return { gray, width, height, xy, sizes };
 }
 
-/** The best pixels of a picture's heat map. */
-async function rankedOf(picture, number) {
-  await findHeatMap(picture);
-  const { map, rgba, width, height } = picture;
-  const chosen = { threshold: 0.5, density: null, maxKeypoints: number };
-  return { gray: luma(rgba), width, height, xy: positions(map, select(map, chosen), chosen) };
-}
-
 /** Matches the pictures where that has not been done, and finds their geometry. */
 export async function match() {
   showControls();
   const [first, second] = page.pictures;
   if (!second) return;
-  const key = [first, second, count(), kind()];
+  const key = [first, second, count()];
   const same = (other) => other?.key.every((value, k) => value === key[k]);
   if (!same(pending)) {
     const own = ++matchings; // what is at work for other options is not wanted any more
@@ -80,10 +62,10 @@ export async function match() {
 
 /** Matches pictures, and finds the geometry of their matches. */
 async function matchNew(key, isWanted) {
-  const [first, second, number, chosen] = key;
+  const [first, second, number] = key;
   const pictures = [];
   for (const picture of [first, second]) {
-    pictures.push(await KINDS[chosen].describe(picture, number));
+    pictures.push(await pointsOf(picture, number));
     if (!isWanted()) return;
   }
   const result = await during("Matching…", background.call("match", { pictures }));
@@ -106,11 +88,11 @@ async function filter() {
   const take = (points) => Float32Array.from({ length: 2 * rows.length },
                                              (_, k) => points[2 * rows[k >> 1] + (k & 1)]);
   const [points0, points1] = [take(found.points0), take(found.points1)];
-  const [first, second, keypoints, mode] = key;
+  const [first, second, keypoints] = key;
   const sizes = [first, second].map(({ width, height }) => [width, height]);
   const geometry = await background.call("geometry", { points0, points1, sizes });
   if (own !== filterings) return;
-  const options = { mode, keypoints, ratio: largest, mutual: true };
+  const options = { keypoints, ratio: largest, mutual: true };
   const ratios = Float32Array.from(rows, (k) => found.ratios[k]);
   kept = { first, second, options, points0, points1, ratios, ...geometry };
   draw();
@@ -204,7 +186,6 @@ export function setUp() {
   element("match-number").oninput = showControls;
   element("match-number").onchange = guarded(match);
   element("agreeing").onchange = draw;
-  for (const input of form.querySelectorAll("[name=match-kind]")) input.onchange = guarded(match);
   addEventListener("resize", onceAFrame(() => !view.hidden && draw()));
   for (const button of form.querySelectorAll("[data-download]")) {
     button.onclick = () => kept && downloads[button.dataset.download](
