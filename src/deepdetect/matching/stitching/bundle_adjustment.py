@@ -32,18 +32,21 @@ FOCAL_WEIGHT = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Correspondences:
-    """Points of two images that belong together.
+class RegisteredPair:
+    """Two images related by a homography that dense keypoints confirm.
 
     Attributes:
         first, second: numbers of the images.
-        points, targets: (M, 2) in pixels of the first and of the second.
+        homography: (3, 3) from the first to the second.
+        points: (M, 2) some of the keypoints of the first that have a match in the second.
+        matches: number of all of these.
     """
 
     first: int
     second: int
+    homography: np.ndarray
     points: np.ndarray
-    targets: np.ndarray
+    matches: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +69,14 @@ class RotatingCamera:
 
 def adjust_homographies(
     homographies: Mapping[int, np.ndarray],
-    pairs: Sequence[Correspondences],
+    pairs: Sequence[RegisteredPair],
     sizes: Mapping[int, tuple[int, int]],
 ) -> tuple[dict[int, np.ndarray], float]:
     """Fit all homographies but the first, which stays, to all pairs at once.
 
     Args:
         homographies: (3, 3) from each image to the frame of the first one, by number, near enough.
-        pairs: what belongs together.
+        pairs: whose homographies say where points belong.
         sizes: (width, height) of the images.
 
     Returns:
@@ -81,7 +84,8 @@ def adjust_homographies(
 
     Example:
         >>> grid = np.argwhere(np.ones((5, 5))) * 20.0
-        >>> pair = Correspondences(0, 1, grid, grid - [30, 0])
+        >>> moved = np.array([[1, 0, -30.0], [0, 1, 0], [0, 0, 1]])
+        >>> pair = RegisteredPair(0, 1, moved, grid, len(grid))
         >>> start = {0: np.eye(3), 1: np.array([[1, 0, 25.0], [0, 1, 3], [0, 0, 1]])}
         >>> found, residual_px = adjust_homographies(start, [pair], {0: (100, 100), 1: (100, 100)})
         >>> (found[1] / found[1][2, 2])[:2, 2].round(3).tolist(), round(residual_px, 3)
@@ -108,14 +112,14 @@ def adjust_homographies(
 
 def adjust_cameras(
     homographies: Mapping[int, np.ndarray],
-    pairs: Sequence[Correspondences],
+    pairs: Sequence[RegisteredPair],
     sizes: Mapping[int, tuple[int, int]],
 ) -> tuple[dict[int, RotatingCamera], float]:
     """Fit rotations and focal lengths of all cameras to all pairs at once.
 
     Args:
         homographies: as of `adjust_homographies`.
-        pairs: what belongs together.
+        pairs: whose homographies say where points belong.
         sizes: (width, height) of the images.
 
     Returns:
@@ -168,7 +172,7 @@ def level_cameras(
 
 def _in_units(
     homographies: Mapping[int, np.ndarray],
-    pairs: Sequence[Correspondences],
+    pairs: Sequence[RegisteredPair],
     sizes: Mapping[int, tuple[int, int]],
 ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], list[tuple[np.ndarray, np.ndarray]]]:
     """Return the maps of pixels to units, 0 in the middle; and homographies and points in units."""
@@ -184,7 +188,8 @@ def _in_units(
     samples = [
         (
             transform_points(pair.points, to_unit[pair.first]),
-            transform_points(pair.targets, to_unit[pair.second]),
+            # The homography is sharper than keypoints on whole pixels.
+            transform_points(transform_points(pair.points, pair.homography), to_unit[pair.second]),
         )
         for pair in pairs
     ]
@@ -193,7 +198,7 @@ def _in_units(
 
 def _normal_equations(
     current: Mapping[int, np.ndarray],
-    pairs: Sequence[Correspondences],
+    pairs: Sequence[RegisteredPair],
     samples: Sequence[tuple[np.ndarray, np.ndarray]],
     columns: Mapping[int, int],
     directions: Mapping[int, np.ndarray],
@@ -252,7 +257,7 @@ def _linearised(
 
 def _residual_px(
     current: Mapping[int, np.ndarray],
-    pairs: Sequence[Correspondences],
+    pairs: Sequence[RegisteredPair],
     samples: Sequence[tuple[np.ndarray, np.ndarray]],
 ) -> float:
     """Return the root mean square of the residuals in pixels."""

@@ -5,8 +5,9 @@ Size and memory of a canvas are known before anything is drawn.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -51,17 +52,16 @@ class Canvas:
     Attributes:
         size: (width, height) in pixels.
         boxes: of each image, by its number.
+        draw: draws an image, by its number, on the canvas, both made smaller: `draw(number, rgb,
+            scale_of_image, scale_of_canvas)`.
     """
 
     size: tuple[int, int]
     boxes: dict[int, Box]
+    draw: Callable[[int, np.ndarray, float, float], WarpedImage]
 
     def check_size(self, max_megapixels: float) -> None:
-        """Check that the canvas can be drawn.
-
-        Raises:
-            OptionError: it has too many pixels, or needs more memory than there is.
-        """
+        """Raise an OptionError if it has too many pixels, or needs more memory than there is."""
         width, height = self.size
         if width * height > max_megapixels * 1e6:
             raise OptionError(
@@ -75,78 +75,6 @@ class Canvas:
             canvas_pixel=width * height,
             blended_pixel=max((box[2] - box[0]) * (box[3] - box[1]) for box in self.boxes.values()),
         )
-
-    def draw(self, number: int, rgb: np.ndarray, shrinking: float, scale: float) -> WarpedImage:
-        """Draw an image, made smaller by `shrinking`, on the canvas, made smaller by `scale`."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True, eq=False)
-class PlaneCanvas(Canvas):
-    """A flat canvas.
-
-    Attributes:
-        homographies: (3, 3) from each image to the canvas, by its number.
-    """
-
-    homographies: dict[int, np.ndarray]
-
-    def draw(self, number: int, rgb: np.ndarray, shrinking: float, scale: float) -> WarpedImage:
-        """As of `Canvas`."""
-        homography, (left, top, right, bottom) = self.homographies[number], self.boxes[number]
-        if (shrinking, scale) != (1, 1):
-            homography = scaled_homography(homography, shrinking, scale)
-            left, top = (int(np.floor(side * scale)) for side in (left, top))
-            right, bottom = (int(np.ceil(side * scale)) for side in (right, bottom))
-        middle = np.array([(rgb.shape[1] - 1) / 2, (rgb.shape[0] - 1) / 2])
-        around = transform_points(middle + [[0, 0], [1, 0], [0, 1]], homography)
-        shown = float(np.sqrt(abs(np.linalg.det(around[1:] - around[0]))))
-        rgb, smaller = _downscaled(rgb, shown)
-        if smaller < 1:
-            homography = scaled_homography(homography, smaller, 1)
-        homography = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]]) @ homography
-        size = (right - left, bottom - top)
-        drawn = cv2.warpPerspective(
-            rgb, homography, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
-        )
-        whole = np.full(rgb.shape[:2], 255, np.uint8)
-        mask = cv2.warpPerspective(whole, homography, size, flags=cv2.INTER_NEAREST)
-        return WarpedImage(drawn, mask, (left, top))
-
-
-@dataclass(frozen=True, eq=False)
-class CurvedCanvas(Canvas):
-    """A canvas on a cylinder or a sphere around the cameras.
-
-    Attributes:
-        projection: "cylindrical" or "spherical".
-        sizes: (width, height) of the images, by number.
-        cameras: of the images.
-        radius_px: of the cylinder or sphere.
-        origin: left and top of the canvas, from the direction of the reference.
-    """
-
-    projection: str
-    sizes: dict[int, tuple[int, int]]
-    cameras: dict[int, RotatingCamera]
-    radius_px: float
-    origin: tuple[int, int]
-
-    def draw(self, number: int, rgb: np.ndarray, shrinking: float, scale: float) -> WarpedImage:
-        """As of `Canvas`."""
-        camera, size, radius = self.cameras[number], self.sizes[number], self.radius_px * scale
-        warper = cv2.PyRotationWarper(self.projection, radius)
-        (left, top, _, _), *maps = warper.buildMaps(size, *_as_float32(camera, size))
-        inside = [(one > -0.5) & (one < side - 0.5) for one, side in zip(maps, size, strict=True)]
-        rgb, smaller = _downscaled(rgb, radius / (camera.focal_px * shrinking))
-        for one in maps:  # to pixels of the image that is drawn
-            one += np.float32(0.5)
-            one *= np.float32(shrinking * smaller)
-            one -= np.float32(0.5)
-        drawn = cv2.remap(rgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        x, y = (round(side * scale) for side in self.origin)
-        mask = np.logical_and(*inside).astype(np.uint8) * np.uint8(255)
-        return WarpedImage(drawn, mask, (left - x, top - y))
 
 
 def least_distorted(
@@ -168,7 +96,7 @@ def plan_plane(
     homographies: Mapping[int, np.ndarray],
     reference: int,
     scale: float,
-) -> PlaneCanvas:
+) -> tuple[Canvas, dict[int, np.ndarray]]:
     """Find the smallest flat canvas that shows all of some images.
 
     Args:
@@ -176,6 +104,9 @@ def plan_plane(
         homographies: (3, 3) from each to a common frame.
         reference: number of the image that is not distorted.
         scale: pixels of the canvas per pixel of the reference.
+
+    Returns:
+        The canvas, and the homographies from each image to it.
 
     Raises:
         RegistrationError: an image reaches the horizon of the reference.
@@ -199,9 +130,38 @@ def plan_plane(
         right, bottom = (np.floor(edge.max(0)) - low).astype(int).tolist()
         boxes[number] = (left, top, right + 1, bottom + 1)
     shift = np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]])
-    return PlaneCanvas(
-        _size(boxes), boxes, {number: shift @ matrix for number, matrix in placed.items()}
+    placed = {number: shift @ matrix for number, matrix in placed.items()}
+    return Canvas(_size(boxes), boxes, partial(draw_plane, placed, boxes)), placed
+
+
+def draw_plane(
+    homographies: Mapping[int, np.ndarray],
+    boxes: Mapping[int, Box],
+    number: int,
+    rgb: np.ndarray,
+    image_scale: float,
+    canvas_scale: float,
+) -> WarpedImage:
+    """Draw an image on a flat canvas, as of `Canvas.draw`."""
+    homography, (left, top, right, bottom) = homographies[number], boxes[number]
+    if (image_scale, canvas_scale) != (1, 1):
+        homography = scaled_homography(homography, image_scale, canvas_scale)
+        left, top = (int(np.floor(side * canvas_scale)) for side in (left, top))
+        right, bottom = (int(np.ceil(side * canvas_scale)) for side in (right, bottom))
+    middle = np.array([(rgb.shape[1] - 1) / 2, (rgb.shape[0] - 1) / 2])
+    around = transform_points(middle + [[0, 0], [1, 0], [0, 1]], homography)
+    shown = float(np.sqrt(abs(np.linalg.det(around[1:] - around[0]))))
+    rgb, smaller = _downscaled(rgb, shown)
+    if smaller < 1:
+        homography = scaled_homography(homography, smaller, 1)
+    homography = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]]) @ homography
+    size = (right - left, bottom - top)
+    drawn = cv2.warpPerspective(
+        rgb, homography, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
     )
+    whole = np.full(rgb.shape[:2], 255, np.uint8)
+    mask = cv2.warpPerspective(whole, homography, size, flags=cv2.INTER_NEAREST)
+    return WarpedImage(drawn, mask, (left, top))
 
 
 def plan_curved(
@@ -210,7 +170,7 @@ def plan_curved(
     cameras: Mapping[int, RotatingCamera],
     reference: int,
     scale: float,
-) -> CurvedCanvas:
+) -> Canvas:
     """Find the smallest canvas on a cylinder or a sphere that shows all of some images.
 
     Args:
@@ -220,16 +180,44 @@ def plan_curved(
         reference: number of the image that gives the canvas its scale.
         scale: pixels of the canvas per pixel in the middle of the reference.
     """
-    radius = cameras[reference].focal_px * scale
-    warper = cv2.PyRotationWarper(projection, radius)
-    corners = {}
+    radius_px = cameras[reference].focal_px * scale
+    warper = cv2.PyRotationWarper(projection, radius_px)
+    boxes = {}
     for number, camera in cameras.items():
         size = sizes[number]
         left, top, width, height = warper.warpRoi(size, *_as_float32(camera, size))
-        corners[number] = (left, top, left + width, top + height)
-    x, y = (min(corner[side] for corner in corners.values()) for side in (0, 1))
-    boxes = {n: (box[0] - x, box[1] - y, box[2] - x, box[3] - y) for n, box in corners.items()}
-    return CurvedCanvas(_size(boxes), boxes, projection, dict(sizes), dict(cameras), radius, (x, y))
+        boxes[number] = (left, top, left + width, top + height)
+    x, y = (min(box[side] for box in boxes.values()) for side in (0, 1))
+    boxes = {n: (box[0] - x, box[1] - y, box[2] - x, box[3] - y) for n, box in boxes.items()}
+    draw = partial(draw_curved, projection, radius_px, (x, y), sizes, cameras)
+    return Canvas(_size(boxes), boxes, draw)
+
+
+def draw_curved(
+    projection: str,
+    radius_px: float,
+    origin: tuple[int, int],
+    sizes: Mapping[int, tuple[int, int]],
+    cameras: Mapping[int, RotatingCamera],
+    number: int,
+    rgb: np.ndarray,
+    image_scale: float,
+    canvas_scale: float,
+) -> WarpedImage:
+    """Draw an image on a curved canvas, as of `Canvas.draw`; `origin` is its left and top."""
+    camera, size, radius_px = cameras[number], sizes[number], radius_px * canvas_scale
+    warper = cv2.PyRotationWarper(projection, radius_px)
+    (left, top, _, _), *maps = warper.buildMaps(size, *_as_float32(camera, size))
+    inside = [(one > -0.5) & (one < side - 0.5) for one, side in zip(maps, size, strict=True)]
+    rgb, smaller = _downscaled(rgb, radius_px / (camera.focal_px * image_scale))
+    for one in maps:  # to pixels of the image that is drawn
+        one += np.float32(0.5)
+        one *= np.float32(image_scale * smaller)
+        one -= np.float32(0.5)
+    drawn = cv2.remap(rgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    mask = np.logical_and(*inside).astype(np.uint8) * np.uint8(255)
+    x, y = (round(side * canvas_scale) for side in origin)
+    return WarpedImage(drawn, mask, (left - x, top - y))
 
 
 def _as_float32(camera: RotatingCamera, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -228,8 +228,7 @@ def _plan(
         }
         if reference is None:
             reference = least_distorted(sizes, homographies)
-        canvas = plan_plane(sizes, homographies, reference, scale)
-        return canvas, canvas.homographies, reference
+        return *plan_plane(sizes, homographies, reference, scale), reference
     if reference is None:
         ahead = {number: one.rotation[:, 2] for number, one in registration.cameras.items()}
         middle = np.sum(list(ahead.values()), axis=0)

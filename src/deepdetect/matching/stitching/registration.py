@@ -19,12 +19,11 @@ from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints
 from ...features.sift_detector import SiftOptions, detect_sift
-from ...geometry.residuals import transform_points
 from ...io.image import luma
 from ..guided import TentativeMatches, find_tentative_matches, guided_matches
 from ..guided.initial_geometry import estimate_initial_geometry
 from .bundle_adjustment import (
-    Correspondences,
+    RegisteredPair,
     RotatingCamera,
     adjust_cameras,
     adjust_homographies,
@@ -44,22 +43,6 @@ MAX_CORRESPONDENCES = 400
 
 MAX_CAMERA_RESIDUAL_PX = 3.0
 """Of cameras that only turned, at the size of the registration: 0.2 to 1 without parallax."""
-
-
-@dataclass(frozen=True, eq=False)
-class RegisteredPair:
-    """Two images related by a homography that dense keypoints confirm.
-
-    Attributes:
-        first, second: numbers of the images.
-        homography: (3, 3) from the first to the second.
-        points: (M, 2) keypoints of the first that have a match in the second.
-    """
-
-    first: int
-    second: int
-    homography: np.ndarray
-    points: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +106,10 @@ def register_images(
     if reference is not None:
         group = next(group for group in groups if reference in group)
     else:
-        group = max(groups, key=lambda group: (len(group), _matches_within(group, pairs)))
+        group = max(
+            groups,
+            key=lambda group: (len(group), sum(p.matches for p in pairs if p.first in group)),
+        )
     if len(group) == 1:
         what = f"no two of these {len(images)} images overlap"
         if reference is not None:
@@ -142,18 +128,17 @@ def register_images(
     }
     pairs = [pair for pair in pairs if pair.first in group]
     start = _compose(group, pairs)
-    correspondences = [_correspondences(pair, views) for pair in pairs]
     sizes = {number: views[number].size for number in group}
-    homographies, residual_px = adjust_homographies(start, correspondences, sizes)
+    homographies, residual_px = adjust_homographies(start, pairs, sizes)
     cameras = None
     if turning:
-        cameras, residual_px = adjust_cameras(homographies, correspondences, sizes)
+        cameras, residual_px = adjust_cameras(homographies, pairs, sizes)
         if residual_px > MAX_CAMERA_RESIDUAL_PX:
             raise RegistrationError(
                 f"the cameras of these images did more than turn ({residual_px:.1f} px remain): "
                 "take all from one place, or choose the projection 'plane'"
             )
-    matches = {(pair.first, pair.second): len(pair.points) for pair in pairs}
+    matches = {(pair.first, pair.second): pair.matches for pair in pairs}
     return Registration(homographies, cameras, matches, residual_px, unregistered)
 
 
@@ -189,20 +174,11 @@ def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair
         )
         if guide.matrix is not None and matches is not None and len(matches):
             points = a.keypoints[matches.indices0]
-            pairs.append(RegisteredPair(first, second, guide.matrix, points))
+            spread = np.argsort(bayer_order(points, a.size), kind="stable")[:MAX_CORRESPONDENCES]
+            pairs.append(RegisteredPair(first, second, guide.matrix, points[spread], len(points)))
             partners[first] += 1
             partners[second] += 1
     return pairs
-
-
-def _correspondences(pair: RegisteredPair, views: Sequence[_Image]) -> Correspondences:
-    """Choose matches of a pair, spread out."""
-    order = np.argsort(bayer_order(pair.points, views[pair.first].size), kind="stable")
-    points = pair.points[order[:MAX_CORRESPONDENCES]]
-    # The homography is sharper than keypoints on whole pixels.
-    return Correspondences(
-        pair.first, pair.second, points, transform_points(points, pair.homography)
-    )
 
 
 def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
@@ -216,19 +192,15 @@ def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
         reached |= more
 
 
-def _matches_within(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> int:
-    return sum(len(pair.points) for pair in pairs if pair.first in group)
-
-
 def _compose(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
     """Compose homographies to the image with most matches, along the maximum spanning tree."""
     tree: list[RegisteredPair] = []
     matches = dict.fromkeys(group, 0)
-    for pair in sorted(pairs, key=lambda pair: -len(pair.points)):
+    for pair in sorted(pairs, key=lambda pair: -pair.matches):
         if pair.second not in _connected(pair.first, tree):
             tree.append(pair)
-        matches[pair.first] += len(pair.points)
-        matches[pair.second] += len(pair.points)
+        matches[pair.first] += pair.matches
+        matches[pair.second] += pair.matches
     homographies = {max(group, key=lambda number: matches[number]): np.eye(3)}
     queue = list(homographies)
     for number in queue:
