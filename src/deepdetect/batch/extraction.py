@@ -1,4 +1,4 @@
-"""Features of all photographs below a folder, in a file of hloc's layout.
+"""Features of all images below a folder, in a file of hloc's layout.
 
 https://github.com/cvg/Hierarchical-Localization stores them so; its pixels are ours.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,16 +14,11 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from .._shared.errors import (
-    BatchError,
-    DeepDetectError,
-    MissingExtraError,
-    OptionError,
-    WeightsError,
-)
+from .._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
 from .._shared.options import suggest_keywords
 from .._shared.parallel import TaskMap
 from .._shared.progress import progress
+from .._shared.records import file_state
 from ..detector.detector import DeepDetect, check_selection, find_keypoints
 from ..detector.heatmap import MAX_AUTO_PIXELS
 from ..detector.point_detector import PointDetector
@@ -34,42 +28,16 @@ from ..features.sift import describe_keypoints
 from ..io.image import find_images, load_image, luma
 from ..io.image_file import megapixel_limit
 from .engines import get_engine
-from .parted_file import Group, PartedFile, write_groups
+from .hdf5 import Group, ShardedWriter, write_groups
+from .report import BatchReport
 
-IMAGES_PER_PART = 16
+IMAGES_PER_SHARD = 16
 """At most: what a killed worker loses, against the number of files."""
 
-MIN_PARTS = 256
+MIN_SHARDS = 256
 """Of a collection that has as many images, so that all workers have something to do."""
 
 DESCRIPTOR = "rootsift"
-
-
-@dataclass(frozen=True)
-class ExtractionReport:
-    """What was extracted.
-
-    Attributes:
-        path: the file.
-        images: names of the images whose features were extracted now.
-        skipped: number of images that had been done before.
-        keypoints: of the images that were done now, together.
-        failures: a sentence on each image that could not be worked on.
-    """
-
-    path: Path
-    images: tuple[str, ...]
-    skipped: int
-    keypoints: int
-    failures: tuple[str, ...]
-
-    def check(self) -> None:
-        """Raise a BatchError where images failed."""
-        if self.failures:
-            total = len(self.images) + self.skipped + len(self.failures)
-            raise BatchError(
-                f"{len(self.failures)} of {total} images failed, the others are done", self.failures
-            )
 
 
 @suggest_keywords
@@ -84,7 +52,7 @@ def extract_features(
     workers: int | None = None,
     overwrite: bool = False,
     quiet: bool = True,
-) -> ExtractionReport:
+) -> BatchReport:
     """Extract the features of all images below a folder into an HDF5 file of hloc's layout.
 
     Each image has a group with its path below the folder as name, as "db/1.jpg". In it are
@@ -122,23 +90,22 @@ def extract_features(
 
     Example:
         >>> if __name__ == "__main__":  # doctest: +SKIP
-        ...     extract_features("photos", "features.h5").check()
+        ...     extract_features("images", "features.h5").check()
     """
     map_tasks: TaskMap = get_engine(engine)
     check_selection(detector, selection)
     root, target = Path(folder).absolute(), Path(path).absolute()
     names = [image.relative_to(root).as_posix() for image in find_images(root)]
     failures = [f"{name}: its name is not UTF-8: rename it" for name in names if not _is_utf8(name)]
-    states = {name: _state(root / name) for name in names if _is_utf8(name)}
+    states = {name: file_state(root / name) for name in names if _is_utf8(name)}
     settings = {
         **detector.settings,
         **({} if selection is None else vars(selection)),
         "descriptor": DESCRIPTOR,
         "version": __version__,
     }
-    file = PartedFile(target, settings, overwrite)
     work = partial(
-        _extract_part,
+        _extract_shard,
         root=root,
         selection=selection,
         detector=detector,
@@ -146,30 +113,27 @@ def extract_features(
         max_megapixels=megapixel_limit(max_megapixels),
     )
     list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
-    done_now: list[str] = []
-    keypoints = 0
-    with file.opened():
-        done = file.done(states.items())
+    counts: dict[str, int] = {}
+    with ShardedWriter(target, settings, overwrite).opened() as file:
+        done = file.done(states)
         left = [name for name in states if name not in done]
         tasks = [
-            (file.part(part), tuple((name, states[name]) for name in part))
-            for part in parts_of(left, IMAGES_PER_PART)
+            (file.shard(shard), tuple((name, states[name]) for name in shard))
+            for shard in shards_of(left, IMAGES_PER_SHARD)
         ]
         with progress(len(states), "extracting", "image", quiet, len(done)) as bar:
-            for counts, failed in map_tasks(work, tasks, workers):
-                bar.update(len(counts) + len(failed))
-                done_now += counts
-                keypoints += sum(counts.values())
+            for extracted, failed in map_tasks(work, tasks, workers):
+                bar.update(len(extracted) + len(failed))
+                counts |= extracted
                 failures += failed
-        file.merge(quiet, {*done, *done_now})
-    return ExtractionReport(
-        Path(path), tuple(sorted(done_now)), len(done), keypoints, tuple(sorted(failures))
-    )
+        file.merge(quiet, {*done, *counts}.__contains__)
+    counts = dict(sorted(counts.items()))
+    return BatchReport(Path(path), counts, len(done), tuple(sorted(failures)), "images")
 
 
-def parts_of(names: Sequence[Any], most: int) -> list[Sequence[Any]]:
-    """Divide what is to be done into parts of at most so many, and of fewer where it is little."""
-    size = min(most, max(1, len(names) // MIN_PARTS))
+def shards_of(names: Sequence[Any], most: int) -> list[Sequence[Any]]:
+    """Divide what is to be done into shards of at most so many, and of fewer where it is little."""
+    size = min(most, max(1, len(names) // MIN_SHARDS))
     return [names[k : k + size] for k in range(0, len(names), size)]
 
 
@@ -181,26 +145,17 @@ def _is_utf8(name: str) -> bool:
     return True
 
 
-def _state(path: Path) -> tuple[int, ...]:
-    """Return an image's size in bytes and the time of its last change."""
-    try:
-        found = path.stat()
-    except OSError:  # removed meanwhile; reading it will say so
-        return (0, 0)
-    return (found.st_size, found.st_mtime_ns)
-
-
 Task = tuple[Path, tuple[tuple[str, tuple[int, ...]], ...]]
 
 
-def _extract_part(
+def _extract_shard(
     task: Task,
     root: Path,
     detector: DeepDetect | PointDetector,
     selection: SelectionOptions | None,
     max_megapixels: float,
 ) -> tuple[dict[str, int], list[str]]:
-    """Write a part; return the number of keypoints by image, and what could not be done."""
+    """Write a shard; return the number of keypoints by image, and what could not be done."""
     path, images = task
     counts: dict[str, int] = {}
     failures: list[str] = []

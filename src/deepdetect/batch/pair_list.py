@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from .._shared.errors import DeepDetectError, MissingFileError, OptionError
 
@@ -52,23 +51,19 @@ def read_pairs(path: str | Path) -> list[Pair]:
     return _once_each(pairs)
 
 
-def check_pairs(pairs: Any) -> list[Pair]:
-    """Return pairs that were given from Python, once each."""
-    try:
-        found: list[Any] = [pair if isinstance(pair, str) else tuple(pair) for pair in pairs]
-    except TypeError:
-        found = [str(pairs)]
-    for pair in found:
-        if (
-            isinstance(pair, str)
-            or len(pair) != 2
-            or not all(isinstance(name, str) and name for name in pair)
-            or pair[0] == pair[1]
-        ):
+def check_pairs(pairs: Sequence[Pair]) -> list[Pair]:
+    """Return pairs that were given from Python, once each.
+
+    Raises:
+        OptionError: one is no pair of two names.
+    """
+    for pair in pairs:
+        names = () if isinstance(pair, str) else tuple(pair)
+        if len(names) != 2 or names[0] == names[1] or not all(names):
             raise OptionError(
                 f"{pair!r} in `pairs` is no pair: give (name, name) of two images, or a text file"
             )
-    return _once_each(found)
+    return _once_each([(name0, name1) for name0, name1 in pairs])
 
 
 def _once_each(pairs: Sequence[Pair]) -> list[Pair]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,29 +11,22 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from .._shared.errors import BatchError, InvalidFileError, OptionError
+from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.parallel import TaskMap
 from .._shared.progress import progress
+from .._shared.records import key
 from .._shared.registry import look_up
 from ..features.matchers import MATCHERS, get_matcher, match_descriptors
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from .engines import get_engine
-from .extraction import DESCRIPTOR, parts_of
+from .extraction import DESCRIPTOR, shards_of
+from .hdf5 import SETTINGS, Group, ShardedWriter, damaged, open_hdf5, state_of, write_groups
 from .pair_list import Pair, check_pairs, pair_name, read_pairs
-from .parted_file import (
-    SETTINGS,
-    Group,
-    PartedFile,
-    damaged,
-    import_h5py,
-    open_hdf5,
-    state_of,
-    write_groups,
-)
+from .report import BatchReport
 
-PAIRS_PER_PART = 64
+PAIRS_PER_SHARD = 64
 """At most."""
 
 ROOT_SIFT_NORM = 512
@@ -54,9 +46,9 @@ class PairMatchingOptions:
         mutual: keep only mutual nearest neighbours.
         matcher: name of the matcher: "auto", "exact", "patchmatch", "flann" or "faiss".
         verify: keep only the matches that agree with a geometry that is estimated from them:
-            "fundamental", "homography", "auto" (one of both), or "none" for all matches.
+            "fundamental", "homography" or "auto"; "none" keeps all.
         inlier_threshold: of this geometry, in pixels.
-        seed: of the estimation, and of matchers that are random.
+        seed: of random choices.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -79,31 +71,6 @@ class PairMatchingOptions:
         check_model(self.verify, self.seed, GeometryOptions())
 
 
-@dataclass(frozen=True)
-class PairMatchingReport:
-    """What was matched.
-
-    Attributes:
-        path: the file.
-        matches: number of matches of each pair that was matched now.
-        skipped: number of pairs that had been done before.
-        failures: a sentence on each pair that could not be matched.
-    """
-
-    path: Path
-    matches: dict[Pair, int] = field(repr=False)
-    skipped: int
-    failures: tuple[str, ...]
-
-    def check(self) -> None:
-        """Raise a BatchError where pairs failed."""
-        if self.failures:
-            total = len(self.matches) + self.skipped + len(self.failures)
-            raise BatchError(
-                f"{len(self.failures)} of {total} pairs failed, the others are done", self.failures
-            )
-
-
 @suggest_keywords
 def match_pairs(
     features: str | Path,
@@ -115,7 +82,7 @@ def match_pairs(
     workers: int | None = None,
     overwrite: bool = False,
     quiet: bool = True,
-) -> PairMatchingReport:
+) -> BatchReport:
     """Match the features of pairs of images, into an HDF5 file of hloc's layout.
 
     Each pair has a group NAME0/NAME1, with "-" for each "/" in the names. In it are
@@ -156,38 +123,32 @@ def match_pairs(
     source, target = Path(features).absolute(), Path(path).absolute()
     if source == target:
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
-    wanted = _find_pairs(source, listed)
-    settings = {**vars(options), "features": wanted.settings, "version": __version__}
-    file = PartedFile(target, settings, overwrite)
-    work = partial(_match_part, features=source, options=options)
+    found, failures, gone, made_with = _find_pairs(source, listed)
+    settings = {**vars(options), "features": made_with, "version": __version__}
+    work = partial(_match_shard, features=source, options=options)
     list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
     _require_matcher(options.matcher)
-    matches: dict[Pair, int] = {}
-    failures = list(wanted.failures)
-    with file.opened():
-        done = file.done((pair_name(*pair), sum(states, ())) for pair, states in wanted.found)
-        done |= file.done(
-            (pair_name(*pair[::-1]), sum(states[::-1], ())) for pair, states in wanted.found
-        )
-        left = [
-            (pair, sum(states, ()))
-            for pair, states in wanted.found
-            if not {pair_name(*pair), pair_name(*pair[::-1])} & done
-        ]
+    counts: dict[Pair, int] = {}
+    with ShardedWriter(target, settings, overwrite).opened() as file:
+        turned = {pair[::-1]: states[::-1] for pair, states in found.items()}
+        wanted = {pair_name(*pair): sum(states, ()) for pair, states in (turned | found).items()}
+        done = file.done(wanted)
+        left = [p for p in found if done.isdisjoint((pair_name(*p), pair_name(*p[::-1])))]
         tasks = [
-            (file.part([pair_name(*pair) for pair, _ in part]), tuple(part))
-            for part in parts_of(sorted(left), PAIRS_PER_PART)
+            (
+                file.shard([pair_name(*pair) for pair in shard]),
+                tuple((pair, wanted[pair_name(*pair)]) for pair in shard),
+            )
+            for shard in shards_of(sorted(left), PAIRS_PER_SHARD)
         ]
-        skipped = len(wanted.found) - len(left)
-        with progress(len(wanted.found), "matching", "pair", quiet, skipped) as bar:
-            for counts, failed in map_tasks(work, tasks, workers):
-                bar.update(len(counts) + len(failed))
-                matches |= counts
+        skipped = len(found) - len(left)
+        with progress(len(found), "matching", "pair", quiet, skipped) as bar:
+            for matched, failed in map_tasks(work, tasks, workers):
+                bar.update(len(matched) + len(failed))
+                counts |= matched
                 failures += failed
-        # What an interrupted attempt to replace the file has matched besides is not asked for.
-        asked = {*done, *(pair_name(*pair) for pair in matches)} if overwrite else None
-        file.merge(quiet, asked, wanted.gone)
-    return PairMatchingReport(Path(path), matches, skipped, tuple(failures))
+        file.merge(quiet, lambda name: name not in gone)
+    return BatchReport(Path(path), counts, skipped, tuple(failures), "pairs")
 
 
 def _require_matcher(name: str) -> None:
@@ -197,37 +158,31 @@ def _require_matcher(name: str) -> None:
         get_matcher(name)(some, some, 1, 0)
 
 
-States = tuple[tuple[int, ...], tuple[int, ...]]
+State = tuple[int, ...]
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """Pairs that can be matched, with the states of their features; and what others lack."""
+def _find_pairs(
+    features: Path, pairs: Sequence[Pair]
+) -> tuple[dict[Pair, tuple[State, State]], list[str], set[str], str]:
+    """Look for the features of pairs.
 
-    settings: str
-    found: tuple[tuple[Pair, States], ...]
-    failures: tuple[str, ...]
-    gone: frozenset[str]
-    """Groups of pairs without features, whose matches would point nowhere."""
-
-
-def _find_pairs(features: Path, pairs: Sequence[Pair]) -> _Wanted:
-    """Look for the features of pairs."""
-    known: dict[str, tuple[int, ...] | None] = {}
-    found: list[tuple[Pair, States]] = []
+    Returns:
+        Pairs that can be matched, with the states of their features; a sentence on each other;
+        groups of pairs without features, whose matches would point nowhere; and a digest of the
+        settings of the features.
+    """
+    found: dict[Pair, tuple[State, State]] = {}
     failures: list[str] = []
     gone: set[str] = set()
     taken: dict[str, Pair] = {}
     with open_hdf5(features) as file:
-        settings = hashlib.sha256(str(file.attrs.get(SETTINGS)).encode()).hexdigest()[:16]
+        settings = key(str(file.attrs.get(SETTINGS)))
+        states = {name: _state(file, name) for pair in pairs for name in pair}
         for pair in pairs:
-            for name in pair:
-                if name not in known:
-                    known[name] = _state(file, name)
-            states = known[pair[0]], known[pair[1]]
+            state0, state1 = states[pair[0]], states[pair[1]]
             name = pair_name(*pair)
-            if states[0] is None or states[1] is None:
-                lacking = pair[0] if states[0] is None else pair[1]
+            if state0 is None or state1 is None:
+                lacking = pair[0] if state0 is None else pair[1]
                 failures.append(f"{' '.join(pair)}: {features.name} has no features of {lacking}")
                 gone |= {name, pair_name(*pair[::-1])}
             elif taken.setdefault(name, pair) != pair:
@@ -236,55 +191,49 @@ def _find_pairs(features: Path, pairs: Sequence[Pair]) -> _Wanted:
                     "rename an image"
                 )
             else:
-                found.append((pair, (states[0], states[1])))
-    # Another pair may have a group of that name.
-    return _Wanted(settings, tuple(found), tuple(failures), frozenset(gone - taken.keys()))
+                found[pair] = state0, state1
+    return found, failures, gone - taken.keys(), settings
 
 
-def _state(file: Any, name: str) -> tuple[int, ...] | None:
+def _state(file: Any, name: str) -> State | None:
     """Return what changes when the features of an image do, None where there are none."""
-    h5py = import_h5py()
-    group = file.get(name)
-    if not isinstance(group, h5py.Group):
+    try:
+        group = file[name]
+        if state := state_of(group):
+            return state
+        digest = key(group["keypoints"][()], group["descriptors"][()])  # other programs note none
+    except (KeyError, TypeError, ValueError, IndexError):
         return None
-    found = [group.get(kind) for kind in ("keypoints", "descriptors")]
-    if not all(isinstance(each, h5py.Dataset) for each in found):
-        return None
-    state = state_of(group)
-    if state:
-        return state
-    digest = hashlib.sha256()  # other programs note nothing
-    for each in found:
-        digest.update(f"{each.dtype}{each.shape}".encode())
-        digest.update(np.ascontiguousarray(each[()]).tobytes())
-    return (int.from_bytes(digest.digest()[:8], "big", signed=True),)
+    return (int(digest[:15], 16),)
 
 
-Task = tuple[Path, tuple[tuple[Pair, tuple[int, ...]], ...]]
-
-
-def _match_part(
-    task: Task, features: Path, options: PairMatchingOptions
+def _match_shard(
+    task: tuple[Path, tuple[tuple[Pair, State], ...]], features: Path, options: PairMatchingOptions
 ) -> tuple[dict[Pair, int], list[str]]:
-    """Write a part; return the number of matches of each pair, and what could not be done."""
+    """Write a shard; return the number of matches of each pair, and what could not be done."""
     path, pairs = task
     counts: dict[Pair, int] = {}
     failures: list[str] = []
 
     def groups() -> Iterator[Group]:
         with open_hdf5(features) as file:
-            held: tuple[str, Features] | None = None  # pairs are sorted by their first image
+            first: tuple[str, Features] | None = None  # pairs are sorted by their first image
             for (name0, name1), state in pairs:
                 try:
-                    if held is None or held[0] != name0:
-                        held = name0, _read_features(file, name0)
-                    both = held[1], _read_features(file, name1)
-                    _check_widths(both, (name0, name1))
+                    if first is None or first[0] != name0:
+                        first = name0, _read_features(file, name0)
+                    features0, features1 = first[1], _read_features(file, name1)
+                    widths = features0[1].shape[1], features1[1].shape[1]
+                    if widths[0] != widths[1]:
+                        raise InvalidFileError(
+                            f"the descriptors of {name0} have {widths[0]} numbers, those of "
+                            f"{name1} have {widths[1]}: extract both alike"
+                        )
                 except InvalidFileError as error:
                     failures.append(f"{name0} {name1}: {error}")
                     continue
                 scaled = any("scales" in file[name] for name in (name0, name1))
-                matches, scores = match_features(*both, options, scaled=scaled)
+                matches, scores = match_rows(features0, features1, options, scaled=scaled)
                 counts[name0, name1] = int(np.count_nonzero(matches >= 0))
                 arrays = {"matches0": matches, "matching_scores0": scores}
                 yield Group(pair_name(name0, name1), arrays, state)
@@ -299,30 +248,33 @@ Features = tuple[np.ndarray, np.ndarray]
 def _read_features(file: Any, name: str) -> Features:
     """Return positions (N, 2) and descriptors (N, D), as bytes where that is what they were."""
     try:
-        return _checked_features(file, name)
+        keypoints = file[name]["keypoints"][()]
+        descriptors = file[name]["descriptors"][()]
+        shapes, kinds = (keypoints.shape, descriptors.shape), keypoints.dtype.kind
+        if (
+            not {kinds, descriptors.dtype.kind} <= set("fiu")
+            or keypoints.shape != (descriptors.shape[-1], 2)
+            or descriptors.ndim != 2
+        ):
+            raise InvalidFileError(
+                f"the features of {name} are keypoints of shape {shapes[0]} and descriptors of "
+                f"shape {shapes[1]}, not (N, 2) and (D, N) numbers: extract them again"
+            )
+        keypoints = keypoints.astype(np.float32)
+        descriptors = np.ascontiguousarray(descriptors.T, np.float32)
     except InvalidFileError:
         raise
     # h5py raises any of these, by what is damaged; a wrong shape asks for too much memory.
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError) as error:
+    except (
+        OSError,
+        RuntimeError,
+        KeyError,
+        ValueError,
+        TypeError,
+        MemoryError,
+        IndexError,
+    ) as error:
         raise damaged(Path(f"{file.filename}, {name}"), error) from error
-
-
-def _checked_features(file: Any, name: str) -> Features:
-    group = file[name]
-    shapes = group["keypoints"].shape, group["descriptors"].shape
-    kinds = group["keypoints"].dtype.kind + group["descriptors"].dtype.kind
-    if (
-        not set(kinds) <= set("fiu")
-        or [len(shape) for shape in shapes] != [2, 2]
-        or shapes[0][1] != 2
-        or shapes[0][0] != shapes[1][1]
-    ):
-        raise InvalidFileError(
-            f"the features of {name} are keypoints of shape {shapes[0]} and descriptors of shape "
-            f"{shapes[1]}, not (N, 2) and (D, N) numbers: extract them again"
-        )
-    keypoints = group["keypoints"][()].astype(np.float32)
-    descriptors = np.ascontiguousarray(group["descriptors"][()].T, np.float32)
     if not (np.isfinite(keypoints).all() and np.isfinite(descriptors).all()):
         raise InvalidFileError(
             f"the features of {name} are not all finite numbers: extract them again"
@@ -332,16 +284,7 @@ def _checked_features(file: Any, name: str) -> Features:
     return keypoints, descriptors
 
 
-def _check_widths(features: tuple[Features, Features], names: Pair) -> None:
-    width0, width1 = (descriptors.shape[1] for _, descriptors in features)
-    if width0 != width1:
-        raise InvalidFileError(
-            f"the descriptors of {names[0]} have {width0} numbers, those of {names[1]} have "
-            f"{width1}: extract both alike"
-        )
-
-
-def match_features(
+def match_rows(
     features0: Features,
     features1: Features,
     options: PairMatchingOptions = PairMatchingOptions(),
@@ -360,7 +303,7 @@ def match_features(
 
     Example:
         >>> features = np.array([[1, 2], [3, 4], [5, 6]], np.float32), np.eye(3, dtype=np.float32)
-        >>> match_features(features, (features[0], features[1][::-1]))[0].tolist()
+        >>> match_rows(features, (features[0], features[1][::-1]))[0].tolist()
         [2, 1, 0]
     """
     found = match_descriptors(
@@ -374,10 +317,9 @@ def match_features(
     )
     rows0, rows1, ratios = found.indices0, found.indices1, found.ratios
     if options.verify != "none":
-        points0, points1 = features0[0][rows0], features1[0][rows1]
         how = GeometryOptions(inlier_threshold=options.inlier_threshold)
         kept = estimate_geometry(
-            points0, points1, options.verify, seed=options.seed, options=how
+            features0[0][rows0], features1[0][rows1], options.verify, seed=options.seed, options=how
         ).inliers
         rows0, rows1, ratios = rows0[kept], rows1[kept], ratios[kept]
     matches = np.full(len(features0[0]), -1, np.int32)

@@ -15,7 +15,7 @@ from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import feature_group
 from ..batch.pair_list import pair_name
-from ..batch.parted_file import Group, write_groups
+from ..batch.hdf5 import Group, write_groups
 from .collection import Collection, check_names, check_upright
 
 FILES = ("features.h5", "matches.h5", "pairs.txt")

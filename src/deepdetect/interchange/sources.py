@@ -14,7 +14,7 @@ from .._shared.options import suggest_keywords
 from ..batch.extraction import extract_features
 from ..batch.pair_list import read_pairs
 from ..batch.pair_matching import PairMatchingOptions, match_pairs
-from ..batch.parted_file import import_h5py, open_hdf5
+from ..batch.hdf5 import import_h5py, open_hdf5
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import UNSET_ANGLE, Keypoints

@@ -1,1 +1,1 @@
-"""Structure from motion: cameras and dense points from many photographs."""
+"""Structure from motion: cameras and dense points from many images."""

@@ -17,7 +17,7 @@ PIXEL_CENTRE = 0.5
 """COLMAP's position of the centre of the first pixel; ours is 0."""
 
 
-def import_pycolmap(purpose: str = "a reconstruction from many photographs") -> Any:
+def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
     """Import pycolmap, after OpenCV: the other way round some versions of both crash.
 
     Args:

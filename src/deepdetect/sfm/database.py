@@ -1,4 +1,4 @@
-"""COLMAP's database: photographs, cameras, keypoints and matches."""
+"""COLMAP's database: images, cameras, keypoints and matches."""
 
 from __future__ import annotations
 
@@ -8,19 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
+from ..batch.pair_list import Pair
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
-from .lens import Lens
-
-Pair = tuple[str, str]
+from .intrinsics import CameraIntrinsics
 
 
 @dataclass(frozen=True, eq=False)
 class DatabaseImage:
-    """A photograph in the database.
+    """An image in the database.
 
     Attributes:
-        name: its path below the folder of the photographs.
-        lens: its camera; photographs with the same object share one.
+        name: its path below the folder of the images.
+        intrinsics: of its camera; images with the same object share one.
         xy: (N, 2) keypoints, centre of the first pixel (0, 0).
         scales: (N,) sigma in pixels, or None.
         orientations: (N,) radians, clockwise; with scales only.
@@ -28,7 +27,7 @@ class DatabaseImage:
     """
 
     name: str
-    lens: Lens
+    intrinsics: CameraIntrinsics
     xy: np.ndarray
     scales: np.ndarray | None = None
     orientations: np.ndarray | None = None
@@ -40,27 +39,27 @@ def write_database(
 ) -> None:
     """Write a new database of COLMAP.
 
-    Each photograph is a frame of its own, of a rig with its camera alone.
+    Each image is a frame of its own, of a rig with its camera alone.
 
     Args:
         path: the file, which must not exist or be empty.
-        images: the photographs.
-        matches: (K, 2) rows of keypoints by the names of the two photographs.
+        images: the images.
+        matches: (K, 2) rows of keypoints by the names of the two images.
 
     Raises:
         MissingExtraError: pycolmap is not installed.
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
-        cameras: dict[int, tuple[int, int]] = {}  # camera and rig by the object of the lens
+        cameras: dict[int, tuple[int, int]] = {}  # camera and rig by the object
         numbers: dict[str, int] = {}
         for image in images:
-            if id(image.lens) not in cameras:
-                camera = image.lens.colmap_camera()
+            if id(image.intrinsics) not in cameras:
+                camera = image.intrinsics.colmap_camera()
                 camera.camera_id = database.write_camera(camera)
                 rig = pycolmap.Rig()
                 rig.add_ref_sensor(camera.sensor_id)
-                cameras[id(image.lens)] = camera.camera_id, database.write_rig(rig)
-            camera_id, rig_id = cameras[id(image.lens)]
+                cameras[id(image.intrinsics)] = camera.camera_id, database.write_rig(rig)
+            camera_id, rig_id = cameras[id(image.intrinsics)]
             row = pycolmap.Image(name=image.name, camera_id=camera_id)
             row.image_id = numbers[image.name] = database.write_image(row)
             frame = pycolmap.Frame()

@@ -1,61 +1,77 @@
-"""Dense points from photographs with known cameras.
+"""Dense points from images with known cameras.
 
-Each photograph in turn is the reference. It is rectified with its best neighbours, and matched with
+Each image in turn is the reference. It is rectified with its best neighbours, and matched with
 them row by row (`matching.guided.rectified`); `fusion` makes points of the matches.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from .._shared.opencv import cv2
+from .._shared.records import file_state
 from ..geometry.camera import Camera
 from ..geometry.posed_view import PosedView, relative_fundamental
 from ..io.image import load_image, luma
 from ..matching.guided.rectified import match_by_rectification
-from .fusion import DenseOptions, DensePoints, angles_between, fuse_matches
-from .lens import Lens
+from .fusion import MIN_VIEWS, DensePoints, angles_between, fuse_matches
+from .intrinsics import CameraIntrinsics
 from .mapping import SparseModel
+
+NEIGHBOURS = 4
+"""Images that each one is matched with."""
+
+MIN_COMMON_POINTS = 30
+"""Sparse points that both see."""
+
+IDEAL_ANGLE_DEG = 5.0
+"""Between the lines of sight from both: smaller ones count less."""
+
+MAX_ANGLE_DEG = 30.0
+"""Larger ones count less, since surfaces look different."""
+
+MAX_SIDE_PX = 2000
+"""Longer sides are scaled down to this."""
+
+CACHED_IMAGES = 16
+"""Prepared images that a process keeps: following references share neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
 class Neighbour:
-    """A photograph that a reference is matched with.
+    """An image that a reference is matched with.
 
     Attributes:
         view: its camera.
-        lens: the same with its distortion.
+        intrinsics: the same with its distortion.
         points0, points1: (K, 2) sparse matches, in pixels of the pinhole cameras of the reference
             and of this one.
     """
 
     view: PosedView
-    lens: Lens
+    intrinsics: CameraIntrinsics
     points0: np.ndarray
     points1: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A photograph whose pixels become points, and those that it is matched with."""
+    """An image whose pixels become points, and those that it is matched with."""
 
     view: PosedView
-    lens: Lens
+    intrinsics: CameraIntrinsics
     neighbours: tuple[Neighbour, ...]
 
 
-def find_references(sparse: SparseModel, options: DenseOptions = DenseOptions()) -> list[Reference]:
-    """Choose the neighbours of each photograph: those that share many points at a good angle.
-
-    Args:
-        sparse: cameras and points.
-        options: how many.
+def find_references(sparse: SparseModel) -> list[Reference]:
+    """Choose the neighbours of each image: those that share many points at a good angle.
 
     Returns:
-        The photographs that have enough neighbours, those that see most points first.
+        The images that have enough neighbours, those that see most points first.
     """
     rows = {number: np.flatnonzero(sparse.seen.views == number) for number in sparse.views}
     found = []
@@ -69,58 +85,58 @@ def find_references(sparse: SparseModel, options: DenseOptions = DenseOptions())
                 sparse.seen.points[rows[other]],
                 return_indices=True,
             )
-            if len(common) < options.min_common_points:
+            if len(common) < MIN_COMMON_POINTS:
                 continue
             score = _angle_weights(
                 sparse.points[common],
                 sparse.views[number].centre,
                 sparse.views[other].centre,
-                options,
             ).sum()
             neighbour = Neighbour(
                 sparse.views[other],
-                sparse.lenses[other],
+                sparse.intrinsics[other],
                 sparse.seen.xy[rows[number][own]],
                 sparse.seen.xy[rows[other][its]],
             )
             scored.append((float(score), neighbour))
         scored.sort(key=lambda each: -each[0])
-        best = tuple(neighbour for _, neighbour in scored[: options.neighbours])
-        if len(best) + 1 >= options.min_views:
-            found.append(Reference(sparse.views[number], sparse.lenses[number], best))
+        best = tuple(neighbour for _, neighbour in scored[: NEIGHBOURS])
+        if len(best) + 1 >= MIN_VIEWS:
+            found.append(Reference(sparse.views[number], sparse.intrinsics[number], best))
     return found
 
 
-def _angle_weights(
-    points: np.ndarray, centre0: np.ndarray, centre1: np.ndarray, options: DenseOptions
-) -> np.ndarray:
+def _angle_weights(points: np.ndarray, centre0: np.ndarray, centre1: np.ndarray) -> np.ndarray:
     """Return what each point says for matching two views, by its triangulation angle."""
     angle = np.degrees(angles_between(points - centre0, points - centre1))
-    weight = np.minimum(angle / options.ideal_angle_deg, 1) ** 1.5
-    return np.asarray(weight * np.minimum(options.max_angle_deg / np.maximum(angle, 1e-9), 1) ** 2)
+    weight = np.minimum(angle / IDEAL_ANGLE_DEG, 1) ** 1.5
+    return np.asarray(weight * np.minimum(MAX_ANGLE_DEG / np.maximum(angle, 1e-9), 1) ** 2)
 
 
-def dense_points(
-    folder: Path, reference: Reference, options: DenseOptions = DenseOptions()
-) -> DensePoints:
+def dense_points(folder: Path, reference: Reference, stride_px: int) -> DensePoints:
     """Match a reference with its neighbours, and return the points that enough of them agree on.
 
     Args:
-        folder: of the photographs.
+        folder: of the images.
         reference: with its neighbours.
-        options: how.
+        stride_px: a point is sought at every so many pixels of a row and of a column.
 
     Raises:
-        ImageError: a photograph cannot be read any more.
+        ImageError: an image cannot be read any more.
     """
-    rgb, view, scale = _prepared(folder, reference.view, reference.lens, options)
-    gray = luma(rgb)
+    path = folder / reference.view.name
+    rgb = _prepared_image(path, file_state(path), reference.intrinsics)
+    gray, view = luma(rgb), limited_view(reference.view)
+    scale = view.camera.size[0] / reference.view.camera.size[0]
     height, width = gray.shape
-    y, x = np.mgrid[0 : height : options.stride_px, 0 : width : options.stride_px]
+    y, x = np.mgrid[0 : height : stride_px, 0 : width : stride_px]
     xy = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
     views, matches = [], []
     for neighbour in reference.neighbours:
-        other, its_view, its_scale = _prepared(folder, neighbour.view, neighbour.lens, options)
+        path = folder / neighbour.view.name
+        other = _prepared_image(path, file_state(path), neighbour.intrinsics)
+        its_view = limited_view(neighbour.view)
+        its_scale = its_view.camera.size[0] / neighbour.view.camera.size[0]
         found = match_by_rectification(
             gray,
             luma(other),
@@ -136,7 +152,7 @@ def dense_points(
         places[found[1].indices0] = found[1].points1
         views.append(its_view)
         matches.append(places)
-    points, errors, counts = fuse_matches(view, xy, views, matches, options)
+    points, errors, counts = fuse_matches(view, xy, views, matches)
     kept = np.flatnonzero(counts)
     return DensePoints(
         points[kept].astype(np.float32),
@@ -146,25 +162,29 @@ def dense_points(
     )
 
 
-def _prepared(
-    folder: Path, view: PosedView, lens: Lens, options: DenseOptions
-) -> tuple[np.ndarray, PosedView, float]:
-    """Read a photograph without its distortion, at most `max_side_px` long; camera and scale."""
-    rgb = lens.undistort(load_image(folder / view.name))
-    smaller = limited_view(view, options)
-    size = smaller.camera.size
-    if size != view.camera.size:
+@lru_cache(maxsize=CACHED_IMAGES)
+def _prepared_image(
+    path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics
+) -> np.ndarray:
+    """Read an image of this `file_state` without its distortion, at most `MAX_SIDE_PX` long."""
+    rgb = intrinsics.undistort(load_image(path))
+    size = _limited_size(intrinsics.size)
+    if size != intrinsics.size:
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    return rgb, smaller, size[0] / view.camera.size[0]
+    return rgb
 
 
-def limited_view(view: PosedView, options: DenseOptions) -> PosedView:
-    """Return a view of at most `max_side_px`."""
+def _limited_size(size: tuple[int, int]) -> tuple[int, int]:
+    scale = min(1.0, MAX_SIDE_PX / max(size))
+    return round(size[0] * scale), round(size[1] * scale)
+
+
+def limited_view(view: PosedView) -> PosedView:
+    """Return a view of at most `MAX_SIDE_PX`."""
     width, height = view.camera.size
-    scale = options.max_side_px / max(width, height)
-    if scale >= 1:
+    size = _limited_size(view.camera.size)
+    if size == view.camera.size:
         return view
-    size = (round(width * scale), round(height * scale))
     across, down = size[0] / width, size[1] / height
     (fx, fy), (cx, cy) = view.camera.focal_px, view.camera.centre
     centre = ((cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._shared.options import check_ranges, suggest_keywords
 from ..geometry.posed_view import PosedView
 
 BLOCK = 50_000
@@ -20,65 +19,28 @@ BLOCK = 50_000
 REWEIGHTINGS = 2
 """Of the linear triangulation, after which it minimises distances in pixels."""
 
+MIN_VIEWS = 3
+"""Images that must agree on a point, the reference among them."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class DenseOptions:
-    """How photographs with known cameras become dense points.
+MAX_ERROR_PX = 1.0
+"""Between a match and the projection of the point that it agrees with."""
 
-    Attributes:
-        neighbours: photographs that each one is matched with.
-        min_common_points: sparse points that both see.
-        ideal_angle_deg: between the lines of sight from both: smaller ones count less.
-        max_angle_deg: larger ones count less, since surfaces look different.
-        stride_px: a point is sought at every so many pixels of a row and of a column.
-        max_side_px: longer sides are scaled down to this.
-        min_views: photographs that must agree on a point, the reference among them.
-        max_error_px: between a match and the projection of the point that it agrees with.
-        min_triangulation_deg: smallest angle between two of the lines of sight.
-        duplicate_depth: of a point that another reference has given already, the relative
-            difference of the depths; it is left out.
+MIN_TRIANGULATION_DEG = 1.0
+"""Smallest angle between two of the lines of sight."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    neighbours: int = 4
-    min_common_points: int = 30
-    ideal_angle_deg: float = 5.0
-    max_angle_deg: float = 30.0
-    stride_px: int = 2
-    max_side_px: int = 2000
-    min_views: int = 3
-    max_error_px: float = 1.0
-    min_triangulation_deg: float = 1.0
-    duplicate_depth: float = 0.01
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("ideal_angle_deg", "max_error_px"),
-            not_negative=("min_triangulation_deg", "duplicate_depth"),
-            between={
-                "neighbours": (1, np.inf),
-                "min_common_points": (8, np.inf),
-                "max_angle_deg": (1, 180),
-                "stride_px": (1, np.inf),
-                "max_side_px": (64, np.inf),
-                "min_views": (2, np.inf),
-            },
-        )
+DUPLICATE_DEPTH = 0.01
+"""Of a point that another reference has given already, the relative difference of the depths."""
 
 
 @dataclass(frozen=True, eq=False)
 class DensePoints:
-    """Points that several photographs agree on.
+    """Points that several images agree on.
 
     Attributes:
         points: (N, 3) float32.
         colors: (N, 3) uint8 sRGB.
         errors: (N,) float32 distance of the projections from the matches in pixels, the root mean
-            square of all photographs that agree.
+            square of all images that agree.
         views: (N,) uint8, how many these are.
     """
 
@@ -114,7 +76,6 @@ def fuse_matches(
     xy: np.ndarray,
     views: Sequence[PosedView],
     matches: Sequence[np.ndarray],
-    options: DenseOptions = DenseOptions(),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the points that the matches of several views agree on.
 
@@ -126,7 +87,6 @@ def fuse_matches(
         xy: (N, 2) its pixels.
         views: the others.
         matches: (N, 2) positions in each of them, NaN where there is none.
-        options: when they agree.
 
     Returns:
         (N, 3) float64 points, (N,) float64 errors as of `DensePoints`, and (N,) int64 number of
@@ -138,7 +98,7 @@ def fuse_matches(
     for start in range(0, len(xy) if views else 0, BLOCK):
         part = slice(start, start + BLOCK)
         points[part], errors[part], counts[part] = _fuse_block(
-            reference, xy[part], views, [places[part] for places in matches], options
+            reference, xy[part], views, [places[part] for places in matches]
         )
     return points, errors, counts
 
@@ -148,7 +108,6 @@ def _fuse_block(
     xy: np.ndarray,
     views: Sequence[PosedView],
     matches: Sequence[np.ndarray],
-    options: DenseOptions,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     all_views = [reference, *views]
     places = np.stack([xy, *matches])
@@ -162,7 +121,7 @@ def _fuse_block(
         alone[0] = alone[k] = known[k]
         points = _triangulate(all_views, places, alone)
         distance, _ = _distances(all_views, places, points)
-        agree = known & known[k] & (distance < options.max_error_px)
+        agree = known & known[k] & (distance < MAX_ERROR_PX)
         number = agree.sum(axis=0)
         better = agree[0] & agree[k] & (number > most)
         agreeing[:, better], most[better] = agree[:, better], number[better]
@@ -177,11 +136,11 @@ def _fuse_block(
         between = np.degrees(angles_between(points - reference.centre, points - view.centre))
         angle = np.maximum(angle, np.where(agreeing[k], between, 0))
     good = (
-        (number >= options.min_views)
+        (number >= MIN_VIEWS)
         & np.isfinite(points).all(axis=1)
         & ahead
-        & (errors < options.max_error_px)
-        & (angle >= options.min_triangulation_deg)
+        & (errors < MAX_ERROR_PX)
+        & (angle >= MIN_TRIANGULATION_DEG)
     )
     return points, errors, np.where(good, number, 0)
 
@@ -227,22 +186,22 @@ def _distances(
 
 
 def merge_dense_points(
-    parts: Sequence[tuple[PosedView, DensePoints]], options: DenseOptions = DenseOptions()
+    parts: Sequence[tuple[PosedView, DensePoints]], stride_px: int
 ) -> DensePoints:
     """Join the points of all references, without those that an earlier one has given already.
 
     Args:
         parts: references with their points.
-        options: `stride_px` and `duplicate_depth`.
+        stride_px: of the points.
     """
     kept: list[DensePoints] = []
     for view, own in parts:
-        seen = _nearest_depths(view, kept, options.stride_px)
+        seen = _nearest_depths(view, kept, stride_px)
         projected, depth = view.project(own.points)
-        cells = np.rint(projected / options.stride_px).astype(np.int64)
+        cells = np.rint(projected / stride_px).astype(np.int64)
         cells = cells.clip(0, np.array(seen.shape[::-1]) - 1)
         before = seen[cells[:, 1], cells[:, 0]]
-        again = np.abs(before - depth) <= options.duplicate_depth * depth
+        again = np.abs(before - depth) <= DUPLICATE_DEPTH * depth
         kept.append(own[np.flatnonzero(~again)])
     return DensePoints.joined(kept)
 

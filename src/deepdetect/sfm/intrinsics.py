@@ -1,117 +1,191 @@
-"""Intrinsics of photographs: by a calibration, EXIF, or a guess that is estimated further."""
+"""Intrinsics of images with distortion, in COLMAP's models: by a calibration, EXIF, or a guess."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .._shared.errors import ReconstructionError
+from .._shared.opencv import cv2
 from ..geometry.camera import Calibration, Camera, read_calibration
 from ..io.exif import camera_from_exif
-from .lens import Lens
+from .colmap import PIXEL_CENTRE, import_pycolmap
+
+ESTIMATED_FOCAL_FACTOR = 1.2
+"""Focal length over the longer side, where nothing is known: where its estimation begins."""
 
 
-@dataclass(frozen=True, eq=False)
-class KnownCameras:
-    """What a calibration says of photographs.
+@dataclass(frozen=True)
+class CameraIntrinsics:
+    """One of COLMAP's camera models with its parameters; focal lengths and centre come first.
 
     Attributes:
-        known: their cameras by name; none without a calibration.
-        refused: why it is not for the others, by name.
+        model: name, as "PINHOLE" or "SIMPLE_RADIAL".
+        size: (width, height) in pixels.
+        params: as COLMAP has them, where the centre of the first pixel is (0.5, 0.5).
+        source: where they come from: "given", "focal_px", "EXIF", or "estimated".
     """
 
-    known: dict[str, Camera]
-    refused: dict[str, str]
+    model: str
+    size: tuple[int, int]
+    params: tuple[float, ...]
+    source: str = "given"
+
+    @classmethod
+    def of_camera(cls, camera: Camera) -> CameraIntrinsics:
+        """Return the intrinsics of a known pinhole camera.
+
+        Example:
+            >>> CameraIntrinsics.of_camera(Camera((640, 480), 500.0)).params
+            (500.0, 500.0, 320.0, 240.0)
+        """
+        centre = (camera.centre[0] + PIXEL_CENTRE, camera.centre[1] + PIXEL_CENTRE)
+        return cls("PINHOLE", camera.size, (*camera.focal_px, *centre))
+
+    @classmethod
+    def initial(
+        cls, size: tuple[int, int], focal_px: float | None = None, source: str = "EXIF"
+    ) -> CameraIntrinsics:
+        """Return intrinsics to be estimated, with one parameter of radial distortion.
+
+        Args:
+            size: (width, height) in pixels.
+            focal_px: where the estimation begins; None where nothing is known.
+            source: of the focal length.
+
+        Example:
+            >>> CameraIntrinsics.initial((1000, 500)).params
+            (1200.0, 500.0, 250.0, 0.0)
+        """
+        if focal_px is None:
+            focal_px, source = ESTIMATED_FOCAL_FACTOR * max(size), "estimated"
+        return cls("SIMPLE_RADIAL", size, (focal_px, size[0] / 2, size[1] / 2, 0.0), source)
+
+    @classmethod
+    def of_colmap(cls, camera: Any, source: str = "given") -> CameraIntrinsics:
+        """Return the intrinsics of a camera of pycolmap."""
+        size = (int(camera.width), int(camera.height))
+        return cls(camera.model_name, size, tuple(map(float, camera.params)), source)
+
+    def colmap_camera(self) -> Any:
+        """Return the camera of pycolmap."""
+        pycolmap = import_pycolmap()
+        camera = pycolmap.Camera(
+            model=self.model, width=self.size[0], height=self.size[1], params=list(self.params)
+        )
+        camera.has_prior_focal_length = self.source != "estimated"
+        return camera
+
+    @property
+    def distorts(self) -> bool:
+        """Whether its images differ from those of a pinhole camera."""
+        return self.model not in ("PINHOLE", "SIMPLE_PINHOLE")
+
+    @property
+    def pinhole(self) -> Camera:
+        """The camera without the distortion."""
+        camera = self.colmap_camera()
+        focal = (float(camera.focal_length_x), float(camera.focal_length_y))
+        centre = (float(camera.principal_point_x), float(camera.principal_point_y))
+        return Camera(self.size, focal, (centre[0] - PIXEL_CENTRE, centre[1] - PIXEL_CENTRE))
+
+    def to_pinhole(self, xy: np.ndarray) -> np.ndarray:
+        """Return where the pinhole camera has positions (N, 2) of the image."""
+        if not self.distorts or not len(xy):
+            return xy
+        pinhole = self.pinhole
+        rays = self.colmap_camera().cam_from_img(np.ascontiguousarray(xy + PIXEL_CENTRE))
+        return np.asarray(rays * pinhole.focal_px + np.array(pinhole.centre))
+
+    def from_pinhole(self, xy: np.ndarray) -> np.ndarray:
+        """Return where the image has positions (N, 2) of the pinhole camera."""
+        if not self.distorts or not len(xy):
+            return xy
+        found = self.colmap_camera().img_from_cam(self.pinhole.rays(xy))
+        return np.asarray(found - PIXEL_CENTRE)
+
+    def undistort(self, image: np.ndarray) -> np.ndarray:
+        """Return an image (H, W) or (H, W, 3) as the pinhole camera would have taken it."""
+        if not self.distorts:
+            return image
+        width, height = self.size
+        y, x = np.indices((height, width))
+        places = self.from_pinhole(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
+        column, row = places.T.astype(np.float32).reshape(2, height, width)
+        return cv2.remap(image, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
 
 
 def known_cameras(
-    calibration: Camera | Calibration | str | Path | None, sizes: Mapping[str, tuple[int, int]]
-) -> KnownCameras:
-    """Return the cameras of photographs by a calibration, which is for one size.
+    calibration: Camera | Calibration | str | Path, sizes: Mapping[str, tuple[int, int]]
+) -> dict[str, Camera]:
+    """Return the cameras of the images, by name, that have the size of a calibration.
 
     Raises:
         ReconstructionError: it is wrong, or for none of them.
 
     Example:
         >>> camera = Camera((640, 480), 500.0)
-        >>> found = known_cameras(camera, {"a.jpg": (640, 480), "b.jpg": (320, 240)})
-        >>> list(found.known), found.refused["b.jpg"]
-        (['a.jpg'], 'it is 320x240 pixels, and the calibration is for another size')
+        >>> list(known_cameras(camera, {"a.jpg": (640, 480), "b.jpg": (320, 240)}))
+        ['a.jpg']
     """
     known: dict[str, Camera] = {}
-    refused: dict[str, str] = {}
-    if calibration is None:
-        return KnownCameras(known, refused)
     problem: ReconstructionError | None = None
     for name, size in sizes.items():
         try:
-            known[name] = _known_camera(calibration, size)
+            if not isinstance(calibration, (Camera, Calibration)):
+                known[name] = read_calibration(calibration, size, size).camera0
+                continue
+            camera = calibration.camera0 if isinstance(calibration, Calibration) else calibration
+            if camera.size != size:
+                raise ReconstructionError(
+                    f"the calibration is for images of {camera.size[0]}x{camera.size[1]} pixels, "
+                    f"the images have {size[0]}x{size[1]}: give the calibration of this size"
+                )
+            known[name] = camera
         except ReconstructionError as error:
             problem = error
-            refused[name] = (
-                f"it is {size[0]}x{size[1]} pixels, and the calibration is for another size"
-            )
     if problem is not None and not known:
         raise problem
-    return KnownCameras(known, refused)
+    return known
 
 
-def _known_camera(calibration: Camera | Calibration | str | Path, size: tuple[int, int]) -> Camera:
-    """Return the camera of a photograph by a calibration."""
-    if not isinstance(calibration, (Camera, Calibration)):
-        return read_calibration(calibration, size, size).camera0
-    camera = calibration.camera0 if isinstance(calibration, Calibration) else calibration
-    if camera.size != size:
-        raise ReconstructionError(
-            f"the calibration is for images of {camera.size[0]}x{camera.size[1]} pixels, the "
-            f"photographs have {size[0]}x{size[1]}: give the calibration of this size"
-        )
-    return camera
-
-
-def _lens_by_exif(path: Path, size: tuple[int, int]) -> Lens:
-    """Return a lens to be estimated, beginning with the focal length of EXIF where it is there."""
-    try:
-        return Lens.initial(size, float(np.mean(camera_from_exif(path, size).focal_px)))
-    except ReconstructionError:
-        return Lens.initial(size)
-
-
-def photograph_lenses(
+def initial_intrinsics(
     folder: Path,
-    names: Sequence[str],
     sizes: Mapping[str, tuple[int, int]],
-    known: Mapping[str, Camera],
+    known: Mapping[str, Camera] = {},
     focal_px: float | None = None,
     single_camera: bool | None = None,
-) -> dict[str, Lens]:
-    """Return the camera of each photograph, the same object for those that share one.
+) -> dict[str, CameraIntrinsics]:
+    """Return the known intrinsics of each image, or where their estimation begins.
 
     Args:
-        folder: of the photographs.
-        names: of the photographs.
-        sizes: (width, height) by name.
+        folder: of the images, whose EXIF is read.
+        sizes: (width, height) by the name of the image.
         known: cameras that are known, by name.
-        focal_px: focal length of the others; None: of their EXIF, or a guess.
+        focal_px: of the others; None: of their EXIF, or a guess.
         single_camera: as of `MultiViewOptions`.
+
+    Returns:
+        By name, the same object for images that share a camera.
     """
-    shared: dict[tuple[Any, ...], Lens] = {}
-    lenses = {}
-    for name in names:
-        size = sizes[name]
+    shared: dict[Any, CameraIntrinsics] = {}
+    intrinsics = {}
+    for name, size in sizes.items():
         if name in known:
-            lens = Lens.of_camera(known[name])
+            begin = CameraIntrinsics.of_camera(known[name])
         elif focal_px is not None:
             focal = Camera(size, focal_px).focal_px[0]
-            lens = replace(Lens.initial(size, focal), source="focal_px")
+            begin = CameraIntrinsics.initial(size, focal, "focal_px")
         else:
-            lens = _lens_by_exif(folder / name, size)
-        key: tuple[Any, ...] = (lens,)
-        if single_camera is not None:
-            key = (size,) if single_camera else (name,)
-        lenses[name] = shared.setdefault(key, lens)
-    return lenses
+            try:
+                exif = camera_from_exif(folder / name, size)
+                begin = CameraIntrinsics.initial(size, float(np.mean(exif.focal_px)))
+            except ReconstructionError:
+                begin = CameraIntrinsics.initial(size)
+        key = {None: begin, True: size, False: name}[single_camera]
+        intrinsics[name] = shared.setdefault(key, begin)
+    return intrinsics

@@ -1,4 +1,4 @@
-"""Poses of all photographs and sparse points: COLMAP's incremental mapping, and a last refinement.
+"""Poses of all images and sparse points: COLMAP's incremental mapping, and a last adjustment.
 
 Schönberger and Frahm, "Structure-from-Motion Revisited", 2016.
 """
@@ -15,69 +15,48 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import NoDepthError
-from .._shared.options import check_ranges, suggest_keywords
+from ..batch.pair_list import Pair
 from ..geometry.posed_view import PosedView
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
-from .lens import Lens
-from .pair_selection import largest_group
+from .intrinsics import CameraIntrinsics
+from .pair_selection import largest_component
 
-Pair = tuple[str, str]
+MIN_VERIFIED = 15
+"""Matches of a pair that must agree with a two-view geometry."""
 
+MAX_VERIFICATION_ERROR_PX = 4.0
+"""Of a match that agrees."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class MappingOptions:
-    """How poses and sparse points are estimated.
+MIN_VIEWS = 3
+"""Of a model; smaller ones are given up."""
 
-    Attributes:
-        min_verified: matches of a pair that must agree with a two-view geometry.
-        max_verification_error_px: of a match that agrees.
-        min_views: of a model; smaller ones are given up.
-        max_models: groups of photographs that do not hang together, of which models are made.
-        max_first_pairs: pairs with which each of them may begin.
-        forward_angle_deg: COLMAP begins with a pair whose points are seen at large angles, and
-            which did not move straight ahead. Where there is none, as in a clip from a car, or
-            where more photographs are left than mapped, it may have, and this angle is enough.
-        robust_scale_px: of the loss (Cauchy) of the last adjustment: larger errors count less.
-        min_views_of_principal_point: photographs of each camera from which that adjustment also
-            estimates its principal point: with fewer it is in the middle.
-        seed: of all random choices.
+MAX_MODELS = 5
+"""Components of images that do not hang together, of which models are made."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
+MAX_FIRST_PAIRS = 20
+"""With which each of them may begin."""
 
-    min_verified: int = 15
-    max_verification_error_px: float = 4.0
-    min_views: int = 3
-    max_models: int = 5
-    max_first_pairs: int = 20
-    forward_angle_deg: float = 4.0
-    robust_scale_px: float = 1.0
-    min_views_of_principal_point: int = 8
-    seed: int = 0
+FORWARD_ANGLE_DEG = 4.0
+"""COLMAP begins with a pair whose points are seen at large angles, and which did not move straight
+ahead. Where there is none, as in a clip from a car, or where more images are left than mapped, it
+may have, and this angle is enough."""
 
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=(
-                *("min_verified", "max_verification_error_px"),
-                *("robust_scale_px", "max_models", "max_first_pairs"),
-                "forward_angle_deg",
-            ),
-            not_negative=("seed",),
-            between={"min_views": (2, np.inf), "min_views_of_principal_point": (3, np.inf)},
-        )
+ROBUST_SCALE_PX = 1.0
+"""Of the loss (Cauchy) of the last adjustment: larger errors count less."""
+
+MIN_VIEWS_OF_PRINCIPAL_POINT = 8
+"""Images of each camera from which that adjustment also estimates its principal point: with fewer
+it is in the middle."""
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Where points are seen: one row for each point in each photograph that sees it.
+    """Where points are seen: one row for each point in each image that sees it.
 
     Attributes:
         points: (K,) int64 rows of the points, ascending.
-        views: (K,) int64 numbers of the photographs.
-        xy: (K, 2) float64 positions in pixels.
+        views: (K,) int64 COLMAP's numbers of the images.
+        xy: (K, 2) float64 positions in pixels of pinhole cameras.
     """
 
     points: np.ndarray
@@ -90,33 +69,33 @@ class SparseModel:
     """Cameras and sparse points, in the frame and unit of the model.
 
     Attributes:
-        views: by COLMAP's number of the photograph; their cameras are pinhole cameras.
-        lenses: of the photographs, by the same number, with their distortion.
+        views: by COLMAP's number of the image; their cameras are pinhole cameras.
+        intrinsics: of the images, by the same number, with their distortion.
         points: (P, 3) float64.
         errors: (P,) float64 mean reprojection error in pixels.
-        seen: where they are seen by the pinhole cameras, ascending by point.
+        seen: where they are seen.
     """
 
     views: Mapping[int, PosedView]
-    lenses: Mapping[int, Lens]
+    intrinsics: Mapping[int, CameraIntrinsics]
     points: np.ndarray
     errors: np.ndarray
     seen: Observations
 
     @property
     def tracks(self) -> np.ndarray:
-        """(P,) number of photographs that each point is seen in."""
+        """(P,) number of images that each point is seen in."""
         return np.bincount(self.seen.points, minlength=len(self.points))
 
 
 def verify_pairs(
-    database: Path, options: MappingOptions, verified: Callable[[int], object] = lambda count: None
+    database: Path, seed: int = 0, verified: Callable[[int], object] = lambda count: None
 ) -> dict[Pair, int]:
     """Estimate the two-view geometries of matched pairs, and store them in the database.
 
     Args:
         database: with matches.
-        options: how.
+        seed: of the random samples.
         verified: called with 1 after each pair.
 
     Returns:
@@ -125,9 +104,9 @@ def verify_pairs(
     found: dict[Pair, int] = {}
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as opened:
         how = pycolmap.TwoViewGeometryOptions()
-        how.min_num_inliers = options.min_verified
-        how.ransac.max_error = options.max_verification_error_px
-        how.ransac.random_seed = options.seed
+        how.min_num_inliers = MIN_VERIFIED
+        how.ransac.max_error = MAX_VERIFICATION_ERROR_PX
+        how.ransac.random_seed = seed
         images = {image.image_id: image for image in opened.read_all_images()}
         cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
         xy = {
@@ -150,47 +129,47 @@ def verify_pairs(
     return found
 
 
-def map_photographs(
+def map_images(
     database: Path,
     folder: Path,
     workspace: Path,
     known_cameras: bool,
-    options: MappingOptions,
+    seed: int = 0,
     registered: Callable[[int], object] = lambda count: None,
 ) -> tuple[Any, list[frozenset[str]]]:
-    """Estimate the poses of as many photographs as hang together.
+    """Estimate the poses of as many images as hang together.
 
     Args:
         database: with verified matches.
-        folder: of the photographs.
+        folder: of the images.
         workspace: an empty folder, for COLMAP's own files.
-        known_cameras: whether the cameras stay as they are.
-        options: how.
-        registered: called with the number of photographs that were added.
+        known_cameras: whether the intrinsics stay as they are.
+        seed: of all random choices.
+        registered: called with the number of images that were added.
 
     Returns:
-        The largest model of pycolmap, and the names of the photographs in each of the others.
+        The largest model of pycolmap, and the names of the images in each other component.
 
     Raises:
-        NoDepthError: no photographs hang together.
+        NoDepthError: no images hang together.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()
-        how.min_model_size = options.min_views
-        how.max_num_models = options.max_models
-        how.init_num_trials = options.max_first_pairs
-        how.min_num_matches = options.min_verified
+        how.min_model_size = MIN_VIEWS
+        how.max_num_models = MAX_MODELS
+        how.init_num_trials = MAX_FIRST_PAIRS
+        how.min_num_matches = MIN_VERIFIED
         how.extract_colors = False
-        how.random_seed = options.seed
+        how.random_seed = seed
         if known_cameras:
             how.ba_refine_focal_length = False
             how.ba_refine_extra_params = False
-        verified = _verified_pairs(pycolmap, database, options.min_verified)
+        verified = _verified_pairs(pycolmap, database)
         found: list[Any] = []
         for forward in (False, True):
             if forward:
                 how.mapper.init_max_forward_motion = 1.0
-                how.mapper.init_min_tri_angle = options.forward_angle_deg
+                how.mapper.init_min_tri_angle = FORWARD_ANGLE_DEG
             space = workspace / str(int(forward))
             space.mkdir()
             models = pycolmap.incremental_mapping(
@@ -204,25 +183,25 @@ def map_photographs(
             attempt = sorted(models.values(), key=lambda model: -model.num_reg_images())
             if _largest(attempt) > _largest(found):
                 found = attempt
-            # What is left may be more than the model: a drive beside some photographs of a house.
+            # What is left may be more than the model: a drive beside some images of a house.
             mapped = frozenset[str]().union(*map(_names, found))
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
-            if found and largest_group(left) <= _largest(found):
+            if found and largest_component(left) <= _largest(found):
                 break
-    if not found or found[0].num_reg_images() < options.min_views:
+    if not found or found[0].num_reg_images() < MIN_VIEWS:
         raise NoDepthError(
-            "the photographs do not hang together: take them so that each shows most of what the "
+            "the images do not hang together: take them so that each shows most of what the "
             "one before shows, from another place"
         )
     return found[0], [_names(model) for model in found[1:]]
 
 
 def _largest(models: Sequence[Any]) -> int:
-    """Return the number of photographs of the first of some models, the largest ones first."""
+    """Return the number of images of the first of some models, the largest ones first."""
     return models[0].num_reg_images() if models else 0
 
 
-def _verified_pairs(pycolmap: Any, database: Path, min_verified: int) -> list[Pair]:
+def _verified_pairs(pycolmap: Any, database: Path) -> list[Pair]:
     """Return the names of the pairs with enough matches that agree with their geometry."""
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
@@ -230,7 +209,7 @@ def _verified_pairs(pycolmap: Any, database: Path, min_verified: int) -> list[Pa
         pairs = [
             pycolmap.pair_id_to_image_pair(number)
             for number, count in found
-            if count >= min_verified
+            if count >= MIN_VERIFIED
         ]
     return [(names[first], names[second]) for first, second in pairs]
 
@@ -244,16 +223,16 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
 
     Args:
         model: a `pycolmap.Reconstruction`.
-        sources: where the intrinsics of each photograph began.
+        sources: where the intrinsics of each image began.
     """
-    views, lenses = {}, {}
+    views, intrinsics = {}, {}
     for number in model.reg_image_ids():
         image = model.images[number]
         pose = image.cam_from_world()
-        lens = Lens.of_colmap(image.camera, sources.get(image.name, "given"))
-        lenses[number] = lens
+        own = CameraIntrinsics.of_colmap(image.camera, sources.get(image.name, "given"))
+        intrinsics[number] = own
         views[number] = PosedView(
-            image.name, lens.pinhole, pose.rotation.matrix(), np.array(pose.translation)
+            image.name, own.pinhole, pose.rotation.matrix(), np.array(pose.translation)
         )
     numbers = sorted(model.points3D)
     rows = [
@@ -264,13 +243,13 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
     table = np.array(rows, np.float64).reshape(-1, 4)
     seen_in = table[:, 1].astype(np.int64)
     xy = table[:, 2:] - PIXEL_CENTRE
-    for number, lens in lenses.items():
-        own = seen_in == number
-        xy[own] = lens.to_pinhole(xy[own])
+    for number, own in intrinsics.items():
+        rows_in = seen_in == number
+        xy[rows_in] = own.to_pinhole(xy[rows_in])
     points = np.array([model.points3D[number].xyz for number in numbers]).reshape(-1, 3)
     seen = Observations(table[:, 0].astype(np.int64), seen_in, xy)
     errors = _mean_errors(points, views, seen)
-    return SparseModel(views, lenses, points, errors, seen)
+    return SparseModel(views, intrinsics, points, errors, seen)
 
 
 def _mean_errors(
@@ -286,26 +265,22 @@ def _mean_errors(
     return sums / np.maximum(np.bincount(seen.points, minlength=len(points)), 1)
 
 
-def adjust(
-    model: Any, known_cameras: bool, scale_px: float, options: MappingOptions = MappingOptions()
-) -> None:
+def adjust(model: Any, known_cameras: bool) -> None:
     """Adjust all cameras and points (bundle adjustment) with a robust loss.
 
     Args:
         model: a `pycolmap.Reconstruction`, which is changed.
-        known_cameras: whether the cameras stay as they are.
-        scale_px: of the loss.
-        options: when the principal point is estimated.
+        known_cameras: whether the intrinsics stay as they are.
     """
     taken = Counter(model.images[number].camera_id for number in model.reg_image_ids())
-    enough = min(taken.values()) >= options.min_views_of_principal_point
+    enough = min(taken.values()) >= MIN_VIEWS_OF_PRINCIPAL_POINT
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.BundleAdjustmentOptions()
         how.refine_focal_length = how.refine_extra_params = not known_cameras
         how.refine_principal_point = enough and not known_cameras
         how.print_summary = False
         how.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        how.ceres.loss_function_scale = scale_px
+        how.ceres.loss_function_scale = ROBUST_SCALE_PX
         pycolmap.bundle_adjustment(model, how)
         model.update_point_3d_errors()
 
@@ -317,7 +292,7 @@ def normalise_model(model: Any) -> str:
         model: a `pycolmap.Reconstruction`, which is changed.
 
     Returns:
-        Name of the photograph whose camera it is: the one that sees most points.
+        Name of the image whose camera it is: the one that sees most points.
     """
     sparse = read_sparse_model(model)
     seen = np.bincount(sparse.seen.views)

@@ -1,4 +1,4 @@
-"""Which photographs are matched with each other.
+"""Which images are matched with each other.
 
 All pairs of a small set; neighbours of a sequence; the most alike of a large set, by VLAD (Jégou et
 al., "Aggregating local descriptors into a compact image representation", 2010) of the best ranked
@@ -7,75 +7,23 @@ keypoints, with a vocabulary of the set itself.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from .._shared.options import check_ranges, suggest_keywords
+from ..batch.pair_list import Pair
 
-Pair = tuple[str, str]
+COMPARED_KEYPOINTS = 512
+"""The best ones of each image, by which images are compared."""
+
+WORDS = 64
+"""Of the vocabulary."""
+
+SIMILAR = 20
+"""Most similar images that each one is matched with."""
 
 KMEANS_ITERATIONS = 10
 MAX_TRAINING_DESCRIPTORS = 50_000
-
-
-@suggest_keywords
-@dataclass(frozen=True)
-class PairSelectionOptions:
-    """Which photographs are matched with each other.
-
-    Attributes:
-        pairs: "all", "sequential" (neighbours in the order of their names), "similar" (the most
-            alike), or "auto": all of up to `max_exhaustive`, else the most alike.
-        sequential: number of following photographs that each one is matched with.
-        similar: number of most similar photographs that each one is matched with.
-        max_exhaustive: photographs of which all pairs are matched.
-        keypoints: the best ones of each photograph by which they are compared.
-        words: of the vocabulary.
-        seed: of the vocabulary.
-
-    Raises:
-        OptionError: a value is unknown or out of its range.
-    """
-
-    pairs: Literal["auto", "all", "sequential", "similar"] = "auto"
-    sequential: int = 10
-    similar: int = 20
-    max_exhaustive: int = 50
-    keypoints: int = 512
-    words: int = 64
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        from .._shared.errors import unknown_name
-
-        known = ("auto", "all", "sequential", "similar")
-        if self.pairs not in known:
-            raise unknown_name("way to choose pairs", self.pairs, known)
-        check_ranges(
-            self,
-            positive=("sequential", "similar", "keypoints", "words"),
-            not_negative=("max_exhaustive", "seed"),
-        )
-
-    def way(self, count: int) -> str:
-        """Return how the pairs of so many photographs are chosen."""
-        if self.pairs != "auto":
-            return self.pairs
-        return "all" if count <= self.max_exhaustive else "similar"
-
-
-def all_pairs(names: Sequence[str]) -> list[Pair]:
-    """Return every pair once.
-
-    Example:
-        >>> all_pairs(["a", "b", "c"])
-        [('a', 'b'), ('a', 'c'), ('b', 'c')]
-    """
-    return list(itertools.combinations(names, 2))
 
 
 def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
@@ -86,9 +34,7 @@ def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
         [('a', 'b'), ('a', 'c'), ('b', 'c'), ('b', 'd'), ('c', 'd')]
     """
     return [
-        (name, other)
-        for k, name in enumerate(names)
-        for other in names[k + 1 : k + 1 + int(following)]
+        (name, other) for k, name in enumerate(names) for other in names[k + 1 : k + 1 + following]
     ]
 
 
@@ -96,7 +42,7 @@ def similar_pairs(names: Sequence[str], vectors: np.ndarray, count: int) -> list
     """Return each name with those whose vectors are most alike, every pair once.
 
     Args:
-        names: of the photographs.
+        names: of the images.
         vectors: (N, D) of length 1, one each.
         count: partners of each; it may also be a partner of others.
 
@@ -109,16 +55,16 @@ def similar_pairs(names: Sequence[str], vectors: np.ndarray, count: int) -> list
     for k, vector in enumerate(vectors):
         alike = vectors @ vector
         alike[k] = -np.inf
-        best = np.argsort(-alike, kind="stable")[: min(int(count), len(names) - 1)]
+        best = np.argsort(-alike, kind="stable")[: min(count, len(names) - 1)]
         found |= {(min(k, int(other)), max(k, int(other))) for other in best}
     return [(names[a], names[b]) for a, b in sorted(found)]
 
 
-def largest_group(pairs: Sequence[Pair]) -> int:
-    """Return the number of photographs in the largest group that pairs connect.
+def largest_component(pairs: Sequence[Pair]) -> int:
+    """Return the number of images in the largest component that pairs connect.
 
     Example:
-        >>> largest_group([("a", "b"), ("c", "d"), ("b", "e")]), largest_group([])
+        >>> largest_component([("a", "b"), ("c", "d"), ("b", "e")]), largest_component([])
         (3, 0)
     """
     neighbours: dict[str, set[str]] = {}
@@ -136,53 +82,53 @@ def largest_group(pairs: Sequence[Pair]) -> int:
 
 
 def vlad_vectors(
-    descriptors: Sequence[np.ndarray], options: PairSelectionOptions = PairSelectionOptions()
+    descriptors: Sequence[np.ndarray], words: int = WORDS, seed: int = 0
 ) -> np.ndarray:
-    """Describe each photograph by one vector: VLAD with the square roots of what each word sums.
+    """Describe each image by one vector: VLAD with the square roots of what each word sums.
 
     Args:
-        descriptors: (N_i, D) float32 of each photograph, of length 1; best keypoints first.
-        options: of the vocabulary.
+        descriptors: (N_i, D) float32 of each image, of length 1.
+        words: of the vocabulary.
+        seed: of the vocabulary.
 
     Returns:
-        (images, words * D) float32 of length 1; 0 for a photograph without keypoints.
+        (images, words * D) float32 of length 1; 0 for an image without keypoints.
 
     Example:
         >>> rng = np.random.default_rng(0)
         >>> one, two = rng.random((2, 40, 8), np.float32)
-        >>> found = vlad_vectors([one, two, one[:30]], PairSelectionOptions(words=4))
+        >>> found = vlad_vectors([one, two, one[:30]], words=4)
         >>> bool(found[0] @ found[2] > found[0] @ found[1])
         True
     """
-    best = [np.asarray(each[: options.keypoints], np.float32) for each in descriptors]
-    centres = _vocabulary(np.concatenate(best), options)
-    vectors = np.zeros((len(best), centres.size), np.float32)
-    for row, own in enumerate(best):
+    centres = _vocabulary(np.concatenate(descriptors), words, seed)
+    vectors = np.zeros((len(descriptors), centres.size), np.float32)
+    for row, own in enumerate(descriptors):
         if not len(own):
             continue
-        words = _nearest(own, centres)
+        nearest = _nearest(own, centres)
         sums = np.zeros_like(centres)
-        np.add.at(sums, words, own - centres[words])
+        np.add.at(sums, nearest, own - centres[nearest])
         sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
         flat = sums.ravel()
         vectors[row] = flat / max(float(np.linalg.norm(flat)), 1e-12)
     return vectors
 
 
-def _vocabulary(descriptors: np.ndarray, options: PairSelectionOptions) -> np.ndarray:
+def _vocabulary(descriptors: np.ndarray, words: int, seed: int) -> np.ndarray:
     """Return the centres of k-means."""
-    rng = np.random.default_rng(options.seed)
+    rng = np.random.default_rng(seed)
     if len(descriptors) > MAX_TRAINING_DESCRIPTORS:
         descriptors = descriptors[
             rng.choice(len(descriptors), MAX_TRAINING_DESCRIPTORS, replace=False)
         ]
-    count = min(options.words, len(descriptors))
+    count = min(words, len(descriptors))
     centres = descriptors[rng.choice(len(descriptors), count, replace=False)].copy()
     for _ in range(KMEANS_ITERATIONS):
-        words = _nearest(descriptors, centres)
-        sizes = np.bincount(words, minlength=count)
+        nearest = _nearest(descriptors, centres)
+        sizes = np.bincount(nearest, minlength=count)
         sums = np.zeros_like(centres)
-        np.add.at(sums, words, descriptors)
+        np.add.at(sums, nearest, descriptors)
         filled = sizes > 0
         centres[filled] = sums[filled] / sizes[filled, None]
     return centres

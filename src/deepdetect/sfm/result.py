@@ -1,4 +1,4 @@
-"""What many photographs gave: cameras, sparse and dense points, and what is known about them."""
+"""What many images gave: cameras, sparse and dense points, and what is known about them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from .._shared.options import suggest_keywords
 from ..geometry.point_cloud import PointCloud
 from ..geometry.posed_view import PosedView
-from .lens import Lens
+from .intrinsics import CameraIntrinsics
 
 SCALE = "lengths are in spacings, the median distance from a camera to the nearest other one: the \
 true scale is not known"
@@ -21,26 +21,26 @@ true scale is not known"
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class MultiViewReconstruction:
-    """Cameras and points of many photographs.
+    """Cameras and points of many images.
 
     The world is the frame of the camera of `reference`: x right, y down, z forward. 1 is the median
     distance from a camera to the nearest other one; the true scale is not known.
 
     Attributes:
-        views: of the photographs that are part of it, by name; their cameras are pinhole cameras.
-        lenses: the same cameras with their distortion.
-        left_out: why each of the others is not, by name.
-        other_groups: names of those left out that hang together among themselves, the largest group
-            first: each can be reconstructed alone.
-        reference: name of the photograph whose camera's frame is the world.
+        views: of the images that are part of it, by name; their cameras are pinhole cameras.
+        intrinsics: of the same cameras, with their distortion.
+        unregistered: why each of the others is not, by name.
+        components: names of unregistered images that hang together among themselves, the largest
+            component first: each can be reconstructed alone.
+        reference: name of the image whose camera's frame is the world.
         sparse: the points by which the poses were estimated.
         sparse_errors: (N,) float32 their mean reprojection errors in pixels.
-        sparse_views: (N,) int32 number of photographs that each of them is seen in.
+        sparse_views: (N,) int32 number of images that each of them is seen in.
         dense: the dense points; without any where none were asked for.
         dense_errors: (M,) float32 reprojection errors of these in pixels: the root mean square of
-            all photographs that agree.
-        dense_views: (M,) uint8 number of photographs that agree on each of them.
-        keypoints: number of keypoints of each photograph.
+            all images that agree.
+        dense_views: (M,) uint8 number of images that agree on each of them.
+        keypoints: number of keypoints of each image.
         matched: number of verified matches of each pair that has some.
         pairs: number of pairs that were matched.
         pair_choice: how they were chosen: "all", "sequential" or "similar".
@@ -49,9 +49,9 @@ class MultiViewReconstruction:
     """
 
     views: Mapping[str, PosedView]
-    lenses: Mapping[str, Lens]
-    left_out: Mapping[str, str]
-    other_groups: tuple[tuple[str, ...], ...]
+    intrinsics: Mapping[str, CameraIntrinsics]
+    unregistered: Mapping[str, str]
+    components: tuple[tuple[str, ...], ...]
     reference: str
     sparse: PointCloud
     sparse_errors: np.ndarray
@@ -67,9 +67,9 @@ class MultiViewReconstruction:
     files: tuple[Path, ...]
 
     def __repr__(self) -> str:
-        total = len(self.views) + len(self.left_out)
+        total = len(self.views) + len(self.unregistered)
         return (
-            f"MultiViewReconstruction({len(self.views)} of {total} photographs, "
+            f"MultiViewReconstruction({len(self.views)} of {total} images, "
             f"{len(self.sparse):,} sparse and {len(self.dense):,} dense points)"
         )
 
@@ -86,10 +86,10 @@ class MultiViewReconstruction:
     def summary(self) -> dict[str, Any]:
         """Return all but the arrays as plain values for JSON: counts, times and errors."""
         return {
-            "photographs": len(self.views) + len(self.left_out),
+            "images": len(self.views) + len(self.unregistered),
             "registered": len(self.views),
-            "left_out": dict(self.left_out),
-            "other_groups": [list(group) for group in self.other_groups],
+            "unregistered": dict(self.unregistered),
+            "components": [list(names) for names in self.components],
             "reference": self.reference,
             "scale": SCALE,
             "keypoints": sum(self.keypoints.values()),
@@ -108,16 +108,16 @@ class MultiViewReconstruction:
         }
 
     def _camera(self, name: str) -> dict[str, Any]:
-        view, lens = self.views[name], self.lenses[name]
+        view, own = self.views[name], self.intrinsics[name]
         return {
-            "width": lens.size[0],
-            "height": lens.size[1],
-            "model": lens.model,
+            "width": own.size[0],
+            "height": own.size[1],
+            "model": own.model,
             "focal_px": [round(value, 3) for value in view.camera.focal_px],
             "cx": round(view.camera.centre[0], 3),
             "cy": round(view.camera.centre[1], 3),
-            "colmap_params": [float(f"{value:.9g}") for value in lens.params],
-            "intrinsics": lens.source,
+            "colmap_params": [float(f"{value:.9g}") for value in own.params],
+            "intrinsics": own.source,
             "rotation": view.rotation.tolist(),
             "translation": np.asarray(view.translation).tolist(),
             "centre": view.centre.tolist(),

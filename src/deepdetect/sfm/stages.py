@@ -26,7 +26,7 @@ from .._shared.progress import progress
 from ..batch.extraction import extract_features
 from ..batch.pair_list import pair_name
 from ..batch.pair_matching import match_pairs
-from ..batch.parted_file import open_hdf5
+from ..batch.hdf5 import open_hdf5
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.selection import SelectionOptions

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..._shared.errors import NoDepthError
 from ...batch.extraction import feature_group
-from ...batch.parted_file import Group, import_h5py, open_hdf5, write_groups
+from ...batch.hdf5 import Group, import_h5py, open_hdf5, write_groups
 from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
 from ...features.orientation import dominant_angles
