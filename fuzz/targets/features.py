@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 
 from deepdetect.batch.extraction import feature_group
-from deepdetect.batch.pair_matching import match_pairs
 from deepdetect.batch.hdf5 import write_groups
+from deepdetect.batch.pair_matching import match_pairs
 from deepdetect.features.keypoints import Keypoints
 
 from ..case import Target, expect, prepared

@@ -14,7 +14,7 @@ import pytest
 
 from deepdetect import DeepDetect, OptionError, PointDetector, SelectionOptions, load_image
 from deepdetect.batch import extract_features
-from deepdetect.batch.extraction import IMAGES_PER_PART, _extract_part, parts_of
+from deepdetect.batch.extraction import IMAGES_PER_SHARD, shards_of
 from deepdetect.features.sift import describe_keypoints, root_sift_descriptors
 from deepdetect.io.image import luma
 
@@ -32,8 +32,8 @@ def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: P
 
     folder = collection(3)
     report = extract_features(folder, tmp_path / "f.h5", FEW, workers=1)
-    assert report.images == ("a/00.png", "a/02.png", "b/01.png")
-    assert (report.skipped, report.keypoints, report.failures) == (0, 150, ())
+    assert tuple(report.counts) == ("a/00.png", "a/02.png", "b/01.png")
+    assert (report.skipped, sum(report.counts.values()), report.failures) == (0, 150, ())
     names = []
 
     def visit(_: str, member: object) -> None:
@@ -42,7 +42,7 @@ def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: P
 
     with h5py.File(tmp_path / "f.h5", "r", libver="latest") as file:
         file.visititems(visit)
-        assert set(names) == set(report.images)
+        assert set(names) == set(report.counts)
         stored = file["b/01.png"]
         found = {name: value[()] for name, value in stored.items()}
         assert stored["keypoints"].attrs["uncertainty"] == 1
@@ -54,6 +54,7 @@ def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: P
         "scores": ((50,), "float32"),
         "scales": ((50,), "float32"),
         "oris": ((50,), "float32"),
+        "colors": ((50, 3), "uint8"),
         "image_size": ((2,), "int32"),
     }
     np.testing.assert_array_equal(found["keypoints"], expected.xy)
@@ -61,6 +62,8 @@ def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: P
     np.testing.assert_array_equal(found["scales"], expected.sizes / 2)
     np.testing.assert_array_equal(found["oris"], expected.angles)
     np.testing.assert_array_equal(found["image_size"], [128, 128])
+    x, y = np.rint(expected.xy[7]).astype(int)
+    np.testing.assert_array_equal(found["colors"][7], load_image(folder / "b/01.png")[y, x])
     np.testing.assert_allclose(np.linalg.norm(found["descriptors"], axis=0), 1, rtol=1e-6)
     cosines = np.sum(found["descriptors"].T * described.descriptors, 1)
     lengths = np.linalg.norm(described.descriptors.astype(float), axis=1)
@@ -91,7 +94,7 @@ def test_an_image_without_keypoints(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (64, 48)).save(tmp_path / "photos/black.png")
     report = extract_features(tmp_path / "photos", tmp_path / "f.h5", workers=1)
-    assert (report.images, report.keypoints) == (("black.png",), 0)
+    assert (tuple(report.counts), sum(report.counts.values())) == (("black.png",), 0)
     with h5py.File(tmp_path / "f.h5") as file:
         assert file["black.png/descriptors"].shape == (128, 0)
         assert file["black.png/keypoints"].shape == (0, 2)
@@ -105,18 +108,18 @@ def test_what_is_done_is_skipped_and_what_has_changed_is_not(
     extract_features(folder, path, FEW, workers=1)
     before = path.stat().st_mtime_ns
     report = extract_features(folder, path, FEW, workers=1)
-    assert (report.images, report.skipped) == ((), 2)
+    assert (tuple(report.counts), report.skipped) == ((), 2)
     assert path.stat().st_mtime_ns == before
     (folder / "c.png").write_bytes((folder / "a/00.png").read_bytes())
     (folder / "a/00.png").write_bytes((folder / "b/01.png").read_bytes())
     report = extract_features(folder, path, FEW, workers=1)
-    assert (report.images, report.skipped) == (("a/00.png", "c.png"), 1)
+    assert (tuple(report.counts), report.skipped) == (("a/00.png", "c.png"), 1)
     extract_features(folder, tmp_path / "new.h5", FEW, workers=1)
     assert same_content(path, tmp_path / "new.h5")
     with pytest.raises(OptionError, match=r"other settings \(`max_keypoints`\)"):
         extract_features(folder, path, workers=1)
     report = extract_features(folder, path, workers=1, overwrite=True)
-    assert len(report.images) == 3
+    assert len(report.counts) == 3
 
 
 def test_bad_images_do_not_stop_the_others(
@@ -128,13 +131,13 @@ def test_bad_images_do_not_stop_the_others(
     (folder / os.fsdecode(b"\xff.png")).write_bytes((folder / "a/00.png").read_bytes())
     for expected in ((3, 0), (0, 3)):
         report = extract_features(folder, tmp_path / "f.h5", FEW, workers=2)
-        assert (len(report.images), report.skipped) == expected
+        assert (len(report.counts), report.skipped) == expected
         first, second = report.failures
         assert "bad.png is not an image" in first + second
         assert "not UTF-8" in first + second
     assert same_content(tmp_path / "f.h5", tmp_path / "good.h5")
     (folder / "bad.png").write_bytes((folder / "a/00.png").read_bytes())
-    assert extract_features(folder, tmp_path / "f.h5", FEW).images == ("bad.png",)
+    assert list(extract_features(folder, tmp_path / "f.h5", FEW).counts) == ["bad.png"]
 
 
 def test_several_processes_give_the_same(
@@ -159,7 +162,7 @@ def test_images_that_are_gone_lose_their_features(
     extract_features(folder, tmp_path / "f.h5", FEW, workers=1)
     (folder / "a/00.png").write_bytes(b"not a photograph")
     report = extract_features(folder, tmp_path / "f.h5", FEW, workers=1)
-    assert (report.images, report.skipped, len(report.failures)) == ((), 3, 1)
+    assert (tuple(report.counts), report.skipped, len(report.failures)) == ((), 3, 1)
     assert names() == ["a/02.png", "b/01.png", "b/03.png"]
     (folder / "b/03.png").unlink()
     extract_features(folder, tmp_path / "f.h5", FEW, workers=1)
@@ -207,7 +210,7 @@ def test_too_large_images_are_failures(
     folder = collection(2)
     Image.new("RGB", (200, 200)).save(folder / "large.png")
     report = extract_features(folder, tmp_path / "f.h5", FEW, max_megapixels=0.03, workers=workers)
-    assert len(report.images) == 2
+    assert len(report.counts) == 2
     assert "large.png has 200x200 pixels, which is over 0.03 megapixels" in report.failures[0]
     with pytest.raises(OptionError, match="`max_megapixels` must be above 0"):
         extract_features(folder, tmp_path / "f.h5", max_megapixels=0)
@@ -215,9 +218,9 @@ def test_too_large_images_are_failures(
 
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 600, 5000])
 def test_parts(count: int) -> None:
-    parts = parts_of(range(count), IMAGES_PER_PART)
+    parts = shards_of(range(count), IMAGES_PER_SHARD)
     assert [number for part in parts for number in part] == list(range(count))
-    assert all(1 <= len(part) <= IMAGES_PER_PART for part in parts)
+    assert all(1 <= len(part) <= IMAGES_PER_SHARD for part in parts)
     assert len(parts) >= min(count, 256)
 
 
@@ -230,15 +233,15 @@ def test_a_killed_run_goes_on(
     command = [sys.executable, "-m", "deepdetect", "extract", str(folder), "--workers", "2"]
     command += ["--max-keypoints", "500", "--json", "-o", str(tmp_path / "f.h5")]
     process = subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL)
-    parts = tmp_path / "f.h5.parts"
+    parts = tmp_path / "f.h5.shards"
     deadline = time.monotonic() + 120
-    while len(list(parts.glob("[0-9a-f]*.h5"))) < 20:
+    while len(list(parts.glob("*/[0-9a-f]*.h5"))) < 20:
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    kept = len(list(parts.glob("[0-9a-f]*.h5")))
+    kept = len(list(parts.glob("*/[0-9a-f]*.h5")))
     assert 20 <= kept < 60
     assert not (tmp_path / "f.h5").exists()
     done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -278,15 +281,3 @@ def test_memory_does_not_grow_with_the_number_of_images(
     )
     few, many = map(int, code.stdout.split())
     assert many < 1.1 * few
-
-
-def test_a_machine_without_the_instructions_fails_as_a_whole(
-    collection: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Machines of a cluster may differ: not each of its images is at fault."""
-    openvino = pytest.importorskip("openvino")
-    monkeypatch.setattr(openvino.Core, "get_property", lambda *_: ["FP32"])
-    arguments = (("precision", "bfloat16"), ("threads", 3))
-    task = (tmp_path / "part.h5", (("b/01.png", (0, 0)),))
-    with pytest.raises(OptionError, match="no instructions for bfloat16"):
-        _extract_part(task, collection(3), FEW, arguments, ("", ""), 1.0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetectError, MissingExtraError, OptionError
-from deepdetect.batch import parted_file
-from deepdetect.batch.parted_file import Group, PartedFile, open_hdf5, state_of, write_groups
+from deepdetect.batch import hdf5
+from deepdetect.batch.hdf5 import Group, ShardedWriter, open_hdf5, state_of, write_groups
 
 
 def group(name: str, value: int, state: int = 1) -> Group:
@@ -19,7 +19,7 @@ def group(name: str, value: int, state: int = 1) -> Group:
 def values(path: Path) -> dict[str, int]:
     """Return the number in each group of a file, which has nothing else."""
     with open_hdf5(path) as file:
-        return {name: int(each["numbers"][0]) for name, each in parted_file._leaves(file)}
+        return {name: int(each["numbers"][0]) for name, each in hdf5._leaves(file)}
 
 
 @pytest.fixture(autouse=True)
@@ -27,11 +27,11 @@ def _h5py() -> None:
     pytest.importorskip("h5py", reason="needs h5py")
 
 
-def test_parts_become_one_file(tmp_path: Path) -> None:
+def test_shards_become_one_file(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
-    with PartedFile(path, {"a": 1}).opened() as file:
-        write_groups(file.part(["x/1"]), [group("x/1", 1)])
-        write_groups(file.part(["y", "x/2"]), [group("y", 2), group("x/2", 3)])
+    with ShardedWriter(path, {"a": 1}).opened() as file:
+        write_groups(file.shard(["x/1"]), [group("x/1", 1)])
+        write_groups(file.shard(["y", "x/2"]), [group("y", 2), group("x/2", 3)])
         assert not path.exists()
         file.merge()
     assert values(path) == {"x/1": 1, "x/2": 3, "y": 2}
@@ -43,55 +43,55 @@ def test_parts_become_one_file(tmp_path: Path) -> None:
 
 def test_what_is_done_is_known_by_its_state(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
-    wanted = [("x", (1,)), ("y", (1,)), ("z", (1,))]
-    with PartedFile(path, {}).opened() as file:
+    wanted = {"x": (1,), "y": (1,), "z": (1,)}
+    with ShardedWriter(path, {}).opened() as file:
         assert file.done(wanted) == set()
-        write_groups(file.part(["x"]), [group("x", 1)])
+        write_groups(file.shard(["x"]), [group("x", 1)])
         file.merge()
-    with PartedFile(path, {}).opened() as file:
-        write_groups(file.part(["y"]), [group("y", 1)])
-    with PartedFile(path, {}).opened() as file:  # as after a kill
+    with ShardedWriter(path, {}).opened() as file:
+        write_groups(file.shard(["y"]), [group("y", 1)])
+    with ShardedWriter(path, {}).opened() as file:  # as after a kill
         assert file.done(wanted) == {"x", "y"}
-        assert file.done([("x", (2,)), ("y", (2,))]) == set()
+        assert file.done({"x": (2,), "y": (2,)}) == set()
 
 
 def test_newer_groups_take_the_place_of_older_ones(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
     for value in (1, 2):
-        with PartedFile(path, {}).opened() as file:
-            write_groups(file.part(["x"]), [group("x", value, value)])
+        with ShardedWriter(path, {}).opened() as file:
+            write_groups(file.shard(["x"]), [group("x", value, value)])
             file.merge()
-    with PartedFile(path, {}).opened() as file:
+    with ShardedWriter(path, {}).opened() as file:
         for value, names in ((3, ["x"]), (4, ["x", "y"]), (5, ["a", "x"])):
-            write_groups(file.part(names), [group("x", value, value)])
+            write_groups(file.shard(names), [group("x", value, value)])
         file.merge()
     assert values(path) == {"x": 5}
 
 
 def test_a_merge_that_fails_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "out.h5"
-    with PartedFile(path, {}).opened() as file:
-        write_groups(file.part(["old"]), [group("old", 0)])
+    with ShardedWriter(path, {}).opened() as file:
+        write_groups(file.shard(["old"]), [group("old", 0)])
         file.merge()
     before = path.read_bytes()
-    copy = parted_file._copy_groups
+    copy = hdf5._copy_groups
     calls: list[Path] = []
 
-    def fail_at_the_second(part: Path, merged: object, names: object) -> None:
-        calls.append(part)
+    def fail_at_the_second(shard: Path, merged: object, stays: object) -> None:
+        calls.append(shard)
         if len(calls) == 2:
             raise OSError(28, "No space left on device")
-        copy(part, merged, names)
+        copy(shard, merged, stays)
 
-    monkeypatch.setattr(parted_file, "_copy_groups", fail_at_the_second)
-    with PartedFile(path, {}).opened() as file:
+    monkeypatch.setattr(hdf5, "_copy_groups", fail_at_the_second)
+    with ShardedWriter(path, {}).opened() as file:
         for name in "xyz":
-            write_groups(file.part([name]), [group(name, ord(name))])
+            write_groups(file.shard([name]), [group(name, ord(name))])
         with pytest.raises(DeepDetectError, match="No space left on device"):
             file.merge()
     assert path.read_bytes() == before
-    with PartedFile(path, {}).opened() as file:
-        assert file.done((name, (1,)) for name in "xyz") == {"x", "y", "z"}
+    with ShardedWriter(path, {}).opened() as file:
+        assert file.done(dict.fromkeys("xyz", (1,))) == {"x", "y", "z"}
         file.merge()
     assert values(path) == {"old": 0, "x": 120, "y": 121, "z": 122}
     assert list(tmp_path.iterdir()) == [path]
@@ -102,48 +102,46 @@ def test_a_full_disk_is_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
     large = [Group(name, {"numbers": np.zeros(20_000)}, (1,)) for name in "abc"]
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with PartedFile(path, {}).opened() as file:
+    with ShardedWriter(path, {}).opened() as file:
         for each in large:
-            write_groups(file.part([each.name]), [each])
+            write_groups(file.shard([each.name]), [each])
         resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, limits[1]))
         try:
             with pytest.raises(DeepDetectError, match=r"cannot write .*out.h5 \(File too large\)"):
                 file.merge()
             with pytest.raises(DeepDetectError, match=r"\(File too large\): free some space"):
-                write_groups(file.part(["all"]), large)
+                write_groups(file.shard(["all"]), large)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        assert len(file._part_files()) == 3
-    assert [each.name for each in tmp_path.iterdir()] == ["out.h5.parts"]
+        assert len(file._shard_files()) == 3
+    assert [each.name for each in tmp_path.iterdir()] == ["out.h5.shards"]
 
 
-def test_a_part_is_whole_or_not_there(tmp_path: Path) -> None:
+def test_a_shard_is_whole_or_not_there(tmp_path: Path) -> None:
     def groups():
         yield group("x", 1)
         raise DeepDetectError("no")
 
     with pytest.raises(DeepDetectError, match="no"):
         write_groups(tmp_path / "part.h5", groups())
-    assert write_groups(tmp_path / "part.h5", []) == 0
+    write_groups(tmp_path / "part.h5", [])
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("place", ["file", "parts"])
-def test_other_settings_are_refused(place: str, tmp_path: Path) -> None:
+def test_other_settings_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
-    with PartedFile(path, {"ratio": 0.8, "same": [1]}).opened() as file:
-        write_groups(file.part(["x"]), [group("x", 1)])
-        if place == "file":
-            file.merge()
+    with ShardedWriter(path, {"ratio": 0.8, "same": [1]}).opened() as file:
+        write_groups(file.shard(["x"]), [group("x", 1)])
+        file.merge()
     other = {"ratio": 0.9, "same": (1,)}
     with (
         pytest.raises(OptionError, match=r"other settings \(`ratio`\).*--overwrite"),
-        PartedFile(path, other).opened(),
+        ShardedWriter(path, other).opened(),
     ):
         pass
-    with PartedFile(path, other, overwrite=True).opened() as file:
-        assert file.done([("x", (1,))]) == set()
-        write_groups(file.part(["y"]), [group("y", 2)])
+    with ShardedWriter(path, other, overwrite=True).opened() as file:
+        assert file.done({"x": (1,)}) == set()
+        write_groups(file.shard(["y"]), [group("y", 2)])
         file.merge()
     assert values(path) == {"y": 2}
 
@@ -156,11 +154,11 @@ def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
         file.create_group("x")
     with (
         pytest.raises(OptionError, match="written by something else"),
-        PartedFile(path, {}).opened(),
+        ShardedWriter(path, {}).opened(),
     ):
         pass
     path.write_bytes(b"no HDF5")
-    with pytest.raises(DeepDetectError, match="is no HDF5 file"), PartedFile(path, {}).opened():
+    with pytest.raises(DeepDetectError, match="is no HDF5 file"), ShardedWriter(path, {}).opened():
         pass
     with pytest.raises(DeepDetectError, match="there is no file"), open_hdf5(tmp_path / "no.h5"):
         pass
@@ -171,11 +169,11 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
     code = (
         "import sys; from pathlib import Path\n"
-        "from deepdetect.batch.parted_file import PartedFile\n"
-        "with PartedFile(Path(sys.argv[1]), {}).opened(): print('opened')\n"
+        "from deepdetect.batch.hdf5 import ShardedWriter\n"
+        "with ShardedWriter(Path(sys.argv[1]), {}).opened(): print('opened')\n"
     )
     command = [sys.executable, "-c", code, str(path)]
-    with PartedFile(path, {}).opened():
+    with ShardedWriter(path, {}).opened():
         other = subprocess.run(command, capture_output=True, text=True)
         assert "is being written by another process" in other.stderr
     assert subprocess.run(command, capture_output=True, text=True).stdout == "opened\n"
@@ -185,7 +183,7 @@ def test_without_h5py(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
     with (
         pytest.raises(MissingExtraError, match="pip install h5py"),
-        PartedFile(tmp_path / "out.h5", {}).opened(),
+        ShardedWriter(tmp_path / "out.h5", {}).opened(),
     ):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -193,42 +191,45 @@ def test_without_h5py(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_replacing_goes_on_after_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
-    with PartedFile(path, {"ratio": 0.8}).opened() as file:
-        write_groups(file.part(["x"]), [group("x", 1)])
+    with ShardedWriter(path, {"ratio": 0.8}).opened() as file:
+        write_groups(file.shard(["x"]), [group("x", 1)])
         file.merge()
     new = {"ratio": 0.9}
-    with PartedFile(path, new, overwrite=True).opened() as file:
-        write_groups(file.part(["x"]), [group("x", 2)])
-    with PartedFile(path, new, overwrite=True).opened() as file:  # as after a kill
-        assert file.done([("x", (1,)), ("y", (1,))]) == {"x"}
-    with PartedFile(path, {"ratio": 1}, overwrite=True).opened() as file:
-        assert file.done([("x", (1,))]) == set()
-        write_groups(file.part(["x"]), [group("x", 3)])
+    with ShardedWriter(path, new, overwrite=True).opened() as file:
+        write_groups(file.shard(["x"]), [group("x", 2)])
+    with ShardedWriter(path, new, overwrite=True).opened() as file:  # as after a kill
+        assert file.done({"x": (1,), "y": (1,)}) == {"x"}
+    with ShardedWriter(path, {"ratio": 1}, overwrite=True).opened() as file:
+        assert file.done({"x": (1,)}) == set()
+        write_groups(file.shard(["x"]), [group("x", 3)])
         file.merge()
     assert values(path) == {"x": 3}
 
 
-def test_a_start_that_failed_does_not_fix_the_settings(tmp_path: Path) -> None:
+def test_shards_of_other_settings_are_not_used(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
-    with PartedFile(path, {"ratio": 0.8}).opened():
-        pass
-    with PartedFile(path, {"ratio": 0.9}).opened() as file:
-        write_groups(file.part(["x"]), [group("x", 1)])
-    with pytest.raises(OptionError, match="`ratio`"), PartedFile(path, {"ratio": 0.8}).opened():
-        pass
+    for ratio in (0.8, 0.9):
+        with ShardedWriter(path, {"ratio": ratio}).opened() as file:
+            assert file.done({"x": (1,)}) == set()
+            write_groups(file.shard(["x"]), [group("x", round(10 * ratio))])
+    with ShardedWriter(path, {"ratio": 0.8}).opened() as file:
+        assert file.done({"x": (1,)}) == {"x"}
+        file.merge()
+    assert values(path) == {"x": 8}
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_only_named_groups_stay(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
-    with PartedFile(path, {}).opened() as file:
-        write_groups(file.part(["x", "y"]), [group("x", 1), group("y/1", 1), group("y/2", 1)])
-        file.merge(names={"x", "y/1", "y/2"})
-    with PartedFile(path, {}).opened() as file:
-        file.merge(names={"x", "y/2"})
+    with ShardedWriter(path, {}).opened() as file:
+        write_groups(file.shard(["x", "y"]), [group("x", 1), group("y/1", 1), group("y/2", 1)])
+        file.merge(stays={"x", "y/1", "y/2"}.__contains__)
+    with ShardedWriter(path, {}).opened() as file:
+        file.merge(stays={"x", "y/2"}.__contains__)
     assert values(path) == {"x": 1, "y/2": 1}
-    with PartedFile(path, {}).opened() as file:
-        write_groups(file.part(["z"]), [group("y/2", 2), group("z", 2)])
-        file.merge(names={"y/2"})
+    with ShardedWriter(path, {}).opened() as file:
+        write_groups(file.shard(["z"]), [group("y/2", 2), group("z", 2)])
+        file.merge(stays={"y/2"}.__contains__)
     assert values(path) == {"y/2": 2}
 
 
@@ -236,7 +237,7 @@ def test_only_named_groups_stay(tmp_path: Path) -> None:
 def test_a_folder_is_no_file(overwrite: bool, tmp_path: Path) -> None:
     with (
         pytest.raises(OptionError, match="is a folder: name a file in it with -o"),
-        PartedFile(tmp_path, {}, overwrite).opened(),
+        ShardedWriter(tmp_path, {}, overwrite).opened(),
     ):
         pass
     with pytest.raises(DeepDetectError, match="is a folder"), open_hdf5(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 from deepdetect import DeepDetectError, OptionError, PointDetector
 from deepdetect.batch import PairMatchingOptions, extract_features, match_pairs
 from deepdetect.batch.pair_list import pair_name, read_pairs
-from deepdetect.batch.pair_matching import match_features
+from deepdetect.batch.pair_matching import match_rows
 
 PAIR = ("a/00.png", "b/01.png")
 
@@ -53,7 +53,7 @@ def test_the_layout_is_that_of_hloc(features: Path, tmp_path: Path) -> None:
     assert (matches.shape, matches.dtype) == ((len(points0),), np.int32)
     assert (scores.shape, scores.dtype) == ((len(points0),), np.float32)
     rows = np.flatnonzero(matches != -1)
-    assert report.matches == {PAIR: len(rows)}
+    assert report.counts == {PAIR: len(rows)}
     assert (scores[rows] > 0).all()
     assert (scores[matches == -1] == 0).all()
     assert len(set(matches[rows])) == len(rows)
@@ -68,11 +68,11 @@ def test_what_is_done_is_skipped(features: Path, tmp_path: Path) -> None:
     assert match_pairs(features, [PAIR], path, workers=1).skipped == 0
     more = [PAIR[::-1], ("b/01.png", "a/02.png")]
     report = match_pairs(features, more, path, workers=1)
-    assert (list(report.matches), report.skipped) == ([more[1]], 1)
+    assert (list(report.counts), report.skipped) == ([more[1]], 1)
     with pytest.raises(OptionError, match=r"other settings \(`ratio`\)"):
         match_pairs(features, more, path, options=PairMatchingOptions(ratio=0.7))
     report = match_pairs(features, more, path, workers=1, overwrite=True)
-    assert len(report.matches) == 2
+    assert len(report.counts) == 2
 
 
 def test_features_that_have_changed_are_matched_again(
@@ -84,7 +84,7 @@ def test_features_that_have_changed_are_matched_again(
     (folder / "a/00.png").write_bytes((folder / "a/04.png").read_bytes())
     extract_features(folder, features, PointDetector(300), workers=1)
     report = match_pairs(features, pairs, path, workers=1)
-    assert (list(report.matches), report.skipped) == ([PAIR], 1)
+    assert (list(report.counts), report.skipped) == ([PAIR], 1)
     fewer = PointDetector(100)
     extract_features(folder, features, fewer, workers=1, overwrite=True)
     with pytest.raises(OptionError, match="`features`"):
@@ -94,7 +94,7 @@ def test_features_that_have_changed_are_matched_again(
 def test_pairs_without_features_do_not_stop_the_others(features: Path, tmp_path: Path) -> None:
     pairs = [("a/00.png", "no.png"), PAIR, ("a-00.png", "no.png")]
     report = match_pairs(features, pairs, tmp_path / "m.h5", workers=1)
-    assert list(report.matches) == [PAIR]
+    assert list(report.counts) == [PAIR]
     assert [failure.split(": ")[1] for failure in report.failures] == [
         "features.h5 has no features of no.png",
         "features.h5 has no features of a-00.png",
@@ -108,7 +108,7 @@ def test_two_pairs_of_one_name_are_not_mixed_up(features: Path, tmp_path: Path) 
         file.copy("a/00.png", file, name="a-00.png")
     pairs = [PAIR, ("a-00.png", "b/01.png")]
     report = match_pairs(features, pairs, tmp_path / "m.h5", workers=1)
-    assert list(report.matches) == [PAIR]
+    assert list(report.counts) == [PAIR]
     assert "is that of a/00.png b/01.png, too" in report.failures[0]
 
 
@@ -165,7 +165,7 @@ def test_more_keypoints_than_int16_holds() -> None:
     many = generator.integers(0, 256, (40_000, 16), np.uint8)
     positions = generator.uniform(0, 500, (40_000, 2)).astype(np.float32)
     last = np.array([39_999, 39_998])
-    matches, scores = match_features(
+    matches, scores = match_rows(
         (positions[last], many[last]),
         (positions, many),
         PairMatchingOptions(matcher="exact"),
@@ -196,7 +196,7 @@ def test_features_of_other_programs_that_have_changed(tmp_path: Path) -> None:
     features["x"] = features["x"][0], features["x"][1][:, ::-1]
     write_foreign(path, **features)
     report = match_pairs(path, pairs, tmp_path / "m.h5", workers=1)
-    assert (list(report.matches), report.skipped) == ([("x", "y")], 1)
+    assert (list(report.counts), report.skipped) == ([("x", "y")], 1)
 
 
 def test_features_that_do_not_fit_do_not_stop_the_others(tmp_path: Path) -> None:
@@ -212,7 +212,7 @@ def test_features_that_do_not_fit_do_not_stop_the_others(tmp_path: Path) -> None
     )
     pairs = [("good", name) for name in ("same", "wide", "few", "flat", "same/keypoints")]
     report = match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5", workers=1)
-    assert report.matches == {("good", "same"): 40}
+    assert report.counts == {("good", "same"): 40}
     told = {failure.split(": ")[0]: failure for failure in report.failures}
     assert "descriptors of good have 8 numbers, those of wide have 9" in told["good wide"]
     assert "(40, 2) and descriptors of shape (8, 20)" in told["good few"]
@@ -223,12 +223,10 @@ def test_features_that_do_not_fit_do_not_stop_the_others(tmp_path: Path) -> None
 def test_pairs_from_python(features: Path, tmp_path: Path) -> None:
     pairs = [PAIR, PAIR[::-1], list(PAIR)]
     report = match_pairs(features, pairs, tmp_path / "m.h5", workers=1)
-    assert (list(report.matches), report.skipped) == ([PAIR], 0)
+    assert (list(report.counts), report.skipped) == ([PAIR], 0)
 
 
-@pytest.mark.parametrize(
-    "pairs", [["a.jpg"], ["ab"], [("a", "b", "c")], [(1, 2)], [1], 1, [("a", "a")], [("a", "")]]
-)
+@pytest.mark.parametrize("pairs", [["a.jpg"], ["ab"], [("a", "b", "c")], [("a", "a")], [("a", "")]])
 def test_wrong_pairs_from_python(pairs: object, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="in `pairs` is no pair"):
         match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5")
@@ -313,7 +311,7 @@ def test_matches_of_features_that_are_gone_go_too(features: Path, tmp_path: Path
     with h5py.File(less, "r+") as file:
         del file[PAIR[1]]
     report = match_pairs(less, [PAIR], path, workers=1)
-    assert (report.matches, len(report.failures)) == ({}, 1)
+    assert (report.counts, len(report.failures)) == ({}, 1)
     with h5py.File(path) as file:
         assert pair_name(*PAIR) not in file
 
@@ -325,7 +323,7 @@ def test_features_that_are_no_numbers_do_not_stop_the_others(tmp_path: Path) -> 
     write_foreign(tmp_path / "f.h5", good=whole, same=whole, unknown=(unknown, whole[1]))
     pairs = [("good", name) for name in ("same", "unknown")]
     report = match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5", workers=1)
-    assert report.matches == {("good", "same"): 40}
+    assert report.counts == {("good", "same"): 40}
     assert "the features of unknown are not all finite numbers" in report.failures[0]
 
 
@@ -347,7 +345,7 @@ def test_damaged_features_do_not_stop_the_others(tmp_path: Path) -> None:
     content[at] ^= 1
     path.write_bytes(content)
     report = match_pairs(path, [("good", "bad"), ("good", "same")], tmp_path / "m.h5", workers=1)
-    assert report.matches == {("good", "same"): 40}
+    assert report.counts == {("good", "same"): 40}
     assert re.fullmatch(
         r"good bad: .*f\.h5, bad is damaged \(.*\): write it again", *report.failures
     )

@@ -71,9 +71,9 @@ def start(
     )
 
 
-def wait_for_parts(output: Path, count: int, process: subprocess.Popen[str]) -> None:
+def wait_for_shards(output: Path, count: int, process: subprocess.Popen[str]) -> None:
     """Wait until so many parts of an extraction are written."""
-    wait_for_files(output.with_name(output.name + ".parts"), "[0-9a-f]*.h5", count, process)
+    wait_for_files(output.with_name(output.name + ".shards"), "*/[0-9a-f]*.h5", count, process)
 
 
 def wait_for_files(folder: Path, pattern: str, count: int, process: subprocess.Popen[str]) -> None:
@@ -144,7 +144,7 @@ def test_a_worker_is_killed_half_way(
     folder, output = collection(60), tmp_path / "f.h5"
     process = start(folder, output)
     try:
-        wait_for_parts(output, 30, process)
+        wait_for_shards(output, 30, process)
         workers = descendants(process.pid, "ray::MapWorker")
         assert len(workers) == 2
         os.kill(workers[0], signal.SIGKILL)
@@ -200,7 +200,7 @@ def test_the_driver_is_killed_half_way(
 ) -> None:
     folder, output = collection(60), tmp_path / "f.h5"
     process = start(folder, output)
-    wait_for_parts(output, 30, process)
+    wait_for_shards(output, 30, process)
     process.kill()
     process.communicate()
     deadline = time.monotonic() + 60
@@ -208,7 +208,7 @@ def test_the_driver_is_killed_half_way(
         assert time.monotonic() < deadline
         time.sleep(0.1)
     time.sleep(5)  # for the workers, which have other command lines
-    kept = len(list(output.with_name("f.h5.parts").glob("[0-9a-f]*.h5")))
+    kept = len(list(output.with_name("f.h5.shards").glob("*/[0-9a-f]*.h5")))
     assert kept >= 30
     process = start(folder, output)
     try:
@@ -235,7 +235,7 @@ def test_a_machine_of_a_cluster_is_lost_half_way(
         second = cluster.add_node(num_cpus=1, object_store_memory=memory)
         process = start(folder, output, cluster.address)
         try:
-            wait_for_parts(output, 30, process)
+            wait_for_shards(output, 30, process)
             cluster.remove_node(second, allow_graceful=False)
             check(process, folder, output, same_content)
         finally:

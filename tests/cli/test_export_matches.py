@@ -163,7 +163,7 @@ def test_what_is_wrong_is_said_before_the_work(
         pytest.importorskip("pycolmap", reason="needs pycolmap")
     shutil.copytree(photos, tmp_path / "photos")
     (tmp_path / "photos" / "cat.jpg").rename(tmp_path / "photos" / "my cat.jpg")
-    monkeypatch.setattr(deepdetect.interchange, "match_photographs", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(deepdetect.interchange, "match_folder", lambda *_, **__: 1 / 0)
     result = run("export", *words.split())
     assert result.exit_code == 2, result.output
     assert message in result.stderr

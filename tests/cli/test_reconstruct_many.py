@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect.cli._reconstruct_many import MAX_LEFT_OUT_ROWS, left_out_rows
+from deepdetect.cli._reconstruct_many import MAX_UNREGISTERED_ROWS, unregistered_rows
 
 from .conftest import one_sentence
 
@@ -36,8 +36,8 @@ def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
     assert result.exit_code == 0, result.output
     values = json.loads(result.stdout)
     assert values == json.loads(Path("model/model.json").read_text())
-    assert (values["photographs"], values["registered"]) == (4, 3)
-    assert list(values["left_out"]) == ["black.png"]
+    assert (values["images"], values["registered"]) == (4, 3)
+    assert list(values["unregistered"]) == ["black.png"]
     assert values["dense_points"] > 1000
     assert values["cameras"]["0005.jpg"]["intrinsics"] == "focal_px"
     assert set(values["seconds"]) == {"features", "matching", "mapping", "dense points"}
@@ -48,7 +48,7 @@ def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
     again = run(*arguments, "--max-keypoints", 1500)
     assert again.exit_code == 0, again.output
     assert "3 of 4" in again.stdout
-    assert "left out: black.png" in again.stdout
+    assert "unregistered: black.png" in again.stdout
     assert "verified of 3 (all of them)" in again.stdout
     other = run(*arguments, "--max-keypoints", 1000)
     assert other.exit_code == 2
@@ -72,14 +72,14 @@ def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
 
 def test_many_that_are_left_out_are_few_lines() -> None:
     group = [f"wall-{k}.jpg" for k in range(30)]
-    alone = [f"sky-{k:02}.jpg" for k in range(MAX_LEFT_OUT_ROWS + 2)]
-    rows = left_out_rows(dict.fromkeys([*group, *alone], "why"), [group])
-    assert rows[0][0] == "left out: 30 photographs"
+    alone = [f"sky-{k:02}.jpg" for k in range(MAX_UNREGISTERED_ROWS + 2)]
+    rows = unregistered_rows(dict.fromkeys([*group, *alone], "why"), [group])
+    assert rows[0][0] == "unregistered: 30 images"
     assert rows[0][1].startswith("wall-0.jpg and 29 more hang together")
-    assert rows[1] == ("left out: sky-00.jpg", "why")
-    assert rows[-1] == ("left out", "2 more, listed in model.json")
-    assert len(rows) == 1 + MAX_LEFT_OUT_ROWS + 1
-    assert left_out_rows({"a.jpg": "why"}, []) == [("left out: a.jpg", "why")]
+    assert rows[1] == ("unregistered: sky-00.jpg", "why")
+    assert rows[-1] == ("unregistered", "2 more, listed in model.json")
+    assert len(rows) == 1 + MAX_UNREGISTERED_ROWS + 1
+    assert unregistered_rows({"a.jpg": "why"}, []) == [("unregistered: a.jpg", "why")]
 
 
 def test_a_list_of_photographs_is_a_folder(run, fountain: Path) -> None:
@@ -92,7 +92,7 @@ def test_a_list_of_photographs_is_a_folder(run, fountain: Path) -> None:
     # More photographs are added to them; fewer would be another model.
     added = run("reconstruct", *images, fountain / "black.png", *more, "--sequential", 2)
     assert added.exit_code == 0, added.output
-    assert json.loads(added.stdout)["photographs"] == 4
+    assert json.loads(added.stdout)["images"] == 4
     fewer = run("reconstruct", *images, *more, "--sequential", 2)
     assert fewer.exit_code == 2
     assert "made from" in fewer.stderr
@@ -109,7 +109,7 @@ def test_results_within_the_folder_are_no_photographs(
     whole = run("reconstruct", ".", *few, "--json")
     assert whole.exit_code == 0, whole.output
     values = json.loads(whole.stdout)
-    assert (values["photographs"], values["registered"]) == (4, 3)
+    assert (values["images"], values["registered"]) == (4, 3)
     drawn = run("detect", "0004.jpg", "-o", "drawn", "--max-keypoints", 100)
     assert drawn.exit_code == 0, drawn.output
     refused = run("reconstruct", ".", *few)

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("h5py", reason="needs h5py")
 
 from deepdetect import Keypoints, PointDetector
-from deepdetect.interchange import Collection, PairMatches, match_photographs
+from deepdetect.interchange import Collection, PairMatches, match_folder
 
 FOUNTAIN = ("0003", "0004", "0005", "0006")
 
@@ -54,7 +54,7 @@ def fountain(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def fountain_collection(fountain: Path) -> Collection:
     """Their keypoints and matches, all pairs."""
     pytest.importorskip("h5py", reason="needs h5py")
-    return match_photographs(fountain, PointDetector(1500), workers=1)
+    return match_folder(fountain, PointDetector(1500), workers=1)
 
 
 @pytest.fixture(scope="session")

@@ -13,15 +13,15 @@ from deepdetect import Camera, Keypoints, OptionError
 from deepdetect.interchange import Collection
 from deepdetect.interchange.colmap import write_colmap, write_colmap_text
 from deepdetect.sfm.colmap import import_pycolmap
-from deepdetect.sfm.lens import Lens
+from deepdetect.sfm.intrinsics import CameraIntrinsics
 
-LENS = Lens.of_camera(Camera((120, 110), 100.0))
+INTRINSICS = CameraIntrinsics.of_camera(Camera((120, 110), 100.0))
 
 
 def test_colmap_reads_what_is_written(small_collection: Collection, tmp_path: Path) -> None:
     pycolmap = import_pycolmap()
-    lenses = dict.fromkeys(small_collection.keypoints, LENS)
-    (path,) = write_colmap(small_collection, tmp_path / "d.db", lenses=lenses, verify=False)
+    intrinsics = dict.fromkeys(small_collection.keypoints, INTRINSICS)
+    (path,) = write_colmap(small_collection, tmp_path / "d.db", intrinsics=intrinsics, verify=False)
     with pycolmap.Database.open(path) as database:
         assert database.num_cameras() == 1
         ids = {image.name: image.image_id for image in database.read_all_images()}
@@ -62,7 +62,7 @@ def test_the_centre_of_a_pixel_is_where_colmap_finds_it(tmp_path: Path) -> None:
     write_colmap(
         Collection({"blob.png": points}),
         tmp_path / "ours.db",
-        lenses={"blob.png": Lens.initial((64, 64))},
+        intrinsics={"blob.png": CameraIntrinsics.initial((64, 64))},
     )
     places = []
     for name in ("theirs.db", "ours.db"):
@@ -75,9 +75,9 @@ def test_the_centre_of_a_pixel_is_where_colmap_finds_it(tmp_path: Path) -> None:
 def test_it_is_mapped(fountain, fountain_collection, map_database, tmp_path: Path) -> None:
     size = next(iter(fountain_collection.keypoints.values())).image_size
     # All four by one camera, whose focal length was measured: 2759 px of 3072.
-    lens = Lens.of_camera(Camera(size, 2759.48 * size[0] / 3072))
-    lenses = dict.fromkeys(fountain_collection.keypoints, lens)
-    (path,) = write_colmap(fountain_collection, tmp_path / "d.db", lenses=lenses)
+    own = CameraIntrinsics.of_camera(Camera(size, 2759.48 * size[0] / 3072))
+    intrinsics = dict.fromkeys(fountain_collection.keypoints, own)
+    (path,) = write_colmap(fountain_collection, tmp_path / "d.db", intrinsics=intrinsics)
     model = map_database(path, fountain, tmp_path / "sparse")
     assert model.num_reg_images() == 4
     assert model.num_points3D() > 300
@@ -87,16 +87,18 @@ def test_it_is_mapped(fountain, fountain_collection, map_database, tmp_path: Pat
 def test_without_sizes_and_descriptors(tmp_path: Path) -> None:
     pycolmap = import_pycolmap()
     points = Keypoints([[3, 4]], [1], (120, 110))
-    (path,) = write_colmap(Collection({"a": points}), tmp_path / "d.db", lenses={"a": LENS})
+    (path,) = write_colmap(
+        Collection({"a": points}), tmp_path / "d.db", intrinsics={"a": INTRINSICS}
+    )
     with pycolmap.Database.open(path) as database:
         np.testing.assert_allclose(database.read_keypoints(1)[:, :2], [[3.5, 4.5]])
         assert not len(database.read_descriptors(1).data)
     with pytest.raises(OptionError, match="SIFT descriptors"):
         write_colmap_text(Collection({"a": points}), tmp_path / "text")
     with pytest.raises(OptionError, match="no camera"):
-        write_colmap(Collection({"a": points}), tmp_path / "e.db", lenses={})
+        write_colmap(Collection({"a": points}), tmp_path / "e.db", intrinsics={})
     with pytest.raises(OptionError, match=r"\.db"):
-        write_colmap(Collection({"a": points}), tmp_path / "e.txt", lenses={"a": LENS})
+        write_colmap(Collection({"a": points}), tmp_path / "e.txt", intrinsics={"a": INTRINSICS})
 
 
 def test_text_files_hold_what_colmap_documents(

@@ -17,7 +17,7 @@ from deepdetect import (
 )
 from deepdetect._shared.errors import BatchError
 from deepdetect.batch import extract_features, match_pairs
-from deepdetect.interchange import match_photographs, read_collection
+from deepdetect.interchange import match_folder, read_collection
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_files_of_extract_and_match_many(pair: Path, tmp_path: Path) -> None:
     extract_features(pair, tmp_path / "f.h5", workers=1)
     match_pairs(tmp_path / "f.h5", [("left_1.png", "right.png")], tmp_path / "m.h5", workers=1)
     found = read_collection([tmp_path / "f.h5"], matches=tmp_path / "m.h5", images=pair)
-    again = match_photographs(pair, workers=1)
+    again = match_folder(pair, workers=1)
     assert list(found.keypoints) == ["left_1.png", "right.png"]
     assert found.path("right.png") == pair / "right.png"
     for name, points in found.keypoints.items():
@@ -172,26 +172,26 @@ def test_the_folder_of_other_photographs_is_refused(tmp_path: Path, one_line) ->
 
 def test_a_bad_photograph_does_not_stop_the_others(pair: Path) -> None:
     (pair / "middle.png").write_bytes(b"no image")
-    found = match_photographs(pair, PointDetector(300), sequential=1, workers=1)
+    found = match_folder(pair, PointDetector(300), sequential=1, workers=1)
     assert list(found.keypoints) == ["left_1.png", "right.png"]
     assert list(found.matches) == [("left_1.png", "right.png")]  # the next one that can be read
     (failure,) = found.failures
     assert "middle.png is not an image" in failure
     pairs = [("left_1.png", "right.png"), ("middle.png", "right.png"), ("right.png", "typo.png")]
-    named = match_photographs(pair, PointDetector(300), pairs=pairs, workers=1)
+    named = match_folder(pair, PointDetector(300), pairs=pairs, workers=1)
     assert list(named.matches) == pairs[:1]
     assert [failure.split()[-1] for failure in named.failures] == ["JPEG", "typo.png"]
     for name in ("left_1.png", "right.png"):
         (pair / name).write_bytes(b"no image")
     with pytest.raises(BatchError, match="3 of 3 images failed"):
-        match_photographs(pair, workers=1)
+        match_folder(pair, workers=1)
 
 
 def test_pairs_of_a_folder(pair: Path) -> None:
-    one = match_photographs(pair, PointDetector(100), sequential=1, workers=1)
+    one = match_folder(pair, PointDetector(100), sequential=1, workers=1)
     assert list(one.matches) == [("left_1.png", "right.png")]
     assert max(len(points) for points in one.keypoints.values()) == 100
     with pytest.raises(OptionError, match="not both"):
-        match_photographs(pair, sequential=1, pairs=[("left_1.png", "right.png")])
+        match_folder(pair, sequential=1, pairs=[("left_1.png", "right.png")])
     with pytest.raises(OptionError, match="sequential"):
-        match_photographs(pair, sequential=0)
+        match_folder(pair, sequential=0)

@@ -6,16 +6,17 @@ import numpy as np
 
 from deepdetect.geometry.camera import Camera
 from deepdetect.sfm.database import DatabaseImage, write_database
-from deepdetect.sfm.lens import Lens
+from deepdetect.sfm.intrinsics import CameraIntrinsics
 
 
 def test_colmap_reads_what_is_written(pycolmap, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    shared, own = Lens.of_camera(Camera((640, 480), 500.0)), Lens.initial((320, 240))
+    shared = CameraIntrinsics.of_camera(Camera((640, 480), 500.0))
+    own = CameraIntrinsics.initial((320, 240))
     names = ["a b.jpg", "sub/ü.jpg", "c.jpg"]
     images = [
-        DatabaseImage(name, lens, rng.uniform(0, 200, (20, 2)).astype(np.float32))
-        for name, lens in zip(names, (shared, shared, own), strict=True)
+        DatabaseImage(name, camera, rng.uniform(0, 200, (20, 2)).astype(np.float32))
+        for name, camera in zip(names, (shared, shared, own), strict=True)
     ]
     rows = np.array([[0, 3], [5, 1]])
     write_database(tmp_path / "d.db", images, {("c.jpg", "a b.jpg"): rows})

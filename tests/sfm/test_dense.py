@@ -1,16 +1,17 @@
-"""Which photographs are matched for dense points; their points are tested with the pipeline."""
+"""Which images are matched for dense points; their points are tested with the pipeline."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
+import pytest
 
 from deepdetect.geometry.camera import Camera
 from deepdetect.geometry.posed_view import PosedView
+from deepdetect.sfm import dense
 from deepdetect.sfm.dense import find_references, limited_view
-from deepdetect.sfm.fusion import DenseOptions
-from deepdetect.sfm.lens import Lens
+from deepdetect.sfm.intrinsics import CameraIntrinsics
 from deepdetect.sfm.mapping import Observations, SparseModel
 
 SIZE = (320, 240)
@@ -25,7 +26,8 @@ def view(x: float, name: str = "") -> PosedView:
     return PosedView(name, Camera(SIZE, 300.0), rotation, -rotation @ [x, 0, 0])
 
 
-def test_neighbours_share_points_at_a_good_angle() -> None:
+def test_neighbours_share_points_at_a_good_angle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dense, "NEIGHBOURS", 2)
     views = {k: view(x, str(k)) for k, x in enumerate((0.0, 0.02, 0.6, 1.2, 9.0))}
     rng = np.random.default_rng(0)
     points = rng.uniform((-1, -1, 5.5), (1, 1, 6.5), (200, 3))
@@ -35,10 +37,10 @@ def test_neighbours_share_points_at_a_good_angle() -> None:
             rows.append(row)
             numbers.append(number)
             xy.append(own.project(point[None])[0][0])
-    seen = Observations(np.array(rows), np.array(numbers), np.array(xy))
-    lenses = {number: Lens.of_camera(own.camera) for number, own in views.items()}
-    sparse = SparseModel(views, lenses, points, np.zeros(200), seen)
-    found = {each.view.name: each for each in find_references(sparse, DenseOptions(neighbours=2))}
+    seen = Observations(np.array(rows), np.array(numbers), np.array(xy), np.array(rows))
+    intrinsics = {number: CameraIntrinsics.of_camera(own.camera) for number, own in views.items()}
+    sparse = SparseModel(views, intrinsics, points, np.zeros(200), seen)
+    found = {each.view.name: each for each in find_references(sparse)}
     assert {each.view.name for each in found["0"].neighbours} == {"2", "3"}
     first = found["0"].neighbours[0]
     np.testing.assert_allclose(first.points0, views[0].project(points)[0])
@@ -47,11 +49,12 @@ def test_neighbours_share_points_at_a_good_angle() -> None:
     assert find_references(lonely) == []
 
 
-def test_a_smaller_view_sees_the_same_directions() -> None:
+def test_a_smaller_view_sees_the_same_directions(monkeypatch: pytest.MonkeyPatch) -> None:
     own = view(0.5)
-    small = limited_view(own, DenseOptions(max_side_px=160))
+    assert limited_view(own) is own
+    monkeypatch.setattr(dense, "MAX_SIDE_PX", 160)
+    small = limited_view(own)
     assert small.camera.size == (160, 120)
     points = np.array([[0.3, -0.2, 6.0]])
     expected = (own.project(points)[0] + 0.5) / 2 - 0.5
     np.testing.assert_allclose(small.project(points)[0], expected)
-    assert limited_view(own, DenseOptions()) is own

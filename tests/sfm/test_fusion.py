@@ -5,15 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect import OptionError
 from deepdetect.geometry.camera import Camera
 from deepdetect.geometry.posed_view import PosedView
-from deepdetect.sfm.fusion import (
-    DenseOptions,
-    DensePoints,
-    fuse_matches,
-    merge_dense_points,
-)
+from deepdetect.sfm import fusion
+from deepdetect.sfm.fusion import DensePoints, fuse_matches, merge_dense_points
 
 SIZE = (320, 240)
 
@@ -46,12 +41,13 @@ def test_exact_matches_give_the_points(scene) -> None:
     assert (counts == 5).all()
 
 
-def test_noise_is_averaged_over_the_views(scene) -> None:
+def test_noise_is_averaged_over_the_views(scene, monkeypatch: pytest.MonkeyPatch) -> None:
     reference, others, xy, points = scene
     rng = np.random.default_rng(1)
     matches = [other.project(points)[0] + rng.normal(0, 0.1, xy.shape) for other in others]
     several, errors, counts = fuse_matches(reference, xy, others, matches)
-    single, _, _ = fuse_matches(reference, xy, others[2:3], matches[2:3], DenseOptions(min_views=2))
+    monkeypatch.setattr(fusion, "MIN_VIEWS", 2)
+    single, _, _ = fuse_matches(reference, xy, others[2:3], matches[2:3])
     good = counts > 0
     assert good.mean() > 0.95
     assert 0.05 < np.median(errors[good]) < 0.15
@@ -72,14 +68,15 @@ def test_a_wrong_match_is_outvoted(scene) -> None:
     assert errors.max() < 1e-6
 
 
-def test_two_views_are_not_enough(scene) -> None:
+def test_two_views_are_not_enough(scene, monkeypatch: pytest.MonkeyPatch) -> None:
     reference, others, xy, points = scene
     matches = [other.project(points)[0] for other in others[:2]]
     matches[1][:250] = np.nan  # there is no match
     matches[1][250:] += (30, 0)  # a match that contradicts
     _, _, counts = fuse_matches(reference, xy, others[:2], matches)
     assert not counts.any()
-    _, _, counts = fuse_matches(reference, xy, others[:2], matches, DenseOptions(min_views=2))
+    monkeypatch.setattr(fusion, "MIN_VIEWS", 2)
+    _, _, counts = fuse_matches(reference, xy, others[:2], matches)
     assert (counts >= 2).all()
 
 
@@ -117,22 +114,16 @@ def surface(reference: PosedView, depth: float = 6.0, stride: int = 2) -> DenseP
 def test_what_two_references_show_is_kept_once() -> None:
     first, second = view(0), view(0.5)
     parts = [(first, surface(first)), (second, surface(second))]
-    merged = merge_dense_points(parts)
+    merged = merge_dense_points(parts, 2)
     new = len(merged) - len(parts[0][1])
     projected, _ = first.project(parts[1][1].points)
     outside = (~((projected > -1) & (projected < SIZE)).all(axis=1)).sum()
     assert outside > 300
     assert outside <= new < 1.3 * outside + 600
-    assert len(merge_dense_points(parts[:1])) == len(parts[0][1])
+    assert len(merge_dense_points(parts[:1], 2)) == len(parts[0][1])
 
 
 def test_another_surface_is_no_duplicate() -> None:
     first, second = view(0), view(0.01)
     parts = [(first, surface(first, 6.0)), (second, surface(second, 5.0))]
-    assert len(merge_dense_points(parts)) == len(parts[0][1]) + len(parts[1][1])
-
-
-@pytest.mark.parametrize("wrong", [{"min_views": 1}, {"stride_px": 0}, {"max_error_px": -1}])
-def test_wrong_options_are_refused(wrong: dict) -> None:
-    with pytest.raises(OptionError, match="must be"):
-        DenseOptions(**wrong)
+    assert len(merge_dense_points(parts, 2)) == len(parts[0][1]) + len(parts[1][1])

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import Calibration, Camera, ReconstructionError
-from deepdetect.sfm.intrinsics import known_cameras, photograph_lenses
+from deepdetect.sfm.intrinsics import CameraIntrinsics, initial_intrinsics, known_cameras
 
 SIZES = {"a.jpg": (640, 480), "b.jpg": (640, 480), "c.jpg": (320, 240)}
 
@@ -19,41 +19,93 @@ def write(folder: Path, name: str, focal_35mm: int | None) -> None:
     Image.new("RGB", SIZES[name]).save(folder / name, exif=exif)
 
 
-def test_photographs_of_one_size_and_focal_length_share_a_camera(tmp_path: Path) -> None:
+def test_images_of_one_size_and_focal_length_share_a_camera(tmp_path: Path) -> None:
     for name in SIZES:
         write(tmp_path, name, 28)
-    lenses = photograph_lenses(tmp_path, list(SIZES), SIZES, {})
-    assert lenses["a.jpg"] is lenses["b.jpg"]
-    assert lenses["c.jpg"] is not lenses["a.jpg"]
-    assert {lens.source for lens in lenses.values()} == {"EXIF"}
+    found = initial_intrinsics(tmp_path, SIZES)
+    assert found["a.jpg"] is found["b.jpg"]
+    assert found["c.jpg"] is not found["a.jpg"]
+    assert {own.source for own in found.values()} == {"EXIF"}
     expected = 28 * np.hypot(640, 480) / np.hypot(36, 24)
-    assert lenses["a.jpg"].params[0] == pytest.approx(expected)
+    assert found["a.jpg"].params[0] == pytest.approx(expected)
     write(tmp_path, "b.jpg", 50)
-    zoomed = photograph_lenses(tmp_path, list(SIZES), SIZES, {})
+    zoomed = initial_intrinsics(tmp_path, SIZES)
     assert zoomed["a.jpg"] is not zoomed["b.jpg"]
     assert zoomed["b.jpg"].params[0] > zoomed["a.jpg"].params[0]
-    one = photograph_lenses(tmp_path, list(SIZES), SIZES, {}, single_camera=True)
+    one = initial_intrinsics(tmp_path, SIZES, single_camera=True)
     assert one["a.jpg"] is one["b.jpg"]
-    each = photograph_lenses(tmp_path, list(SIZES), SIZES, {}, single_camera=False)
-    assert len({id(lens) for lens in each.values()}) == 3
+    each = initial_intrinsics(tmp_path, SIZES, single_camera=False)
+    assert len({id(own) for own in each.values()}) == 3
 
 
 def test_without_exif_the_focal_length_is_given_or_guessed(tmp_path: Path) -> None:
     write(tmp_path, "a.jpg", None)
-    (guessed,) = photograph_lenses(tmp_path, ["a.jpg"], SIZES, {}).values()
+    one = {"a.jpg": SIZES["a.jpg"]}
+    (guessed,) = initial_intrinsics(tmp_path, one).values()
     assert (guessed.source, guessed.params[0]) == ("estimated", 1.2 * 640)
-    (given,) = photograph_lenses(tmp_path, ["a.jpg"], SIZES, {}, 555.0).values()
+    (given,) = initial_intrinsics(tmp_path, one, focal_px=555.0).values()
     assert (given.source, given.params[0]) == ("focal_px", 555.0)
     with pytest.raises(ReconstructionError, match="above 0"):
-        photograph_lenses(tmp_path, ["a.jpg"], SIZES, {}, -3.0)
+        initial_intrinsics(tmp_path, one, focal_px=-3.0)
 
 
-def test_a_calibration_is_for_one_size() -> None:
+def test_a_calibration_is_for_one_size(tmp_path: Path) -> None:
     camera = Camera((640, 480), 500.0)
     for calibration in (camera, Calibration(camera, camera)):
-        found = known_cameras(calibration, SIZES)
-        assert found.known == {"a.jpg": camera, "b.jpg": camera}
-        assert list(found.refused) == ["c.jpg"]
-    assert known_cameras(None, SIZES).known == {}
+        known = known_cameras(calibration, SIZES)
+        assert known == {"a.jpg": camera, "b.jpg": camera}
+    found = initial_intrinsics(tmp_path, SIZES, known)
+    assert found["a.jpg"] is found["b.jpg"]
+    assert found["a.jpg"].source == "given"
     with pytest.raises(ReconstructionError, match="640x480"):
         known_cameras(camera, {"c.jpg": SIZES["c.jpg"]})
+
+
+def test_a_known_camera_keeps_its_numbers(pycolmap) -> None:
+    camera = Camera((640, 480), (500.0, 510.0), (310.0, 250.0))
+    own = CameraIntrinsics.of_camera(camera)
+    assert own.pinhole == camera
+    assert not own.distorts
+    theirs = own.colmap_camera()
+    # COLMAP's centre of the first pixel is (0.5, 0.5).
+    assert (theirs.principal_point_x, theirs.principal_point_y) == (310.5, 250.5)
+    assert theirs.has_prior_focal_length
+    xy = np.array([[3.0, 4.0]])
+    assert own.to_pinhole(xy) is not None
+    np.testing.assert_array_equal(own.from_pinhole(own.to_pinhole(xy)), xy)
+
+
+def test_distortion_goes_there_and_back(pycolmap) -> None:
+    own = CameraIntrinsics("SIMPLE_RADIAL", (640, 480), (500.0, 320.0, 240.0, -0.1))
+    xy = np.random.default_rng(0).uniform((0, 0), (639, 479), (50, 2))
+    straight = own.to_pinhole(xy)
+    np.testing.assert_allclose(own.from_pinhole(straight), xy, atol=1e-6)
+    # By the formula: x_distorted = x (1 + k r^2), in focal lengths from the centre.
+    rays = (straight - np.array(own.pinhole.centre)) / 500
+    bent = rays * (1 - 0.1 * (rays**2).sum(axis=1, keepdims=True))
+    np.testing.assert_allclose(bent * 500 + np.array(own.pinhole.centre), xy, atol=1e-6)
+
+
+def test_a_straight_image_has_straight_lines(pycolmap) -> None:
+    own = CameraIntrinsics("SIMPLE_RADIAL", (320, 240), (250.0, 160.0, 120.0, -0.15))
+    y, x = np.indices((240, 320))
+    straight = own.to_pinhole(np.column_stack([x.ravel(), y.ravel()]))
+    # An image whose values are the straight columns of what it shows.
+    picture = straight[:, 0].reshape(240, 320).astype(np.float32)
+    found = own.undistort(picture)
+    inside = (slice(30, -30), slice(30, -30))
+    np.testing.assert_allclose(found[inside], x[inside], atol=0.1)
+    assert np.abs(picture[inside] - x[inside]).max() > 2
+
+
+def test_a_guess_is_marked_as_such(pycolmap) -> None:
+    assert not CameraIntrinsics.initial((1000, 500)).colmap_camera().has_prior_focal_length
+    assert CameraIntrinsics.initial((1000, 500), 900.0).colmap_camera().has_prior_focal_length
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_RADIAL", "OPENCV"])
+def test_cameras_of_colmap_come_back(pycolmap, model: str) -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, model, 400.0, 320, 240)
+    own = CameraIntrinsics.of_colmap(camera)
+    assert list(own.colmap_camera().params) == list(camera.params)
+    assert own.pinhole == Camera((320, 240), 400.0)

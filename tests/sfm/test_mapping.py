@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import Camera, OptionError
+from deepdetect import Camera
+from deepdetect.sfm import mapping
 from deepdetect.sfm.database import DatabaseImage, write_database
-from deepdetect.sfm.lens import Lens
+from deepdetect.sfm.intrinsics import CameraIntrinsics
 from deepdetect.sfm.mapping import (
-    MappingOptions,
     adjust,
     camera_spacing,
-    map_photographs,
+    map_images,
     normalise_model,
     read_sparse_model,
     verify_pairs,
@@ -29,7 +29,7 @@ PLACES = np.array([[0.0, 0, 0], [2, 0, 0], [4, 0.5, 0], [6, 0, 0.5]])
 def model(pycolmap):
     """A model of four cameras in a row, with exact points, in no special frame."""
     made = pycolmap.Reconstruction()
-    camera = Lens.of_camera(Camera((640, 480), 500.0)).colmap_camera()
+    camera = CameraIntrinsics.of_camera(Camera((640, 480), 500.0)).colmap_camera()
     camera.camera_id = 1
     made.add_camera_with_trivial_rig(camera)
     rng = np.random.default_rng(0)
@@ -80,19 +80,20 @@ def test_the_last_adjustment_brings_cameras_back(model) -> None:
     for number in model.points3D:
         model.points3D[number].xyz = model.points3D[number].xyz + rng.normal(0, 0.02, 3)
     assert np.median(read_sparse_model(model).errors) > 0.3
-    adjust(model, True, 1.0)
+    adjust(model, True)
     found = read_sparse_model(model)
     assert found.errors.max() < 1e-3
     assert found.views[1].camera == exact.views[1].camera
 
 
-def test_the_principal_point_is_estimated_from_many_photographs_only(model, pycolmap) -> None:
+def test_the_principal_point_is_estimated_from_many_images_only(model, monkeypatch) -> None:
     camera = model.cameras[1]
     camera.params = np.array([500.0, 500.0, 312.0, 236.0])
-    adjust(model, False, 1.0)  # four photographs are fewer than eight
+    adjust(model, False)  # four images are fewer than eight
     centre = read_sparse_model(model).views[1].camera.centre
     assert centre == (311.5, 235.5)
-    adjust(model, False, 1.0, MappingOptions(min_views_of_principal_point=3))
+    monkeypatch.setattr(mapping, "MIN_VIEWS_OF_PRINCIPAL_POINT", 3)
+    adjust(model, False)
     centre = read_sparse_model(model).views[1].camera.centre
     assert centre == pytest.approx((319.5, 239.5), abs=0.1)
 
@@ -125,7 +126,7 @@ def attempts(pycolmap, monkeypatch: pytest.MonkeyPatch) -> list[dict]:
 def write_scenes(path: Path, steps: dict[str, tuple[np.ndarray, int]]) -> None:
     """Write a database of cameras that pass random points, by name: step and number of cameras."""
     rng = np.random.default_rng(0)
-    lens = Lens.of_camera(Camera((640, 480), 500.0))
+    intrinsics = CameraIntrinsics.of_camera(Camera((640, 480), 500.0))
     images: list[DatabaseImage] = []
     matches = {}
     for scene, (step, count) in steps.items():
@@ -137,7 +138,7 @@ def write_scenes(path: Path, steps: dict[str, tuple[np.ndarray, int]]) -> None:
             inside = ((xy > 0) & (xy < (639, 479))).all(axis=1)
             own.append((f"{scene}{number}.jpg", np.flatnonzero(inside)))
             noisy = xy[inside] + rng.normal(0, 0.2, (inside.sum(), 2))
-            images.append(DatabaseImage(own[-1][0], lens, noisy))
+            images.append(DatabaseImage(own[-1][0], intrinsics, noisy))
         for (name0, rows0), (name1, rows1) in itertools.combinations(own, 2):
             rows = np.intersect1d(rows0, rows1, return_indices=True)[1:]
             matches[name0, name1] = np.column_stack(rows)
@@ -149,13 +150,10 @@ AHEAD, ASIDE = np.array([0, 0, 0.4]), np.array([0.8, 0, 0])
 
 def test_cameras_that_move_straight_ahead_are_mapped(attempts, tmp_path: Path) -> None:
     """COLMAP's defaults find no pair to begin with: the second attempt does."""
-    options = MappingOptions()
     write_scenes(tmp_path / "database.db", {"ahead": (AHEAD, 5)})
-    verify_pairs(tmp_path / "database.db", options)
+    verify_pairs(tmp_path / "database.db")
     (tmp_path / "space").mkdir()
-    model, others = map_photographs(
-        tmp_path / "database.db", tmp_path, tmp_path / "space", True, options
-    )
+    model, others = map_images(tmp_path / "database.db", tmp_path, tmp_path / "space", True)
     assert [len(models) for models in attempts] == [0, 1]
     views = read_sparse_model(model).views.values()
     assert (len(views), others) == (5, [])
@@ -169,13 +167,10 @@ def test_cameras_that_move_straight_ahead_are_mapped(attempts, tmp_path: Path) -
 @pytest.mark.parametrize(("ahead", "calls"), [(5, 2), (3, 1)])
 def test_a_drive_beside_a_smaller_scene(attempts, ahead: int, calls: int, tmp_path: Path) -> None:
     """A second attempt is made where more photographs are left than the first has mapped."""
-    options = MappingOptions()
     write_scenes(tmp_path / "database.db", {"ahead": (AHEAD, ahead), "aside": (ASIDE, 4)})
-    verify_pairs(tmp_path / "database.db", options)
+    verify_pairs(tmp_path / "database.db")
     (tmp_path / "space").mkdir()
-    model, others = map_photographs(
-        tmp_path / "database.db", tmp_path, tmp_path / "space", True, options
-    )
+    model, others = map_images(tmp_path / "database.db", tmp_path, tmp_path / "space", True)
     assert len(attempts) == calls
     aside = frozenset(f"aside{number}.jpg" for number in range(4))
     names = {view.name for view in read_sparse_model(model).views.values()}
@@ -184,9 +179,3 @@ def test_a_drive_beside_a_smaller_scene(attempts, ahead: int, calls: int, tmp_pa
     else:
         assert names == {f"ahead{number}.jpg" for number in range(ahead)}
         assert others == [aside]
-
-
-@pytest.mark.parametrize("wrong", [{"min_views": 1}, {"min_verified": 0}, {"robust_scale_px": 0}])
-def test_wrong_options_are_refused(wrong: dict) -> None:
-    with pytest.raises(OptionError, match="must"):
-        MappingOptions(**wrong)

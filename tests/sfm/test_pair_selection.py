@@ -8,24 +8,22 @@ import pytest
 
 from deepdetect import OptionError
 from deepdetect.features.sift import to_root_sift
-from deepdetect.sfm.pair_selection import (
-    PairSelectionOptions,
-    sequential_pairs,
-    similar_pairs,
-    vlad_vectors,
-)
+from deepdetect.sfm.options import MultiViewOptions
+from deepdetect.sfm.pair_selection import sequential_pairs, similar_pairs, vlad_vectors
 
 
 def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> None:
-    options = PairSelectionOptions(max_exhaustive=20)
-    assert [options.way(count) for count in (3, 20, 21)] == ["all", "all", "similar"]
-    assert PairSelectionOptions(pairs="sequential").way(3) == "sequential"
+    choices = [MultiViewOptions().pair_choice(count) for count in (3, 50, 51)]
+    assert choices == ["all", "all", "similar"]
+    assert MultiViewOptions(pairs="sequential").pair_choice(3) == "sequential"
 
 
-@pytest.mark.parametrize("wrong", [{"pairs": "sequental"}, {"sequential": 0}, {"words": -1}])
+@pytest.mark.parametrize(
+    "wrong", [{"pairs": "sequental"}, {"sequential": 0}, {"stride_px": 0}, {"ratio": 0}]
+)
 def test_wrong_options_are_refused(wrong: dict) -> None:
-    with pytest.raises(OptionError, match=r"sequential|must be above 0"):
-        PairSelectionOptions(**wrong)
+    with pytest.raises(OptionError, match=r"sequential|must be"):
+        MultiViewOptions(**wrong)
 
 
 def test_a_sequence_is_matched_with_what_follows() -> None:
@@ -81,12 +79,10 @@ def test_of_a_large_set_those_that_see_the_same_are_matched(count: int) -> None:
         strange = rng.normal(size=(80, 128))  # leaves, and what moves
         each = np.concatenate([own, strange]).astype(np.float32)
         seen.append(each / np.linalg.norm(each, axis=1, keepdims=True))
-    options = PairSelectionOptions(similar=6)
-    assert options.way(count) == "similar"
     names = [f"{k:03}" for k in range(count)]
     order = rng.permutation(count)
-    vectors = vlad_vectors([seen[k] for k in order], options)
-    pairs = similar_pairs([names[k] for k in order], vectors, options.similar)
+    vectors = vlad_vectors([seen[k] for k in order])
+    pairs = similar_pairs([names[k] for k in order], vectors, 6)
     assert len(pairs) <= 6 * count < count * (count - 1) / 2
     found = {tuple(sorted(map(int, pair))) for pair in pairs}
     assert len(found) == len(pairs)

@@ -22,11 +22,12 @@ from deepdetect import (
     ReconstructionError,
     reconstruct_many,
 )
-from deepdetect.sfm.fusion import DenseOptions
+from deepdetect.sfm import options as sfm_options
+from deepdetect.sfm import stages
 from deepdetect.sfm.options import MultiViewOptions
-from deepdetect.sfm.pair_selection import PairSelectionOptions
 
 QUICK = {"workers": 1, "detector": PointDetector(1500)}
+SPARSE = {**QUICK, "options": MultiViewOptions(dense=False)}
 
 
 def true_poses(shared: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -104,10 +105,10 @@ def test_good_photographs_are_registered_and_bad_ones_named(small, shared: Path)
     folder, output = small
     found = reconstruct_many(folder, output, **QUICK)
     assert set(found.views) == {"0003.jpg", "0004.jpg", "0005.jpg", "0006.jpg"}
-    assert set(found.left_out) == {"black.png", "broken.jpg", "other.jpg"}
-    assert "it is black" in found.left_out["black.png"]
-    assert "broken.jpg" in found.left_out["broken.jpg"]
-    assert "matches none of the others" in found.left_out["other.jpg"]
+    assert set(found.unregistered) == {"black.png", "broken.jpg", "other.jpg"}
+    assert "it is black" in found.unregistered["black.png"]
+    assert "broken.jpg" in found.unregistered["broken.jpg"]
+    assert "matches none of the others" in found.unregistered["other.jpg"]
     # Of a path of 4 m; the focal length is estimated.
     assert pose_errors(found.views, true_poses(shared))[0] < 25
     assert relative_rotation_error(found.views, true_poses(shared)) < 0.5
@@ -151,7 +152,7 @@ def test_all_files_are_there_and_readable(small, pycolmap) -> None:
         *("sparse", "database.db", "work"),
     }
     values = json.loads((output / "model.json").read_text())
-    assert (values["photographs"], values["registered"]) == (7, 4)
+    assert (values["images"], values["registered"]) == (7, 4)
     model = pycolmap.Reconstruction(output / "sparse")
     assert model.num_reg_images() == 4
     assert model.num_points3D() == values["sparse_points"]
@@ -168,8 +169,6 @@ def test_all_files_are_there_and_readable(small, pycolmap) -> None:
 
 
 def test_a_run_goes_on_where_it_was_killed(small, tmp_path: Path, monkeypatch) -> None:
-    from deepdetect.sfm import stages
-
     folder, before = small
     output = tmp_path / "model"
     shutil.copytree(before, output)
@@ -178,7 +177,7 @@ def test_a_run_goes_on_where_it_was_killed(small, tmp_path: Path, monkeypatch) -
     lost, *kept = sorted((output / "work" / "dense").iterdir())
     lost.unlink()
     times = {path: path.stat().st_mtime_ns for path in [*kept, output / "sparse" / "images.bin"]}
-    monkeypatch.setattr(stages, "map_photographs", None)  # it would fail
+    monkeypatch.setattr(stages, "map_images", None)  # it would fail
     found = reconstruct_many(folder, output, **QUICK)
     assert times == {path: path.stat().st_mtime_ns for path in times}
     assert lost.exists()
@@ -198,7 +197,7 @@ def test_a_known_camera_stays_as_it_is(write_fountain, shared: Path, tmp_path: P
     folder = write_fountain(tmp_path / "photos")
     camera = Camera((384, 256), (1379.74 / 4, 1382.08 / 4), (189.65, 125.41))
     found = reconstruct_many(
-        sorted(folder.iterdir()), tmp_path / "model", calibration=camera, dense=False, **QUICK
+        sorted(folder.iterdir()), tmp_path / "model", calibration=camera, **SPARSE
     )
     assert len(found.views) == 4
     assert found.views["0004.jpg"].camera == camera
@@ -217,11 +216,11 @@ def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
     Image.fromarray(photo).save(folder / "other.png")
     calibration = {"focal_px": [344.935, 345.52], "cx": 189.65, "cy": 125.41, "width": 384}
     (tmp_path / "calib.json").write_text(json.dumps({**calibration, "height": 256}))
-    arguments = {"calibration": tmp_path / "calib.json", "dense": False, **QUICK}
+    arguments = {"calibration": tmp_path / "calib.json", **SPARSE}
     found = reconstruct_many(folder, tmp_path / "model", **arguments)
     assert len(found.views) == 3
-    assert "calibration is for another size" in found.left_out["other.png"]
-    assert found.lenses["0004.jpg"].source == "given"
+    assert "calibration is for another size" in found.unregistered["other.png"]
+    assert found.intrinsics["0004.jpg"].source == "given"
     (tmp_path / "calib.json").write_text(json.dumps({**calibration, "height": 999}))
     with pytest.raises(ReconstructionError, match="384x999"):
         reconstruct_many(folder, tmp_path / "model", **arguments)
@@ -235,27 +234,25 @@ def test_photographs_with_blanks_in_their_names_in_a_sequence(
     folder = write_fountain(tmp_path / "photos")
     for path in list(folder.iterdir()):
         path.rename(folder / f"view {path.name}")
-    found = reconstruct_many(folder, tmp_path / "model", sequential=2, dense=False, **QUICK)
+    found = reconstruct_many(
+        folder,
+        tmp_path / "model",
+        options=MultiViewOptions("sequential", sequential=2, dense=False),
+        **QUICK,
+    )
     assert found.pairs == 5
     assert len(found.views) == 4
 
 
-@pytest.mark.parametrize(
-    "selection",
-    [PairSelectionOptions("similar", similar=2), PairSelectionOptions(max_exhaustive=3, similar=2)],
-    ids=["asked for", "more than are matched exhaustively"],
-)
+@pytest.mark.parametrize("pairs", ["similar", "auto"])
 def test_the_most_alike_are_matched(
-    write_fountain, tmp_path: Path, pycolmap, selection: PairSelectionOptions
+    write_fountain, tmp_path: Path, pycolmap, monkeypatch: pytest.MonkeyPatch, pairs: str
 ) -> None:
+    monkeypatch.setattr(stages, "SIMILAR", 2)
+    monkeypatch.setattr(sfm_options, "MAX_EXHAUSTIVE", 3)
+    options = MultiViewOptions(pairs, dense=False)
     folder = write_fountain(tmp_path / "photos")
-    found = reconstruct_many(
-        folder,
-        tmp_path / "model",
-        dense=False,
-        options=MultiViewOptions(pair_selection=selection),
-        **QUICK,
-    )
+    found = reconstruct_many(folder, tmp_path / "model", options=options, **QUICK)
     assert 4 <= found.pairs < 6
     assert len(found.views) == 4
 
@@ -268,13 +265,13 @@ def test_of_two_scenes_the_larger_is_the_model(write_fountain, tmp_path: Path, p
     for name in ("0003", "0004", "0005"):
         with Image.open(folder / f"{name}.jpg") as image:
             ImageOps.invert(image).save(folder / f"negative-{name}.jpg")
-    found = reconstruct_many(folder, tmp_path / "model", dense=False, **QUICK)
+    found = reconstruct_many(folder, tmp_path / "model", **SPARSE)
     assert set(found.views) == {"0003.jpg", "0004.jpg", "0005.jpg", "0006.jpg"}
     negatives = tuple(f"negative-{name}.jpg" for name in ("0003", "0004", "0005"))
-    assert found.other_groups == (negatives,)
-    assert all("with 2 others only" in found.left_out[name] for name in negatives)
+    assert found.components == (negatives,)
+    assert all("with 2 others only" in found.unregistered[name] for name in negatives)
     values = json.loads((tmp_path / "model/model.json").read_text())
-    assert values["other_groups"] == [list(negatives)]
+    assert values["components"] == [list(negatives)]
     assert (values["pairs"], values["pair_choice"]) == (21, "all")
 
 
@@ -283,10 +280,10 @@ def test_names_that_are_part_of_others(write_fountain, tmp_path: Path, pycolmap)
     folder = write_fountain(tmp_path / "photos", ("0004", "0005", "0006"))
     (folder / "0004.jpg").rename(folder / "1.jpg")
     (folder / "11.jpg").write_bytes(b"no image")
-    found = reconstruct_many(folder, tmp_path / "model", dense=False, **QUICK)
+    found = reconstruct_many(folder, tmp_path / "model", **SPARSE)
     assert set(found.views) == {"1.jpg", "0005.jpg", "0006.jpg"}
-    assert list(found.left_out) == ["11.jpg"]
-    assert "11.jpg is not an image" in found.left_out["11.jpg"]
+    assert list(found.unregistered) == ["11.jpg"]
+    assert "11.jpg is not an image" in found.unregistered["11.jpg"]
 
 
 def test_too_few_photographs_are_one_sentence(
@@ -300,7 +297,7 @@ def test_too_few_photographs_are_one_sentence(
         reconstruct_many(folder, tmp_path / "model", **QUICK)
     Image.fromarray(photo).save(folder / "a.png")
     Image.new("RGB", (200, 200)).save(folder / "black.png")
-    with pytest.raises(ReconstructionError, match=r"1 of 2 photographs.*black\.png") as caught:
+    with pytest.raises(ReconstructionError, match=r"1 of 2 images.*black\.png") as caught:
         reconstruct_many(folder, tmp_path / "model", **QUICK)
     one_line(caught.value)
 
@@ -320,19 +317,14 @@ def test_unrelated_photographs_are_one_sentence(tmp_path: Path, one_line, pycolm
 
 
 @pytest.mark.parametrize(
-    ("output", "options", "message"),
-    [
-        ("model.ply", {}, "name of a file"),
-        ("model", {"pairs": "sequentially"}, "did you mean 'sequential'"),
-        ("photos", {}, "holds the photographs"),
-    ],
+    ("output", "message"), [("model.ply", "name of a file"), ("photos", "holds the images")]
 )
 def test_wrong_arguments_are_one_sentence(
-    tmp_path: Path, one_line, output: str, options: dict, message: str, pycolmap
+    tmp_path: Path, one_line, output: str, message: str, pycolmap
 ) -> None:
     (tmp_path / "photos").mkdir()
     with pytest.raises(OptionError, match=message) as caught:
-        reconstruct_many(tmp_path / "photos", tmp_path / output, **options)
+        reconstruct_many(tmp_path / "photos", tmp_path / output)
     one_line(caught.value)
 
 
@@ -396,7 +388,7 @@ def test_the_fountain_is_as_good_as_with_sift(shared: Path, tmp_path: Path, pyco
             folder,
             tmp_path / "model" / f"{given is None}",
             calibration=given,
-            dense=given is not None,
+            options=MultiViewOptions(dense=given is not None),
         )
         ours = pose_errors(found.views, truth)
         assert len(found.views) == 11
@@ -405,9 +397,3 @@ def test_the_fountain_is_as_good_as_with_sift(shared: Path, tmp_path: Path, pyco
         if given:
             assert len(found.dense) >= 10 * len(sift.points)
             assert np.median(found.dense_errors) < 0.5
-
-
-def test_options_are_all_at_once() -> None:
-    options = MultiViewOptions(dense=DenseOptions(stride_px=4))
-    assert options.dense is not None
-    assert options.dense.stride_px == 4

@@ -246,8 +246,8 @@ def run_reconstruct_many(
     for name in names:
         (work / name).rename(folder / name)
     numbers = {
-        "Images": f"{len(images) - len(found.left_out)} of {len(images)}",
-        "Left out": f"{len(found.left_out)}",
+        "Images": f"{len(images) - len(found.unregistered)} of {len(images)}",
+        "Unregistered": f"{len(found.unregistered)}",
     }
     return TaskResult(numbers, "model.html", names)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from .._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
+from .._shared.errors import DeepDetectError, MissingExtraError, WeightsError
 from .._shared.options import suggest_keywords
 from .._shared.parallel import TaskMap
 from .._shared.progress import progress
@@ -58,9 +59,9 @@ def extract_features(
     Each image has a group with its path below the folder as name, as "db/1.jpg". In it are
     `keypoints` (N, 2) float32, x right and y down in pixels, centre of the first pixel (0, 0), with
     the attribute `uncertainty` in pixels; `descriptors` (128, N) float32, RootSIFT of length 1;
-    `scores` (N,) float32, the higher the better; `image_size` (width, height) int32; and of
-    keypoints with sizes and angles `scales` (N,) float32, sigma in pixels (half the size), and
-    `oris` (N,) float32 in degrees.
+    `scores` (N,) float32, the higher the better; `colors` (N, 3) uint8 sRGB; `image_size` (width,
+    height) int32; and of keypoints with sizes and angles `scales` (N,) float32, sigma in pixels
+    (half the size), and `oris` (N,) float32 in degrees.
 
     A call that is interrupted or killed goes on when it is made again; images that are done and
     have not changed are skipped, new ones are added, and features of images that are no longer
@@ -163,9 +164,9 @@ def _extract_shard(
     def groups() -> Iterator[Group]:
         for name, state in images:
             try:
-                keypoints, uncertainty = _features_of(
-                    root / name, detector, selection, max_megapixels
-                )
+                rgb = load_image(root / name, max_megapixels=max_megapixels)
+                gray = luma(rgb)
+                keypoints = describe_keypoints(gray, find_keypoints(detector, rgb, selection))
             except (MissingExtraError, WeightsError):  # concern all images
                 raise
             except DeepDetectError as error:
@@ -174,29 +175,16 @@ def _extract_shard(
             except MemoryError:
                 failures.append(f"{name}: there is not enough memory for it: use a smaller image")
                 continue
-            yield feature_group(name, keypoints, state, uncertainty)
+            # Of a pixel of the image that they were found on.
+            scaled = detector.settings["resolution"] != "native" and gray.size > MAX_AUTO_PIXELS
+            uncertainty = math.sqrt(gray.size / MAX_AUTO_PIXELS) if scaled else 1.0
+            column, row = np.rint(keypoints.xy).astype(np.int64).T
+            group = feature_group(name, keypoints, state, uncertainty)
+            yield replace(group, arrays={**group.arrays, "colors": rgb[row, column]})
             counts[name] = len(keypoints)
 
     write_groups(path, groups())
     return counts, failures
-
-
-def _features_of(
-    path: Path,
-    detector: DeepDetect | PointDetector,
-    selection: SelectionOptions | None,
-    max_megapixels: float,
-) -> tuple[Keypoints, float]:
-    """Return described keypoints of an image file, and the size of a pixel that they were found on.
-
-    Raises:
-        DeepDetectError: the image cannot be worked on.
-    """
-    rgb = load_image(path, max_megapixels=max_megapixels)
-    gray, resolution = luma(rgb), detector.settings["resolution"]
-    keypoints = describe_keypoints(gray, find_keypoints(detector, rgb, selection))
-    scaled = resolution != "native" and gray.size > MAX_AUTO_PIXELS
-    return keypoints, math.sqrt(gray.size / MAX_AUTO_PIXELS) if scaled else 1.0
 
 
 def feature_group(
@@ -206,7 +194,7 @@ def feature_group(
 
     Args:
         name: of the image.
-        keypoints: with descriptors.
+        keypoints: with descriptors, or without.
         state: of the image.
         uncertainty: of the positions in pixels.
 
@@ -216,18 +204,16 @@ def feature_group(
         >>> group.arrays["descriptors"].shape, (group.arrays["descriptors"] ** 2).sum().round(3)
         ((128, 1), np.float32(1.0))
     """
-    found = keypoints.descriptors
-    if found is None:
-        raise OptionError("features need keypoints with descriptors: describe them first")
-    descriptors = found.astype(np.float32)
-    norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
-    descriptors /= np.where(norms > 0, norms, 1)
     arrays = {
         "keypoints": keypoints.xy,
-        "descriptors": np.ascontiguousarray(descriptors.T),
         "scores": keypoints.scores,
         "image_size": np.array(keypoints.image_size, np.int32),
     }
+    if keypoints.descriptors is not None:
+        descriptors = keypoints.descriptors.astype(np.float32)
+        norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
+        descriptors /= np.where(norms > 0, norms, 1)
+        arrays["descriptors"] = np.ascontiguousarray(descriptors.T)
     if keypoints.sizes is not None and keypoints.angles is not None:
         arrays |= {"scales": keypoints.sizes / 2, "oris": keypoints.angles}
     return Group(name, arrays, state, {"keypoints": {"uncertainty": np.float32(uncertainty)}})

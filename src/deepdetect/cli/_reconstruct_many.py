@@ -16,21 +16,20 @@ if TYPE_CHECKING:
     from ..sfm.result import MultiViewReconstruction
 
 MANY = FieldOptions(
-    "sfm.pipeline:reconstruct_many",
+    "sfm.options:MultiViewOptions",
     names=("pairs", "sequential", "dense", "stride_px", "single_camera"),
     flags={
         "stride_px": "--stride",
         "single_camera": "--single-camera/--camera-each",
     },
     metavars={"sequential": "N", "stride_px": "PX"},
-    defaults={"stride_px": "2"},
 )
 """Options that two photographs do not have."""
 
 OUTPUT = Path("deepdetect-output/model")
 
-MAX_LEFT_OUT_ROWS = 10
-"""Photographs that are named with a reason on the terminal; model.json names all."""
+MAX_UNREGISTERED_ROWS = 10
+"""Images that are named with a reason on the terminal; model.json names all."""
 
 
 def reconstruct_folder(
@@ -44,24 +43,28 @@ def reconstruct_folder(
 ) -> None:
     """Reconstruct many photographs, and print what was found."""
     from ..sfm.colmap import import_pycolmap
+    from ..sfm.options import MultiViewOptions
     from ..sfm.pipeline import (
         MAX_KEYPOINTS,
         check_output_folder,
         output_files,
         reconstruct_many,
     )
-    from ..sfm.stages import check_photographs
+    from ..sfm.stages import check_images
     from ._records import check_not_made, claim_outputs
 
     target = OUTPUT if output is None else output
     detector, selection = chosen_detector(kind, values, max_keypoints=MAX_KEYPOINTS, threads=1)
     if values.pop("rectified") is not None:
         raise click.UsageError("--rectified and --not-rectified are for two photographs")
+    chosen = given_only({name: values.pop(name) for name in MANY.names})
+    if "sequential" in chosen:
+        chosen.setdefault("pairs", "sequential")
     photographs: Path | Sequence[Path] = images[0] if len(images) == 1 else images
     # What is missing or wrong is said before anything is written.
     import_pycolmap()
     check_output_folder(target)
-    found_images = check_photographs(photographs)
+    found_images = check_images(photographs)
     if isinstance(photographs, Path):
         check_not_made(photographs, found_images.values())
     claim_outputs("reconstruct", sorted(images), output_files(target), overwrite, growing=True)
@@ -73,6 +76,7 @@ def reconstruct_folder(
         workers=workers,
         overwrite=overwrite,
         quiet=False,
+        options=MultiViewOptions(**chosen),
         **given_only(values),
     )
     numbers = json.loads((target / "model.json").read_text(encoding="utf-8"))
@@ -85,8 +89,8 @@ def _rows(found: MultiViewReconstruction, numbers: dict[str, Any]) -> list[tuple
     focal = sorted({(camera["focal_px"][0], camera["intrinsics"]) for camera in cameras})
     shown = ", ".join(f"{px:g} px ({source})" for px, source in focal[:3])
     rows = [
-        ("photographs", f"{numbers['registered']} of {numbers['photographs']}"),
-        *left_out_rows(numbers["left_out"], numbers["other_groups"]),
+        ("images", f"{numbers['registered']} of {numbers['images']}"),
+        *unregistered_rows(numbers["unregistered"], numbers["components"]),
         ("focal length", shown + (", ..." if len(focal) > 3 else "")),
         ("keypoints", f"{numbers['keypoints']:,}"),
         ("pairs", _pairs(numbers)),
@@ -109,39 +113,41 @@ def _rows(found: MultiViewReconstruction, numbers: dict[str, Any]) -> list[tuple
     return rows
 
 
-def left_out_rows(
-    left_out: Mapping[str, str], other_groups: Sequence[Sequence[str]]
+def unregistered_rows(
+    unregistered: Mapping[str, str], components: Sequence[Sequence[str]]
 ) -> list[tuple[str, str]]:
-    """Name groups of photographs that are no part of the model, and the others one by one.
+    """Name components that are no part of the model, and the other images one by one.
 
     Args:
-        left_out: reasons by name.
-        other_groups: names of those that hang together among themselves.
+        unregistered: reasons by name.
+        components: names of those that hang together among themselves.
 
     Returns:
         Rows for the table of the terminal.
     """
     rows: list[tuple[str, str]] = []
     grouped: set[str] = set()
-    for group in other_groups:
+    for group in components:
         grouped |= set(group)
         rows.append(
             (
-                f"left out: {len(group)} photographs",
+                f"unregistered: {len(group)} images",
                 f"{group[0]} and {len(group) - 1} more hang together, but not with the others: "
                 "they show something else, or too little of the same; model.json lists them",
             )
         )
-    alone = [(name, why) for name, why in left_out.items() if name not in grouped]
-    rows += [(f"left out: {name}", why) for name, why in alone[:MAX_LEFT_OUT_ROWS]]
-    if len(alone) > MAX_LEFT_OUT_ROWS:
-        rows.append(("left out", f"{len(alone) - MAX_LEFT_OUT_ROWS} more, listed in model.json"))
+    alone = [(name, why) for name, why in unregistered.items() if name not in grouped]
+    rows += [(f"unregistered: {name}", why) for name, why in alone[:MAX_UNREGISTERED_ROWS]]
+    if len(alone) > MAX_UNREGISTERED_ROWS:
+        rows.append(
+            ("unregistered", f"{len(alone) - MAX_UNREGISTERED_ROWS} more, listed in model.json")
+        )
     return rows
 
 
 def _pairs(numbers: dict[str, Any]) -> str:
     """Say how many pairs were matched, of how many, and how they were chosen."""
-    count = numbers["photographs"]
+    count = numbers["images"]
     choice = {
         "all": "all of them",
         "sequential": "neighbours by name",

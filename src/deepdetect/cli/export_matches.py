@@ -22,7 +22,7 @@ from ._records import claimed_outputs
 
 if TYPE_CHECKING:
     from ..interchange import Collection
-    from ..sfm.lens import Lens
+    from ..sfm.intrinsics import CameraIntrinsics
 
 Command = Callable[..., Any]
 
@@ -208,7 +208,7 @@ def _export(
         if describe:
             collection = describe_collection(collection, quiet=False)
         if camera:
-            settings["lenses"] = _lenses(collection, camera)
+            settings["intrinsics"] = _intrinsics(collection, camera)
         writers: dict[str, Callable[..., tuple[Path, ...]]] = {
             "colmap": write_colmap,
             "colmap-text": write_colmap_text,
@@ -276,7 +276,7 @@ MARKERS = {"colmap-text": "matches.txt", "hloc": "features.h5"}
 def _collection(sources: tuple[Path, ...], values: Mapping[str, Any]) -> Collection:
     """Read saved keypoints and matches, or find and match those of a folder."""
     from ..detector.point_detector import PointDetector
-    from ..interchange import match_photographs, read_collection
+    from ..interchange import match_folder, read_collection
 
     of_folder = {name: values[name] for name in ("pairs", "sequential", "max_keypoints")}
     if len(sources) == 1 and sources[0].is_dir():
@@ -287,7 +287,7 @@ def _collection(sources: tuple[Path, ...], values: Mapping[str, Any]) -> Collect
         count = of_folder.pop("max_keypoints")
         detector = PointDetector() if count is None else PointDetector(count)
         workers = values["workers"]
-        return match_photographs(sources[0], detector, workers=workers, quiet=False, **of_folder)
+        return match_folder(sources[0], detector, workers=workers, quiet=False, **of_folder)
     unused = [name for name, value in of_folder.items() if value is not None]
     if unused:
         flag = "--" + unused[0].replace("_", "-")
@@ -295,19 +295,22 @@ def _collection(sources: tuple[Path, ...], values: Mapping[str, Any]) -> Collect
     return read_collection(sources, matches=values["matches"], images=values["images"])
 
 
-def _lenses(collection: Collection, camera: Mapping[str, Any]) -> dict[str, Lens]:
-    """Return the cameras of all photographs."""
-    from ..sfm.intrinsics import known_cameras, photograph_lenses
+def _intrinsics(collection: Collection, camera: Mapping[str, Any]) -> dict[str, CameraIntrinsics]:
+    """Return the intrinsics of all images."""
+    from ..sfm.intrinsics import initial_intrinsics, known_cameras
 
     sizes = {name: points.image_size for name, points in collection.keypoints.items()}
-    found = known_cameras(camera["calibration"], sizes)
-    if found.refused:
-        name, reason = next(iter(found.refused.items()))
-        raise OptionError(f"{name}: {reason}")
+    calibration = camera["calibration"]
+    known = {} if calibration is None else known_cameras(calibration, sizes)
+    if calibration is not None and (others := sizes.keys() - known.keys()):
+        name = min(others)
+        raise OptionError(
+            f"{name} is {sizes[name][0]}x{sizes[name][1]} pixels, and the calibration is for "
+            "another size: leave the image out"
+        )
     folder = collection.folder or Path("no-such-folder")
-    return photograph_lenses(
-        folder, list(sizes), sizes, found.known, camera["focal_px"], camera["single_camera"]
-    )
+    focal_px, single_camera = camera["focal_px"], camera["single_camera"]
+    return initial_intrinsics(folder, sizes, known, focal_px, single_camera)
 
 
 EXPORTS_OF_MATCHES = (export_colmap, export_hloc)

@@ -81,10 +81,18 @@ def extract(
         quiet=False,
     )
     if as_json:
-        print_json(vars(report))
+        print_json(
+            {
+                "path": report.path,
+                "images": list(report.counts),
+                "skipped": report.skipped,
+                "keypoints": sum(report.counts.values()),
+                "failures": report.failures,
+            }
+        )
     else:
         click.echo(
-            f"{len(report.images)} images with {report.keypoints:,} keypoints, "
+            f"{len(report.counts)} images with {sum(report.counts.values()):,} keypoints, "
             f"{report.skipped} already done" + (f" -> {output}" if output.exists() else "")
         )
     report.check()

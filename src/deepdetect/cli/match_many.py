@@ -72,13 +72,20 @@ def match_many(
         overwrite=overwrite,
         quiet=False,
     )
-    total = sum(report.matches.values())
+    total = sum(report.counts.values())
     if as_json:
-        matched = [{"pair": pair, "matches": count} for pair, count in report.matches.items()]
-        print_json({**vars(report), "matches": matched})
+        matched = [{"pair": pair, "matches": count} for pair, count in report.counts.items()]
+        print_json(
+            {
+                "path": report.path,
+                "matches": matched,
+                "skipped": report.skipped,
+                "failures": report.failures,
+            }
+        )
     else:
         click.echo(
-            f"{len(report.matches)} pairs with {total:,} matches, {report.skipped} already done"
+            f"{len(report.counts)} pairs with {total:,} matches, {report.skipped} already done"
             + (f" -> {output}" if output.exists() else "")
         )
     report.check()

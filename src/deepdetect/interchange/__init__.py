@@ -3,13 +3,13 @@
 from .collection import Collection, PairMatches, describe_collection
 from .colmap import write_colmap, write_colmap_text
 from .hloc import write_hloc
-from .sources import match_photographs, read_collection
+from .sources import match_folder, read_collection
 
 __all__ = [
     "Collection",
     "PairMatches",
     "describe_collection",
-    "match_photographs",
+    "match_folder",
     "read_collection",
     "write_colmap",
     "write_colmap_text",

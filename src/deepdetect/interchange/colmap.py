@@ -17,8 +17,8 @@ from .._shared.options import suggest_keywords
 from ..features.keypoints import UNSET_ANGLE, Keypoints
 from ..sfm.colmap import PIXEL_CENTRE, import_pycolmap
 from ..sfm.database import DatabaseImage, write_database
-from ..sfm.lens import Lens
-from ..sfm.mapping import MappingOptions, verify_pairs
+from ..sfm.intrinsics import CameraIntrinsics
+from ..sfm.mapping import verify_pairs
 from .collection import Collection, check_names, sift_bytes
 
 MATCHES_NAME = "matches"
@@ -33,9 +33,9 @@ def write_colmap(
     collection: Collection,
     output: str | Path,
     *,
-    lenses: Mapping[str, Lens],
+    intrinsics: Mapping[str, CameraIntrinsics],
     verify: bool = True,
-    options: MappingOptions = MappingOptions(),
+    seed: int = 0,
 ) -> tuple[Path, ...]:
     """Write COLMAP's database, whole or not at all; it is replaced where it exists.
 
@@ -45,9 +45,9 @@ def write_colmap(
     Args:
         collection: the photographs.
         output: ending in .db.
-        lenses: camera of each photograph; those with the same object share one.
+        intrinsics: of the camera of each image; those with the same object share one.
         verify: estimate the two-view geometry of each pair, without which COLMAP maps nothing.
-        options: of this verification.
+        seed: of this verification.
 
     Returns:
         The file.
@@ -63,17 +63,19 @@ def write_colmap(
         raise OptionError(f"{path} must end in .db")
     images = []
     for name, points in collection.keypoints.items():
-        if name not in lenses:
-            raise OptionError(f"{name} has no camera: give one in `lenses`")
+        if name not in intrinsics:
+            raise OptionError(f"{name} has no camera: give one in `intrinsics`")
         scales, orientations = _frames(points)
         images.append(
-            DatabaseImage(name, lenses[name], points.xy, scales, orientations, sift_bytes(points))
+            DatabaseImage(
+                name, intrinsics[name], points.xy, scales, orientations, sift_bytes(points)
+            )
         )
     with atomic_path(path) as temporary:
         rows = {pair: found.rows for pair, found in collection.matches.items()}
         write_database(temporary, images, rows)
         if verify and rows:
-            verify_pairs(temporary, options)
+            verify_pairs(temporary, seed)
     return (path,)
 
 

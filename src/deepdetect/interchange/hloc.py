@@ -14,8 +14,8 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import feature_group
-from ..batch.pair_list import pair_name
 from ..batch.hdf5 import Group, write_groups
+from ..batch.pair_list import pair_name
 from .collection import Collection, check_names, check_upright
 
 FILES = ("features.h5", "matches.h5", "pairs.txt")
@@ -45,20 +45,6 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
     check_upright(collection.paths)
     features, matches, pairs = (Path(output) / name for name in FILES)
 
-    def feature_groups() -> Iterator[Group]:
-        for name, points in collection.keypoints.items():
-            if points.descriptors is not None:
-                yield feature_group(name, points)
-                continue
-            arrays = {
-                "keypoints": points.xy,
-                "scores": points.scores,
-                "image_size": np.array(points.image_size, np.int32),
-            }
-            if points.sizes is not None and points.angles is not None:
-                arrays |= {"scales": points.sizes / 2, "oris": points.angles}
-            yield Group(name, arrays, (), {"keypoints": {"uncertainty": np.float32(1)}})
-
     taken: dict[str, tuple[str, str]] = {}
     for pair in collection.matches:
         other = taken.setdefault(pair_name(*pair), pair)
@@ -78,7 +64,8 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
             arrays = {"matches0": matches0, "matching_scores0": scores}
             yield Group(pair_name(name0, name1), arrays)
 
-    write_groups(features, feature_groups())
+    groups = (feature_group(name, points) for name, points in collection.keypoints.items())
+    write_groups(features, groups)
     if not collection.matches:
         return (features,)
     write_groups(matches, match_groups())

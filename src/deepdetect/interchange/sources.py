@@ -12,15 +12,16 @@ import numpy as np
 from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import extract_features
-from ..batch.pair_list import read_pairs
-from ..batch.pair_matching import PairMatchingOptions, match_pairs
 from ..batch.hdf5 import import_h5py, open_hdf5
+from ..batch.pair_list import read_pairs
+from ..batch.pair_matching import match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import UNSET_ANGLE, Keypoints
 from ..features.matches import Matches
 from ..io.image import find_images
 from ..io.tables import load_keypoints, load_matches
+from ..sfm.pair_selection import sequential_pairs
 from .collection import Collection, Pair, PairMatches
 
 MAX_ALL_PAIRS = 50
@@ -259,13 +260,12 @@ def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pai
 
 
 @suggest_keywords
-def match_photographs(
+def match_folder(
     folder: str | Path,
     detector: DeepDetect | PointDetector = PointDetector(),
     *,
     pairs: str | Path | Sequence[Pair] | None = None,
     sequential: int | None = None,
-    matching: PairMatchingOptions = PairMatchingOptions(),
     workers: int | None = None,
     quiet: bool = True,
 ) -> Collection:
@@ -279,7 +279,6 @@ def match_photographs(
         detector: as of `extract_features`.
         pairs: of names, or a text file with one on each line; None: all, of up to 50 photographs.
         sequential: number of following photographs that each is matched with, instead of `pairs`.
-        matching: how pairs are matched.
         workers: number of processes; default one per processor.
         quiet: show no progress bars.
 
@@ -309,24 +308,18 @@ def match_photographs(
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
         features, found = Path(temporary, "features.h5"), Path(temporary, "matches.h5")
         extracted = extract_features(root, features, detector, workers=workers, quiet=quiet)
-        if not extracted.images:
+        if not extracted.counts:
             extracted.check()
         keypoints = read_features_file(features)
         unread = set(names) - keypoints.keys()
         if pairs is None:
             good = [name for name in names if name in keypoints]
             reach = len(good) if sequential is None else sequential
-            wanted = [
-                (first, second)
-                for k, first in enumerate(good)
-                for second in good[k + 1 : k + 1 + reach]
-            ]
+            wanted = sequential_pairs(good, reach)
         else:  # a photograph that cannot be read is one failure, not one for each of its pairs
             wanted = [pair for pair in pairs if unread.isdisjoint(pair)]
         if not wanted:
             return Collection(keypoints, {}, root, extracted.failures)
-        matched = match_pairs(
-            features, wanted, found, options=matching, workers=workers, quiet=quiet
-        )
-        matches = read_matches_file(found, keypoints) if matched.matches else {}
+        matched = match_pairs(features, wanted, found, workers=workers, quiet=quiet)
+        matches = read_matches_file(found, keypoints) if matched.counts else {}
         return Collection(keypoints, matches, root, (*extracted.failures, *matched.failures))

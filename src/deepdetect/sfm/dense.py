@@ -100,7 +100,7 @@ def find_references(sparse: SparseModel) -> list[Reference]:
             )
             scored.append((float(score), neighbour))
         scored.sort(key=lambda each: -each[0])
-        best = tuple(neighbour for _, neighbour in scored[: NEIGHBOURS])
+        best = tuple(neighbour for _, neighbour in scored[:NEIGHBOURS])
         if len(best) + 1 >= MIN_VIEWS:
             found.append(Reference(sparse.views[number], sparse.intrinsics[number], best))
     return found
@@ -129,7 +129,7 @@ def dense_points(folder: Path, reference: Reference, stride_px: int) -> DensePoi
     gray, view = luma(rgb), limited_view(reference.view)
     scale = view.camera.size[0] / reference.view.camera.size[0]
     height, width = gray.shape
-    y, x = np.mgrid[0 : height : stride_px, 0 : width : stride_px]
+    y, x = np.mgrid[0:height:stride_px, 0:width:stride_px]
     xy = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
     views, matches = [], []
     for neighbour in reference.neighbours:
@@ -163,9 +163,7 @@ def dense_points(folder: Path, reference: Reference, stride_px: int) -> DensePoi
 
 
 @lru_cache(maxsize=CACHED_IMAGES)
-def _prepared_image(
-    path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics
-) -> np.ndarray:
+def _prepared_image(path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics) -> np.ndarray:
     """Read an image of this `file_state` without its distortion, at most `MAX_SIDE_PX` long."""
     rgb = intrinsics.undistort(load_image(path))
     size = _limited_size(intrinsics.size)

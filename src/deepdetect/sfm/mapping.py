@@ -57,11 +57,13 @@ class Observations:
         points: (K,) int64 rows of the points, ascending.
         views: (K,) int64 COLMAP's numbers of the images.
         xy: (K, 2) float64 positions in pixels of pinhole cameras.
+        keypoints: (K,) int64 rows of the keypoints of the image.
     """
 
     points: np.ndarray
     views: np.ndarray
     xy: np.ndarray
+    keypoints: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,18 +238,21 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
         )
     numbers = sorted(model.points3D)
     rows = [
-        (k, element.image_id, *model.images[element.image_id].points2D[element.point2D_idx].xy)
+        (
+            *(k, element.image_id, element.point2D_idx),
+            *model.images[element.image_id].points2D[element.point2D_idx].xy,
+        )
         for k, number in enumerate(numbers)
         for element in model.points3D[number].track.elements
     ]
-    table = np.array(rows, np.float64).reshape(-1, 4)
-    seen_in = table[:, 1].astype(np.int64)
-    xy = table[:, 2:] - PIXEL_CENTRE
+    table = np.array(rows, np.float64).reshape(-1, 5)
+    seen_points, seen_in, keypoints = table[:, :3].astype(np.int64).T
+    xy = table[:, 3:] - PIXEL_CENTRE
     for number, own in intrinsics.items():
         rows_in = seen_in == number
         xy[rows_in] = own.to_pinhole(xy[rows_in])
     points = np.array([model.points3D[number].xyz for number in numbers]).reshape(-1, 3)
-    seen = Observations(table[:, 0].astype(np.int64), seen_in, xy)
+    seen = Observations(seen_points, seen_in, xy, keypoints)
     errors = _mean_errors(points, views, seen)
     return SparseModel(views, intrinsics, points, errors, seen)
 

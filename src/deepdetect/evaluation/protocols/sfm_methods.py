@@ -26,10 +26,9 @@ from ...geometry.camera import Camera
 from ...io.image import load_image, luma
 from ...sfm.colmap import PIXEL_CENTRE, quiet_pycolmap
 from ...sfm.fusion import DensePoints
-from ...sfm.intrinsics import photograph_lenses
+from ...sfm.intrinsics import initial_intrinsics
 from ...sfm.mapping import SparseModel, read_sparse_model
 from ...sfm.options import MultiViewOptions
-from ...sfm.pair_selection import PairSelectionOptions
 from ...sfm.pipeline import MAX_KEYPOINTS
 from ...sfm.stages import Stages
 from ..metrics.multi_view import cloud_agreement
@@ -38,7 +37,7 @@ from .sfm_results import SfmModel, SfmResult
 
 FEATURES, DATABASE = "features.h5", "sift.db"
 
-OPTIONS = MultiViewOptions(pair_selection=PairSelectionOptions(pairs="all"))
+OPTIONS = MultiViewOptions(pairs="all")
 """Of all methods: those of `reconstruct_many`, but every pair is matched."""
 
 Pair = tuple[str, str]
@@ -251,11 +250,11 @@ def _map(
     known: Mapping[str, Camera],
 ) -> tuple[SfmModel, SparseModel | None]:
     """Map with known cameras, or with those that are estimated; no model is a result, too."""
-    lenses = photograph_lenses(folder, names, sizes, known)
+    intrinsics = initial_intrinsics(folder, {name: sizes[name] for name in names}, known)
     clock = _Clock()
     try:
         with clock.running():
-            model, _, _ = stages.map(folder, names, lenses, matches, bool(known))
+            model, _, _ = stages.map(folder, intrinsics, matches, bool(known))
     except NoDepthError:
         return SfmModel({}, 0, float("nan"), float("nan"), clock.seconds, clock.cpu_seconds), None
     sparse = read_sparse_model(model)
@@ -295,10 +294,11 @@ def part_of_model(sparse: SparseModel, numbers: Sequence[int]) -> SparseModel:
         points=sparse.seen.points[rows],
         views=sparse.seen.views[rows],
         xy=sparse.seen.xy[rows],
+        keypoints=sparse.seen.keypoints[rows],
     )
     return replace(
         sparse,
         views={number: sparse.views[number] for number in numbers},
-        lenses={number: sparse.lenses[number] for number in numbers},
+        intrinsics={number: sparse.intrinsics[number] for number in numbers},
         seen=seen,
     )
