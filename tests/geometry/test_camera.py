@@ -9,7 +9,6 @@ import pytest
 
 from deepdetect._shared.errors import ReconstructionError
 from deepdetect.geometry.camera import (
-    Calibration,
     Camera,
     calibration_from_focal,
     read_calibration,
@@ -123,12 +122,6 @@ def test_what_is_wrong_is_said(tmp_path: Path, one_line, values: Any, message: s
     assert len(message) < 300 + len(str(path))
 
 
-def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
-    path = written(tmp_path, "\ufeff" + json.dumps({"focal_px": 900}))
-    assert path.read_bytes().startswith(b"\xef\xbb\xbf")
-    assert read_calibration(path, SIZE, SIZE).camera0 == Camera(SIZE, 900)
-
-
 def test_a_missing_file_is_said(tmp_path: Path, one_line) -> None:
     for path in (tmp_path / "no.json", tmp_path):
         with pytest.raises(ReconstructionError, match="cannot be read") as error:
@@ -151,12 +144,6 @@ def test_rays_and_projection_undo_each_other() -> None:
     camera = Camera(SIZE, (700, 720), (300, 250))
     pixels = np.random.default_rng(0).uniform(0, SIZE, (50, 2))
     np.testing.assert_allclose(camera.project(camera.rays(pixels) * 3), pixels)
-
-
-def test_without_a_baseline_depths_are_in_baselines() -> None:
-    camera = Camera(SIZE, 700)
-    calibration = Calibration(camera, camera)
-    np.testing.assert_allclose(calibration.depth_mm([70, 7, 0, -3]), [10, 100, np.inf, np.inf])
 
 
 def test_the_size_of_the_images_is_checked() -> None:

@@ -24,12 +24,6 @@ def test_slices_masks_and_numbers_select_points() -> None:
     assert cloud[:2].unit == "mm"
 
 
-def test_an_empty_cloud_is_allowed() -> None:
-    cloud = PointCloud([], [], "mm")
-    assert cloud.points.shape == cloud.colors.shape == (0, 3)
-    assert len(cloud[:0]) == 0
-
-
 @pytest.mark.parametrize(
     ("points", "colors", "unit", "word"),
     [
@@ -63,17 +57,6 @@ def test_a_few_wild_points_hardly_move_the_box() -> None:
     assert plain.radius == pytest.approx(np.sqrt(3) * 0.98, rel=0.03)
 
 
-def test_a_box_of_one_point_has_a_size() -> None:
-    box = robust_box(PointCloud([[1.0, 2, 3]], [[0, 0, 0]], "mm"))
-    assert box.centre.tolist() == [1, 2, 3]
-    assert box.radius == 1
-
-
-def test_an_empty_cloud_has_no_box() -> None:
-    with pytest.raises(OptionError, match="no points"):
-        robust_box(PointCloud([], [], "mm"))
-
-
 def test_spacing_is_that_of_the_pixels_at_any_depth() -> None:
     y, x = np.indices((200, 300)).reshape(2, -1)
     rng = np.random.default_rng(0)
@@ -83,8 +66,3 @@ def test_spacing_is_that_of_the_pixels_at_any_depth() -> None:
     assert angular_spacing(cloud) == pytest.approx(1 / 400, rel=0.03)
     # A quarter of the points lie twice as far apart.
     assert angular_spacing(cloud[rng.permutation(x.size)[::4]]) == pytest.approx(2 / 400, rel=0.05)
-
-
-def test_few_points_or_none_ahead_have_the_largest_spacing() -> None:
-    assert angular_spacing(PointCloud([[0.0, 0, 5]], [[0, 0, 0]], "mm")) == 0.02
-    assert angular_spacing(PointCloud([[0.0, 0, -5]], [[0, 0, 0]], "mm")) == 0.02

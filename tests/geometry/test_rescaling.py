@@ -40,18 +40,6 @@ def test_a_spot_is_where_its_scaled_position_says(x: int, y: int, width: int, he
     np.testing.assert_allclose(centre(small), scaled_points(np.array([x, y]), scale), atol=0.05)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 200), (150, 200)])
-def test_small_images_stay_as_they_are(shape: tuple[int, int]) -> None:
-    gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    same, scale = downscale(gray, 200)
-    assert scale == 1
-    np.testing.assert_array_equal(same, gray)
-
-
-def test_a_line_of_pixels_keeps_one_row() -> None:
-    assert downscale(np.zeros((1, 5000), np.uint8), 200)[0].shape == (1, 200)
-
-
 def test_a_scaled_homography_maps_scaled_points() -> None:
     points = np.random.default_rng(0).uniform(0, 300, (20, 2))
     matrix = scaled_homography(MILD, 2.5, 0.3)

@@ -20,16 +20,6 @@ def test_sums_are_those_of_brute_force(window: int) -> None:
         np.testing.assert_allclose(found, near @ values, atol=1e-9)
 
 
-def test_sums_are_of_the_type_of_the_values() -> None:
-    pixels = np.array([[1, 1]])
-    assert window_sums(pixels, np.float32(1), (3, 3, 3), 3).dtype == np.float32
-    assert window_sums(pixels, 1.0, (3, 3), 3).dtype == np.float64
-
-
-def test_no_points_have_no_sums() -> None:
-    assert window_sums(np.empty((0, 2), np.int64), 1.0, (4, 5), 3).shape == (0,)
-
-
 @pytest.fixture
 def some() -> tuple[np.ndarray, np.ndarray]:
     """Pixels of a 30x20 image, each once, and their values."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 import deepdetect
-from deepdetect import DeepDetect, OptionError, PointDetector, ReconstructionError, SelectionOptions
+from deepdetect import DeepDetect, PointDetector, ReconstructionError, SelectionOptions
 from deepdetect._shared import parallel
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_middlebury
@@ -121,11 +119,6 @@ def test_with_an_offset_no_depth_is_invented(offset: int, cones: Any) -> None:
     assert found.matched[outside].mean() < 0.1
 
 
-def test_disparities_are_below_the_pixel_without_terraces(found: Any) -> None:
-    tenths, _ = np.histogram(found.disparity % 1, 10, (0, 1))
-    assert tenths.max() < 1.5 * tenths.min()
-
-
 def test_points_are_the_disparities_by_the_calibration(found: Any) -> None:
     """z = f b / d, and x and y where the pixel looks: x right, y down, z forward."""
     expected = 500 / found.disparity
@@ -181,30 +174,6 @@ def test_a_pair_that_is_not_rectified_has_true_depths(posed: Any, turned: Any) -
     assert len(posed.reprojection_errors) == len(posed)
     with pytest.raises(ReconstructionError, match="use depth_map"):
         posed.disparity_map()
-
-
-@pytest.mark.slow
-def test_a_post_before_a_wall_is_not_left_out(
-    facade: Any, detector: DeepDetect, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A homography explains nine tenths of the pair, and must not choose the matches."""
-    pair = facade(0.07)
-    given: list[np.ndarray] = []
-
-    def stop(points0: np.ndarray, points1: np.ndarray, *rest: Any, refined: bool) -> None:
-        assert refined  # they come from rectified rows
-        given.extend([points0, points1])
-        raise ReconstructionError("seen enough")
-
-    monkeypatch.setattr("deepdetect.reconstruction.pipeline.reconstruct_two_view", stop)
-    with pytest.raises(ReconstructionError, match="seen enough"):
-        reconstruct(pair.left, pair.right, detector, focal_px=400)
-    column, row = given[0].astype(int).T
-    near = pair.near[row, column]
-    errors = np.linalg.norm(given[1] - pair.match(given[0]), axis=1)
-    for part, fewest in ((near, 1000), (~near, 20_000)):
-        assert np.count_nonzero(errors[part] < 2) > fewest
-        assert (errors[part] < 2).mean() > 0.9
 
 
 @pytest.mark.slow
@@ -276,37 +245,6 @@ def test_both_pipelines_agree_on_a_rectified_pair(level: Any, detector: DeepDete
     assert abs(np.median(ratio) - 1) < 0.02
 
 
-def test_a_disparity_offset_is_taken_into_account(level: Any, detector: DeepDetect) -> None:
-    """Columns cut off the left of one view change disparity and offset, and no depth."""
-    cut = 10
-    right = level.calibration.camera1
-    moved = Camera((360, 250), right.focal_px, (right.centre[0] - cut, right.centre[1]))
-    left = Camera((360, 250), right.focal_px, level.calibration.camera0.centre)
-    options = {"rectified": True, "density": 1}
-    whole = reconstruct(
-        level.left, level.right, detector, calibration=level.calibration, **options
-    ).depth_map()[:, :360]
-    other = reconstruct(
-        np.ascontiguousarray(level.left[:, :360]),
-        np.ascontiguousarray(level.right[:, cut:]),
-        detector,
-        calibration=Calibration(left, moved),
-        **options,
-    ).depth_map()
-    ratio = (whole / other)[:, 40:300]
-    assert abs(np.nanmedian(ratio) - 1) < 1e-3
-    assert (np.abs(ratio[np.isfinite(ratio)] - 1) < 0.02).mean() > 0.95
-
-
-@pytest.mark.slow
-def test_is_the_same_on_repetition(found: Any, posed: Any, cones: Any, turned: Any) -> None:
-    detector = DeepDetect("dense")
-    again = reconstruct(cones.left, cones.right, detector, focal_px=500)
-    np.testing.assert_array_equal(again.points, found.points)
-    again = reconstruct(turned.left, turned.right, detector, calibration=turned.calibration)
-    np.testing.assert_array_equal(again.points, posed.points)
-
-
 @pytest.mark.slow
 def test_is_the_same_for_any_number_of_threads(
     turned: Any, level: Any, monkeypatch: pytest.MonkeyPatch
@@ -368,49 +306,6 @@ def test_keypoints_of_a_rectified_pair_only_choose_pixels_of_the_disparity_map(
     np.testing.assert_array_equal(made.disparity, expected[row, column])
 
 
-@pytest.mark.slow
-def test_stages_are_reported_as_they_end(level: Any, turned: Any, detector: DeepDetect) -> None:
-    for pair, expected in (
-        (level, ["rectified or not", "keypoints", "matching", "triangulation", "outlier removal"]),
-        (
-            turned,
-            ["rectified or not", "keypoints and matching", "sub-pixel", "checks", "pose"]
-            + ["focal length", "triangulation", "outlier removal"],
-        ),
-    ):
-        reported: list[str] = []
-        made = reconstruct(
-            pair.left,
-            pair.right,
-            detector,
-            calibration=pair.calibration,
-            max_keypoints=20_000,
-            progress=reported.append,
-        )
-        assert reported == expected == list(made.seconds)
-
-
-def test_options_and_results_are_frozen(found: Any) -> None:
-    for value in (ReconstructionOptions(), found):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            value.rectified = True
-
-
-@pytest.mark.parametrize(
-    ("options", "nearest"),
-    [
-        ({"rectifed": True}, "rectified"),
-        ({"progres": print}, "progress"),
-    ],
-)
-def test_an_unknown_option_names_the_nearest(
-    level: Any, options: dict[str, Any], nearest: str, one_line: Any
-) -> None:
-    with pytest.raises(OptionError, match=f"did you mean '{nearest}'") as error:
-        reconstruct(level.left, level.right, AllPixels(), focal_px=500, **options)
-    one_line(error.value)
-
-
 def refusal(one_line: Any, *pair: Any, **options: Any) -> str:
     with pytest.raises(ReconstructionError) as error:
         reconstruct(*pair, AllPixels(), **{"focal_px": 497.5, **options})
@@ -434,19 +329,6 @@ def test_pairs_only_said_to_be_rectified_give_no_cloud(
     assert "all disparities are -9 px" in refusal(one_line, *shifted, **options)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rectified", [None, True, False])
-@pytest.mark.parametrize("quality", [80, 95])
-def test_a_copy_as_jpeg_gives_no_depth(
-    level: Any, detector: DeepDetect, quality: int, rectified: bool | None, one_line: Any
-) -> None:
-    file = io.BytesIO()
-    Image.fromarray(level.left).save(file, "JPEG", quality=quality)
-    with pytest.raises(ReconstructionError) as error:
-        reconstruct(level.left, file.getvalue(), detector, focal_px=497.5, rectified=rectified)
-    assert ("without a baseline" if rectified else "nothing moves") in one_line(error.value)
-
-
 def test_a_pair_taken_in_the_dark_has_depth(level: Any) -> None:
     """Of a mean of 6 grey levels."""
     factor = 6 / level.left.mean()
@@ -456,26 +338,6 @@ def test_a_pair_taken_in_the_dark_has_depth(level: Any) -> None:
     off = np.abs(found.disparity - level.disparity[row, column])
     assert len(found) > 10_000
     assert np.nanmedian(off) < 0.5
-
-
-def test_no_keypoint_is_said(level: Any, detector: DeepDetect, one_line: Any) -> None:
-    class Sure:
-        """Nowhere is a keypoint."""
-
-        def heatmap(self, image: Any) -> np.ndarray:
-            return np.full(level.left.shape[:2], 0.25, np.float32)
-
-    for rectified, message in (
-        (True, "no pixel of the left image is above the threshold of 0.5: lower `threshold`"),
-        (None, "no pixel of the left image is above the threshold of 0.5: lower `threshold`"),
-        (False, "or no pixel of one is above the threshold"),
-    ):
-        with pytest.raises(ReconstructionError) as error:
-            reconstruct(level.left, level.right, Sure(), focal_px=497.5, rectified=rectified)
-        assert message in one_line(error.value)
-    blank = np.full_like(level.left, 128)
-    with pytest.raises(ReconstructionError, match="above the threshold"):
-        reconstruct(blank, level.right, detector, focal_px=497.5, rectified=True)
 
 
 def test_cameras_that_contradict_rectified_rows_are_refused(level: Any, one_line: Any) -> None:
@@ -528,13 +390,6 @@ def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> Non
     )
     with pytest.raises(ImageError, match="must have one size"):
         reconstruct(level.left, narrow, AllPixels(), focal_px=500, rectified=True)
-
-
-def test_the_representation_is_one_short_line(found: Any, posed: Any) -> None:
-    for made, pair in ((found, "rectified"), (posed, "not rectified")):
-        text = repr(made)
-        assert len(text) < 120
-        assert f"Reconstruction({len(made):,} points, {pair}, depth " in text
 
 
 def test_the_values_are_plain_and_complete(found: Any, posed: Any) -> None:

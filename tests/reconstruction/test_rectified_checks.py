@@ -10,7 +10,6 @@ import pytest
 
 from deepdetect._shared.errors import ReconstructionError
 from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.features.selection import SelectionOptions
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
 from deepdetect.matching.stereo import DENSE, DisparityOptions, disparity_map
@@ -18,7 +17,6 @@ from deepdetect.reconstruction.rectified_checks import (
     check_cameras,
     check_depths,
     check_disparities,
-    check_keypoints,
     check_matched,
     check_pure_rotation,
 )
@@ -69,13 +67,6 @@ def test_points_behind_the_cameras(one_line) -> None:
         check_depths(-disparity[250:], plain)
 
 
-def test_what_is_very_far_away_is_not_behind() -> None:
-    """Disparities of 0 with noise, as of a sky, are of both signs."""
-    camera = Camera((400, 300), 500.0)
-    noise = np.random.default_rng(0).normal(0, 0.3, 1000)
-    check_depths(np.append(noise, np.full(200, 5.0)), Calibration(camera, camera))
-
-
 def test_cameras_that_no_rectified_pair_has(one_line) -> None:
     left = Camera((640, 480), 500.0, (320.0, 240.0))
 
@@ -91,20 +82,6 @@ def test_cameras_that_no_rectified_pair_has(one_line) -> None:
     assert "cy of the left and the right view are 240 and 243 px" in refusal(centre=(320.0, 243.0))
     for changes in ({"focal_px": 504.0}, {"centre": (390.0, 240.0)}, {"centre": (320.0, 238.5)}):
         check_cameras(Calibration(left, replace(left, **changes)))
-
-
-def test_no_keypoints(one_line) -> None:
-    for selection, message in (
-        (
-            SelectionOptions(threshold=0.75),
-            "threshold of 0.75: lower `threshold`, or give `density`",
-        ),
-        (SelectionOptions(density=1e-7), "a density of 1e-07 gives no keypoint"),
-    ):
-        check_keypoints(1, selection)
-        with pytest.raises(ReconstructionError, match=message) as error:
-            check_keypoints(0, selection)
-        one_line(error.value)
 
 
 PIXELS = np.stack(np.meshgrid(np.arange(0, 640, 8.0), np.arange(0, 480, 8.0)), -1).reshape(-1, 2)
@@ -137,27 +114,6 @@ def test_a_wall_before_two_cameras_is_no_rotation(slant: tuple[float, float], fo
     noise = np.random.default_rng(0).normal(0, 0.1, len(PIXELS))
     for shift in (0, 5, 40):
         check_pure_rotation(PIXELS, shift + PIXELS @ slant + noise, Calibration(camera, camera))
-
-
-def test_bent_surfaces_are_no_rotation() -> None:
-    """Random quadrics of little depth, which a turn with a roll comes near to."""
-    camera = Camera((640, 480), 1200.0)
-    generator = np.random.default_rng(0)
-    x, y = ((PIXELS - [320, 240]) / [320, 240]).T
-    for _ in range(100):
-        bent = np.column_stack([x, y, x * x, x * y, y * y]) @ generator.normal(size=5)
-        bent *= generator.uniform(0.5, 4) / np.ptp(np.quantile(bent, [0.05, 0.95]))
-        disparity = generator.uniform(0, 60) + bent + generator.normal(0, 0.1, len(x))
-        check_pure_rotation(PIXELS, disparity, Calibration(camera, camera))
-
-
-def test_too_few_matches_and_impossible_focal_lengths_give_no_rotation() -> None:
-    camera = Camera((640, 480), 600.0)
-    calibration = Calibration(camera, camera)
-    disparity = turned_disparity(calibration, (0, -2, 0))
-    check_pure_rotation(PIXELS[::300], disparity[::300], calibration)
-    tiny = Camera((640, 480), 1.0)
-    check_pure_rotation(PIXELS, disparity, Calibration(tiny, tiny))
 
 
 @pytest.mark.parametrize("name", ["art", "cones", "dolls", "moebius", "teddy"])

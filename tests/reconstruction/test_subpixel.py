@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import OptionError
 from deepdetect.io.image import luma
 from deepdetect.reconstruction import subpixel
 from deepdetect.reconstruction.subpixel import (
@@ -109,17 +108,6 @@ def test_what_cannot_be_aligned_stays_and_says_so(gray: np.ndarray) -> None:
     assert not refine_matches(gray, gray, pixels, outside).converged.any()
 
 
-def test_the_number_of_threads_does_not_matter(
-    gray: np.ndarray, pixels: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    other = moved(gray, 0.4, -0.3)
-    many = refine_matches(gray, other, pixels, pixels)
-    monkeypatch.setattr(subpixel, "parallel_for", lambda count, work: work(0, count))
-    one = refine_matches(gray, other, pixels, pixels)
-    np.testing.assert_array_equal(many.points1, one.points1)
-    np.testing.assert_array_equal(many.converged, one.converged)
-
-
 def test_bands_of_rows_do_not_matter(
     gray: np.ndarray, pixels: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -159,13 +147,6 @@ def test_corners_come_from_all_parts_of_the_image_each_once(
     assert len(spread_corners(gray, np.empty((0, 2)), 60)) == 0
 
 
-def test_no_matches_and_few(gray: np.ndarray) -> None:
-    assert len(refine_matches(gray, gray, *np.empty((2, 0, 2))).points1) == 0
-    for count in (1, 2, 3):
-        points = np.array([[100, 100], [60, 80], [150, 120]])[:count]
-        assert refine_matches(gray, gray, points, points).converged.all()
-
-
 def test_affinities_are_those_of_the_motion_around() -> None:
     pixels = np.stack(np.meshgrid(np.arange(60), np.arange(50)), -1).reshape(-1, 2)
     one, other = np.array([[1.1, 0.1], [0, 0.9]]), np.array([[0.9, -0.1], [0.2, 1.2]])
@@ -183,20 +164,3 @@ def test_affinities_are_those_of_the_motion_around() -> None:
         np.array([[5, 5]]), np.array([[9.0, 9.0]]), np.ones(1, bool), (50, 60), one
     )
     np.testing.assert_allclose(alone[0], one, atol=1e-6)
-
-
-def test_what_is_wrong_is_said(gray: np.ndarray) -> None:
-    for points in ([[0.5, 3]], [[-1, 3]], [[256, 3]]):
-        with pytest.raises(OptionError, match="whole pixels of the image"):
-            refine_matches(gray, gray, np.array(points), np.array(points))
-
-
-def test_wrong_matches_around_do_not_bend_an_affinity() -> None:
-    pixels = np.stack(np.meshgrid(np.arange(60), np.arange(50)), -1).reshape(-1, 2)
-    places = pixels.astype(np.float64)
-    wrong = np.random.default_rng(0).random(len(pixels)) < 0.3
-    places[wrong] += 40
-    found = local_affinities(pixels, places, ~wrong, (50, 60), np.eye(2))
-    np.testing.assert_allclose(found, np.broadcast_to(np.eye(2), found.shape), atol=1e-6)
-    nowhere = local_affinities(pixels, places, np.zeros(3000, bool), (50, 60), 2 * np.eye(2))
-    np.testing.assert_allclose(nowhere, np.broadcast_to(2 * np.eye(2), found.shape), atol=1e-6)

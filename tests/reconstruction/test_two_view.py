@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, match_images
 from deepdetect._shared.errors import ReconstructionError
 from deepdetect.geometry.camera import calibration_from_focal
-from deepdetect.geometry.relative_pose import estimate_relative_pose
 from deepdetect.reconstruction.outliers import PointFilterOptions
 from deepdetect.reconstruction.two_view import (
     TwoViewReconstruction,
@@ -75,13 +73,6 @@ def test_their_pose_is_that_of_corners_refined_alone(
     assert errors[0] < 0.5 * errors[1]
 
 
-def test_whole_pixels_give_a_worse_model(turned: Any, turned_matches: Any, found: Any) -> None:
-    coarse = reconstruct_two_view(*turned_matches, turned.calibration)
-    fine = depth_errors(turned, found, turned_matches[0])
-    assert np.median(fine) < 0.6 * np.median(depth_errors(turned, coarse, turned_matches[0]))
-    assert turned.rotation_error(found.pose.rotation) < turned.rotation_error(coarse.pose.rotation)
-
-
 def test_points_lie_where_their_pixels_look(turned: Any, turned_matches: Any, found: Any) -> None:
     """x right, y down, z forward, and each point on the ray of its own match."""
     points0, _ = turned_matches
@@ -111,18 +102,6 @@ def test_a_known_baseline_gives_millimetres(turned: Any, turned_matches: Any, fo
     assert metric.unit == "mm"
     np.testing.assert_array_equal(metric.indices, found.indices)
     np.testing.assert_allclose(metric.points, found.points * 193.001, rtol=1e-5)
-
-
-def test_is_the_same_on_repetition(turned: Any, turned_matches: Any, found: Any) -> None:
-    again = reconstruct_two_view(*turned_matches, turned.calibration, turned.grays)
-    np.testing.assert_array_equal(again.points, found.points)
-
-
-def test_a_rectified_pair_is_only_a_special_case(level: Any, level_matches: Any) -> None:
-    found = reconstruct_two_view(*level_matches, level.calibration, level.grays)
-    assert level.rotation_error(found.pose.rotation) < 0.1
-    errors = depth_errors(level, found, level_matches[0])
-    assert np.median(errors) < 0.015
 
 
 def test_wrong_matches_are_taken_out(turned: Any, turned_matches: Any, found: Any) -> None:
@@ -167,25 +146,3 @@ def test_what_is_wrong_is_said(turned: Any, turned_matches: Any, level: Any, one
             None,
             point_filter=PointFilterOptions(min_parallax_px=1e4),
         )
-
-
-@pytest.mark.slow
-def test_a_camera_that_only_rotated_gives_no_cloud(level: Any, only_turned: np.ndarray) -> None:
-    from deepdetect.io.image import luma
-
-    found = match_images(level.left, only_turned, DeepDetect("dense"))
-    calibration = replace(level.calibration, camera1=level.calibration.camera0)
-    with pytest.raises(ReconstructionError, match="rotation of the camera"):
-        reconstruct_two_view(
-            found.points0, found.points1, calibration, (level.grays[0], luma(only_turned))
-        )
-
-
-def test_real_matches_give_the_pose(
-    turned: Any, turned_matches: tuple[np.ndarray, np.ndarray]
-) -> None:
-    """Whole pixels: the refined matches above give it several times better."""
-    pose = estimate_relative_pose(*turned_matches, turned.calibration)
-    assert turned.rotation_error(pose.rotation) < 0.5
-    assert turned.direction_error(pose.translation) < 3
-    assert pose.cheirality_ratio > 0.95

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.features.sift_detector import detect_sift
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.asift import TILTS, simulate_view, simulated_views
 
@@ -16,24 +15,11 @@ def blob(x: float, y: float, across: float, down: float) -> np.ndarray:
     return np.rint(40 + 180 * np.exp(-away / 2)).astype(np.uint8)
 
 
-def test_without_tilt_and_turn_it_is_the_image_itself(photo: np.ndarray) -> None:
-    gray = luma(photo)[:100]
-    view, affine = simulate_view(gray, 1.0, 0.0)
-    np.testing.assert_array_equal(view, gray)
-    np.testing.assert_allclose(affine, np.eye(2, 3), atol=1e-12)
-
-
 def test_a_tilt_shortens_the_width_only(photo: np.ndarray) -> None:
     gray = luma(photo)[:100]
     view, affine = simulate_view(gray, 2.0, 0.0)
     assert view.shape == (100, 128)
     np.testing.assert_allclose(affine, [[0.5, 0, 0], [0, 1, 0]], atol=1e-12)
-
-
-def test_a_quarter_turn_shortens_the_height(photo: np.ndarray) -> None:
-    gray = luma(photo)[:100]
-    view, _ = simulate_view(gray, 2.0, 90.0)
-    assert view.shape == pytest.approx((256, 50), abs=1)
 
 
 @pytest.mark.parametrize("tilt", [1.0, *TILTS])
@@ -85,31 +71,6 @@ def test_keypoints_lie_at_their_positions_in_the_image_itself(tilt: float) -> No
     near = gaps[np.argmin(np.linalg.norm(gaps, axis=1))]
     assert abs(near[0]) < 0.15 * tilt
     assert abs(near[1]) < 0.15
-
-
-@pytest.mark.parametrize("tilt", TILTS)
-def test_keypoints_are_within_the_image_and_described(photo: np.ndarray, tilt: float) -> None:
-    gray = luma(photo)[:100]
-    for found in simulated_views(gray, tilt, 100):
-        assert (found.xy > 0).all()
-        assert (found.xy < (255, 99)).all()
-        assert found.descriptors.shape == (len(found.xy), 128)
-
-
-def test_larger_tilts_are_seen_from_more_directions(photo: np.ndarray) -> None:
-    gray = luma(photo)[:64, :64]
-    counts = [len(list(simulated_views(gray, tilt, 10))) for tilt in TILTS]
-    assert counts == sorted(counts)
-    assert counts[0] == 5  # every 36 degrees of 180
-    assert counts[-1] == 10
-
-
-def test_no_view_has_more_keypoints_than_asked_for(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    found = [len(view) for view in simulated_views(gray, 2.0, 30)]
-    assert max(found) <= 30
-    assert min(found) > 10
-    assert len(detect_sift(gray)) > 30
 
 
 @pytest.mark.parametrize("tilt", TILTS)

@@ -85,23 +85,6 @@ def test_a_pattern_that_repeats_elsewhere_is_matched_on_its_line(
     np.testing.assert_allclose(points1 - points0, np.tile([30, 0.5], (len(points0), 1)))
 
 
-def test_what_is_off_the_line_is_no_partner() -> None:
-    described = np.random.default_rng(0).integers(0, 256, (2, 128))
-    first = keypoints(np.array([[50.0, 50.0], [90.0, 200.0]]), described)
-    second = keypoints(np.array([[60.0, 54.0], [70.0, 202.0]]), described)
-    points0, points1 = epipolar_search(first, second, ROWS)
-    assert points0.tolist() == [[90, 200]]
-    assert points1.tolist() == [[70, 202]]
-
-
-def test_without_keypoints_there_are_no_matches() -> None:
-    first, _ = random_pair(10)
-    none = keypoints(np.empty((0, 2)), np.empty((0, 128)))
-    for pair in ((first, none), (none, first), (none, none)):
-        points0, points1 = epipolar_search(*pair, ROWS)
-        assert points0.shape == points1.shape == (0, 2)
-
-
 def test_right_lines_find_more_than_chance() -> None:
     first, second = random_pair(300)
     nothing = np.empty((0, 2))

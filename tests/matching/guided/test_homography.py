@@ -83,13 +83,6 @@ def test_all_within_reach_are_found_wherever_they_lie(seed: int) -> None:
     assert (distances[~within] >= REACH).all()
 
 
-def test_places_that_are_nowhere_have_no_nearest_keypoint() -> None:
-    where = np.array([[np.nan, 2], [np.inf, 2], [2, -np.inf], [1e300, 2], [-1e18, 2], [2, 1e10]])
-    rows, distances = nearest_keypoint(where, np.array([[2, 2]]), (5, 5))
-    assert (rows == -1).all()
-    assert np.isinf(distances).all()
-
-
 def test_the_corners_of_the_image_are_reached_from_outside() -> None:
     xy = np.array([[0, 0], [9, 6]])
     where = np.array([[-0.5, -0.5], [9.6, 6.6], [-0.9, 0], [9, 6.9]])
@@ -122,30 +115,6 @@ def test_matches_lie_within_reach_of_where_the_homography_takes_them(photo: np.n
     inside = ((there > 2) & (there < 253)).all(1)
     partner = KDTree(xy1).query(there)[0] < REACH
     assert len(rows0) > 0.9 * np.count_nonzero(inside & partner)
-
-
-@pytest.mark.slow
-def test_scores_are_under_one_and_smaller_where_both_look_more_alike(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    xy = every_pixel(gray)
-    second = warped(gray, MILD)
-    blurred = cv2.GaussianBlur(second, (0, 0), 1.5)
-    sharp, dull = (matched(gray, one, xy, xy, MILD) for one in (second, blurred))
-    for rows0, rows1, scores in (sharp, dull):
-        assert len(rows0) == len(rows1) == len(scores)
-        assert (scores >= 0).all()
-        assert (scores < 1).all()
-    assert np.median(sharp[2]) < np.median(dull[2])
-
-
-def test_several_may_share_a_partner(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    half = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
-    small = cv2.resize(gray, (128, 128), interpolation=cv2.INTER_AREA)
-    rows0, rows1, _ = matched(gray, small, every_pixel(gray), every_pixel(small), half)
-    counts = np.bincount(rows1)
-    assert counts.max() == 4
-    assert len(rows0) > 0.9 * gray.size
 
 
 def test_what_is_covered_in_the_second_image_is_not_matched(photo: np.ndarray) -> None:
@@ -184,29 +153,3 @@ def test_a_homography_to_nowhere_is_taken(photo: np.ndarray, homography: np.ndar
     rows0, rows1, _ = matched(gray, gray, xy, xy, homography)
     assert len(rows0) == len(rows1) < 0.5 * len(xy)
     assert (transfer_errors(xy[rows0], xy[rows1], homography) < REACH).all()
-
-
-def test_without_keypoints_nothing_matches(photo: np.ndarray) -> None:
-    gray = luma(photo)[:60, :80]
-    xy, none = every_pixel(gray), np.empty((0, 2), np.float32)
-    for first, second in ((none, xy), (xy, none), (none, none)):
-        rows0, rows1, _ = matched(gray, gray, first, second, np.eye(3))
-        assert rows0.shape == rows1.shape == (0,)
-        assert np.issubdtype(rows0.dtype, np.integer)
-
-
-def test_one_keypoint_matches_itself(photo: np.ndarray) -> None:
-    gray = luma(photo)[:60, :80]
-    one = np.array([[40, 30]], np.float32)
-    rows0, rows1, _ = matched(gray, gray, one, one, np.eye(3))
-    assert rows0.tolist() == rows1.tolist() == [0]
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (5, 5), (40, 50)])
-def test_flat_and_tiny_images_are_taken(shape: tuple[int, int]) -> None:
-    flat = np.full(shape, 90, np.uint8)
-    noise = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    xy = every_pixel(flat)
-    assert len(matched(flat, flat, xy, xy, np.eye(3))[0]) == 0
-    rows0, rows1, _ = matched(noise, noise, xy, xy, np.eye(3))
-    np.testing.assert_array_equal(rows0, rows1)

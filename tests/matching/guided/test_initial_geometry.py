@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.geometry import epipolar_errors, transfer_errors, transform_points
 from deepdetect.geometry.acontrario import MAX_LOG10_NFA
 from deepdetect.geometry.two_view import GUIDING_THRESHOLDS_PX
@@ -154,16 +153,6 @@ def test_the_centre_of_the_first_pixel_is_the_origin(
     assert np.abs(gaps.mean(0)).max() < 0.08
 
 
-def test_points_are_the_matches_and_lie_in_the_images(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    found = initial_geometry(gray, warped(gray, MILD, (300, 240)))
-    for points, size in ((found.points0, (256, 256)), (found.points1, (300, 240))):
-        assert (points >= 0).all()
-        assert (points < size).all()
-    errors = transfer_errors(found.points0, found.points1, MILD)
-    assert np.median(errors) < 0.5
-
-
 @pytest.mark.parametrize(
     ("turn", "swapped"), [pytest.param(0.0, False, marks=pytest.mark.slow), (35.0, True)]
 )
@@ -198,28 +187,6 @@ def test_matches_that_are_there_already_are_not_made_again(
     np.testing.assert_array_equal(found.matrix, expected.matrix)
 
 
-@pytest.mark.slow
-def test_tentative_matches_of_a_large_pair_are_at_its_own_size(photo: np.ndarray) -> None:
-    gray = cv2.resize(luma(photo), (2400, 2400), interpolation=cv2.INTER_CUBIC)
-    shift = np.array([[1.0, 0, 40], [0, 1, -20], [0, 0, 1]])
-    found = find_tentative_matches(gray, warped(gray, shift, (2400, 2400)))
-    assert found.scales == (0.5, 0.5)
-    np.testing.assert_allclose(
-        np.median(found.points1 - found.points0, axis=0), [40, -20], atol=0.2
-    )
-
-
-def test_a_pair_that_needs_none_has_no_simulated_views(
-    photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(*_: object) -> None:
-        raise AssertionError("a view was simulated")
-
-    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.simulated_views", refused)
-    gray = luma(photo)
-    assert initial_geometry(gray, warped(gray, MILD, (256, 256))).num_views == 0
-
-
 @pytest.mark.parametrize(
     ("first", "second"),
     [
@@ -245,12 +212,6 @@ def test_stronger_tilts_are_tried_where_something_hints_at_a_geometry(
         found = initial_geometry(image, image)
         assert found.matrix is None
         assert found.num_views == tried
-
-
-def test_noise_has_no_geometry() -> None:
-    generator = np.random.default_rng(0)
-    first, second = (generator.integers(0, 256, (90, 120)).astype(np.uint8) for _ in range(2))
-    assert_nothing(initial_geometry(first, second))
 
 
 def test_a_scene_with_depth_has_a_fundamental_matrix(art: tuple) -> None:
@@ -297,13 +258,6 @@ def test_the_homography_of_a_scene_with_depth_is_given_when_asked_for(art: tuple
     assert len(found.points0) < len(initial_geometry(*art[:2], "fundamental").points0)
 
 
-def test_the_fundamental_matrix_of_a_plane_is_given_when_asked_for(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    found = initial_geometry(gray, warped(gray, MILD, (256, 256)), "fundamental")
-    assert found.model == "fundamental"
-    check_agreeing(found)
-
-
 @pytest.mark.slow
 def test_a_large_image_is_shrunk_and_its_matrix_comes_back_at_its_own_size(
     picture: Callable[..., np.ndarray],
@@ -325,75 +279,9 @@ def test_a_large_image_is_shrunk_and_its_matrix_comes_back_at_its_own_size(
     assert errors.max() < GUIDING_THRESHOLDS_PX["homography"] * 1500 / LONGEST + 1e-6
 
 
-@pytest.mark.slow
-def test_the_fundamental_matrix_of_large_images_comes_back_at_their_own_size(art: tuple) -> None:
-    left, right, points0, points1 = art
-    (large, up), (other, also_up) = resized(left, 1389, 1110), resized(right, 926, 740)
-    found = initial_geometry(large, other)
-    if found.model == "homography":  # the images decide
-        assert found.parallax.exceeds(0)
-        found = initial_geometry(large, other, "fundamental")
-    assert found.model == "fundamental"
-    errors = epipolar_errors(
-        transform_points(points0, up), transform_points(points1, also_up), found.matrix
-    )
-    assert np.quantile(errors, 0.95) < 2
-    errors = epipolar_errors(found.points0, found.points1, found.matrix)
-    assert errors.max() < GUIDING_THRESHOLDS_PX["fundamental"] * 1389 / LONGEST + 1e-6
-
-
-def test_is_the_same_on_repetition_and_leaves_its_input_alone(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    second = warped(gray, MILD, (256, 256))
-    before = gray.copy(), second.copy()
-    first, again = (initial_geometry(gray, second, seed=3) for _ in range(2))
-    np.testing.assert_array_equal(first.matrix, again.matrix)
-    np.testing.assert_array_equal(first.points1, again.points1)
-    np.testing.assert_array_equal(before[0], gray)
-    np.testing.assert_array_equal(before[1], second)
-
-
 @pytest.mark.parametrize("odd", ODD, ids=lambda odd: f"{odd.shape[1]}x{odd.shape[0]}")
 def test_images_without_keypoints_have_no_geometry(odd: np.ndarray, photo: np.ndarray) -> None:
     small = luma(photo)[60:140, 60:140]
     assert_nothing(initial_geometry(odd, odd))
     assert_nothing(initial_geometry(odd, small))
     assert_nothing(initial_geometry(small, odd, "fundamental"))
-
-
-def test_one_keypoint_makes_no_geometry() -> None:
-    row, column = np.indices((60, 70))
-    spot = np.exp(-((column - 30) ** 2 + (row - 28) ** 2) / 18)
-    gray = np.rint(40 + 180 * spot).astype(np.uint8)
-    assert_nothing(initial_geometry(gray, gray))
-
-
-def test_few_matches_on_a_line_make_no_geometry() -> None:
-    row, column = np.indices((60, 160))
-    spots = sum(np.exp(-((column - x) ** 2 + (row - 30) ** 2) / 18) for x in (20, 55, 90, 140))
-    gray = np.rint(40 + 180 * spots).astype(np.uint8)
-    assert_nothing(initial_geometry(gray, gray))
-
-
-def test_features_that_are_there_are_taken(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    second = warped(gray, MILD, (256, 240))
-    features = detect_sift(gray), detect_sift(second)
-    found = estimate_initial_geometry(find_tentative_matches(gray, second, features), "homography")
-    whole = initial_geometry(gray, second, "homography")
-    assert (found.model, whole.model, whole.num_views) == ("homography", "homography", 0)
-    np.testing.assert_allclose(found.matrix, whole.matrix)
-    np.testing.assert_array_equal(found.points1, whole.points1)
-    assert found.log10_nfa == whole.log10_nfa
-    fewest = detect_sift(second, SiftOptions(max_keypoints=100))
-    fewer = find_tentative_matches(gray, second, (features[0], fewest))
-    assert 0 < len(fewer.points0) <= 100
-
-
-def test_views_are_simulated_only_where_they_are_wanted(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    noise = np.random.default_rng(0).integers(0, 256, (240, 256)).astype(np.uint8)
-    for other in (noise, np.zeros((64, 64), np.uint8)):
-        found = estimate_initial_geometry(find_tentative_matches(gray, other), "homography")
-        assert_nothing(found)
-        assert found.num_views == 0

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from PIL import Image
 
 from deepdetect import DeepDetect, Matches, OptionError
-from deepdetect.cli import main
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.metrics.stereo import stereo_score
 from deepdetect.geometry import transform_points
@@ -59,19 +55,6 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
 
 
 @pytest.mark.slow
-def test_unguided_gives_fewer(photo: np.ndarray, second: np.ndarray) -> None:
-    guided, unguided = (
-        match(photo, second, Everywhere(), guided_matching=guided, model="homography")
-        for guided in (True, False)
-    )
-    assert unguided.two_view_geometry is None
-    assert not unguided.guided
-    assert not unguided.subpixel
-    assert not guided.subpixel  # keypoints of the second image
-    assert guided.inliers.sum() > unguided.inliers.sum()
-
-
-@pytest.mark.slow
 def test_what_cannot_be_trusted_has_no_matches_and_says_so(photo: np.ndarray) -> None:
     data = pytest.importorskip("skimage.data")
     other = np.ascontiguousarray(data.coffee()[:256, :256])
@@ -81,28 +64,6 @@ def test_what_cannot_be_trusted_has_no_matches_and_says_so(photo: np.ndarray) ->
     assert not matches.success
     assert not matches.guided
     assert len(matches) == 0
-
-
-@pytest.mark.slow
-def test_the_command_says_what_guided(
-    photo: np.ndarray, second: np.ndarray, tmp_path: Path
-) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
-    for name, image in (("a", photo), ("b", second), ("c", noise)):
-        Image.fromarray(image).save(tmp_path / f"{name}.png")
-    words = ["-o", str(tmp_path / "out"), "--no-pictures"]
-    good = CliRunner().invoke(
-        main, ["match", str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--json", *words]
-    )
-    report = json.loads(good.stdout)
-    assert report["guided"] is True
-    assert report["two_view_geometry"]["model"] == report["model"] == "homography"
-    assert report["two_view_geometry"]["tentative_inliers"] >= 10
-    bad = CliRunner().invoke(
-        main, ["match", str(tmp_path / "a.png"), str(tmp_path / "c.png"), *words]
-    )
-    assert bad.exit_code == 3
-    assert "no geometry between these images can be trusted" in bad.stderr
 
 
 @pytest.mark.slow
@@ -229,49 +190,3 @@ def test_mutual_matches_are_one_to_one(photo: np.ndarray, second: np.ndarray) ->
             assert dict(scores) == best
             assert len(mutual) == len(best)
     assert agreeing
-
-
-@pytest.mark.slow
-def test_the_command_says_which_options_do_not_apply(
-    photo: np.ndarray, second: np.ndarray, tmp_path: Path
-) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
-    for name, image in (("a", photo), ("b", second), ("c", noise)):
-        Image.fromarray(image).save(tmp_path / f"{name}.png")
-
-    def said(other: str, *options: str) -> list[str]:
-        words = ["match", str(tmp_path / "a.png"), str(tmp_path / f"{other}.png"), "--json"]
-        words += ["--max-keypoints", "3000", "--no-pictures", "-o", str(tmp_path / "out")]
-        result = CliRunner().invoke(main, [*words, *options])
-        assert result.exit_code == (3 if other == "c" else 0), result.output
-        assert json.loads(result.stdout)["guided"] == (other == "b" and "--unguided" not in options)
-        return result.stderr.splitlines()
-
-    assert said("b", "--ratio", "0.9") == [
-        "--ratio applies only to unguided matching: add --unguided"
-    ]
-    several = ("--matcher", "exact", "--descriptor", "rootsift", "--keypoint-size", "4")
-    assert said("b", *several, "--mutual") == [
-        "--descriptor and --keypoint-size and --matcher apply only to unguided matching: "
-        "add --unguided"
-    ]
-    for quiet in (("b",), ("b", "--mutual"), ("b", "--ratio", "0.9", "--unguided")):
-        assert said(*quiet) == []
-    lost = said("c", "--ratio", "0.9")
-    assert len(lost) == 1
-    assert "--unguided" in lost[0]
-
-
-@pytest.mark.slow
-def test_is_the_same_on_repetition(photo: np.ndarray, second: np.ndarray) -> None:
-    one, other = (match(photo, second, Everywhere()) for _ in range(2))
-    np.testing.assert_array_equal(one.points1, other.points1)
-    np.testing.assert_array_equal(one.scores, other.scores)
-    np.testing.assert_array_equal(one.matrix, other.matrix)
-
-
-def test_an_unknown_guide_brings_the_nearest(photo: np.ndarray) -> None:
-    with pytest.raises(OptionError, match="did you mean 'homography'"):
-        match(photo, photo, Everywhere(), two_view_model="homografy")
-    with pytest.raises(OptionError, match="unknown model"):
-        guided_matches(luma(photo), luma(photo), np.zeros((1, 2)), np.zeros((1, 2)), "none")

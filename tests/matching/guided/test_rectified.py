@@ -133,9 +133,3 @@ def test_without_tracked_corners_no_match_counts(cones, monkeypatch) -> None:
     assert match(gray0, gray1, xy) is not None
     monkeypatch.setattr(rectified, "MIN_TRACKS", 1_000_000)
     assert match(gray0, gray1, xy) is None
-
-
-def test_too_few_sparse_matches_give_no_frame(cones) -> None:
-    left, right, _ = cones
-    few = np.zeros((5, 2))
-    assert match_by_rectification(left, right, every_second(left), few, few, np.eye(3)) is None

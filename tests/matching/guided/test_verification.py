@@ -18,7 +18,6 @@ from deepdetect.matching.guided.verification import (
     NULL_SHIFTS,
     NullPairs,
     dissimilarity,
-    index_map,
     sample_null_pairs,
 )
 
@@ -116,15 +115,6 @@ def test_few_null_pairs_pass(picture: Callable[..., np.ndarray], name: str) -> N
     assert np.mean(shares) < 2 * FALSE_POSITIVE_RATE
 
 
-def test_an_image_moved_by_more_than_a_descriptor_does_not_agree(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    moved = np.roll(gray, (25, 20), (0, 1))
-    pixels = edges(gray)
-    assert same_patches(gray, moved, everywhere(gray), pixels).mean() < 0.1
-    nearly = np.roll(gray, 1, 1)
-    assert same_patches(gray, nearly, everywhere(gray), pixels).mean() > 0.95
-
-
 def test_what_is_not_seen_does_not_agree(photo: np.ndarray) -> None:
     gray = luma(photo)
     pixels = every_pixel(gray)
@@ -163,42 +153,6 @@ def test_follows_the_order_of_the_points(photo: np.ndarray) -> None:
     )
 
 
-def test_takes_keypoints_in_single_precision(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    pixels = edges(gray)
-    first, second = (
-        same_patches(gray, seen_again(gray), everywhere(gray), pixels.astype(kind))
-        for kind in (np.int64, np.float32)
-    )
-    np.testing.assert_array_equal(first, second)
-
-
-@pytest.mark.slow
-def test_the_seed_decides_and_hardly_matters(photo: np.ndarray) -> None:
-    """More blocks than are taken: the choice of null pairs differs."""
-    gray = cv2.resize(luma(photo), (1472, 1280))
-    pixels = every_pixel(gray)[::31]
-    assert len(np.unique(pixels // BLOCK, axis=0)) > BLOCKS
-    found = [
-        same_patches(gray, seen_again(gray), everywhere(gray), pixels, seed=seed)
-        for seed in (0, 0, 5)
-    ]
-    np.testing.assert_array_equal(found[0], found[1])
-    assert (found[0] == found[2]).mean() > 0.95
-
-
-@pytest.mark.slow
-def test_up_to_a_megapixel_the_seed_does_not_matter(photo: np.ndarray) -> None:
-    gray = cv2.resize(luma(photo), (1000, 700))  # the largest of Oxford
-    pixels = every_pixel(gray)[::31]
-    assert 64 < len(np.unique(pixels // BLOCK, axis=0)) <= BLOCKS
-    found = [
-        dissimilarity(gray, seen_again(gray), everywhere(gray), pixels, seed=seed)
-        for seed in (0, 5)
-    ]
-    np.testing.assert_array_equal(found[0], found[1])
-
-
 @pytest.mark.slow
 def test_what_is_known_of_the_unmoved_image_is_not_described_again_and_the_same(
     photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
@@ -225,29 +179,6 @@ def test_what_is_known_of_the_unmoved_image_is_not_described_again_and_the_same(
     assert not np.allclose(none[some], plain[some], rtol=1e-3)  # at edges it is not the same
 
 
-def test_no_points_give_no_answers(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    for nothing in (np.empty((0, 2)), np.empty((0, 2), np.int64)):
-        found = same_patches(gray, gray, everywhere(gray), nothing)
-        assert found.shape == (0,)
-        assert found.dtype == bool
-
-
-def test_one_point_is_taken(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    found = same_patches(gray, gray, everywhere(gray), np.array([[80, 60]]))
-    assert found.tolist() == [True]
-
-
-def test_flat_images_tell_nothing(photo: np.ndarray) -> None:
-    """No place is more similar to another than to any unrelated one."""
-    flat = np.full((70, 90), 90, np.uint8)
-    pixels = every_pixel(flat)
-    assert not same_patches(flat, flat, everywhere(flat), pixels).any()
-    for pair in ((luma(photo)[:70, :90], flat), (flat, luma(photo)[:70, :90])):
-        assert same_patches(*pair, everywhere(flat), pixels).mean() < 1.5 * FALSE_POSITIVE_RATE
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "width",
@@ -259,14 +190,6 @@ def test_images_that_are_flat_for_a_large_part_tell_nothing(width: int) -> None:
     noise = np.random.default_rng(width).normal(size=(300, width))
     gray[:, :width] = np.clip(128 + 150 * cv2.GaussianBlur(noise, (0, 0), 1.5), 0, 255)
     assert np.isinf(dissimilarity(gray, gray, everywhere(gray), every_pixel(gray))).all()
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (5, 5), (1, 30), (16, 16)])
-def test_tiny_images_are_taken(shape: tuple[int, int]) -> None:
-    gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    found = same_patches(gray, gray, everywhere(gray), every_pixel(gray))
-    assert found.shape == (gray.size,)
-    assert found.dtype == bool
 
 
 @pytest.mark.parametrize("odd", [0, 1])
@@ -284,17 +207,6 @@ def test_points_far_apart_are_all_described(photo: np.ndarray, odd: int) -> None
     assert np.isfinite(scores[right]).mean() > 0.9
     assert (scores[right] < 1).mean() > 0.9
     assert (scores[wrong] < 1).mean() < 0.05
-
-
-@pytest.mark.slow
-def test_it_changes_little_which_points_are_described(photo: np.ndarray) -> None:
-    """Points on pixels of one colour of a chessboard agree like those of the other."""
-    gray = luma(photo)
-    pixels = every_pixel(gray)
-    even, odd = (pixels[pixels.sum(axis=1) % 2 == parity] for parity in (0, 1))
-    second = seen_again(gray)
-    shares = [same_patches(gray, second, everywhere(gray), part).mean() for part in (even, odd)]
-    assert abs(shares[0] - shares[1]) < 0.03
 
 
 # Null pairs
@@ -345,33 +257,3 @@ def test_interior_descriptors_are_those_of_the_image_that_is_not_shifted(
         unmoved = dense_sift(gray, null.places, size)
         np.testing.assert_array_equal(moved[null.interior], unmoved[null.interior])
         assert (moved != unmoved).any(axis=1).mean() > 0.03  # those at an edge are others
-
-
-def test_null_partners_are_valid(gray: np.ndarray, points: np.ndarray) -> None:
-    seen = everywhere(gray)
-    seen[:, 200:] = False
-    for null in sample_null_pairs(points, gray, seen):
-        assert 0.3 < len(null.rows) / len(points) < 0.9
-        assert null.places[:, 0].max() < 200
-
-
-def test_beyond_a_megapixel_blocks_are_chosen_by_the_seed(photo: np.ndarray) -> None:
-    gray = cv2.resize(luma(photo), (1472, 1280))
-    row, column = np.indices((20, 23))
-    points = np.column_stack([column.ravel(), row.ravel()]) * BLOCK + 5
-    assert len(points) > BLOCKS
-    chosen = [sample_null_pairs(points, gray, everywhere(gray), seed=seed) for seed in (0, 0, 5)]
-    for first, again, other in zip(*chosen, strict=True):
-        assert 0.8 * BLOCKS < len(first.rows) <= BLOCKS  # some partners alone lie at an edge
-        np.testing.assert_array_equal(first.rows, again.rows)
-        assert set(first.rows) != set(other.rows)
-    together = {int(row) for null in chosen[0] for row in null.rows}
-    assert len(together) > 0.95 * len(points)  # each shift takes others while there are any
-
-
-def test_each_pixel_has_one_index() -> None:
-    pixels = np.array([[3, 1], [0, 0], [3, 1], [2, 2]])
-    distinct, index = index_map(pixels, (3, 4))
-    assert {tuple(xy) for xy in distinct.tolist()} == {(3, 1), (0, 0), (2, 2)}
-    np.testing.assert_array_equal(distinct[index[pixels[:, 1], pixels[:, 0]]], pixels)
-    assert (index >= 0).sum() == 3
