@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,24 +19,25 @@ from .._shared.options import suggest_keywords
 from .._shared.timing import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, find_keypoints
 from ..detector.image_lists import Images, ignore_masks
+from ..features.keypoints import Keypoints
+from ..features.matches import Matches
 from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
 from ..io.exif import calibration_from_exif
-from ..matching.guided import TentativeMatches
 from ..matching.options import MatchingOptions
 from ..matching.pipeline import LoadedPair, match_pair
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
-from .checks import check_images
-from .outliers import PointFilterOptions, sor_inliers_on_grid
-from .rectification import Rectification, find_rectification
-from .rectified_checks import (
+from .checks import (
     check_cameras,
     check_depths,
     check_disparities,
+    check_images,
     check_keypoints,
     check_matched,
     check_pure_rotation,
 )
+from .outliers import PointFilterOptions, sor_inliers_on_grid
+from .rectification import find_rectification
 from .result import Reconstruction
 from .two_view import reconstruct_two_view
 
@@ -47,12 +48,12 @@ class ReconstructionOptions:
     """How a pair becomes points.
 
     Attributes:
-        disparity: the disparity map of rectified pairs; None: `DENSE` for a density of 1, else the
-            strict default.
+        disparity: the disparity map of rectified pairs; "auto": `DENSE` where every pixel is asked
+            for (a density of 1), else the strict default.
         point_filter: which points are kept.
     """
 
-    disparity: DisparityOptions | None = None
+    disparity: DisparityOptions | Literal["auto"] = "auto"
     point_filter: PointFilterOptions = field(default_factory=PointFilterOptions)
 
 
@@ -116,175 +117,153 @@ def reconstruct(
         (True, 'baseline')
     """
     loaded = LoadedPair.load(left, right, channels)
-    images, grays = loaded.rgb, loaded.gray
-    sizes = (images[0].shape[1], images[0].shape[0]), (images[1].shape[1], images[1].shape[0])
+    grays = loaded.gray
+    sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     known = _calibration(calibration, focal_px, (left, right), sizes)
     check_images(*grays)
     timer = StageTimer(progress)
     tentative = rectification = None
-    is_rectified = rectified
-    if is_rectified is None:
+    if rectified is None:
         with timer.stage("rectified or not"):
             rectification, tentative = find_rectification(*grays, known.disparity_offset_px, seed)
-        is_rectified = rectification.rectified
+        rectified = rectification.rectified
         if rectification.swapped:
             offset = known.disparity_offset_px
             raise ReconstructionError(
                 "this is a rectified pair with left and right exchanged: give the other one first"
                 + (f"; or the disparity offset of {offset:g} px is wrong" if offset else "")
             )
-    if detector is None:
-        detector = DeepDetect("dense")
+    detector = DeepDetect("dense") if detector is None else detector
     masks = ignore_masks(ignore, 2)
-    pair = _Pair(
-        loaded, detector, selection, masks, known, seed, options, tentative, rectification, timer
+    # Matches start at whole pixels, and disparities are those of pixels.
+    whole = None if selection is None else replace(selection, subpixel=False)
+    if rectified:
+        with timer.stage("keypoints"):
+            keypoints = find_keypoints(detector, loaded.rgb[0], whole, masks[0])
+        made = _from_disparities(keypoints, grays, known, selection, options, timer)
+    else:
+        with timer.stage("keypoints and matching"):
+            matches = match_pair(
+                loaded,
+                detector,
+                selection=whole,
+                ignore=masks,
+                # A homography would keep the points of one plane, and drop all in front of it.
+                model="none",
+                options=MatchingOptions(two_view_model="fundamental"),
+                seed=seed,
+                tentative_matches=tentative,
+            )
+        made = _from_matches(matches, grays, known, options.point_filter, seed, timer)
+    columns, rows = np.rint(made["pixels"]).astype(np.int64).T
+    return Reconstruction(
+        **made,
+        colors=loaded.rgb[0][rows, columns],
+        unit="baseline" if known.baseline_mm is None else "mm",
+        size=sizes[0],
+        rectified=rectified,
+        rectification=rectification,
+        calibration=known,
+        seconds=timer.seconds,
     )
-    return _reconstruct_rectified(pair) if is_rectified else _reconstruct_general(pair)
 
 
 Size = tuple[int, int]
 
 
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    """What both pipelines begin with."""
-
-    loaded: LoadedPair
-    detector: AnyDetector
-    selection: SelectionOptions | None
-    masks: list[np.ndarray | None]
-    calibration: Calibration
-    seed: int
-    options: ReconstructionOptions
-    tentative: TentativeMatches | None
-    rectification: Rectification | None
-    timer: StageTimer
-
-
-def _reconstruct_rectified(pair: _Pair) -> Reconstruction:
-    """Take the keypoints of the left image from the disparity map of the pair."""
-    image, options = pair.loaded.rgb[0], pair.options
-    calibration, timer = pair.calibration, pair.timer
-    disparity_options = options.disparity
-    if disparity_options is None:
-        every_pixel = pair.selection is not None and pair.selection.density == 1
-        disparity_options = DENSE if every_pixel else DisparityOptions()
+def _from_disparities(
+    keypoints: Keypoints,
+    grays: tuple[np.ndarray, np.ndarray],
+    calibration: Calibration,
+    selection: SelectionOptions | None,
+    options: ReconstructionOptions,
+    timer: StageTimer,
+) -> dict[str, Any]:
+    """Take the keypoints of the left image from the disparity map of a rectified pair."""
+    every_pixel = selection is not None and selection.density == 1
+    how = options.disparity
+    if how == "auto":
+        how = DENSE if every_pixel else DisparityOptions()
+    point_filter = options.point_filter
     check_cameras(calibration)
-    with timer.stage("keypoints"):
-        keypoints = find_keypoints(pair.detector, image, _whole_pixels(pair), pair.masks[0])
-        # Disparities are those of pixels.
-        keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
-    check_keypoints(len(keypoints), pair.selection or SelectionOptions())
+    keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
+    check_keypoints(len(keypoints), selection or SelectionOptions())
     with timer.stage("matching"):
-        found = compute_disparity(*pair.loaded.gray, disparity_options).at(keypoints)
-    matched = found.matched
-    unique = disparity_options.uniqueness_ratio > 1
-    check_matched(int(np.count_nonzero(matched)), len(keypoints), unique)
-    check_disparities(found.disparity)
-    pixels, disparity = keypoints.xy[found.indices], found.disparity
+        found = compute_disparity(*grays, how).at(keypoints)
+    matched, disparity = found.matched, found.disparity
+    check_matched(int(np.count_nonzero(matched)), len(keypoints), how.uniqueness_ratio > 1)
+    check_disparities(disparity)
+    pixels = keypoints.xy[found.indices]
     check_pure_rotation(pixels[matched], disparity[matched], calibration)
     check_depths(disparity, calibration)
-    size = (image.shape[1], image.shape[0])
     with timer.stage("triangulation"):
-        depth = calibration.depth_mm(disparity)
-        rays = calibration.camera0.rays(pixels)
+        rays, depth = calibration.camera0.rays(pixels), calibration.depth_mm(disparity)
     shift = disparity + calibration.disparity_offset_px
     in_front = shift > 0
-    kept = in_front & (shift >= options.point_filter.min_parallax_px)
+    kept = in_front & (shift >= point_filter.min_parallax_px)
     dropped = {
         "behind a camera": int(np.count_nonzero(~in_front)),
         "parallax": int(np.count_nonzero(in_front & ~kept)),
     }
-    points = rays[kept] * depth[kept, None]
-    if options.point_filter.sor_neighbors and disparity_options.discontinuity_margin_px:
+    if point_filter.sor_neighbors and how.discontinuity_margin_px:
         with timer.stage("outlier removal"):
             inliers = sor_inliers_on_grid(
                 pixels[kept],
                 disparity[kept],
-                size,
-                options.point_filter.sor_window_px,
-                options.point_filter.sor_std_ratio,
+                grays[0].shape[::-1],
+                point_filter.sor_window_px,
+                point_filter.sor_std_ratio,
             )
         dropped["statistical outlier"] = int(np.count_nonzero(~inliers))
         kept[kept] = inliers
-        points = points[inliers]
-    if not len(points):
+    if not kept.any():
         raise ReconstructionError(
             "no disparity gives a depth: all are too small, the scene is too far away for cameras "
             "so close together"
         )
-    pixels = pixels[kept]
-    columns, rows = pixels.astype(np.int64).T
-    return Reconstruction(
-        points=points.astype(np.float32),
-        colors=image[rows, columns],
-        pixels=pixels.astype(np.float32),
-        disparity=disparity[kept],
-        matched=matched[kept],
-        unit="baseline" if calibration.baseline_mm is None else "mm",
-        size=size,
-        rectified=True,
-        rectification=pair.rectification,
-        calibration=calibration,
-        pose=None,
-        reprojection_errors=None,
-        keypoints=len(keypoints),
-        matches=len(found),
-        dropped=dropped,
-        seconds=timer.seconds,
-    )
+    return {
+        "points": (rays[kept] * depth[kept, None]).astype(np.float32),
+        "pixels": pixels[kept].astype(np.float32),
+        "disparity": disparity[kept],
+        "matched": matched[kept],
+        "pose": None,
+        "reprojection_errors": None,
+        "keypoints": len(keypoints),
+        "matches": len(found),
+        "dropped": dropped,
+    }
 
 
-def _reconstruct_general(pair: _Pair) -> Reconstruction:
-    """Match the keypoints of both images, estimate the pose and triangulate."""
-    image, options, timer = pair.loaded.rgb[0], pair.options, pair.timer
-    with timer.stage("keypoints and matching"):
-        found = match_pair(
-            pair.loaded,
-            pair.detector,
-            selection=_whole_pixels(pair),
-            ignore=pair.masks,
-            # A homography would keep the points of one plane, and drop all in front of it.
-            model="none",
-            options=MatchingOptions(two_view_model="fundamental"),
-            seed=pair.seed,
-            tentative_matches=pair.tentative,
-        )
+def _from_matches(
+    matches: Matches,
+    grays: tuple[np.ndarray, np.ndarray],
+    calibration: Calibration,
+    point_filter: PointFilterOptions,
+    seed: int,
+    timer: StageTimer,
+) -> dict[str, Any]:
+    """Estimate the pose from matches and triangulate them."""
     made = reconstruct_two_view(
-        found.points0,
-        found.points1,
-        pair.calibration,
-        pair.loaded.gray,
-        options.point_filter,
-        pair.seed,
+        matches.points0,
+        matches.points1,
+        calibration,
+        grays,
+        point_filter,
+        seed,
         timer,
-        refined=found.subpixel,
+        refined=matches.subpixel,
     )
-    pixels = found.points0[made.indices]
-    columns, rows = np.rint(pixels).astype(np.int64).T
-    return Reconstruction(
-        points=made.points,
-        colors=image[rows, columns],
-        pixels=pixels,
-        disparity=None,
-        matched=np.ones(len(pixels), bool),
-        unit=made.unit,
-        size=(image.shape[1], image.shape[0]),
-        rectified=False,
-        rectification=pair.rectification,
-        calibration=pair.calibration,
-        pose=made.pose,
-        reprojection_errors=made.reprojection_errors,
-        keypoints=len(found.keypoints0),
-        matches=len(found),
-        dropped=made.dropped,
-        seconds=timer.seconds,
-    )
-
-
-def _whole_pixels(pair: _Pair) -> SelectionOptions | None:
-    """Return the selection without refined positions: matches start at whole pixels."""
-    return None if pair.selection is None else replace(pair.selection, subpixel=False)
+    return {
+        "points": made.points,
+        "pixels": matches.points0[made.indices],
+        "disparity": None,
+        "matched": np.ones(len(made.indices), bool),
+        "pose": made.pose,
+        "reprojection_errors": made.reprojection_errors,
+        "keypoints": len(matches.keypoints0),
+        "matches": len(matches),
+        "dropped": made.dropped,
+    }
 
 
 def _calibration(

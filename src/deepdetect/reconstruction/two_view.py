@@ -20,7 +20,7 @@ from ..geometry import epipolar_errors
 from ..geometry.camera import Calibration
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
 from ..geometry.triangulation import fundamental_matrix, triangulate
-from .checks import check_focal, check_images, check_matches, check_pose
+from .checks import check_focal, check_matches, check_pose
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import refine_matches, spread_corners
 
@@ -41,31 +41,22 @@ class TwoViewReconstruction:
 
     Attributes:
         points: (N, 3) float32 in the frame of the left camera: x right, y down, z forward.
-        unit: "mm" when the baseline is known, else "baseline": the distance of the cameras is 1.
         indices: (N,) int64, the match that each comes from, rising.
         points1: (N, 2) float64 positions in the right image that the points were made from.
         pose: of the right camera; its inliers and errors belong to `pose_indices`.
         pose_indices: (P,) int64, the matches that the pose was estimated from: those that were
             refined; or all.
         reprojection_errors: (N,) float32 in pixels, root mean square of both images.
-        triangulation_angles: (N,) float32 angle between both rays in degrees.
         dropped: how many matches each check removed, in order.
-        seconds: time of each stage.
     """
 
     points: np.ndarray
-    unit: str
     indices: np.ndarray
     points1: np.ndarray
     pose: RelativePose
     pose_indices: np.ndarray
     reprojection_errors: np.ndarray
-    triangulation_angles: np.ndarray
     dropped: dict[str, int]
-    seconds: dict[str, float]
-
-    def __len__(self) -> int:
-        return len(self.points)
 
 
 def reconstruct_two_view(
@@ -84,7 +75,7 @@ def reconstruct_two_view(
         points0, points1: (M, 2) matched positions in the left and the right image. To be refined,
             those of the left lie on whole pixels.
         calibration: of both cameras.
-        images: (H, W) uint8 luma of both, for the refinement; None leaves it out.
+        images: (H, W) uint8 luma of both, for the refinement; None leaves that out.
         point_filter: which points are kept.
         seed: of all random choices.
         timer: of the stages; None: a new one.
@@ -92,8 +83,7 @@ def reconstruct_two_view(
             (`Matches.subpixel`): then some are refined for the pose only.
 
     Raises:
-        ReconstructionError: the pair gives no depth (`checks` says why), the calibration is for
-            images of another size, or no point is left.
+        ReconstructionError: the pair gives no depth (`checks` says why), or no point is left.
 
     Example:
         >>> from deepdetect.geometry.camera import Camera
@@ -105,7 +95,7 @@ def reconstruct_two_view(
         >>> right = camera.project(true - [1, 0.1, 0])
         >>> found = reconstruct_two_view(left, right, Calibration(camera, camera))
         >>> points = found.points * np.hypot(1, 0.1)
-        >>> len(found) > 1000, bool(np.allclose(points, true[found.indices], rtol=1e-2))
+        >>> len(points) > 1000, bool(np.allclose(points, true[found.indices], rtol=1e-2))
         (True, True)
     """
     timer = StageTimer() if timer is None else timer
@@ -115,8 +105,6 @@ def reconstruct_two_view(
     pose_points1 = points1
     dropped: dict[str, int] = {}
     if images is not None:
-        calibration.check_sizes(*((image.shape[1], image.shape[0]) for image in images))
-        check_images(*images)
         with timer.stage("sub-pixel"):
             if refined:
                 pose_indices = spread_corners(images[0], points0, POSE_CELLS)
@@ -168,13 +156,10 @@ def reconstruct_two_view(
         )
     return TwoViewReconstruction(
         points=made.points[kept].astype(np.float32),
-        unit="baseline" if calibration.baseline_mm is None else "mm",
         indices=indices[kept],
         points1=points1[indices[kept]],
         pose=pose,
         pose_indices=pose_indices,
         reprojection_errors=made.reprojection_errors[kept].astype(np.float32),
-        triangulation_angles=np.degrees(made.triangulation_angle[kept]).astype(np.float32),
         dropped=dropped,
-        seconds=timer.seconds,
     )
