@@ -74,16 +74,6 @@ def test_an_old_file_survives_a_failure(tmp_path: Path) -> None:
     assert names(tmp_path) == ["out.txt"]
 
 
-def test_an_old_file_is_replaced(tmp_path: Path) -> None:
-    target = tmp_path / "out.txt"
-    target.write_text("old")
-    with atomic_path(target) as temporary:
-        temporary.write_text("new")
-        assert target.read_text() == "old"
-    assert target.read_text() == "new"
-    assert names(tmp_path) == ["out.txt"]
-
-
 def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
     target = tmp_path / "out.txt"
     with atomic_path(target) as first, atomic_path(target) as second:
@@ -128,39 +118,12 @@ def check_refusal(target: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_folder_that_is_a_file(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("old")
-    check_refusal(tmp_path / "file" / "out.txt")
-    assert (tmp_path / "file").read_text() == "old"
-    assert names(tmp_path) == ["file"]
-
-
-def test_a_target_that_is_a_folder(tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    check_refusal(tmp_path / "folder")
-    assert names(tmp_path) == ["folder"]
-    assert names(tmp_path / "folder") == []
-
-
 def test_an_unwritable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> int:
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(os, "open", refuse)
     check_refusal(tmp_path / "out.txt")
-
-
-@pytest.mark.skipif(
-    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write everywhere"
-)
-def test_a_read_only_folder(tmp_path: Path) -> None:
-    folder = tmp_path / "locked"
-    folder.mkdir()
-    folder.chmod(0o500)
-    try:
-        check_refusal(folder / "out.txt")
-    finally:
-        folder.chmod(0o700)
 
 
 def start_writer(folder: Path) -> subprocess.Popen[str]:
@@ -264,12 +227,3 @@ def test_folders_of_processes_that_ended_are_removed(temporary: Path) -> None:
     assert other.is_dir()
     assert named_alike.is_dir()
     assert link.is_symlink()
-
-
-def test_no_place_for_a_private_folder_is_an_error_of_ours(
-    temporary: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary / "absent"))
-    with pytest.raises(DeepDetectError, match="cannot make a temporary folder") as caught:
-        private_folder("example-")
-    assert "\n" not in str(caught.value)

@@ -7,11 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
 import pytest
 
 import deepdetect
-from deepdetect._shared.kernels import compiled
 
 PACKAGE = Path(deepdetect.__file__).parent
 MODULE = """
@@ -125,50 +123,11 @@ def test_a_folder_that_another_user_may_have_made_is_not_taken(kind: str, sealed
     assert kind == "file" or list(folder.iterdir()) == []
 
 
-@needs_users
-@pytest.mark.slow
-def test_a_folder_of_another_user_is_not_taken(sealed: Path) -> None:
-    if os.getuid() != 0:
-        pytest.skip("only the superuser can give a folder to another user")
-    folder = temporary_folder(sealed)
-    folder.mkdir(mode=0o700)
-    os.chown(folder, 65534, 65534)
-    assert run(ADD, sealed) == "None 0"
-    assert list(folder.iterdir()) == []
-
-
-@pytest.mark.skipif(
-    not hasattr(numba.config, "CACHE_LOCATOR_CLASSES"), reason="needs a later numba"
-)
-@pytest.mark.slow
-def test_where_numba_is_told_to_look_nowhere_else(sealed: Path) -> None:
-    assert run(ADD, sealed, NUMBA_CACHE_LOCATOR_CLASSES="InTreeCacheLocator") == "None 0"
-
-
-@pytest.mark.slow
-def test_the_folder_that_the_user_names(sealed: Path, tmp_path: Path) -> None:
-    path, _ = run(ADD, sealed, NUMBA_CACHE_DIR=tmp_path / "named").split()
-    assert Path(path).parent == tmp_path / "named"
-    assert list((tmp_path / "named").rglob("*.nbi"))
-    assert list((tmp_path / "temporary").iterdir()) == []
-
-
 def test_the_cache_beside_the_module(sealed: Path) -> None:
     (sealed / "__pycache__").unlink()
     path, _ = run(ADD, sealed).split()
     assert Path(path) == sealed / "__pycache__"
     assert list(Path(path).glob("*.nbi"))
-
-
-def test_the_flags_reach_numba() -> None:
-    @compiled(nogil=True, fastmath={"reassoc"}, inline="always")
-    def double(value):  # type: ignore[no-untyped-def]
-        return 2 * value
-
-    assert double.targetoptions["fastmath"] == {"reassoc"}
-    assert double.targetoptions["inline"] == "always"
-    assert double.targetoptions["nogil"] is True
-    assert double(4) == 8
 
 
 def test_the_first_compilation_is_announced_once(sealed: Path) -> None:

@@ -39,32 +39,11 @@ def test_workers_are_other_processes_with_one_thread() -> None:
     assert {threads for _, threads in found} == {1}
 
 
-THREADS = (
-    "[__import__('os').environ['OPENBLAS_NUM_THREADS'], "
-    "__import__('deepdetect._shared.parallel', fromlist=['x'])._max_threads]"
-)
-
-
-def test_libraries_in_workers_use_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    assert list(map_in_processes(eval, [THREADS] * 2, workers=2)) == [["1", 1]] * 2
-    assert "OPENBLAS_NUM_THREADS" not in os.environ
-    assert parallel._max_threads is None
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "3")
-    assert list(map_in_processes(eval, [THREADS] * 2, workers=2)) == [["3", 1]] * 2
-    assert os.environ["OPENBLAS_NUM_THREADS"] == "3"
-
-
 @pytest.mark.parametrize(("tasks", "workers"), [([PROBE] * 3, 1), ([PROBE], 4), ([PROBE], None)])
 def test_one_worker_or_one_task_stays_in_this_process(
     tasks: list[str], workers: int | None
 ) -> None:
     assert [pid for pid, _ in map_in_processes(eval, tasks, workers)] == [os.getpid()] * len(tasks)
-
-
-@pytest.mark.parametrize("workers", [None, 1, 2])
-def test_no_task(workers: int | None) -> None:
-    assert list(map_in_processes(math.sqrt, [], workers)) == []
 
 
 @pytest.mark.parametrize("workers", [0, -3])
@@ -239,22 +218,3 @@ def test_an_error_in_a_part_is_the_callers() -> None:
 
     with pytest.raises(ZeroDivisionError, match="as it happens"):
         parallel_for(5, work)
-
-
-def test_calls_from_several_threads_do_not_meet() -> None:
-    results: dict[int, list[int]] = {}
-
-    def call(number: int) -> Callable[[], None]:
-        def run() -> None:
-            done: list[int] = []
-            parallel_for(50, lambda start, stop: done.extend(range(start, stop)))
-            results[number] = sorted(done)
-
-        return run
-
-    callers = [threading.Thread(target=call(number)) for number in range(4)]
-    for caller in callers:
-        caller.start()
-    for caller in callers:
-        caller.join()
-    assert all(results[number] == list(range(50)) for number in range(4))

@@ -95,16 +95,6 @@ def test_the_points_of_a_photograph(name: str, run_node: Any) -> None:
         assert (np.diff(found[:, 2]) <= 0).all()
 
 
-@pytest.mark.parametrize("shape", [(16, 16), (17, 200), (300, 24)], ids=str)
-def test_the_points_of_small_pictures(shape: tuple[int, int], run_node: Any) -> None:
-    """Gaussians reach over both borders, more than once."""
-    gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    (found,) = points_in_node(run_node, gray, [(1000, "none")])
-    expected = detect_points(gray, 1000)
-    assert len(found) == len(expected)
-    assert compare(found, expected) == 1
-
-
 @pytest.mark.parametrize("spread", ["none", "grid", "anms"])
 @pytest.mark.parametrize("shape", [(16, 17), (23, 31), (101, 99)], ids=str)
 def test_few_points_of_small_pictures(shape: tuple[int, int], spread: str, run_node: Any) -> None:
@@ -116,16 +106,6 @@ def test_few_points_of_small_pictures(shape: tuple[int, int], spread: str, run_n
         expected = detect_points(gray, count, spread=spread)
         assert len(found) == len(expected)
         assert compare(found, expected) == 1
-
-
-@pytest.mark.parametrize("shape", [(1, 50), (50, 1), (2, 40), (40, 2)], ids=str)
-def test_pictures_without_an_inside_have_no_points(shape: tuple[int, int], run_node: Any) -> None:
-    gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    assert len(detect_points(gray)) == 0
-    assert [len(part) for part in points_in_node(run_node, gray, [(9, "none"), (9, "grid")])] == [
-        0,
-        0,
-    ]
 
 
 @pytest.mark.parametrize("sigma", [0.9, 1.36, 4.5, 11.1])

@@ -120,17 +120,6 @@ def test_only_the_files_of_the_page_are_served(path: str, serve: Any) -> None:
     assert client.ask("GET", path).status == 404
 
 
-def test_port_80_is_left_out_by_browsers(serve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    client, _ = serve()
-    assert client.ask("GET", "/", headers={"Host": "127.0.0.1"}).status == 421
-    port = client.server.port
-    monkeypatch.setattr(client.server, "port", 80)
-    connection = socket.create_connection(("127.0.0.1", port))
-    connection.sendall(b"GET /config.json HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-    assert connection.recv(12) == b"HTTP/1.1 200"
-    connection.close()
-
-
 def test_a_body_that_nobody_reads_is_no_request(serve: Any) -> None:
     client, _ = serve()
     port = client.server.port
@@ -273,13 +262,6 @@ def test_a_task_is_done_and_forgotten(serve: Any, photo: np.ndarray) -> None:
     assert client.ask("GET", address).status == 404
 
 
-def test_images_can_be_read_by_their_owner_only(serve: Any, photo: np.ndarray) -> None:
-    client, temporary = serve()
-    client.start("folder-keypoints", [("a.png", encoded(photo))])
-    for folder in [*temporary.iterdir(), *folders(temporary)]:
-        assert folder.stat().st_mode & 0o077 == 0
-
-
 def noise(count: int) -> list[tuple[str, bytes]]:
     """Return images that take seconds each."""
     rgb = np.random.default_rng(0).integers(0, 256, (600, 600, 3)).astype(np.uint8)
@@ -380,18 +362,6 @@ def test_a_body_that_trickles_is_ended(serve: Any) -> None:
 
         with pytest.raises(ConnectionError):
             trickle()
-
-
-def test_images_that_cannot_be_written_are_said(
-    serve: Any, capfd: pytest.CaptureFixture[str]
-) -> None:
-    client, temporary = serve()
-    (home,) = temporary.iterdir()
-    home.rmdir()  # as programs do that clean up
-    answer = client.start("folder-keypoints", [("a.png", b"x")])
-    assert answer.status == 400
-    assert answer.values["error"].startswith("the task cannot be started (No such file")
-    assert capfd.readouterr().err == ""
 
 
 def test_the_last_place_is_taken_once(serve: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -104,17 +104,6 @@ def test_what_carries_no_focal_length_says_what_to_give(one_line, tmp_path: Path
     cropped = photograph({FILM: 24, WIDTH: 400, HEIGHT: 200})
     with pytest.raises(ReconstructionError, match=r"cropped .*400x200"):
         camera_from_exif(cropped, (300, 200))
-
-
-def test_open_files_and_any_path_are_read(tmp_path: Path) -> None:
-    data = photograph({FILM: 24})
-    path = tmp_path / "photo.jpg"
-    path.write_bytes(data)
-    expected = camera_from_exif(data, (300, 200))
-    with path.open("rb") as opened:
-        for image in (PurePath(path), bytearray(data), io.BytesIO(data), opened):
-            assert size_of(image) == (300, 200)
-            assert camera_from_exif(image, (300, 200)) == expected
 
 
 def test_both_photographs_give_a_calibration() -> None:

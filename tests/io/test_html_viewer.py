@@ -15,7 +15,6 @@ from deepdetect.geometry.camera import Camera
 from deepdetect.geometry.point_cloud import PointCloud
 from deepdetect.geometry.posed_view import PosedView
 from deepdetect.io.html_viewer import (
-    camera_lines,
     page_points,
     write_html_page,
 )
@@ -81,17 +80,6 @@ def test_the_page_holds_the_points_to_half_a_step(cones: PointCloud, tmp_path: P
     assert (tmp_path / "cones.html").stat().st_size < 12.1 * len(cones) + 20_000
 
 
-def test_points_very_far_away_change_neither_view_nor_step(small: PointCloud) -> None:
-    wild = PointCloud(
-        np.concatenate([small.points, [[0, 0, 1e7], [-1e7, 0, 5]]]),
-        np.concatenate([small.colors, np.zeros((2, 3), np.uint8)]),
-        "mm",
-    )
-    plain, stored = page_points(small), page_points(wild)
-    assert (plain.left_out, stored.left_out) == (0, 2)
-    np.testing.assert_allclose(stored.step, plain.step, rtol=1e-6)
-
-
 def test_nothing_is_fetched(small: PointCloud, tmp_path: Path) -> None:
     page = saved(small, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text("utf-8")
@@ -111,15 +99,6 @@ def test_notes_are_shown_and_escaped(small: PointCloud, tmp_path: Path) -> None:
     assert "{{positions}}" in page.texts
     assert "49,979" in page.texts
     assert f"a & b {evil}" in page.texts
-
-
-def test_unit_and_step_are_told(small: PointCloud, tmp_path: Path) -> None:
-    page = saved(small, tmp_path / "page.html")
-    step = page_points(small).step.max() / 2
-    assert f"{step:.2g} mm (16 bits per axis)" in page.texts
-    scaleless = PointCloud(small.points, small.colors, "baseline")
-    texts = saved(scaleless, tmp_path / "page.html").texts
-    assert any("no scale" in text for text in texts)
 
 
 def run_node(page: Page, code: str) -> dict:
@@ -167,17 +146,6 @@ def test_the_first_view_shows_the_cloud_upright(
     assert np.corrcoef(picture[near, 1], screen[:, 1])[0, 1] < -0.9999
 
 
-def test_windows_of_any_shape_show_round_things_round(small: PointCloud, tmp_path: Path) -> None:
-    page = saved(small, tmp_path / "page.html")
-    square, wide, high = (
-        np.reshape(run_node(page, f"return [...clipMatrix(cloud, firstView(cloud), {a})];"), (4, 4))
-        for a in (1, 2, 0.5)
-    )
-    # The shorter side keeps its angle.
-    np.testing.assert_allclose(wide, square * [0.5, 1, 1, 1], rtol=1e-6)
-    np.testing.assert_allclose(high, square * [1, 0.5, 1, 1], rtol=1e-6)
-
-
 def _kept(cloud: PointCloud) -> np.ndarray:
     stored = page_points(cloud)
     high = stored.offset + 65535 * stored.step
@@ -204,12 +172,6 @@ def test_the_matrix_is_that_of_a_camera_around_the_target(
     np.testing.assert_allclose(
         clip[:2] / clip[3], seen[:2] / seen[2] * [zoom, -zoom], rtol=1e-3, atol=1e-4
     )
-
-
-def test_the_template_is_part_of_the_package() -> None:
-    from importlib.resources import files
-
-    assert files("deepdetect.io").joinpath("viewer.html").is_file()
 
 
 def view_cameras() -> list[PosedView]:
@@ -268,8 +230,3 @@ def test_a_page_with_cameras_opens_where_all_of_them_are_seen(
     again = run_node(page, "const v = firstView(cloud); v.azimuth = 9; return firstView(cloud);")
     assert again["azimuth"] == pytest.approx(0.4)
     assert json.loads(saved(cones, tmp_path / "plain.html").scripts["cloud"])["view"] is None
-
-
-def test_a_single_camera_is_drawn_without_a_path() -> None:
-    assert camera_lines(view_cameras()[:1]).shape == (8, 2, 3)
-    assert camera_lines([]).shape == (0, 2, 3)

@@ -212,50 +212,6 @@ def test_damaged_files_are_one_sentence(
     assert f"{path} holds no keypoints (" in one_line(caught.value)
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "k.npz"
-    path.write_bytes(zipped({n: c for n, c in WHOLE.items() if n != "scores.npy"}))
-    with pytest.raises(DeepDetectError, match=r"no keypoints \(it has no array 'scores'\)"):
-        load_keypoints(path)
-
-
-@pytest.mark.parametrize("error", [AttributeError, AssertionError, IndexError])
-def test_errors_of_ours_are_not_taken_for_damage(
-    error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise error("ours")
-
-    save_keypoints(keypoints(3), tmp_path / "k.npz")
-    monkeypatch.setattr(tables, "Keypoints", fail)
-    with pytest.raises(error, match="ours"):
-        load_keypoints(tmp_path / "k.npz")
-
-
-@pytest.mark.parametrize(
-    ("error", "told"),
-    [(MemoryError, "not enough memory to read"), (PermissionError, "may not be read")],
-)
-def test_a_whole_file_that_cannot_be_read_is_not_called_damaged(
-    error: type[Exception],
-    told: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    one_line: Callable[[BaseException], str],
-) -> None:
-    def fail(*_: object) -> None:
-        raise error
-
-    path = tmp_path / "k.npz"
-    save_keypoints(keypoints(3), path)
-    monkeypatch.setattr(tables, "_check_npz", fail)
-    with pytest.raises(DeepDetectError, match=told) as caught:
-        load_keypoints(path)
-    text = one_line(caught.value)
-    assert str(path) in text
-    assert "holds no" not in text
-
-
 def test_every_flipped_bit_is_one_sentence_or_harmless(
     tmp_path: Path, one_line: Callable[[BaseException], str]
 ) -> None:
@@ -282,18 +238,6 @@ def test_indices_survive_the_round_trip(tmp_path: Path) -> None:
     loaded = load_matches(tmp_path / "m.npz")
     assert loaded.indices0.tolist() == [4, 3, 2, 1, 0]
     assert loaded.indices1.tolist() == [0, 1, 2, -1, -1]
-
-
-def test_files_of_earlier_versions_have_no_indices(tmp_path: Path) -> None:
-    saved = matches_of()
-    save_matches(saved, tmp_path / "m.npz")
-    with np.load(tmp_path / "m.npz") as file:
-        arrays = {name: file[name] for name in file if not name.startswith("indices")}
-    np.savez(tmp_path / "old.npz", **arrays)
-    loaded = load_matches(tmp_path / "old.npz")
-    assert loaded.indices0.tolist() == [0, 1, 2, 3, 4]
-    # The last two keypoints are not among those of the second image.
-    assert loaded.indices1.tolist() == [-1, -1, 2, 1, 0]
 
 
 def test_indices_of_no_keypoint_are_damage(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from deepdetect.features.display import PICTURE_SIDE_PX, draw_matches
 from deepdetect.viz import draw
 from deepdetect.viz.draw import (
     CAPTION_HEIGHT,
-    SHOWN_KEYPOINTS,
     add_caption,
     add_scale,
     draw_best_keypoints,
@@ -21,9 +20,7 @@ from deepdetect.viz.draw import (
     draw_depth,
     draw_heatmap,
     draw_logits,
-    fit_picture,
     save_picture,
-    vstack,
 )
 
 
@@ -41,13 +38,6 @@ def test_pictures_are_saved_as_they_are(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "deep" / "p.png")), rgb)
 
 
-def test_captions_fit_narrow_pictures() -> None:
-    picture = add_caption(np.zeros((20, 60, 3), np.uint8), "a caption that is far too long")
-    assert picture.shape[1] == 60
-    assert picture[20:].any()
-    assert not picture[20:, -2:].any()
-
-
 def test_a_picture_ends_in_png_or_jpg(tmp_path: Path) -> None:
     picture = np.full((20, 30, 3), (200, 30, 90), np.uint8)
     for ending in (".png", ".jpg", ".JPEG"):
@@ -57,16 +47,6 @@ def test_a_picture_ends_in_png_or_jpg(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="must end in"):
         save_picture(picture, tmp_path / "a.bmp")
     assert not (tmp_path / "a.bmp").exists()
-
-
-def test_stacked_rows_are_padded_with_white() -> None:
-    rows = [np.zeros((4, 10, 3), np.uint8), np.zeros((5, 6, 3), np.uint8)]
-    picture = vstack(rows, gap=2)
-    assert picture.shape == (11, 10, 3)
-    assert not picture[:4].any()
-    assert (picture[4:6] == 255).all()
-    assert not picture[6:, :6].any()
-    assert (picture[6:, 6:] == 255).all()
 
 
 def test_a_picture_too_large_for_its_format_is_refused(
@@ -136,19 +116,6 @@ def test_the_best_keypoints_of_all_parts_are_shown_by_score(photo: np.ndarray) -
     assert right[of[1]][:, 0].mean() > right[of[1]][:, 2].mean() + 20
 
 
-def test_no_more_keypoints_are_drawn_than_can_be_seen() -> None:
-    rgb = np.zeros((900, 900, 3), np.uint8)
-    row, column = (grid.ravel() * 18 + 9 for grid in np.mgrid[:50, :50])
-    keypoints = Keypoints(np.stack([column, row], 1), rng_scores(2500), (900, 900))
-    picture = draw_best_keypoints(rgb, keypoints)[:900]
-    rims = cv2.connectedComponents((picture.max(2) > 60).astype(np.uint8))[0] - 1
-    assert rims == SHOWN_KEYPOINTS
-
-
-def rng_scores(count: int) -> np.ndarray:
-    return np.random.default_rng(0).uniform(0.5, 1, count)
-
-
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_keypoints_are_drawn(count: int) -> None:
     keypoints = Keypoints(np.full((count, 2), 20), np.ones(count), (60, 40))
@@ -216,18 +183,6 @@ def test_the_ends_of_a_scale_have_few_digits(
     assert sorted(captions) == sorted(["values", *expected])
 
 
-def test_a_scale_has_its_values_at_its_ends() -> None:
-    """Nothing is written over the colours, and the lower value is directly before them."""
-    strip = add_scale(np.zeros((20, 400, 3), np.uint8), "a", 1.1, 66)[20:]
-    rows = strip[len(strip) // 2 - 5 : len(strip) // 2 + 5]
-    colored = np.flatnonzero((np.ptp(rows.astype(int), axis=2) > 30).all(0))
-    assert len(colored) == np.ptp(colored) + 1 == 400 // 5
-    written = np.flatnonzero((rows.min(2) > 120).any(0))
-    before, after = written[written < colored[0]], written[written > colored[-1]]
-    assert 3 <= colored[0] - before[-1] <= 12
-    assert 3 <= after[0] - colored[-1] <= 12
-
-
 @pytest.mark.parametrize(
     ("count", "logits", "expected"),
     [
@@ -245,9 +200,3 @@ def test_the_caption_counts_the_keypoints(
     keypoints = Keypoints(xy, np.ones(count), (900, 900), values if logits else None)
     draw_best_keypoints(np.zeros((900, 900, 3), np.uint8), keypoints)
     assert expected in captions
-
-
-def test_small_pictures_keep_their_size() -> None:
-    rgb = np.zeros((30, 40, 3), np.uint8)
-    assert fit_picture(rgb) is rgb
-    assert fit_picture(np.zeros((10, 4000), np.float32)).shape == (5, 2000)

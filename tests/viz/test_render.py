@@ -124,18 +124,6 @@ def test_points_become_wider_as_the_viewer_comes_nearer() -> None:
     assert ink[:, :40].sum() == pytest.approx((round(2 * 1.4 * 10 / 7) / 2) ** 2, rel=0.01)
 
 
-def test_nothing_in_view_is_white() -> None:
-    cloud = PointCloud([[0.0, 0, -10], [1e6, 0, 10]], np.zeros((2, 3), np.uint8), "mm")
-    assert (render(cloud, PLAIN) == 255).all()
-
-
-def test_points_at_the_border_are_cut() -> None:
-    x = (79.4 - 39.5) / 50 * 10
-    picture = render(PointCloud([[x, 0.0, 10]], [[0, 0, 0]], "mm"), PLAIN, point_width=10)
-    assert (picture[30, -3:] == 0).all()
-    assert (picture[:, :60] == 255).all()
-
-
 def test_dense_points_close_a_surface(cloud: PointCloud) -> None:
     camera = orbit_camera(cloud, 20, 10, (300, 300))
     grey = PointCloud(cloud.points, np.zeros_like(cloud.colors), "mm")
@@ -145,34 +133,6 @@ def test_dense_points_close_a_surface(cloud: PointCloud) -> None:
     cv2.fillConvexPoly(hull, cv2.convexHull(np.rint(xy).astype(np.int32)), 1)
     inner = cv2.erode(hull, np.ones((9, 9), np.uint8)) > 0
     assert (picture[inner] == 0).mean() > 0.999
-
-
-def test_pictures_are_equal_from_run_to_run(cloud: PointCloud) -> None:
-    camera = orbit_camera(cloud, size=(160, 120))
-    np.testing.assert_array_equal(render(cloud, camera), render(cloud, camera))
-
-
-@pytest.mark.parametrize(
-    ("call", "word"),
-    [
-        (lambda c: render(c[:0], PLAIN), "no points"),
-        (lambda c: render(c, PLAIN, point_width=0), "above 0"),
-        (lambda c: orbit_camera(c[:0]), "no points"),
-        (lambda c: orbit_camera(c, elevation=91), "elevation"),
-        (lambda c: orbit_camera(c, size=(0, 5)), "at least one pixel"),
-    ],
-)
-def test_mistakes_are_one_sentence(call, word: str, cloud: PointCloud, one_line) -> None:
-    with pytest.raises(OptionError) as caught:
-        call(cloud)
-    assert word in one_line(caught.value)
-
-
-def test_one_point_can_be_drawn() -> None:
-    cloud = PointCloud([[1.0, 2, 30]], [[0, 0, 0]], "mm")
-    picture = render(cloud, orbit_camera(cloud, size=(40, 30)))
-    rows, columns = np.nonzero(picture[..., 0] < 128)
-    assert (abs(rows.mean() - 14.5), abs(columns.mean() - 19.5)) <= (0.5, 0.5)
 
 
 def test_a_real_scene_looks_like_its_photograph(shared: Path) -> None:
@@ -213,20 +173,6 @@ def test_all_clouds_are_seen_by_one_camera(photo: np.ndarray, flat_cloud: PointC
     assert columns.min() > 100
     inside = (slice(rows.min() + 5, rows.max() - 5), slice(columns.min() + 5, columns.max() - 5))
     assert np.abs(few[inside].astype(int) - full[inside]).mean() < 3
-
-
-def test_titles_and_counts_are_written_below(photo: np.ndarray, flat_cloud: PointCloud) -> None:
-    one, two = (
-        draw_clouds(photo, {"ours": part}, width=200)[200:]
-        for part in (flat_cloud, flat_cloud[::2])
-    )
-    assert (one != two).any()
-    assert one[:, 206:].max() > 200
-
-
-def test_panels_can_stand_in_one_row(photo: np.ndarray, flat_cloud: PointCloud) -> None:
-    picture = draw_clouds(photo, {"a": flat_cloud, "b": flat_cloud}, width=100, columns=3)
-    assert picture.shape == (100 + CAPTION_HEIGHT, 312, 3)
 
 
 def test_nothing_to_draw_is_an_error(photo: np.ndarray, flat_cloud: PointCloud) -> None:

@@ -152,12 +152,14 @@ class DeepDetect:
             **vars(self.heatmap_options),
         }
 
+    @suggest_keywords
     def configured(self, heatmap_options: HeatmapOptions) -> DeepDetect:
         """Return a detector with the same loaded network and other heat map options."""
         other = object.__new__(DeepDetect)
         other.__dict__.update(self.__dict__, heatmap_options=heatmap_options)
         return other
 
+    @suggest_keywords
     def with_weights(self, weights: str | Path) -> DeepDetect:
         """Return a detector with other weights, and all other options as they are."""
         keywords = {**vars(self._runtime), **vars(self.heatmap_options)}
@@ -332,6 +334,7 @@ class DeepDetect:
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
         return describe_keypoints(luma(rgb), self.select(rgb, options, ignore))
 
+    @suggest_keywords
     def select(
         self,
         rgb: np.ndarray,
