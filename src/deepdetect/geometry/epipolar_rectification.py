@@ -4,7 +4,7 @@ Two frames, for two kinds of motion. `PlanarFrame` warps each view by a homograp
 and practice of projective rectification", 1999); it suits cameras side by side. `PolarFrame` has a
 row for each direction from the epipole, as Pollefeys, Koch and Van Gool ("A simple and efficient
 rectification method for general motion", 1999), and is right wherever the epipole lies, also in the
-picture. Its columns are logarithms of the distance from the epipole: where a camera moves forward,
+image. Its columns are logarithms of the distance from the epipole: where a camera moves forward,
 everything grows about the epipole, and growth by a factor is a shift.
 
 In both frames the match of (x, y) in the first view is (x - disparity, y) in the second.
@@ -13,7 +13,6 @@ In both frames the match of (x, y) in the first view is (x - disparity, y) in th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -39,29 +38,9 @@ MIN_RADIUS_PX = 8.0
 rows."""
 
 
-class RectifiedFrame(Protocol):
-    """A common frame of two views, in which matches lie on the same row.
-
-    `view` is 0 for the first and 1 for the second view.
-    """
-
-    @property
-    def size(self) -> Size:
-        """Width and height of the frame in pixels."""
-
-    def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
-        """Take (N, 2) positions of a view into the frame, (N, 2) float64."""
-
-    def from_frame(self, points: np.ndarray, view: int) -> np.ndarray:
-        """Take (N, 2) positions of the frame into a view, (N, 2) float64."""
-
-    def warp(self, image: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Show a view in the frame: its image, and the (H, W) bool mask of what it shows."""
-
-
 @dataclass(frozen=True, eq=False)
 class PlanarFrame:
-    """Two views rectified by homographies.
+    """Two views rectified by homographies; `view` is 0 for the first and 1 for the second.
 
     Attributes:
         homographies: (3, 3) of each view, from its pixels to those of the frame.
@@ -72,15 +51,15 @@ class PlanarFrame:
     size: Size
 
     def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
-        """Take positions of a view into the frame."""
+        """Take (N, 2) positions of a view into the frame, (N, 2) float64."""
         return transform_points(points, self.homographies[view])
 
     def from_frame(self, points: np.ndarray, view: int) -> np.ndarray:
-        """Take positions of the frame into a view."""
+        """Take (N, 2) positions of the frame into a view, (N, 2) float64."""
         return transform_points(points, np.linalg.inv(self.homographies[view]))
 
     def warp(self, image: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Show a view in the frame."""
+        """Show a view in the frame: its image, and the (H, W) bool mask of what it shows."""
         matrix = self.homographies[view]
         whole = np.full(image.shape[:2], 255, np.uint8)
         return (
@@ -91,7 +70,7 @@ class PlanarFrame:
 
 @dataclass(frozen=True, eq=False)
 class PolarFrame:
-    """Two views rectified about their epipoles.
+    """Two views rectified about their epipoles; methods as of `PlanarFrame`.
 
     Attributes:
         fundamental: (3, 3) with x1^T F x0 = 0.
@@ -161,6 +140,9 @@ class PolarFrame:
         lines = first @ self.fundamental[:, :2].T
         along = self.orientation * np.column_stack([lines[:, 1], -lines[:, 0]])
         return along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-300)
+
+
+RectifiedFrame = PlanarFrame | PolarFrame
 
 
 def rectified_frame(

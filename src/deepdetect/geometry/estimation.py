@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +15,9 @@ from .residuals import epipolar_errors, transfer_errors
 
 ESTIMATORS = ("magsac", "ransac")
 MODEL_NAMES = ("auto", "homography", "fundamental", "essential", "none")
+
+MIN_MATCHES = {"homography": 4, "fundamental": 15, "essential": 6}
+"""With fewer than 15 matches OpenCV's RANSAC ignores the threshold of a fundamental matrix."""
 
 
 @suggest_keywords
@@ -97,15 +99,6 @@ class Geometry:
         return f"Geometry(model={self.model!r}, {found} inliers of {len(self.inliers)} matches)"
 
 
-@dataclass(frozen=True)
-class _Model:
-    """How a model is fitted, from how many matches, and how its errors are measured in pixels."""
-
-    min_matches: int
-    fit: Callable[[np.ndarray, np.ndarray, GeometryOptions, int], np.ndarray | None]
-    errors: Callable[[np.ndarray, np.ndarray, np.ndarray, GeometryOptions], np.ndarray]
-
-
 @suggest_keywords
 def estimate_geometry(
     points0: np.ndarray,
@@ -156,20 +149,24 @@ def estimate_geometry(
             return depth if plane.matrix is None else plane
         parallax = measure_parallax(points0, points1, plane.matrix, seed=seed)
         return depth if parallax.shows_depth else plane
-    fitting = MODELS[model]
     nothing = Geometry(model, None, np.zeros(len(points0), bool))
-    if len(points0) < fitting.min_matches:
+    if len(points0) < MIN_MATCHES[model]:
         return nothing
     # OpenCV draws the same samples every time; another order of the matches draws others.
     order = np.random.default_rng(seed).permutation(len(points0))
-    method = cv2.USAC_MAGSAC if options.estimator == "magsac" else cv2.RANSAC
     try:
-        matrix = fitting.fit(points0[order], points1[order], options, method)
+        matrix = _fit(points0[order], points1[order], model, options)
     except cv2.error:  # degenerate input, as all points in one place
         return nothing
     if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return nothing
-    errors = fitting.errors(points0, points1, matrix, options)
+    if model == "homography":
+        errors = transfer_errors(points0, points1, matrix)
+    elif model == "fundamental":
+        errors = epipolar_errors(points0, points1, matrix)
+    else:
+        inverse0, inverse1 = (np.linalg.inv(camera) for camera in _cameras(options))
+        errors = epipolar_errors(points0, points1, inverse1.T @ matrix @ inverse0)
     return Geometry(model, matrix, errors < options.inlier_threshold)
 
 
@@ -183,51 +180,39 @@ def check_model(model: str, seed: int, options: GeometryOptions) -> None:
         _cameras(options)
 
 
-def _fit_homography(
-    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, method: int
+def _fit(
+    points0: np.ndarray, points1: np.ndarray, model: str, options: GeometryOptions
 ) -> np.ndarray | None:
-    return cv2.findHomography(
-        points0,
-        points1,
-        method,
-        options.inlier_threshold,
-        maxIters=options.iterations,
-        confidence=options.confidence,
-    )[0]
-
-
-def _fit_fundamental(
-    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, method: int
-) -> np.ndarray | None:
-    return cv2.findFundamentalMat(
-        points0, points1, method, options.inlier_threshold, options.confidence, options.iterations
-    )[0]
-
-
-def _fit_essential(
-    points0: np.ndarray, points1: np.ndarray, options: GeometryOptions, method: int
-) -> np.ndarray | None:
+    """Fit a model by OpenCV's estimator; None, or an odd matrix, where that fails."""
+    method = cv2.USAC_MAGSAC if options.estimator == "magsac" else cv2.RANSAC
+    threshold, confidence = options.inlier_threshold, options.confidence
+    iterations = options.iterations
+    if model == "homography":
+        return cv2.findHomography(
+            points0, points1, method, threshold, maxIters=iterations, confidence=confidence
+        )[0]
+    if model == "fundamental":
+        return cv2.findFundamentalMat(points0, points1, method, threshold, confidence, iterations)[
+            0
+        ]
     # Both images in normalised coordinates; the threshold shrinks with the focal length.
-    camera0, camera1 = _cameras(options)
-    focal = (camera0[0, 0] + camera1[0, 0]) / 2
+    cameras = _cameras(options)
+    first, second = (
+        np.ascontiguousarray(
+            (np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(camera).T)[:, :2]
+        )
+        for points, camera in zip((points0, points1), cameras, strict=True)
+    )
     matrix, _ = cv2.findEssentialMat(
-        _normalised(points0, camera0),
-        _normalised(points1, camera1),
+        first,
+        second,
         np.eye(3),
         method=method,
-        prob=options.confidence,
-        threshold=options.inlier_threshold / focal,
-        maxIters=options.iterations,
+        prob=confidence,
+        threshold=threshold / ((cameras[0][0, 0] + cameras[1][0, 0]) / 2),
+        maxIters=iterations,
     )
     return None if matrix is None else matrix[:3]
-
-
-def _essential_errors(
-    points0: np.ndarray, points1: np.ndarray, matrix: np.ndarray, options: GeometryOptions
-) -> np.ndarray:
-    camera0, camera1 = _cameras(options)
-    fundamental = np.linalg.inv(camera1).T @ matrix @ np.linalg.inv(camera0)
-    return epipolar_errors(points0, points1, fundamental)
 
 
 def _cameras(options: GeometryOptions) -> tuple[np.ndarray, np.ndarray]:
@@ -237,16 +222,3 @@ def _cameras(options: GeometryOptions) -> tuple[np.ndarray, np.ndarray]:
             "or choose the fundamental matrix"
         )
     return options.camera0, options.camera1
-
-
-def _normalised(points: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    homogeneous = np.column_stack([points, np.ones(len(points))])
-    return np.ascontiguousarray((homogeneous @ np.linalg.inv(camera).T)[:, :2])
-
-
-# With fewer than 15 matches OpenCV's RANSAC ignores the threshold.
-MODELS: dict[str, _Model] = {
-    "homography": _Model(4, _fit_homography, lambda a, b, m, _: transfer_errors(a, b, m)),
-    "fundamental": _Model(15, _fit_fundamental, lambda a, b, m, _: epipolar_errors(a, b, m)),
-    "essential": _Model(6, _fit_essential, _essential_errors),
-}

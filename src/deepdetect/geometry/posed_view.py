@@ -12,10 +12,10 @@ from .triangulation import cross_matrix
 
 @dataclass(frozen=True, eq=False)
 class PosedView:
-    """A photograph whose camera is known.
+    """An image whose camera is known.
 
     Attributes:
-        name: of the photograph.
+        name: of the image.
         camera: its pinhole camera, centre of the first pixel (0, 0).
         rotation, translation: (3, 3) and (3,) float64: a point X of the world is
             rotation @ X + translation in the camera's frame, x right, y down, z forward.

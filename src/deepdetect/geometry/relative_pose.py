@@ -72,16 +72,14 @@ def estimate_relative_pose(
     calibration: Calibration,
     inlier_threshold: float = 1.0,
     seed: int = 0,
-    refine: bool = True,
 ) -> RelativePose | None:
-    """Estimate the pose: essential matrix by MAGSAC, then the best of its four poses (cheirality).
+    """Estimate the pose: essential matrix by MAGSAC, the best of its four poses, refined.
 
     Args:
         points0, points1: (M, 2) matched positions in pixels.
         calibration: of both cameras.
         inlier_threshold: Sampson distance in pixels.
         seed: of the random samples.
-        refine: fit the pose to all inliers afterwards (`refine_pose`).
 
     Returns:
         The pose, or None when there are too few matches or it cannot be estimated.
@@ -96,7 +94,7 @@ def estimate_relative_pose(
     )
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    every = -(-len(points0) // MAX_MATCHES) if refine and len(points0) else 1
+    every = -(-len(points0) // MAX_MATCHES) if len(points0) else 1
     geometry = estimate_geometry(
         points0[::every], points1[::every], "essential", seed=seed, options=essential
     )
@@ -105,8 +103,8 @@ def estimate_relative_pose(
     kept = np.zeros(len(points0), bool)
     kept[::every] = geometry.inliers
     inliers = points0[kept], points1[kept]
-    pose = best_of_four(geometry.matrix, *inliers, calibration, MAX_MATCHES)
-    for _ in range(MAX_REFITS if refine else 0):
+    pose = best_of_four(geometry.matrix, *inliers, calibration)
+    for _ in range(MAX_REFITS):
         inliers = points0[kept], points1[kept]
         pose = refine_pose(*inliers, calibration, *pose, scale_px=inlier_threshold)
         before = np.count_nonzero(kept)
@@ -202,7 +200,6 @@ def best_of_four(
     points0: np.ndarray,
     points1: np.ndarray,
     calibration: Calibration,
-    max_matches: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the pose of an essential matrix with most points in front of both cameras.
 
@@ -210,13 +207,12 @@ def best_of_four(
         essential: (3, 3), in normalised coordinates.
         points0, points1: (M, 2) matched positions in pixels.
         calibration: of both cameras.
-        max_matches: at most so many are looked at, sampled evenly.
 
     Returns:
         (3, 3) rotation and (3,) translation of length 1.
     """
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
-    every = -(-len(points0) // max_matches)
+    every = -(-len(points0) // MAX_MATCHES)
     points0, points1 = points0[::every], points1[::every]
     poses = [
         (rotation, sign * translation.ravel())

@@ -1,4 +1,4 @@
-"""The fundamental matrix of two cameras of which something is known: those of most photographs.
+"""The fundamental matrix of two cameras of which something is known: those of most images.
 
 Pixels are square, the principal point lies near the middle of the image, and both images were taken
 with about the same focal length. Five matches then give a relative pose for each focal length that
@@ -129,7 +129,7 @@ def estimate_semi_calibrated(
         return best
     essential, cameras = start
     inliers = points0[best.inliers], points1[best.inliers]
-    here = _View(best_of_four(essential, *inliers, cameras.calibration, len(order)), cameras)
+    here = _View(best_of_four(essential, *inliers, cameras.calibration), cameras)
     for _ in range(MAX_FITS):
         inliers = points0[best.inliers], points1[best.inliers]
         here = _fit(here, *inliers, np.full(len(inliers[0]), MATCH_SIGMA_PX))
@@ -166,7 +166,7 @@ def refine_fundamental(
     if len(points0) < MIN_MATCHES:
         return fundamental
     cameras, essential = _nearest_cameras(fundamental, sizes)
-    pose = best_of_four(essential, points0, points1, cameras.calibration, len(points0))
+    pose = best_of_four(essential, points0, points1, cameras.calibration)
     start = _View(pose, cameras)
     matrix = _fit(start, points0, points1, match_sigmas_px).fundamental
     return np.asarray(matrix / np.linalg.norm(matrix))

@@ -18,6 +18,7 @@ from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.keypoints import Keypoints
+from ..geometry.optical_flow import track_round_trip
 from ..io.image import load_image, luma
 from .tracks import TrackedFrame
 
@@ -170,34 +171,22 @@ class Tracker:
     def _follow(self, gray: np.ndarray) -> None:
         """Move the points to where the next frame shows them; drop those that are lost."""
         options = self.options
-        settings = {
-            "winSize": (options.window_px, options.window_px),
-            "maxLevel": options.pyramid_levels - 1,
-            "criteria": (
-                cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS,
-                options.max_iterations,
-                options.min_step_px,
-            ),
-            "minEigThreshold": options.min_eigenvalue,
-        }
-        before = np.ascontiguousarray(self._xy, np.float32).reshape(-1, 1, 2)
-        there, found, _ = cv2.calcOpticalFlowPyrLK(self._gray, gray, before, None, **settings)
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            gray,
+        assert self._gray is not None
+        there, errors = track_round_trip(
             self._gray,
-            there,
-            before.copy(),
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            **settings,
+            gray,
+            self._xy,
+            options.window_px,
+            levels=options.pyramid_levels - 1,
+            iterations=options.max_iterations,
+            step_px=options.min_step_px,
+            min_eigenvalue=options.min_eigenvalue,
+            back_to_start=True,
         )
-        there, back = there.reshape(-1, 2), back.reshape(-1, 2)
-        errors = np.linalg.norm(back - self._xy, axis=1)
         assert self._size is not None
         low, high = options.border_px, np.array(self._size) - 1 - options.border_px
         kept = (
-            (found.ravel() == 1)
-            & (returned.ravel() == 1)
-            & (errors <= options.max_return_error_px)
+            (errors <= options.max_return_error_px)
             & (there >= low).all(axis=1)
             & (there <= high).all(axis=1)
         )

@@ -65,28 +65,28 @@ def match_by_homography(
     """
     gray1 = pair.gray1
     places = transform_points(pair.xy0, homography)
-    rows1, distances = nearest_keypoint(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
+    indices1, distances = nearest_keypoint(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
     with np.errstate(invalid="ignore"):
         shown = (places > -0.5) & (places < np.array(gray1.shape[::-1]) - 0.5)
     near = distances < MAX_DISTANCE_PX
-    rows0 = np.flatnonzero(shown.all(axis=1))
+    indices0 = np.flatnonzero(shown.all(axis=1))
     proposed = np.flatnonzero(near)
     # Where keypoints are few it is chance which of them have another there: all are judged.
-    if len(proposed) >= MIN_PROPOSED_FRACTION * len(rows0):
-        rows0 = proposed
-    if not len(rows0):
-        return DescriptorMatches(rows0, rows0, np.empty(0, np.float32)), 0.0
-    ratios = _compare(pair, homography, rows0, seed)
+    if len(proposed) >= MIN_PROPOSED_FRACTION * len(indices0):
+        indices0 = proposed
+    if not len(indices0):
+        return DescriptorMatches(indices0, indices0, np.empty(0, np.float32)), 0.0
+    ratios = _compare(pair, homography, indices0, seed)
     same = ratios < 1
-    kept = same & near[rows0]
-    matched = rows0[kept]
-    return DescriptorMatches(matched, rows1[matched], ratios[kept]), float(same.mean())
+    kept = same & near[indices0]
+    matched = indices0[kept]
+    return DescriptorMatches(matched, indices1[matched], ratios[kept]), float(same.mean())
 
 
 def _compare(
     pair: ImagePair,
     homography: np.ndarray,
-    rows0: np.ndarray,
+    indices0: np.ndarray,
     seed: int,
 ) -> np.ndarray:
     """Return the `dissimilarity` of keypoints, of large images on smaller copies."""
@@ -94,7 +94,7 @@ def _compare(
         downscale(gray, round(max(gray.shape) * min(1, np.sqrt(MAX_VERIFIED_MEGAPIXELS / area))))
         for gray, area in ((each, each.size / 1e6) for each in (pair.gray0, pair.gray1))
     )
-    pixels = pair.xy0[rows0]
+    pixels = pair.xy0[indices0]
     if scale0 < 1 or scale1 < 1:
         homography = scaled_homography(homography, scale0, scale1)
         last = np.array(gray0.shape[::-1], np.float32) - 1

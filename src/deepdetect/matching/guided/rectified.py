@@ -2,7 +2,7 @@
 
 Both images are warped into a frame in which matches lie on the same row
 (`geometry.epipolar_rectification`), the row matcher finds a disparity for each pixel
-(`matching.stereo`), and its matches are taken back to the photographs. They are sub-pixel
+(`matching.stereo`), and its matches are taken back to the images. They are sub-pixel
 positions, not keypoints of the second image.
 
 A fundamental matrix from few matches may miss by some pixels where none of them was. So corners are

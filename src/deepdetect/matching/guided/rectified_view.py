@@ -1,4 +1,4 @@
-"""Two photographs in a frame in which matches lie on the same row, and the disparities there.
+"""Two images in a frame in which matches lie on the same row, and the disparities there.
 
 Rows are matched (`matching.stereo`) in the range that sparse matches, and small copies, allow. What
 the windows of the two views show tells which disparities are kept: how well they correlate by
