@@ -9,10 +9,18 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from deepdetect import DeepDetectError, OptionError, PointDetector
+from deepdetect import (
+    DeepDetectError,
+    OptionError,
+    PointDetector,
+    RegistrationError,
+    load_image,
+    match_images,
+)
 from deepdetect.cli import main
 from deepdetect.evaluation.metrics.homography import corner_error
-from deepdetect.matching.registration import register
+from deepdetect.io.image import luma
+from deepdetect.matching.registration import agree, register
 
 WARP = np.array([[0.92, -0.1, 25.0], [0.08, 0.97, -6.0], [1e-4, 2e-4, 1.0]])
 
@@ -74,6 +82,40 @@ def test_the_command_writes_pictures_and_the_homography(
     homography = np.loadtxt(tmp_path / "out" / "b_on_a_homography.txt")
     np.testing.assert_allclose(homography, report["homography"])
     assert corner_error(homography, WARP, (256, 256)) < 0.5
+
+
+def poster(photo: np.ndarray) -> np.ndarray:
+    """An otherwise different image, a ninth of which shows the middle of the photograph."""
+    other = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
+    other[85:171, 85:171] = photo[85:171, 85:171]
+    return other
+
+
+def test_a_homography_that_the_images_contradict_is_refused(
+    photo: np.ndarray, tmp_path: Path
+) -> None:
+    for name, image in (("a", photo), ("b", poster(photo))):
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+    assert match_images(photo, poster(photo), model="homography").guided  # by what both show
+    with pytest.raises(RegistrationError, match="the images contradict the homography"):
+        register(photo, poster(photo))
+    words = ["register", str(tmp_path / "a.png"), str(tmp_path / "b.png")]
+    result = CliRunner().invoke(main, [*words, "-o", str(tmp_path / "out")])
+    assert result.exit_code == 3
+    assert result.stderr.startswith("deepdetect: the images contradict the homography")
+    assert not (tmp_path / "out").exists()
+
+
+def test_images_of_one_plane_agree_and_others_do_not(shared: Path) -> None:
+    folder = shared / "data" / "oxford"
+    scenes = ["graf", "leuven", "trees", "ubc"]
+    first, second = (
+        {name: luma(load_image(folder / name / f"img{k}.png")) for name in scenes} for k in (1, 4)
+    )
+    for name, other in zip(scenes, [*scenes[1:], scenes[0]], strict=True):
+        homography = np.loadtxt(folder / name / "H1to4p")
+        assert agree(first[name], second[name], homography)
+        assert not agree(first[name], second[other], homography)
 
 
 @pytest.mark.slow

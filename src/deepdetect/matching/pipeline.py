@@ -183,7 +183,7 @@ def match_pair(
     first = None
     # Keypoints of the network take no part in the first geometry, and finding them cannot fail:
     # where no geometry can be trusted nobody may ever ask for them.
-    if isinstance(detector, DeepDetect) and masks == [None, None]:
+    if isinstance(detector, DeepDetect) and all(mask is None for mask in masks):
         with timer.stage("initial geometry"):
             first = guiding_geometry(gray0, gray1, guiding, seed, known)
         if first.matrix is None:
