@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from deepdetect import (
-    PUBLISHED_MATCHING,
     DeepDetect,
     MatchingOptions,
     PointDetector,
@@ -28,6 +27,7 @@ from deepdetect import (
     match_images,
     reconstruct,
 )
+from deepdetect.matching import PUBLISHED_MATCHING
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 OXFORD = ("graf 1 3", "wall 1 4", "bikes 1 4", "boat 1 6", "ubc 1 6", "leuven 1 4")

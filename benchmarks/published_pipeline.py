@@ -23,7 +23,6 @@ import numpy as np
 
 from deepdetect import (
     DeepDetect,
-    HeatmapOptions,
     MatchingOptions,
     MissingExtraError,
     WeightsError,
@@ -34,6 +33,7 @@ from deepdetect import (
 from deepdetect.datasets.middlebury import load_calibrated_pair, load_middlebury
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.types import CalibratedStereoPair, PlanarPair, StereoPair
+from deepdetect.detector import HeatmapOptions
 from deepdetect.detector.pretrained import PRETRAINED
 from deepdetect.evaluation.planar_benchmarks import select_pairs
 from deepdetect.evaluation.profiling import Profile, profiled

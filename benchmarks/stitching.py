@@ -20,13 +20,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deepdetect import DeepDetect, Panorama
+from deepdetect import DeepDetect
 from deepdetect.datasets.oxford import find_scene, load_oxford
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.evaluation.profiling import peak_memory, run_in_child
 from deepdetect.evaluation.report import Cell, Column, Table
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
+from deepdetect.matching import Panorama
 from deepdetect.matching.stitching import stitch
 
 SIZE_PX = (2000, 1500)

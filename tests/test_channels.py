@@ -37,7 +37,7 @@ def calls() -> dict[str, Any]:
         "stitch": lambda a, b, **o: deepdetect.stitch([a, b], detector=RandomDetector(), **o).image,
         "reconstruct": calibrated,
         "disparity_map": lambda a, b, **o: deepdetect.disparity_map(a, b, **o).disparity,
-        "fuse": lambda a, b, **o: deepdetect.fuse(a, **o).mask,
+        "fuse": lambda a, b, **o: deepdetect.labels.fuse(a, **o).mask,
         "points": lambda a, b, **o: deepdetect.PointDetector(50).detect(a, **o).xy,
     }
 
@@ -71,8 +71,8 @@ def test_files_say_their_order_themselves(photo: np.ndarray, photo_path: Any) ->
 
 def test_luma_is_taken_as_it_is(photo: np.ndarray) -> None:
     gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
-    np.testing.assert_array_equal(deepdetect.fuse(gray).mask, deepdetect.fuse(photo).mask)
-    assert deepdetect.fuse(gray[:10, :12]).mask.shape == (10, 12)
+    np.testing.assert_array_equal(deepdetect.labels.fuse(gray).mask, deepdetect.fuse(photo).mask)
+    assert deepdetect.labels.fuse(gray[:10, :12]).mask.shape == (10, 12)
 
 
 def test_the_order_for_the_network_is_another_matter(photo: np.ndarray) -> None:

@@ -37,9 +37,9 @@ sys.addaudithook(refuse)
 FUNCTIONS = """
 import contextlib
 from deepdetect import (
-    DeepDetect, DeepDetectError, LabelOptions, PointDetector, fuse, load_image, match_images,
-    reconstruct, register
+    DeepDetect, DeepDetectError, PointDetector, load_image, match_images, reconstruct, register
 )
+from deepdetect.labels import LabelOptions, fuse
 from deepdetect.io.image import luma
 
 if __name__ == "__main__":

@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 
 import deepdetect
+from deepdetect.geometry.point_cloud import PointCloud
+from deepdetect.labels import Label
+from deepdetect.matching import DisparityMap, Panorama, Registration
 
 ROOT = Path(deepdetect.__path__[0])
 HEAVY = {"cv2", "matplotlib", "numba", "numpy", "onnxruntime", "openvino", "scipy", "torch"}
@@ -29,6 +32,21 @@ def test_every_public_name_can_be_imported() -> None:
     for name in deepdetect.__all__:
         assert getattr(deepdetect, name).__name__ == name
     assert deepdetect.__version__ == "0.2.0"
+    assert len(deepdetect.__all__) <= 30
+
+
+@pytest.mark.parametrize(
+    "package",
+    ["detector", "evaluation", "features", "matching", "reconstruction", "sfm", "training"],
+)
+def test_every_name_of_a_namespace_can_be_imported(package: str) -> None:
+    if package == "training":
+        pytest.importorskip("torch")
+    code = (
+        f"import json, deepdetect.{package} as names; "
+        "print(json.dumps([str(getattr(names, name)) for name in names.__all__]))"
+    )
+    assert in_a_fresh_interpreter(code)
 
 
 def test_the_stub_exports_what_it_imports() -> None:
@@ -70,11 +88,11 @@ def test_results_say_what_they_hold() -> None:
     rgb, mask = np.zeros((20, 30, 3), np.uint8), np.ones((20, 30), bool)
     matrix, cloud = np.eye(3), np.zeros((4, 3))
     results = [
-        deepdetect.Label(mask, ~mask, "low"),
-        deepdetect.PointCloud(cloud, cloud.astype(np.uint8), "mm"),
-        deepdetect.DisparityMap(np.full((20, 30), np.nan, np.float32), ~mask, None),
-        deepdetect.Registration(matrix, rgb, rgb, mask, 1234, 0.5),
-        deepdetect.Panorama(rgb, mask, {0: matrix, 1: matrix}, 0, {}, {(0, 1): 9}, 0.25, {}, {}),
+        Label(mask, ~mask, "low"),
+        PointCloud(cloud, cloud.astype(np.uint8), "mm"),
+        DisparityMap(np.full((20, 30), np.nan, np.float32), ~mask, None),
+        Registration(matrix, rgb, rgb, mask, 1234, 0.5),
+        Panorama(rgb, mask, {0: matrix, 1: matrix}, 0, {}, {(0, 1): 9}, 0.25, {}, {}),
     ]
     assert [repr(result) for result in results] == [
         "Label(30x20, density 1.000, low visibility)",

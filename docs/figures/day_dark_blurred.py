@@ -23,7 +23,6 @@ from deepdetect import (
     Keypoints,
     NoDepthError,
     PointDetector,
-    Reconstruction,
     match_images,
     reconstruct,
 )
@@ -31,6 +30,7 @@ from deepdetect.datasets import load_stereo_pair
 from deepdetect.datasets.degradation import DEGRADATIONS, degrade
 from deepdetect.features.display import draw_circle
 from deepdetect.geometry import disparity_errors
+from deepdetect.reconstruction import Reconstruction
 from deepdetect.viz.draw import _dimmed, draw_heatmap
 from deepdetect.viz.render import orbit_camera, render
 

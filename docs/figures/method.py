@@ -14,10 +14,11 @@ import numpy as np
 from day_dark_blurred import POINTS, draw_points
 from layout import caption, write_jpeg
 
-from deepdetect import DeepDetect, LabelOptions, Matches, PointDetector, fuse, match_images
+from deepdetect import DeepDetect, Matches, PointDetector, match_images
 from deepdetect.datasets import StereoPair, load_stereo_pair
 from deepdetect.features.display import draw_matches
 from deepdetect.geometry import disparity_errors
+from deepdetect.labels import LabelOptions, fuse
 from deepdetect.viz.draw import draw_heatmap
 
 FOLDER = Path(__file__).parents[1] / "images"

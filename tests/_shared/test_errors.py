@@ -96,7 +96,7 @@ def missing_files() -> dict[str, Callable[[Path], object]]:
         "keypoints": deepdetect.load_keypoints,
         "matches": deepdetect.load_matches,
         "match_images": lambda path: deepdetect.match_images(path, path),
-        "fuse": deepdetect.fuse,
+        "fuse": deepdetect.labels.fuse,
         "disparity_map": lambda path: deepdetect.disparity_map(path, path),
         "stitch": lambda path: deepdetect.stitch([path, path]),
         "calibration": lambda path: deepdetect.reconstruct(image, image, calibration=path),

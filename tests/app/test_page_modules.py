@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import deepdetect
-from deepdetect import SelectionOptions, select_keypoints
+from deepdetect import SelectionOptions
+from deepdetect.features import select_keypoints
 
 
 def select_in_node(run_node: Any, logits: np.ndarray, options: dict[str, Any]) -> np.ndarray:

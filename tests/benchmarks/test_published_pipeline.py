@@ -10,15 +10,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from deepdetect import (
-    PUBLISHED_MATCHING,
-    DeepDetect,
-    WeightsError,
-    match_images,
-)
+from deepdetect import DeepDetect, WeightsError, match_images
 from deepdetect.datasets.middlebury import load_calibrated_pair
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.io.image import load_image
+from deepdetect.matching import PUBLISHED_MATCHING
 
 pytest.importorskip("torch", reason="the published pipeline runs in torch")
 

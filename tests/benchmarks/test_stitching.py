@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import Panorama
+from deepdetect.matching import Panorama
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import LabelOptions, fuse, load_image
+from deepdetect import load_image
 from deepdetect.io.image import luma
+from deepdetect.labels import LabelOptions, fuse
 
 
 def test_writes_one_bit_masks(run, photos: Path) -> None:

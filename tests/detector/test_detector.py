@@ -15,17 +15,11 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import (
-    DeepDetect,
-    HeatmapOptions,
-    PointDetector,
-    SelectionOptions,
-    load_image,
-    match_images,
-    select_keypoints,
-)
+from deepdetect import DeepDetect, PointDetector, SelectionOptions, load_image, match_images
 from deepdetect._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
+from deepdetect.detector import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
+from deepdetect.features import select_keypoints
 from deepdetect.features.sift import root_sift_descriptors
 
 # The bundled weights change, so nothing here depends on the values that they give.

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, HeatmapOptions, Keypoints, SelectionOptions
+from deepdetect import DeepDetect, Keypoints, SelectionOptions
 from deepdetect._shared.errors import OptionError
+from deepdetect.detector import HeatmapOptions, heatmap, tiling
 from deepdetect.detector import detector as detector_module
-from deepdetect.detector import heatmap, tiling
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.detector.tiling import TiledNetwork, open_tiled
 from deepdetect.features.maps import Maps

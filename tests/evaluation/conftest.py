@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Keypoints, SelectionOptions, select_keypoints
+from deepdetect import DeepDetect, Keypoints, SelectionOptions
 from deepdetect.detector.backends import RuntimeOptions
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
+from deepdetect.features import select_keypoints
 from deepdetect.io.image import luma
 
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")

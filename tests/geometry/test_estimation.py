@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.transform import FundamentalMatrixTransform, ProjectiveTransform
 
-from deepdetect import Geometry, GeometryOptions, OptionError, estimate_geometry
+from deepdetect import OptionError, estimate_geometry
+from deepdetect.geometry import Geometry, GeometryOptions
 
 CAMERA0 = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], float)
 CAMERA1 = np.array([[640, 0, 310], [0, 640, 250], [0, 0, 1]], float)

@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect import GeometryOptions, estimate_geometry
+from deepdetect import estimate_geometry
+from deepdetect.geometry import GeometryOptions
 from deepdetect.geometry.parallax import measure_parallax
 
 CAMERA = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], float)

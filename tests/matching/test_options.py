@@ -4,7 +4,8 @@ from typing import Any
 
 import pytest
 
-from deepdetect import PUBLISHED_MATCHING, MatchingOptions, OptionError
+from deepdetect import MatchingOptions, OptionError
+from deepdetect.matching import PUBLISHED_MATCHING
 
 
 def test_the_published_options_are_what_the_published_code_runs() -> None:

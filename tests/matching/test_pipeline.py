@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from deepdetect import (
-    PUBLISHED_MATCHING,
     DeepDetect,
-    HeatmapOptions,
     ImageError,
     Keypoints,
     Matches,
@@ -20,13 +18,14 @@ from deepdetect import (
     OptionError,
     PointDetector,
     SelectionOptions,
-    select_keypoints,
 )
+from deepdetect.detector import HeatmapOptions
 from deepdetect.detector.detector import find_keypoints
 from deepdetect.evaluation.baselines.random import RandomDetector
+from deepdetect.features import select_keypoints
 from deepdetect.features.sift import sift_descriptors
 from deepdetect.geometry import transfer_errors
-from deepdetect.matching import pipeline
+from deepdetect.matching import PUBLISHED_MATCHING, pipeline
 
 from .conftest import match
 

@@ -16,7 +16,6 @@ from deepdetect import (
     Camera,
     ImageError,
     MissingExtraError,
-    MultiViewReconstruction,
     OptionError,
     PointDetector,
     ReconstructionError,
@@ -24,6 +23,7 @@ from deepdetect import (
 )
 from deepdetect.sfm import options as sfm_options
 from deepdetect.sfm import stages
+from deepdetect.sfm import MultiViewReconstruction
 from deepdetect.sfm.options import MultiViewOptions
 
 QUICK = {"workers": 1, "detector": PointDetector(1500)}

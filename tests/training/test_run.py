@@ -8,9 +8,9 @@ pytest.importorskip("torch", reason="needs torch, which is for training only")
 
 import importlib.util
 
-from deepdetect import MissingExtraError, TrainingOptions, train
+from deepdetect import MissingExtraError
 from deepdetect.labels import LabelOptions
-from deepdetect.training import DeviceOptions, Stage, profile
+from deepdetect.training import DeviceOptions, Stage, TrainingOptions, profile, train
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from ._generated import generated_command
 from ._options import DETECTOR, PATH, json_option, make_detector, print_json
 
 if TYPE_CHECKING:
-    from ..evaluation.evaluate import Evaluation, OxfordScore
+    from ..evaluation.weights import Evaluation, OxfordScore
 
 WIDTH = 14
 
@@ -94,10 +94,10 @@ def evaluate(
     from .._shared.errors import OptionError
     from ..datasets.oxford import load_oxford
     from ..detector.heatmap import HeatmapOptions
-    from ..evaluation.evaluate import evaluate as run
-    from ..evaluation.evaluate import evaluate_oxford
     from ..evaluation.options import PAPER_RESOLUTION_PX
     from ..evaluation.protocols.masks import LabelDetector
+    from ..evaluation.weights import evaluate as run
+    from ..evaluation.weights import evaluate_oxford
 
     if labels and oxford is None:
         raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")

@@ -1,1 +1,5 @@
 """Keypoints, their selection and descriptors, and descriptor matching."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

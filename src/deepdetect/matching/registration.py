@@ -28,7 +28,7 @@ different things correlate like."""
 
 MIN_DEVIATIONS = 4.0
 """By which the correlation must exceed the mean of the shifted ones, in their standard deviations.
-Of eight scenes of Oxford, images 1 with 4 and 6: 9 to 70; with those of other scenes at most 1.8."""
+Of eight scenes of Oxford, images 1 with 4 and 6: 9 to 70; with images of others at most 1.8."""
 
 COMPARED_SIDE_PX = 480
 """Longer side to which images are reduced before."""

@@ -1,1 +1,5 @@
 """Structure from motion: cameras and dense points from many images."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

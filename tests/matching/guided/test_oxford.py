@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, HeatmapOptions, match_images
+from deepdetect import DeepDetect, match_images
 from deepdetect.datasets.oxford import find_scene, load_oxford
+from deepdetect.detector import HeatmapOptions
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image

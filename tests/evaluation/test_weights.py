@@ -12,7 +12,6 @@ from deepdetect.datasets.oxford import SCENES, load_oxford
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.evaluation.baselines.method import heatmap_feature
 from deepdetect.evaluation.context import BenchmarkContext
-from deepdetect.evaluation.evaluate import _of_paper, evaluate, evaluate_oxford
 from deepdetect.evaluation.options import PAPER_RESOLUTION_PX, THRESHOLDS
 from deepdetect.evaluation.protocols import paper
 from deepdetect.evaluation.protocols.masks import (
@@ -21,6 +20,7 @@ from deepdetect.evaluation.protocols.masks import (
     score_at_scale,
 )
 from deepdetect.evaluation.protocols.paper import OXFORD_PAIRS, mean_correct_matches
+from deepdetect.evaluation.weights import _of_paper, evaluate, evaluate_oxford
 from deepdetect.geometry.residuals import transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.labels import fuse
@@ -174,7 +174,7 @@ def test_equal_density_without_images_is_refused(tmp_path: Path) -> None:
 def test_a_missing_folder_is_said_before_the_work(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("deepdetect.evaluation.evaluate.readable_images", None)
+    monkeypatch.setattr("deepdetect.evaluation.weights.readable_images", None)
     for name in ("oxford", "foreground"):
         with pytest.raises(ImageError, match="there are no"):
             evaluate(samples=tmp_path, **{name: tmp_path / "none"})

@@ -1,0 +1,1 @@
+from .weights import Evaluation as Evaluation, evaluate as evaluate

@@ -1,0 +1,7 @@
+from .keypoints import Keypoints as Keypoints
+from .matches import Matches as Matches, TwoViewGeometry as TwoViewGeometry
+from .selection import (
+    SelectionOptions as SelectionOptions,
+    select_keypoints as select_keypoints,
+)
+from .sift import describe_keypoints as describe_keypoints

@@ -1,0 +1,18 @@
+from .guided import TentativeMatches as TentativeMatches, tentative_matches as tentative_matches
+from .options import (
+    PUBLISHED_MATCHING as PUBLISHED_MATCHING,
+    MatchingOptions as MatchingOptions,
+)
+from .pipeline import match_images as match_images
+from .registration import Registration as Registration, register as register
+from .stereo import (
+    DisparityMap as DisparityMap,
+    DisparityOptions as DisparityOptions,
+    disparity_map as disparity_map,
+)
+from .stitching import (
+    Panorama as Panorama,
+    StitchingOptions as StitchingOptions,
+    stitch as stitch,
+)
+from .unguided import match_features as match_features

@@ -1,0 +1,5 @@
+from .pipeline import (
+    ReconstructionOptions as ReconstructionOptions,
+    reconstruct as reconstruct,
+)
+from .result import Reconstruction as Reconstruction
