@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import deepdetect
+import deepdetect.labels
 from deepdetect import OptionError
 from deepdetect.evaluation.baselines.random import RandomDetector
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import deepdetect
+import deepdetect.labels
 from deepdetect._shared.errors import (
     DeepDetectError,
     ImageError,

@@ -21,9 +21,8 @@ from deepdetect import (
     ReconstructionError,
     reconstruct_many,
 )
+from deepdetect.sfm import MultiViewReconstruction, stages
 from deepdetect.sfm import options as sfm_options
-from deepdetect.sfm import stages
-from deepdetect.sfm import MultiViewReconstruction
 from deepdetect.sfm.options import MultiViewOptions
 
 QUICK = {"workers": 1, "detector": PointDetector(1500)}
