@@ -3,7 +3,7 @@
     python benchmarks/onnx_variants.py SAMPLES [IMAGES] [--weights default] [--rounds 21]
 
 The table of docs/other-programs.md. SAMPLES holds `image_NAME.png` and `mask_image_NAME.png`; int8
-is calibrated on photographs of IMAGES, and left out without them. Bfloat16 and rows of OpenVINO are
+is calibrated on images of IMAGES, and left out without them. Bfloat16 and rows of OpenVINO are
 left out where they cannot be run. Time is processor time of one thread at 480x640 pixels, beside
 fp32 in the same runtime: the median ratio of rounds in which both run; `--rounds 0` leaves it out.
 """

@@ -1,11 +1,11 @@
 """Panoramas whose homographies are known: size, processor time, memory and corner errors.
 
-    python benchmarks/stitching.py OXFORD PHOTOGRAPH [--weights default]
+    python benchmarks/stitching.py OXFORD IMAGE [--weights default] [--projection plane]
 
 The table of docs/matching.md: Oxford's boat 1 and 2, by the published homography, and ten views of
-2000x1500 pixels that are rendered of PHOTOGRAPH, hung up as a flat scene: five yaws from -32 to 32
+2000x1500 pixels that are rendered of IMAGE, hung up as a flat scene: five yaws from -32 to 32
 degrees at pitches of -8 and 8 degrees, rolled by up to 2 degrees, with exposures of 0.8 to 1.1. The
-photograph is enlarged where it is smaller than what they show. Each row has a process of its own;
+image is enlarged where it is smaller than what they show. Each row has a process of its own;
 what numba compiles should be compiled before.
 """
 
@@ -29,6 +29,7 @@ from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
 from deepdetect.matching import Panorama
 from deepdetect.matching.stitching import stitch
+from deepdetect.matching.stitching.panorama import PROJECTIONS, Projection
 
 SIZE_PX = (2000, 1500)
 FOCAL_PX = 3700.0
@@ -43,13 +44,15 @@ def main() -> None:
     """Print a row for each panorama."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("oxford", type=Path)
-    parser.add_argument("photograph", type=Path)
+    parser.add_argument("image", type=Path)
     parser.add_argument("--weights", default="default")
+    parser.add_argument("--projection", default="plane", choices=PROJECTIONS)
     arguments = parser.parse_args()
+    how = arguments.weights, arguments.projection
     pair = next(find_scene(load_oxford(arguments.oxford), "boat").pairs())
     boat = [Path(pair.first), Path(pair.second)]
     with tempfile.TemporaryDirectory() as name:
-        views = render_views(load_image(arguments.photograph), SIZE_PX, FOCAL_PX)
+        views = render_views(load_image(arguments.image), SIZE_PX, FOCAL_PX)
         paths = [Path(name) / f"{k}.png" for k in range(len(views))]
         for path, (image, _) in zip(paths, views, strict=True):
             cv2.imwrite(str(path), image[..., ::-1])
@@ -58,9 +61,9 @@ def main() -> None:
         rows = [
             (
                 "boat 1 and 2",
-                *run_in_child(measure, boat, [pair.homography, np.eye(3)], arguments.weights),
+                *run_in_child(measure, boat, [pair.homography, np.eye(3)], *how),
             ),
-            ("ten rendered views", *run_in_child(measure, paths, truths, arguments.weights)),
+            ("ten rendered views", *run_in_child(measure, paths, truths, *how)),
         ]
     print(table(rows).to_markdown())
 
@@ -80,19 +83,22 @@ def table(rows: Sequence[tuple[Cell, ...]]) -> Table:
     return Table("stitching", "Panoramas", columns, tuple(rows))
 
 
-def measure(paths: Sequence[Path], truths: Sequence[np.ndarray], weights: str) -> tuple[Cell, ...]:
-    """Stitch photographs; return the number of them, size, seconds, gigabytes and errors.
+def measure(
+    paths: Sequence[Path], truths: Sequence[np.ndarray], weights: str, projection: Projection
+) -> tuple[Cell, ...]:
+    """Stitch images; return the number of them, size, seconds, gigabytes and errors.
 
     Args:
-        paths: of the photographs.
+        paths: of the images.
         truths: homographies from each to one frame of all.
         weights: of the detector.
+        projection: of the panorama.
     """
     started = time.process_time()
-    panorama = stitch(paths, detector=DeepDetect(weights))
+    panorama = stitch(paths, DeepDetect(weights), projection=projection)
     seconds = time.process_time() - started
     height, width = panorama.valid.shape
-    memory = peak_memory() / 1e9  # before the photographs are read for their sizes
+    memory = peak_memory() / 1e9  # before the images are read for their sizes
     errors = corner_errors(panorama, truths, [load_image(path).shape[1::-1] for path in paths])
     spread = float(np.mean(errors)), min(errors), max(errors)
     return len(panorama.homographies), f"{width}x{height}", seconds, memory, *spread
@@ -101,7 +107,7 @@ def measure(paths: Sequence[Path], truths: Sequence[np.ndarray], weights: str) -
 def corner_errors(
     panorama: Panorama, truths: Sequence[np.ndarray], sizes: Sequence[tuple[int, int]]
 ) -> list[float]:
-    """Return the mean corner error of each photograph but the reference, in its pixels."""
+    """Return the mean corner error of each image but the reference, in its pixels."""
     to_reference = np.linalg.inv(panorama.homographies[panorama.reference])
     truth_to_reference = np.linalg.inv(truths[panorama.reference])
     return [
@@ -112,12 +118,12 @@ def corner_errors(
 
 
 def render_views(
-    photograph: np.ndarray, size: tuple[int, int], focal_px: float
+    scene: np.ndarray, size: tuple[int, int], focal_px: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Render views of a flat scene by a camera that turns.
 
     Args:
-        photograph: (H, W, 3) uint8, scaled so that it just fills all views.
+        scene: (H, W, 3) uint8, scaled so that it just fills all views.
         size: (width, height) of the views.
         focal_px: their focal length.
 
@@ -138,14 +144,14 @@ def render_views(
     corners = np.array([[0, 0], [right, 0], [right, bottom], [0, bottom]], float)
     seen = np.concatenate([transform_points(corners, truth) for truth in truths])
     first, last = seen.min(0), seen.max(0)
-    given = np.array(photograph.shape[1::-1])
-    scale = float(((last - first) / (given - 1)).max())
-    left, top = (first + last - scale * (given - 1)) / 2
+    whole = np.array(scene.shape[1::-1])
+    scale = float(((last - first) / (whole - 1)).max())
+    left, top = (first + last - scale * (whole - 1)) / 2
     hung = np.array([[scale, 0, left], [0, scale, top], [0, 0, 1]])
     views = []
     for truth in truths:
         to_view = np.linalg.inv(truth) @ hung
-        view = cv2.warpPerspective(photograph, to_view, size, flags=cv2.INTER_CUBIC)
+        view = cv2.warpPerspective(scene, to_view, size, flags=cv2.INTER_CUBIC)
         exposed = np.rint(view * rng.uniform(*EXPOSURES)).clip(0, 255)
         views.append((exposed.astype(np.uint8), truth))
     return views

@@ -1,4 +1,4 @@
-// Dense keypoints of a photograph by ONNX Runtime: keypoints MODEL.onnx PHOTO.ppm [PROBABILITY]
+// Dense keypoints of an image by ONNX Runtime: keypoints MODEL.onnx PHOTO.ppm [PROBABILITY]
 // prints "x y probability" of each pixel over the threshold (0.5 unless given).
 #include <onnxruntime_cxx_api.h>
 

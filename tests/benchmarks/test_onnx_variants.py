@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import count
 from pathlib import Path
 from types import ModuleType
 
@@ -60,19 +59,3 @@ def test_half_precision_beside_the_whole(
         loss, overlap = map(float, score.split(" / "))
         assert 0 < loss < 1
         assert 0.3 < overlap < 1
-
-
-def test_the_ratio_of_times(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = [0.0]
-    monkeypatch.setattr(script.time, "process_time", lambda: clock[0])
-    calls = count(1)
-
-    def takes(seconds: float) -> Callable[[np.ndarray], None]:
-        def run(_: np.ndarray) -> None:
-            # The first round is not counted, however long it takes.
-            clock[0] += seconds if next(calls) > 2 else 100 * seconds**3
-
-        return run
-
-    assert script.time_ratio(takes(2), takes(3), np.zeros(1), rounds=4) == pytest.approx(1.5)
-    assert np.isnan(script.time_ratio(takes(2), takes(3), np.zeros(1), rounds=0))

@@ -55,33 +55,6 @@ def test_the_keypoints_are_those_of_the_package(
 
 
 @pytest.mark.slow
-def test_two_images_at_once(installed: Path, photo: np.ndarray, tmp_path: Path) -> None:
-    """A batch of two gives what each image gives by itself."""
-    (installed / "batch.mjs").write_text(
-        """
-import { readFileSync, writeFileSync } from "node:fs";
-import * as ort from "onnxruntime-web";
-ort.env.wasm.numThreads = 1;
-const [model, given, made, height, width] = process.argv.slice(2);
-const planes = new Float32Array(new Uint8Array(readFileSync(given)).buffer);
-const image = new ort.Tensor("float32", planes, [2, 3, Number(height), Number(width)]);
-const session = await ort.InferenceSession.create(readFileSync(model));
-writeFileSync(made, new Uint8Array((await session.run({ image })).logits.data.buffer));
-"""
-    )
-    two = np.stack([photo[:83, :90], photo[100:183, 60:150]])
-    planes = np.ascontiguousarray(two.transpose(0, 3, 1, 2) * np.float32(1 / 255))
-    planes.tofile(tmp_path / "given.bin")
-    words = [pretrained_weights(), tmp_path / "given.bin", tmp_path / "made.bin", 83, 90]
-    command = ["node", "batch.mjs", *map(str, words)]
-    subprocess.run(command, cwd=installed, check=True)
-    found = np.fromfile(tmp_path / "made.bin", np.float32).reshape(2, 83, 90)
-    detector = DeepDetect(backend="onnxruntime")
-    for logits, rgb in zip(found, two, strict=True):
-        np.testing.assert_allclose(logits, detector.heatmap_and_logits(rgb)[1], atol=1e-3)
-
-
-@pytest.mark.slow
 def test_a_file_that_gives_keypoints(installed: Path, photo: np.ndarray, tmp_path: Path) -> None:
     pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
     from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx
@@ -153,9 +126,3 @@ def test_a_mistake_is_one_sentence(
     assert (ended.returncode, ended.stdout) == (2, "")
     assert message in ended.stderr
     assert one_sentence(ended.stderr)
-
-
-def test_the_example_is_short_and_pinned() -> None:
-    assert len((FOLDER / "keypoints.mjs").read_text(encoding="utf-8").splitlines()) <= 40
-    assert '"onnxruntime-web": "1.30.0"' in (FOLDER / "package.json").read_text(encoding="utf-8")
-    assert '"integrity"' in (FOLDER / "package-lock.json").read_text(encoding="utf-8")

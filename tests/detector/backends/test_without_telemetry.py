@@ -103,35 +103,6 @@ def test_the_watch_sees_files_processes_and_connections(tmp_path: Path) -> None:
     assert list(tmp_path.rglob("*")) == []
 
 
-def test_a_user_s_own_setting_of_onnxruntime_stays(tmp_path: Path) -> None:
-    code = (
-        "import os, sys\n"
-        "from deepdetect.detector.backends.without_telemetry import import_onnxruntime\n"
-        "seen = []\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, *_):\n"
-        "        if name == 'onnxruntime':\n"
-        "            seen.append(os.environ['ORT_DISABLE_TELEMETRY'])\n"
-        "sys.meta_path.insert(0, Finder())\n"
-        "import_onnxruntime()\n"
-        "assert seen == [os.environ['ORT_DISABLE_TELEMETRY']] == ['true']\n"
-    )
-    assert run(code, tmp_path, ORT_DISABLE_TELEMETRY="true") == []
-
-
-@needs_openvino
-@needs_openvino_telemetry
-def test_the_user_s_openvino_stays(tmp_path: Path) -> None:
-    code = (
-        "import sys, openvino, openvino_telemetry as before\n"
-        "from deepdetect.detector.backends.without_telemetry import import_openvino\n"
-        "assert import_openvino() is openvino\n"
-        "assert sys.modules['openvino_telemetry'] is before\n"
-        "assert openvino.tools.ovc.telemetry_utils.tm is before\n"
-    )
-    assert run(code, tmp_path, CI="true") == []
-
-
 @needs_openvino
 @needs_openvino_telemetry
 def test_openvino_telemetry_can_be_imported_afterwards(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting on
 import cv2  # noqa: E402
 import onnxruntime  # noqa: E402
 
-from deepdetect import DeepDetect, OptionError  # noqa: E402
+from deepdetect import DeepDetect  # noqa: E402
 from deepdetect.detector.network.onnx_keypoints import MAX_KEYPOINTS, add_keypoints  # noqa: E402
 from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
@@ -137,34 +137,6 @@ def test_one_size(
         check_keypoints(xy[k], values[k], selected, 500)
         if precision == "fp32":
             check_keypoints(xy[k], values[k], best(images[k], 500), 500)
-
-
-def test_half_precision_is_near(tmp_path: Path, photo: np.ndarray) -> None:
-    half = tmp_path / "half.onnx"
-    write_onnx("default", half, OnnxOptions(precision="fp16", max_keypoints=COUNT))
-    rgb = photo[:123, :157]
-    xy, values = session_of(half).run(OUTPUTS, {"image": planes_of(rgb)})
-    assert xy.dtype == values.dtype == np.float32
-    # The package reads the same file, and gives the same keypoints.
-    check_keypoints(xy[0], values[0], best(rgb, weights=half), COUNT)
-    gaps = np.linalg.norm(xy[0][:, None] - best(rgb).xy, axis=2).min(1)
-    assert np.mean(gaps < 0.05) > 0.95
-    assert gaps.max() > 0
-
-
-@pytest.mark.slow
-def test_eight_bits(tmp_path: Path, photo: np.ndarray) -> None:
-    from PIL import Image
-
-    Image.fromarray(photo[:150, :180]).save(tmp_path / "a.png")
-    small, rgb = tmp_path / "small.onnx", photo[:123, :157]
-    options = OnnxOptions(precision="int8", max_keypoints=COUNT)
-    write_onnx("default", small, options, calibration=[tmp_path / "a.png"])
-    onnx.checker.check_model(onnx.load(small), full_check=True)
-    logits, xy, values = session_of(small).run(["logits", *OUTPUTS], {"image": planes_of(rgb)})
-    (map_,) = logits[0]
-    selected = select_keypoints(sigmoid(map_), best_of(COUNT), map_)
-    check_keypoints(xy[0], values[0], selected, COUNT)
 
 
 @pytest.mark.slow
@@ -296,42 +268,6 @@ def test_a_constant_image_has_weak_ones(grey: int, path: Path, photo: np.ndarray
     assert others.max() > 20
 
 
-@pytest.mark.skipif(cv2.__version__ < "5", reason="its message is of OpenCV 5")
-def test_the_classic_engine_refuses_them(tmp_path: Path) -> None:
-    write_onnx("default", tmp_path / "one.onnx", OnnxOptions((64, 96), max_keypoints=20))
-    with pytest.raises(cv2.error, match="Pad"):
-        cv2.dnn.readNetFromONNX(str(tmp_path / "one.onnx"), cv2.dnn.ENGINE_CLASSIC)
-
-
-def test_metadata(path: Path, count: int) -> None:
-    found = session_of(path).get_modelmeta().custom_metadata_map
-    assert found["max_keypoints"] == str(count)
-
-
-@pytest.mark.parametrize("name", ["default", "dense", "free"])
-def test_all_shipped_files_give_them(name: str, photo: np.ndarray) -> None:
-    rgb = photo[:123, :157]
-    xy, values = session_of(pretrained_weights(name)).run(OUTPUTS, {"image": planes_of(rgb)})
-    check_keypoints(xy[0], values[0], best(rgb, MAX_KEYPOINTS, name), MAX_KEYPOINTS)
-
-
-@pytest.mark.parametrize(
-    ("options", "count"),
-    [
-        (OnnxOptions(), MAX_KEYPOINTS),
-        (OnnxOptions(precision="fp16"), MAX_KEYPOINTS),
-        (OnnxOptions(max_keypoints=0), 0),
-        (OnnxOptions((64, 96), max_keypoints=7), 7),
-    ],
-)
-def test_how_many_a_file_gives(options: OnnxOptions, count: int, tmp_path: Path) -> None:
-    metadata = write_onnx("default", tmp_path / "made.onnx", options)
-    assert metadata.get("max_keypoints", "0") == str(count)
-    outputs = session_of(tmp_path / "made.onnx").get_outputs()
-    shapes = {value.name: value.shape[-1] for value in outputs if value.name in OUTPUTS}
-    assert shapes == ({"keypoints": 2, "keypoint_logits": count} if count else {})
-
-
 @pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
 def test_the_package_reads_the_maps_of_such_a_file(
     backend: str, path: Path, photo: np.ndarray
@@ -362,9 +298,3 @@ def test_a_file_is_made_of_such_a_file(path: Path, tmp_path: Path) -> None:
     write_onnx(path, tmp_path / "fewer.onnx", OnnxOptions(max_keypoints=7))
     write_onnx("default", tmp_path / "expected.onnx", OnnxOptions(max_keypoints=7))
     assert (tmp_path / "fewer.onnx").read_bytes() == (tmp_path / "expected.onnx").read_bytes()
-
-
-@pytest.mark.parametrize("count", [-3, 100_001, 0.5, 1.5, "many", float("nan")])
-def test_the_number_is_checked(count: Any) -> None:
-    with pytest.raises(OptionError, match="`max_keypoints` must"):
-        OnnxOptions(max_keypoints=count)

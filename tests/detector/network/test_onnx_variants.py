@@ -59,18 +59,6 @@ def check_answers(logits: np.ndarray, probability: np.ndarray, expected: np.ndar
     assert probability.max() <= 1
 
 
-@pytest.mark.parametrize("batch", [1, 2])
-@pytest.mark.parametrize(("height", "width"), SIZES)
-def test_onnxruntime(
-    height: int, width: int, batch: int, photo: np.ndarray, network: onnxruntime.InferenceSession
-) -> None:
-    images = images_of(photo, height, width, batch)
-    logits, probability = session_of(pretrained_weights()).run(
-        ["logits", "probability"], {"image": images}
-    )
-    check_answers(logits, probability, expected_logits(network, images))
-
-
 def test_the_probability_is_never_over_one() -> None:
     """Without the limit it is 1.0000001 at some of these."""
     shipped = pretrained_weights().read_bytes()
@@ -106,12 +94,6 @@ def test_opencv_5_at_any_size(
             ["logits", "probability", "keypoints", "keypoint_logits"]
         )
         check_answers(logits, probability, expected_logits(network, images))
-
-
-@pytest.mark.skipif(cv2.__version__ < "5", reason="its message is of OpenCV 5")
-def test_the_classic_engine_refuses_the_file_for_any_size() -> None:
-    with pytest.raises(cv2.error, match="Shape"):
-        cv2.dnn.readNetFromONNX(str(pretrained_weights()), cv2.dnn.ENGINE_CLASSIC)
 
 
 NAMES = ["ENGINE_CLASSIC", "ENGINE_NEW"] if cv2.__version__ >= "5" else []

@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect.matching.stereo import refinement
 from deepdetect.matching.stereo.refinement import refine_disparity
 
 SHAPE = (60, 120)
@@ -53,16 +52,3 @@ def test_unknown_pixels_stay_and_do_not_count(rectified_pair) -> None:
     refined = refine_disparity(left, right, start, known)
     assert (refined[~known] == 77).all()
     assert np.median(np.abs(refined - truth)[known]) < 0.02
-
-
-def test_more_iterations_come_nearer(rectified_pair, monkeypatch: pytest.MonkeyPatch) -> None:
-    truth = np.full(SHAPE, 6.4, np.float32)
-    left, right = rectified_pair(truth)
-    start, known = np.full(SHAPE, 6.0, np.float32), np.ones(SHAPE, bool)
-    errors = []
-    for iterations in (0, 1, 2):
-        monkeypatch.setattr(refinement, "ITERATIONS", iterations)
-        refined = refine_disparity(left, right, start, known)
-        errors.append(np.median(np.abs(refined - truth)[INNER]))
-    assert errors[0] == pytest.approx(0.4, abs=1e-5)
-    assert errors[0] > 2 * errors[1] > 4 * errors[2]

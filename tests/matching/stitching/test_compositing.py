@@ -139,13 +139,6 @@ def test_brightness_becomes_equal(scene: np.ndarray) -> None:
     assert factor[:150].mean() / factor[-150:].mean() == pytest.approx(1, abs=0.03)
 
 
-def test_the_same_every_time(scene: np.ndarray) -> None:
-    images = {0: scene[:300, :400], 1: scene[50:350, 120:520]}
-    canvas = planned({0: moved(0), 1: turned(3) @ moved(120, 50)})
-    first, second = put_together(images, canvas), put_together(images, canvas)
-    np.testing.assert_array_equal(first[0], second[0])
-
-
 @pytest.mark.parametrize(
     ("projection", "height"),
     [

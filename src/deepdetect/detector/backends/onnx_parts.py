@@ -6,7 +6,7 @@ the format (onnx.proto3) are read: nodes and weights are copied as they are.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 MODEL_GRAPH = 7
@@ -33,13 +33,10 @@ def cut_onnx(model: bytes, inputs: Sequence[str], outputs: Sequence[str]) -> byt
     Raises:
         KeyError: a tensor is not there, or needs more than the inputs.
     """
-    graph = _read(model)
-    nodes, weights = graph.needed(inputs, outputs)
-    return graph.written(
-        nodes,
-        weights,
-        [_message(GRAPH_INPUT, _tensor(name)) for name in inputs],
-        [_message(GRAPH_OUTPUT, _tensor(name)) for name in outputs],
+    return _cut(
+        _read(model),
+        {name: _message(GRAPH_INPUT, _tensor(name)) for name in inputs},
+        {name: _message(GRAPH_OUTPUT, _tensor(name)) for name in outputs},
     )
 
 
@@ -60,14 +57,10 @@ def leave_out_outputs(model: bytes, names: Collection[str]) -> bytes:
     """
     try:
         graph = _read(model)
-        kept = [name for name in graph.outputs if name not in names]
-        if len(kept) == len(graph.outputs):
-            return model
-        nodes, weights = graph.needed(list(graph.inputs), kept)
+        kept = {name: raw for name, raw in graph.outputs.items() if name not in names}
+        return model if len(kept) == len(graph.outputs) else _cut(graph, graph.inputs, kept)
     except (IndexError, StopIteration, UnicodeDecodeError) as error:
         raise KeyError(str(error)) from None
-    outputs = [graph.outputs[name] for name in kept]
-    return graph.written(nodes, weights, graph.inputs.values(), outputs)
 
 
 @dataclass(frozen=True)
@@ -80,35 +73,24 @@ class _Graph:
     inputs: dict[str, Bytes]
     outputs: dict[str, Bytes]
 
-    def needed(
-        self, inputs: Sequence[str], outputs: Sequence[str]
-    ) -> tuple[list[Bytes], list[Bytes]]:
-        """Return the nodes and the weights that compute some tensors from others."""
-        kept: list[Bytes] = []
-        wanted = set(outputs)
-        used = []
-        for raw, read, written in reversed(self.nodes):
-            if wanted.isdisjoint(written):
-                continue
-            kept.append(raw)
-            wanted -= set(written)
-            used += [name for name in read if name in self.weights]
-            wanted |= {name for name in read if name not in self.weights and name not in inputs}
-        if wanted:
-            raise KeyError(min(wanted))
-        return kept[::-1], [self.weights[name] for name in dict.fromkeys(used)]
 
-    def written(
-        self,
-        nodes: list[Bytes],
-        weights: list[Bytes],
-        inputs: Iterable[Bytes],
-        outputs: Iterable[Bytes],
-    ) -> bytes:
-        """Return the content of a file with these parts of a graph."""
-        part = [*nodes, _message(GRAPH_NAME, b"part"), *weights, *inputs, *outputs]
-        length = _number(sum(map(len, part)))
-        return b"".join([*self.model, _number(MODEL_GRAPH << 3 | 2), length, *part])
+def _cut(graph: _Graph, inputs: Mapping[str, Bytes], outputs: Mapping[str, Bytes]) -> bytes:
+    """Return the content of a file that computes some tensors from others."""
+    wanted, nodes, used = set(outputs), [], []
+    for raw, read, written in reversed(graph.nodes):
+        if wanted.isdisjoint(written):
+            continue
+        nodes.append(raw)
+        wanted -= set(written)
+        used += [name for name in read if name in graph.weights]
+        wanted |= {name for name in read if name not in graph.weights and name not in inputs}
+    if wanted:
+        raise KeyError(min(wanted))
+    weights = [graph.weights[name] for name in dict.fromkeys(used)]
+    name = _message(GRAPH_NAME, b"part")
+    part = [*nodes[::-1], name, *weights, *inputs.values(), *outputs.values()]
+    length = _number(sum(map(len, part)))
+    return b"".join([*graph.model, _number(MODEL_GRAPH << 3 | 2), length, *part])
 
 
 def _read(model: bytes) -> _Graph:

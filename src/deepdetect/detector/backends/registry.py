@@ -22,7 +22,7 @@ from ..._shared.errors import (
 from .onnxruntime_backend import open_onnxruntime
 from .openvino_backend import open_openvino
 from .options import Network, RuntimeOptions
-from .shapes import check_answer
+from .shapes import sanity_check
 from .torch_backend import open_torch
 
 
@@ -84,7 +84,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
     """Load a file; one whose state has changed since is loaded again."""
     network = _BACKENDS[backend].open(path, options)
-    check_answer(network, path)
+    sanity_check(network, path)
     return network
 
 

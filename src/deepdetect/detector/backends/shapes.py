@@ -102,7 +102,7 @@ def as_logits(
     return np.log(probability / (1 - probability)).astype(np.float32)
 
 
-def check_answer(network: Callable[[np.ndarray], np.ndarray], path: Path) -> None:
+def sanity_check(network: Callable[[np.ndarray], np.ndarray], path: Path) -> None:
     """Run a network on a small image of noise, so that a damaged one is refused when it is loaded.
 
     Raises:

@@ -46,12 +46,12 @@ def to_float16(model: ModelProto) -> None:
         if one.name in weights:
             halved = numpy_helper.to_array(one).astype(np.float16)
             one.CopyFrom(numpy_helper.from_array(halved, one.name))
-    given, found = (PADDED_IMAGE, PADDED_LOGITS) if before else (IMAGE, LOGITS)
+    image, logits = (PADDED_IMAGE, PADDED_LOGITS) if before else (IMAGE, LOGITS)
     for node in inner:
-        rename(node, given, f"{given}_float16")
-        rename(node, found, f"{found}_float16")
-    down = helper.make_node("Cast", [given], [f"{given}_float16"], to=TensorProto.FLOAT16)
-    up = helper.make_node("Cast", [f"{found}_float16"], [found], to=TensorProto.FLOAT)
+        rename(node, image, f"{image}_float16")
+        rename(node, logits, f"{logits}_float16")
+    down = helper.make_node("Cast", [image], [f"{image}_float16"], to=TensorProto.FLOAT16)
+    up = helper.make_node("Cast", [f"{logits}_float16"], [logits], to=TensorProto.FLOAT)
     replace_nodes(graph, [*before, down, *inner, up, *behind])
 
 

@@ -1,4 +1,7 @@
-"""Which disparities of a map can be trusted, and how gaps between surfaces are filled."""
+"""Which disparities of a map can be trusted, and how gaps between surfaces are filled.
+
+Maps are (H, W): `disparity` float32 in pixels, `known` bool.
+"""
 
 from __future__ import annotations
 
@@ -18,16 +21,9 @@ OCCLUSION_SLACK_PX = 8
 
 
 def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) -> np.ndarray:
-    """Remove small patches whose disparity differs from all around them: most are wrong.
+    """Return the known pixels without patches of at most so many pixels: most of these are wrong.
 
-    Args:
-        disparity: (H, W) float32 in pixels.
-        known: (H, W) bool.
-        max_area_px: patches of at most this many pixels are removed; a patch is connected by steps
-            of at most twice `MAX_DIFFERENCE_PX`.
-
-    Returns:
-        (H, W) bool, the known pixels without the patches.
+    A patch is connected by steps of at most twice `MAX_DIFFERENCE_PX`.
 
     Example:
         >>> disparity = np.zeros((20, 20), np.float32)
@@ -42,18 +38,10 @@ def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) 
 
 
 def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
-    """Find the pixels near a disparity discontinuity.
+    """Find the pixels this near to a disparity discontinuity, along rows, columns or both.
 
     The window of a match there sees both surfaces, and gives a pixel beside the nearer one its
     disparity. Where nothing is known, the farther of both sides is assumed to continue.
-
-    Args:
-        disparity: (H, W) float32 in pixels.
-        known: (H, W) bool.
-        distance_px: along rows, columns or both.
-
-    Returns:
-        (H, W) bool.
 
     Example:
         >>> disparity = np.zeros((5, 9), np.float32)
@@ -74,19 +62,11 @@ def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: in
 
 
 def on_occluding_edge(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
-    """Find the outermost pixels of surfaces in front of others.
+    """Find the outermost known pixels of surfaces in front of others, as wide as `distance_px`.
 
     The windows of the match give the nearer disparity also to what lies just beside it, so these
     are the least sure of all. Where nothing is known, the farther of both sides is assumed to
     continue.
-
-    Args:
-        disparity: (H, W) float32 in pixels.
-        known: (H, W) bool.
-        distance_px: along rows, columns or both.
-
-    Returns:
-        (H, W) bool, a part of the known pixels.
 
     Example:
         >>> disparity = np.zeros((5, 9), np.float32)
@@ -104,10 +84,6 @@ def fill_occlusions(disparity: np.ndarray, known: np.ndarray) -> tuple[np.ndarra
     """Fill unknown pixels with the farther of the nearest known ones on both sides of their row.
 
     What the right view does not see lies behind what occludes it.
-
-    Args:
-        disparity: (H, W) float32 in pixels.
-        known: (H, W) bool.
 
     Returns:
         (H, W) float32 disparity, 0 in rows where nothing is known; and (H, W) bool, true where

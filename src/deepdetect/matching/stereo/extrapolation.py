@@ -22,8 +22,7 @@ def extrapolate_disparity(
     known pixels from the nth on must predict those before, to `MAX_DIFFERENCE_PX`.
 
     Args:
-        disparity: (H, W) float32 in pixels.
-        known: (H, W) bool.
+        disparity, known: as of `consistency`.
         carried: (H, W) float32, what semi-global matching chooses for each pixel; where nothing can
             be seen that is the disparity, not extrapolated, that the most paths bring.
 

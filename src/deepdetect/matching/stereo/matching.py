@@ -300,13 +300,13 @@ def _whole_pixels(
     keypoints: Keypoints | np.ndarray, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return columns and rows of keypoints that lie on pixels of an image."""
-    given = np.asarray(keypoints.xy if isinstance(keypoints, Keypoints) else keypoints)
-    if given.ndim != 2 or given.shape[1] != 2 or given.dtype.kind not in "iuf":
-        raise OptionError(f"keypoints must be an array of shape (N, 2), not {given.shape}")
-    pixels = np.rint(np.where(np.isfinite(given), given, -1)).astype(np.int64)
+    xy = np.asarray(keypoints.xy if isinstance(keypoints, Keypoints) else keypoints)
+    if xy.ndim != 2 or xy.shape[1] != 2 or xy.dtype.kind not in "iuf":
+        raise OptionError(f"keypoints must be an array of shape (N, 2), not {xy.shape}")
+    pixels = np.rint(np.where(np.isfinite(xy), xy, -1)).astype(np.int64)
     height, width = shape
     inside = (pixels >= 0).all() and (pixels < [width, height]).all()
-    if (pixels != given).any() or not inside:
+    if (pixels != xy).any() or not inside:
         raise OptionError(
             "rectified matching takes keypoints on whole pixels of the left view: detect them with "
             "subpixel=False"

@@ -151,16 +151,11 @@ def matching_cost(
     count: int,
     outside: int = WRONG_PLACE_BITS,
 ) -> np.ndarray:
-    """Compute the cost of each disparity of each pixel.
-
-    Args:
-        left, right: (H, W) uint64 census of both views.
-        min_disparity: the first disparity.
-        count: number of disparities, D.
-        outside: distance in bits of a place outside the right view.
+    """Compute the cost of each of so many disparities of each pixel of two censuses.
 
     Returns:
-        (H, W, D) uint8, a quarter of the sum of the distances over 3 x 3 pixels.
+        (H, W, count) uint8, a quarter of the sum of the distances over 3 x 3 pixels; `outside` is
+        that of a place outside the right view.
 
     Example:
         >>> words = np.zeros((8, 30), np.uint64)
