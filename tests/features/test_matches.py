@@ -113,13 +113,14 @@ def test_the_nearest_keypoint_is_that_of_a_search_of_all(data: st.DataObject) ->
     xy = np.column_stack([pixels % 20, pixels // 20]) + offsets
     keypoints = Keypoints(xy, np.ones(len(xy)), (20, 15))
     places = rng.uniform(-3, 23, (60, 2))
-    found = nearest_keypoints(places, keypoints)
+    found, gaps = nearest_keypoints(places, keypoints.xy, (20, 15))
+    np.testing.assert_array_equal(found >= 0, np.isfinite(gaps))
     if not len(xy):
         assert (found == -1).all()
         return
     distances = np.linalg.norm(places[:, None] - keypoints.xy.astype(float), axis=2)
     near = distances.min(axis=1) <= 1
-    np.testing.assert_array_equal(found >= 0, near)
+    np.testing.assert_array_equal(gaps <= 1, near)
     np.testing.assert_array_equal(distances[near, found[near]], distances[near].min(axis=1))
 
 

@@ -12,6 +12,7 @@ from .._shared.errors import MissingExtraError, OptionError, install_command
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
+from .._shared.parallel import parallel_for
 
 MAX_COORDINATE_BITS = 12
 """Of a position in `bayer_order`: float32 holds the order exactly up to this many."""
@@ -318,43 +319,39 @@ def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 UNSET_ANGLE = -1
 """OpenCV's angle of a keypoint that has none."""
 
-MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""Of a position from the keypoint that it belongs to."""
 
-
-def nearest_keypoints(places: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Return the keypoint nearest to each position, up to a pixel away.
+def nearest_keypoints(
+    places: np.ndarray, xy: np.ndarray, image_size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the keypoint nearest to each position, of those in the 3x3 pixels around it.
 
     Args:
-        places: (M, 2) positions.
-        keypoints: of the same image. Of several on one pixel the first counts.
+        places: (N, 2) positions.
+        xy: (M, 2) keypoints of the same image. Of several on one pixel the first counts.
+        image_size: (width, height) of the image.
 
     Returns:
-        (M,) int32 rows of the keypoints; -1 where none is so near.
+        (N,) int32 rows of `xy`, and (N,) distances in pixels: -1 and infinite where none is near.
 
     Example:
-        >>> points = Keypoints([[2, 3], [4, 3]], [1, 1], (8, 8))
-        >>> nearest_keypoints(np.array([[3.9, 3.2], [2, 3], [6, 6]]), points).tolist()
-        [1, 0, -1]
+        >>> points = np.array([[2, 3], [4, 3]])
+        >>> places = np.array([[3.9, 3], [2, 3], [6, 6]])
+        >>> [values.round(1).tolist() for values in nearest_keypoints(places, points, (8, 8))]
+        [[1, 0, -1], [0.1, 0.0, inf]]
     """
-    width, height = keypoints.image_size
-    pixels = np.floor(keypoints.xy + np.float32(0.5)).astype(np.int64)
-    inside = np.flatnonzero(((pixels >= 0) & (pixels < (width, height))).all(axis=1))
-    grid = np.full((height + 4, width + 4), -1, np.int32)  # a border of two spares the checks
-    # The first of several is written last.
-    grid[pixels[inside[::-1], 1] + 2, pixels[inside[::-1], 0] + 2] = inside[::-1]
-    places = np.asarray(places, np.float64).reshape(-1, 2)
-    column, row = np.clip(np.floor(places + 0.5), -1, (width, height)).astype(np.int64).T + 2
+    from .nearest_kernel import nearest_of_nine
+
+    width, height = image_size
+    pixels = np.floor(np.asarray(xy) + np.float32(0.5)).astype(np.int64).reshape(-1, 2)
+    rows = np.flatnonzero(((pixels >= 0) & (pixels < image_size)).all(axis=1))[::-1]
+    grid = np.full((height, width), -1, np.int32)
+    grid[pixels[rows, 1], pixels[rows, 0]] = rows  # the first of several is written last
+    places = np.ascontiguousarray(places, np.float64)
     nearest = np.full(len(places), -1, np.int32)
-    best = np.full(len(places), np.nextafter(MAX_KEYPOINT_DISTANCE_PX**2, 2))
-    if not len(keypoints):
-        return nearest
-    for down, across in np.ndindex(3, 3):
-        found = grid[row + down - 1, column + across - 1]
-        squared = ((keypoints.xy[found] - places) ** 2).sum(axis=1)
-        nearer = (found >= 0) & (squared < best)
-        nearest[nearer], best[nearer] = found[nearer], squared[nearer]
-    return nearest
+    distances = np.full(len(places), np.inf)
+    keypoints = np.ascontiguousarray(xy, np.float64)
+    parallel_for(len(places), nearest_of_nine, places, keypoints, grid, nearest, distances)
+    return nearest, distances
 
 
 def on_pixels(xy: np.ndarray, shape: tuple[int, ...] | None = None) -> bool:

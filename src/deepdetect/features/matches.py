@@ -14,6 +14,9 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .keypoints import Keypoints, nearest_keypoints
 
+MAX_KEYPOINT_DISTANCE_PX = 1.0
+"""Of a position from the keypoint that it belongs to."""
+
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,
     "points1": np.float32,
@@ -196,7 +199,10 @@ class Matches:
             indices = getattr(self, name)
             if indices is None and len(self):
                 keypoints = getattr(self, f"keypoints{side}")
-                indices = nearest_keypoints(getattr(self, f"points{side}"), keypoints)
+                indices, distances = nearest_keypoints(
+                    getattr(self, f"points{side}"), keypoints.xy, keypoints.image_size
+                )
+                indices[distances > MAX_KEYPOINT_DISTANCE_PX] = -1
             found = np.zeros(0, np.int32) if indices is None else np.asarray(indices)
             object.__setattr__(self, name, self._checked_indices(found, side))
 

@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
+from deepdetect.features.keypoints import nearest_keypoints
 from deepdetect.geometry import transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.homography import (
@@ -15,7 +16,6 @@ from deepdetect.matching.guided.homography import (
 from deepdetect.matching.guided.homography import (
     ImagePair,
     match_by_homography,
-    nearest_keypoint,
 )
 
 SHIFT = np.array([[1.0, 0, 9], [0, 1, -6], [0, 0, 1]])
@@ -39,36 +39,6 @@ def warped(gray: np.ndarray, homography: np.ndarray) -> np.ndarray:
     return cv2.warpPerspective(gray, homography, size, flags=cv2.INTER_CUBIC)
 
 
-@given(
-    width=st.integers(1, 12),
-    height=st.integers(1, 12),
-    count=st.integers(0, 40),
-    places=st.integers(0, 30),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_the_nearest_keypoint_is_that_of_a_tree(
-    width: int, height: int, count: int, places: int, seed: int
-) -> None:
-    generator = np.random.default_rng(seed)
-    order = generator.permutation(width * height)[:count]
-    xy = np.column_stack([order % width, order // width]).astype(np.float32)
-    where = generator.uniform(-4, [width + 4, height + 4], (places, 2))
-    where[::5] = np.rint(where[::5] * 2) / 2  # also halfway, where several are as near
-    rows, distances = nearest_keypoint(where, xy, (width, height))
-    assert rows.shape == distances.shape == (places,)
-    found = rows >= 0
-    np.testing.assert_array_equal(found, np.isfinite(distances))
-    own = np.linalg.norm(where - xy[rows], axis=1) if count else distances
-    np.testing.assert_allclose(distances[found], own[found], atol=1e-9)
-    if count and places:
-        nearest = KDTree(xy).query(where)[0]
-        near = nearest < 1.5  # of those in the 3x3 pixels around it, these are all there are
-        inner = near & (np.abs(where - np.rint(where)) < 0.5).all(1) & (nearest < 1)
-        np.testing.assert_allclose(distances[inner], nearest[inner], atol=1e-9)
-        assert (distances >= nearest - 1e-9).all()
-        assert not np.isfinite(distances[nearest > np.hypot(1.5, 1.5)]).any()
-
-
 @given(seed=st.integers(0, 2**32 - 1))
 def test_all_within_reach_are_found_wherever_they_lie(seed: int) -> None:
     """Also from places half a pixel off, and from outside the image."""
@@ -77,18 +47,10 @@ def test_all_within_reach_are_found_wherever_they_lie(seed: int) -> None:
     xy = np.column_stack([order % 10, order // 10])
     where = np.rint(generator.uniform(-2, [12, 9], (60, 2)) * 4) / 4
     nearest = KDTree(xy).query(where)[0]
-    distances = nearest_keypoint(where, xy, (10, 7))[1]
+    distances = nearest_keypoints(where, xy, (10, 7))[1]
     within = nearest < REACH
     np.testing.assert_allclose(distances[within], nearest[within], atol=1e-9)
     assert (distances[~within] >= REACH).all()
-
-
-def test_the_corners_of_the_image_are_reached_from_outside() -> None:
-    xy = np.array([[0, 0], [9, 6]])
-    where = np.array([[-0.5, -0.5], [9.6, 6.6], [-0.9, 0], [9, 6.9]])
-    rows, distances = nearest_keypoint(where, xy, (10, 7))
-    assert rows.tolist() == [0, 1, 0, 1]
-    np.testing.assert_allclose(distances, [0.5**0.5, 0.72**0.5, 0.9, 0.9])
 
 
 def test_a_shift_by_whole_pixels_matches_each_pixel_with_its_own(photo: np.ndarray) -> None:

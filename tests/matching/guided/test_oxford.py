@@ -12,9 +12,9 @@ from deepdetect import DeepDetect, match_images
 from deepdetect.datasets.oxford import find_scene, load_oxford
 from deepdetect.detector import HeatmapOptions
 from deepdetect.evaluation.metrics.homography import corner_error
+from deepdetect.features.keypoints import nearest_keypoints
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
-from deepdetect.matching.guided.homography import nearest_keypoint
 
 pytestmark = pytest.mark.slow
 
@@ -37,7 +37,7 @@ def test_most_of_what_can_be_matched_is(shared: Path, scene: str, number: int) -
     assert found.guided
     places = transform_points(found.keypoints0.xy, pair.homography)
     size = (rgb[1].shape[1], rgb[1].shape[0])
-    ceiling = np.count_nonzero(nearest_keypoint(places, found.keypoints1.xy, size)[1] < 1)
+    ceiling = np.count_nonzero(nearest_keypoints(places, found.keypoints1.xy, size)[1] < 1)
     errors = np.linalg.norm(
         transform_points(found.points0, pair.homography) - found.points1, axis=1
     )

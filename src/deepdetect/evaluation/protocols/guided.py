@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from ...datasets.types import PlanarPair
+from ...features.keypoints import nearest_keypoints
 from ...geometry import transform_points
 from ...geometry.residuals import transfer_errors
 from ...io.image import load_image, luma
 from ...matching.guided import guided_matches
-from ...matching.guided.homography import nearest_keypoint
 from ..baselines.method import LocalFeature
 from ..cache import Arrays
 from ..context import BenchmarkContext, feature_key, pack_profile, unpack_profile
@@ -140,7 +140,7 @@ def _measure(
     cells: dict[str, tuple[Cell, ...]] = {}
     for truth, one in by_truth.items():
         places = transform_points(alone.keypoints0, one.homography)
-        gaps = nearest_keypoint(places, alone.keypoints1, sizes[1])[1]
+        gaps = nearest_keypoints(places, alone.keypoints1, sizes[1])[1]
         matchable = int(np.count_nonzero(gaps < CORRECT_PX))
         correct = _correct(alone.points0, alone.points1, one)
         cells[truth] = (

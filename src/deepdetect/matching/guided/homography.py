@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..._shared.parallel import parallel_for
+from ...features.keypoints import nearest_keypoints
 from ...features.matchers import DescriptorMatches
 from ...geometry.homography_refinement import refine_homography
 from ...geometry.rescaling import downscale, scaled_homography
@@ -65,7 +65,7 @@ def match_by_homography(
     """
     gray1 = pair.gray1
     places = transform_points(pair.xy0, homography)
-    indices1, distances = nearest_keypoint(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
+    indices1, distances = nearest_keypoints(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
     with np.errstate(invalid="ignore"):
         shown = (places > -0.5) & (places < np.array(gray1.shape[::-1]) - 0.5)
     near = distances < MAX_DISTANCE_PX
@@ -136,34 +136,3 @@ def _scales_at_centre(homography: np.ndarray, shape: tuple[int, ...]) -> tuple[f
     if smallest > MAX_SCALE_RATIO:
         return 1.0, max(1 / float(smallest), MIN_SCALE)
     return 1.0, 1.0
-
-
-def nearest_keypoint(
-    places: np.ndarray, xy: np.ndarray, size: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find the keypoint nearest to each place, of those in the 3x3 pixels around it.
-
-    Args:
-        places: (N, 2) positions.
-        xy: (M, 2) keypoints on whole pixels.
-        size: (width, height) of their image.
-
-    Returns:
-        (N,) rows of `xy` and (N,) distances, -1 and infinite where there is none so near.
-
-    Example:
-        >>> places = np.array([[2.2, 3.0], [9, 9]])
-        >>> rows, far = nearest_keypoint(places, np.array([[2, 3]]), (10, 10))
-        >>> rows[0], far.round(2).tolist()
-        (np.int32(0), [0.2, inf])
-    """
-    from .homography_kernel import nearest_of_nine
-
-    grid = np.full((size[1], size[0]), -1, np.int32)
-    pixels = np.asarray(xy).astype(np.int64)
-    grid[pixels[:, 1], pixels[:, 0]] = np.arange(len(pixels))
-    places = np.ascontiguousarray(places, np.float64)
-    rows = np.full(len(places), -1, np.int32)
-    best = np.full(len(places), np.inf)
-    parallel_for(len(places), nearest_of_nine, places, grid, rows, best)
-    return rows, best

@@ -10,13 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...features.keypoints import Keypoints
+from ...features.keypoints import Keypoints, nearest_keypoints
 from ...features.matchers import DescriptorMatches
 from ...features.matches import GuidedMatches, TwoViewGeometry
 from .homography import (
     ImagePair,
     match_by_homography,
-    nearest_keypoint,
     refine_guiding_homography,
 )
 from .initial_geometry import (
@@ -148,7 +147,7 @@ def _match_plane(
 def _sparse_matches(pair: ImagePair, first: InitialGeometry) -> GuidedMatches:
     """Return the sparse matches that agree with the geometry, moved to the keypoints near them."""
     height, width = pair.gray0.shape
-    rows, distances = nearest_keypoint(first.points0, pair.xy0, (width, height))
+    rows, distances = nearest_keypoints(first.points0, pair.xy0, (width, height))
     near = np.isfinite(distances)
     moved = first.points1[near] + pair.xy0[rows[near]] - first.points0[near]
     rows, order = np.unique(rows[near].astype(np.int64), return_index=True)
