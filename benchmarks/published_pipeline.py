@@ -35,9 +35,9 @@ from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.types import CalibratedStereoPair, PlanarPair, StereoPair
 from deepdetect.detector import HeatmapOptions
 from deepdetect.detector.pretrained import PRETRAINED
-from deepdetect.evaluation.planar_benchmarks import select_pairs
 from deepdetect.evaluation.profiling import Profile, profiled
 from deepdetect.evaluation.protocols.paper import CORRECT_PX
+from deepdetect.evaluation.protocols.planar import select_pairs
 from deepdetect.evaluation.protocols.stereo_pipelines import (
     PAPER_FLANN_CHECKS,
     PAPER_FLANN_TREES,

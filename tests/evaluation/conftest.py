@@ -94,22 +94,3 @@ def write_posed_fountain(shared: Path) -> Callable[..., Path]:
         return folder
 
     return write
-
-
-class NoBar:
-    """A progress bar that shows nothing and keeps account."""
-
-    def __init__(self) -> None:
-        self.done = 0
-
-    def update(self, n: int) -> None:
-        self.done += n
-
-    def set_postfix_str(self, s: str, refresh: bool) -> None:
-        assert s
-
-
-@pytest.fixture(scope="session")
-def no_bar() -> NoBar:
-    """A progress bar that shows nothing."""
-    return NoBar()

@@ -34,6 +34,7 @@ def test_all_classical_methods_are_default_or_low() -> None:
         ({"classical": ("fast", "fast_low")}, "'fast-low'"),
         ({"protocols": ()}, "paper or standard"),
         ({"channels": "bgrr"}, "'bgr'"),
+        ({"max_images": 2}, "max_images"),
     ],
     ids=str,
 )

@@ -11,7 +11,6 @@ from deepdetect import DeepDetect, ImageError, OptionError, SelectionOptions, ma
 from deepdetect.datasets.oxford import SCENES, load_oxford
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.evaluation.baselines.method import heatmap_feature
-from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.options import PAPER_RESOLUTION_PX, THRESHOLDS
 from deepdetect.evaluation.protocols import paper
 from deepdetect.evaluation.protocols.masks import (
@@ -20,6 +19,7 @@ from deepdetect.evaluation.protocols.masks import (
     score_at_scale,
 )
 from deepdetect.evaluation.protocols.paper import OXFORD_PAIRS, mean_correct_matches
+from deepdetect.evaluation.run import Run
 from deepdetect.evaluation.weights import _of_paper, evaluate, evaluate_oxford
 from deepdetect.geometry.residuals import transfer_errors
 from deepdetect.io.image import luma
@@ -33,7 +33,7 @@ SIZE = 96
 def quick_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small images are not enlarged to 480x480, nor are few matches counted 64 times."""
     monkeypatch.setattr(paper, "MANY_SEEDS", 1)
-    for module in ("evaluate", "options"):
+    for module in ("weights", "options"):
         monkeypatch.setattr(f"deepdetect.evaluation.{module}.PAPER_RESOLUTION_PX", SIZE)
 
 
@@ -239,7 +239,7 @@ def test_counts_are_those_of_the_published_matching(
         counts.append([np.count_nonzero(errors < 1), len(found)])
     expected = np.rint(np.mean(counts, axis=0)).astype(int).tolist()
     assert expected[1] > 0
-    assert list(mean_correct_matches(BenchmarkContext(folder), feature, pair)) == expected
+    assert list(mean_correct_matches(Run(folder), feature, pair)) == expected
 
 
 def test_all_weights_see_the_images_alike(run_evaluate, tmp_path: Path) -> None:
@@ -346,11 +346,11 @@ def test_damaged_photographs_do_not_end_the_measurement_of_the_others(
     assert "fraction (density)" in result.stdout
     *_, told, first, second = result.stderr.splitlines()
     assert told == "deepdetect: 2 parts could not be measured, the scores are of the rest:"
-    assert first.startswith("  foreground of a.png: ")
-    assert second.startswith("  foreground of b.png: ")
+    assert first.startswith("  foreground of the weights on a.png: ")
+    assert second.startswith("  foreground of the weights on b.png: ")
     for name in ("b.png", "c.png"):
         (photographs / name).write_bytes(b"damaged")
-    with pytest.raises(ImageError, match=r"foreground of a\.png"):
+    with pytest.raises(ImageError, match=r"foreground of the weights on a\.png"):
         evaluate(foreground=photographs)
 
 
@@ -376,9 +376,9 @@ def test_damaged_images_do_not_end_the_measurement_of_the_other_scenes(
     assert "graf" not in result.stdout
     told = result.stderr.splitlines()[-10:]
     assert told[0] == "deepdetect: 9 parts could not be measured, the scores are of the rest:"
-    assert told[1].startswith("  density of boat/img6.png: ")
-    assert told[3].startswith("  repeatability of boat 1-6: ")
-    assert told[-1].startswith("  matches of graf 1-6: ")
+    assert told[1].startswith("  density of the weights on boat/img6.png: ")
+    assert told[3].startswith("  repeatability of the weights on boat 1-6: ")
+    assert told[-1].startswith("  matches of the weights on graf 1-6: ")
 
 
 def test_probabilities_are_calibrated_against_masks_and_labels(tmp_path: Path, photo) -> None:

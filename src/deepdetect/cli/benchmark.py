@@ -123,11 +123,9 @@ def benchmark(
     """
     from .._shared.errors import BatchError, OptionError
     from .._shared.registry import look_up
-    from ..datasets.pair_selection import PairSelectionOptions
     from ..evaluation.baselines.plugin import find_feature
-    from ..evaluation.benchmarks import BENCHMARKS
-    from ..evaluation.options import BASELINES, DEFAULT_PROTOCOLS, BenchmarkOptions, SfmOptions
-    from ..evaluation.runner import run_benchmarks
+    from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
+    from ..evaluation.options import BASELINES, DEFAULT_PROTOCOLS, BenchmarkOptions
 
     if values["resolution"] not in (None, "auto", "native"):
         raise OptionError(
@@ -148,9 +146,9 @@ def benchmark(
         tuple(find_feature(word) for word in words),
         "bgr" if preset == "published" else "rgb",
         geometry_weights,
-        PairSelectionOptions(max_pairs),
+        max_pairs,
         degraded_images,
-        SfmOptions(max_photographs),
+        max_photographs,
         ranker,
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)

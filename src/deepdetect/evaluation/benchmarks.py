@@ -1,102 +1,98 @@
-"""The benchmarks: data sets with the protocols that are run on them.
+"""The benchmarks, and how they are run.
 
-To add a benchmark, write the function that plans its sections, and add its line to `BENCHMARKS`.
+To add one, write a function from a run and its options to sections of a report, and add its line
+to `BENCHMARKS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
 
-from .._shared.errors import ImageError
-from ..datasets.foreground import load_foreground
-from ..datasets.oxford import load_oxford
-from ..datasets.posed_images import load_posed_scenes
-from .context import BenchmarkContext
+from .._shared.errors import ImageError, MissingExtraError
+from .._shared.provenance import provenance
+from .._shared.records import file_digest
+from .._shared.registry import look_up
+from ..detector.pretrained import resolve_weights
 from .options import BenchmarkOptions
-from .planar_benchmarks import (
-    Plans,
-    plan_hpatches,
-    plan_low_visibility,
-    plan_oxford,
-    select_pairs,
-)
-from .protocols.foreground import foreground_part
-from .protocols.pose import pose_section
-from .protocols.sfm import sfm_section
-from .protocols.speed import PAIR, speed_part
-from .protocols.stereo import STEREO_TEXT, stereo_parts
-from .tasks import SectionPlan
+from .profiling import StageProfiler, peak_memory
+from .report import Report, Section
+from .run import Run
 
-
-@dataclass(frozen=True)
-class Benchmark:
-    """A benchmark.
-
-    Attributes:
-        name: by which users choose it.
-        plan: plans the sections of its report; raises ImageError where its data are missing.
-        weights: which it runs: "default", "dense" or both.
-    """
-
-    name: str
-    plan: Callable[[BenchmarkContext, BenchmarkOptions], Plans]
-    weights: tuple[str, ...] = ("default",)
-
-
-def plan_middlebury(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
-    """Reconstruct the stereo pairs by all pipelines (Figure 8)."""
-    folder = context.folder("middlebury")
-    scenes = sorted(path.parent for path in folder.glob("*/left.png"))
-    if not scenes:
-        raise ImageError(
-            f"there are no stereo scenes in {folder}: it must hold SCENE/left.png and right.png"
-        )
-    parts = stereo_parts(context, options, scenes)
-    return [SectionPlan("Middlebury stereo, and Figure 8", (STEREO_TEXT,), parts)]
-
-
-def plan_pose(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
-    """Relative poses from matches, in any images with known cameras."""
-    scenes = load_posed_scenes(context.folder("pose"), options.pair_selection)
-    return [pose_section(context, options, scenes)]
-
-
-def plan_sfm(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
-    """Cameras and points of many photographs with known cameras."""
-    folder = context.folder("sfm")
-    if folder == context.data:
-        folder = context.folder("pose")
-    return [sfm_section(context, options, load_posed_scenes(folder))]
-
-
-def plan_foreground(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
-    """Table I's second half."""
-    photographs = load_foreground(context.folder("foreground"))
-    part = foreground_part(context, options.density_features(), photographs)
-    return [SectionPlan("Foreground (Table I)", (), [part])]
-
-
-def plan_speed(context: BenchmarkContext, options: BenchmarkOptions) -> Plans:
-    """Time the stages on one pair of Oxford."""
-    folder = context.folder("oxford")
-    pairs = select_pairs(load_oxford(folder), [PAIR])
-    if not pairs:
-        raise ImageError(f"speed is measured on {PAIR[0]} of Oxford, which is not in {folder}")
-    (pair,) = pairs
-    return [SectionPlan("Speed", (), [speed_part(options.matching_features(), pair)])]
-
-
-BENCHMARKS: dict[str, Benchmark] = {
-    benchmark.name: benchmark
-    for benchmark in (
-        Benchmark("oxford", plan_oxford),
-        Benchmark("hpatches", plan_hpatches),
-        Benchmark("middlebury", plan_middlebury, ("dense",)),
-        Benchmark("pose", plan_pose),
-        Benchmark("sfm", plan_sfm),
-        Benchmark("foreground", plan_foreground),
-        Benchmark("low-visibility", plan_low_visibility),
-        Benchmark("speed", plan_speed),
-    )
+BENCHMARKS: dict[str, tuple[str, str]] = {
+    "oxford": ("planar", "oxford"),
+    "hpatches": ("planar", "hpatches"),
+    "middlebury": ("stereo", "middlebury"),
+    "pose": ("pose", "pose"),
+    "sfm": ("sfm", "sfm"),
+    "foreground": ("paper", "foreground"),
+    "low-visibility": ("planar", "low_visibility"),
+    "speed": ("speed", "speed"),
 }
+"""Module of `protocols`, imported when it is run, and its function, by the benchmark's name."""
+
+
+def run_benchmarks(
+    names: Sequence[str],
+    data: str | Path,
+    options: BenchmarkOptions,
+    *,
+    cache: str | Path | None = None,
+    quiet: bool = True,
+) -> Report:
+    """Run benchmarks and collect their report.
+
+    Args:
+        names: of `BENCHMARKS`.
+        data: folder of the data sets, in which each has a folder of its own; or of the only one.
+        options: what is compared, and how.
+        cache: folder for the results of the stages; None keeps nothing.
+        quiet: show no progress bar.
+
+    Raises:
+        OptionError: a name is unknown.
+        ImageError: data are missing.
+        MissingExtraError: a package of the extra "benchmark" is missing.
+    """
+    started = time.monotonic()
+    entries = [look_up("benchmark", name, BENCHMARKS) for name in names]
+    StageProfiler()  # says at once when its package is missing
+    run = Run(Path(data), None if cache is None else Path(cache), quiet)
+    sections: list[Section] = []
+    for name, (module, function) in zip(names, entries, strict=True):
+        benchmark: Callable[[Run, BenchmarkOptions], list[Section]] = getattr(
+            import_module(f".protocols.{module}", __package__), function
+        )
+        try:
+            sections += benchmark(run, options)
+        except (ImageError, MissingExtraError) as error:
+            if len(names) == 1:
+                raise
+            run.fail(f"the benchmark {name}: {error}")
+    metadata = {
+        **provenance(),
+        **_weights(names, options),
+        "results made, not found in the cache": str(run.made),
+        "minutes": f"{(time.monotonic() - started) / 60:.1f}",
+        "peak memory": f"{peak_memory() / 1e9:.2f} GB",
+    }
+    skipped, failures = (tuple(dict.fromkeys(x)) for x in (run.skipped, run.failures))
+    title = f"DeepDetect benchmark: {', '.join(names)}"
+    return Report(title, metadata, sections, skipped, failures)
+
+
+def _weights(names: Sequence[str], options: BenchmarkOptions) -> dict[str, str]:
+    """Return the names of the weights that were run, with the beginning of their SHA-256."""
+    files = {}
+    if set(names) != {"middlebury"}:
+        files["weights (SHA-256)"] = [options.detector.weights]
+    if "middlebury" in names:
+        files["weights for stereo pairs (SHA-256)"] = [
+            resolve_weights(weights) for weights in options.geometry_weights
+        ]
+    return {
+        title: ", ".join(f"{file.name} ({file_digest(file)[:16]})" for file in listed)
+        for title, listed in files.items()
+    }

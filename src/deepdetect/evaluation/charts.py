@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -55,82 +54,38 @@ def line_chart(
     y_label: str,
     *,
     logarithmic: bool = False,
+    ticks: Sequence[float] = (),
 ) -> bytes:
-    """Draw lines of (x, y) values, with their names in a legend.
+    """Draw lines of (x, y) values, with their names in a legend; one of one value is a point.
 
     Args:
         lines: by name.
         x_label, y_label: of the axes.
-        logarithmic: of the x axis, with a tick at each x of the lines.
-
-    Returns:
-        The PNG file.
-    """
-    figure, axes = _with_legend(len(lines), x_label, y_label)
-    for (name, (x, y)), style in zip(lines.items(), _styles(len(lines)), strict=True):
-        axes.plot(x, y, label=name, **style)
-    if logarithmic and lines:
-        axes.set_xscale("log")
-        ticks = sorted({value for x, _ in lines.values() for value in x})
-        axes.set_xticks(ticks, [f"{tick:,g}" for tick in ticks], minor=False)
-        axes.set_xticks([], minor=True)
-    return _legend_saved(figure, axes)
-
-
-def scatter_chart(
-    points: Mapping[str, tuple[float, float]],
-    x_label: str,
-    y_label: str,
-    *,
-    logarithmic: bool = False,
-) -> bytes:
-    """Draw a point (x, y) for each name, with the names in a legend.
-
-    Args:
-        points: by name.
-        x_label, y_label: of the axes.
         logarithmic: of the x axis.
+        ticks: of the x axis.
 
     Returns:
         The PNG file.
     """
-    figure, axes = _with_legend(len(points), x_label, y_label)
-    for (name, (x, y)), style in zip(points.items(), _styles(len(points)), strict=True):
-        axes.plot([x], [y], label=name, **{**style, "linestyle": "", "markersize": 8})
-    if logarithmic and points:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("{x:g}")
-    axes.set_ylim(bottom=0)
-    return _legend_saved(figure, axes)
-
-
-def _with_legend(names: int, x_label: str, y_label: str):  # type: ignore[no-untyped-def]
-    """Make a figure and its axes, high enough for a legend beside them."""
-    figure = _figure(11, max(4.5, 0.27 * names + 0.5))
+    figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
     axes = figure.subplots()
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.grid(alpha=0.3)
-    return figure, axes
-
-
-def _legend_saved(figure, axes) -> bytes:  # type: ignore[no-untyped-def]
-    if axes.lines:
+    for k, (name, (x, y)) in enumerate(lines.items()):
+        # Ten colours, and other marks and lines each time round.
+        marker, dash = MARKERS[k // 10 % len(MARKERS)], DASHES[k // 10 % len(DASHES)]
+        axes.plot(x, y, label=name, color=f"C{k % 10}", marker=marker, linestyle=dash)
+    if logarithmic:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("{x:g}")
+    if ticks:
+        axes.set_xticks(ticks, [f"{tick:,g}" for tick in ticks], minor=False)
+        axes.set_xticks([], minor=True)
+    if lines:
         axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.01, 0.5))
     return _saved(figure)
-
-
-def _styles(count: int) -> list[dict[str, Any]]:
-    """Return styles that differ: ten colours, and other marks and lines each time round."""
-    return [
-        {
-            "color": f"C{k % 10}",
-            "marker": MARKERS[k // 10 % len(MARKERS)],
-            "linestyle": DASHES[k // 10 % len(DASHES)],
-        }
-        for k in range(count)
-    ]
 
 
 def picture(rgb: np.ndarray) -> bytes:

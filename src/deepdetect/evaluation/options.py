@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.options import check_ranges, suggest_keywords
-from ..datasets.pair_selection import PairSelectionOptions
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
 from ..features.selection import SelectionOptions
@@ -29,30 +28,11 @@ PROTOCOLS = ("paper", "standard", "guided", "degraded")
 DEFAULT_PROTOCOLS = PROTOCOLS[:3]
 """All but the one that measures everything five times."""
 
-DegradedImages = Literal["second", "both"]
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 PAPER_RESOLUTION_PX = 480
 
 BASELINES: dict[str, LocalFeature] = {**CLASSICAL, **HESSIAN}
 """The classical baselines by name: the paper's, and those of the standard protocol only."""
-
-
-@suggest_keywords
-@dataclass(frozen=True)
-class SfmOptions:
-    """Which photographs of a scene are reconstructed.
-
-    Attributes:
-        max_photographs: at most this many: of a sequence the first, else evenly spaced ones.
-
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    max_photographs: int = 20
-
-    def __post_init__(self) -> None:
-        check_ranges(self, between={"max_photographs": (3, float("inf"))})
 
 
 @suggest_keywords
@@ -68,13 +48,14 @@ class BenchmarkOptions:
         channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
             feeds its own weights.
         geometry_weights: the weights for stereo pairs, one or more.
-        pair_selection: which pairs of a scene are measured, and at which frame distances.
+        max_pairs: of each scene at most this many pairs, evenly spaced; of one the last.
         degraded_images: which images of a pair the protocol "degraded" degrades.
-        sfm: which photographs are reconstructed.
+        max_images: of each scene at most this many are reconstructed: of a sequence the first,
+            else evenly spaced ones.
         ranker: of the points, as of `PointDetector`.
 
     Raises:
-        OptionError: a name is unknown, or nothing is left to do.
+        OptionError: a name is unknown, a number is out of its range, or nothing is left to do.
     """
 
     detector: DeepDetect
@@ -83,19 +64,23 @@ class BenchmarkOptions:
     others: tuple[LocalFeature, ...] = ()
     channels: Literal["rgb", "bgr"] = "rgb"
     geometry_weights: tuple[str | Path, ...] = ("dense",)
-    pair_selection: PairSelectionOptions = field(default_factory=PairSelectionOptions)
-    degraded_images: DegradedImages = "second"
-    sfm: SfmOptions = field(default_factory=SfmOptions)
+    max_pairs: int = 60
+    degraded_images: Literal["second", "both"] = "second"
+    max_images: int = 20
     ranker: str | Path | None = None
 
     def __post_init__(self) -> None:
-        for protocol in self.protocols:
-            if protocol not in PROTOCOLS:
-                raise unknown_name("protocol", protocol, PROTOCOLS)
+        check_ranges(self, positive=("max_pairs",), between={"max_images": (3, float("inf"))})
+        for kind, names, known in (
+            ("protocol", self.protocols, PROTOCOLS),
+            ("choice of images", (self.degraded_images,), ("second", "both")),
+            ("classical baseline", self.classical, tuple(BASELINES)),
+        ):
+            for name in names:
+                if name not in known:
+                    raise unknown_name(kind, name, known)
         if not self.protocols:
             raise OptionError(f"choose a protocol: {' or '.join(PROTOCOLS)}")
-        if self.degraded_images not in ("second", "both"):
-            raise unknown_name("choice of images", self.degraded_images, ("second", "both"))
         if not self.geometry_weights:
             raise OptionError("geometry_weights must name at least one weights file")
         stems = [Path(weights).stem for weights in self.geometry_weights]
@@ -104,9 +89,6 @@ class BenchmarkOptions:
                 f"two weights for stereo pairs have the same name ({', '.join(stems)}): rename a "
                 "file"
             )
-        for name in self.classical:
-            if name not in BASELINES:
-                raise unknown_name("classical baseline", name, BASELINES)
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
         """Return DeepDetect as the paper runs it: images squashed to 480x480, SIFT of size 3."""
@@ -121,7 +103,7 @@ class BenchmarkOptions:
     def deepdetect_native(self) -> LocalFeature:
         """Return DeepDetect at the image's own size, all pixels over 0.5."""
         title = "DeepDetect, native resolution, all pixels over 0.5"
-        return deepdetect_feature(self._native(), name="deepdetect-native", title=title)
+        return deepdetect_feature(self.native_detector(), name="deepdetect-native", title=title)
 
     def chance_baselines(self) -> tuple[LocalFeature, LocalFeature]:
         """Return random points of the number that `deepdetect_480` finds, and all pixels."""
@@ -144,13 +126,11 @@ class BenchmarkOptions:
         """Return the rows of the standard protocol: default settings, ours sparse, chance."""
         ranked = {**STANDARD, **HESSIAN}
         chosen = [name for name in ranked if name in self.classical]
-        classical = [with_common_descriptor(ranked[name]) for name in chosen]
-        others = [feature for feature in self.others if feature.name not in BASELINES]
+        # Those with descriptors of their own have a row with these, too.
         systems = {f.name: f for f in self.others if f.name in BASELINES}
         systems |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
-        scaled = [with_own_scale(ranked[name]) for name in chosen if ranked[name].own_scale]
         own = deepdetect_feature(
-            self._native(),
+            self.native_detector(),
             SelectionOptions(nms_radius=1, subpixel=True),
             name="deepdetect-sparse",
             title="DeepDetect, pixels by logits, suppression 3x3, sub-pixel",
@@ -161,13 +141,13 @@ class BenchmarkOptions:
         chance = random_feature(native, name="random-native"), all_pixels_feature()
         return without_repeats(
             (
-                *classical,
+                *(with_common_descriptor(ranked[name]) for name in chosen),
                 *(
                     replace(f, name=f"{f.name}-own", title=f"{f.title}, own descriptors")
                     for f in systems.values()
                 ),
-                *scaled,
-                *others,
+                *(with_own_scale(ranked[name]) for name in chosen if ranked[name].own_scale),
+                *(feature for feature in self.others if feature.name not in BASELINES),
                 with_common_descriptor(points),
                 with_own_scale(points),
                 own,
@@ -184,7 +164,8 @@ class BenchmarkOptions:
             for weights in self.geometry_weights
         }
 
-    def _native(self) -> DeepDetect:
+    def native_detector(self) -> DeepDetect:
+        """Return the detector at the image's own size."""
         return self.detector.configured(HeatmapOptions("native", self.channels))
 
 

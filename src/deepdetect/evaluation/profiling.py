@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, TypeVar
 
+import numpy as np
+
 from .._shared.errors import DeepDetectError, MissingExtraError
 from .._shared.parallel import start_child
 
@@ -30,6 +32,16 @@ class Profile:
 
     seconds: float = 0.0
     memory: int = 0
+
+    def packed(self) -> np.ndarray:
+        """Return it as an array, for the cache."""
+        return np.array([self.seconds, self.memory], np.float64)
+
+    @classmethod
+    def unpacked(cls, array: np.ndarray) -> Profile:
+        """Return the profile of `packed`."""
+        seconds, memory = array.tolist()
+        return cls(seconds, int(memory))
 
 
 class StageProfiler:

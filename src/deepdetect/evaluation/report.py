@@ -1,19 +1,49 @@
-"""A report: sections of text, tables and figures; written as Markdown, CSV and JSON."""
+"""A report: rows of values, tables and figures made of them, written as Markdown, CSV and JSON."""
 
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
+
+import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 
 Cell = str | int | float | None
 """What a table holds: None is shown as a dash."""
+
+Row = dict[Any, Any]
+"""What was measured once: values by name."""
+
+Rows = list[Row]
+
+
+def where(rows: Iterable[Row], **wanted: Any) -> Rows:
+    """Return the rows that have these values.
+
+    Example:
+        >>> where([{"scene": "graf", "n": 1}, {"scene": "wall", "n": 2}], scene="wall")
+        [{'scene': 'wall', 'n': 2}]
+    """
+    return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+
+
+def mean(rows: Iterable[Row], name: Any) -> float | None:
+    """Return the mean of the values of this name that are not NaN; None without any."""
+    return mean_of(row[name] for row in rows)
+
+
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are not None or NaN; None without any."""
+    known = [value for value in values if value is not None and value == value]
+    return float(np.mean(known)) if known else None
 
 
 @dataclass(frozen=True)
@@ -74,26 +104,85 @@ class Table:
                     f"{len(self.columns)} columns"
                 )
 
-    def titles(self) -> list[Cell]:
-        """Return the first cell of each row."""
-        return [row[0] for row in self.rows]
-
-    def shown(self) -> list[list[str]]:
-        """Return all cells as text."""
+    def values(self) -> list[dict[str, Cell]]:
+        """Return each row as a dict by the columns' titles; JSON has no NaN: it becomes None."""
         return [
-            [column.show(cell) for column, cell in zip(self.columns, row, strict=True)]
+            {
+                column.title: None if isinstance(cell, float) and not math.isfinite(cell) else cell
+                for column, cell in zip(self.columns, row, strict=True)
+            }
             for row in self.rows
         ]
 
     def to_markdown(self) -> str:
         """Write the table in Markdown: names to the left, numbers to the right."""
 
-        def line(cells: list[str]) -> str:
+        def line(cells: Iterable[str]) -> str:
             return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
         rule = "|---|" + "---:|" * (len(self.columns) - 1)
-        heads = line([column.title for column in self.columns])
-        return "\n".join([heads, rule, *map(line, self.shown())])
+        rows = [[c.show(x) for c, x in zip(self.columns, row, strict=True)] for row in self.rows]
+        return "\n".join([line(c.title for c in self.columns), rule, *map(line, rows)])
+
+    def to_csv(self) -> str:
+        """Write all digits; an unknown value is an empty cell."""
+        text = io.StringIO(newline="")
+        writer = csv.writer(text)
+        writer.writerow(column.title for column in self.columns)
+        writer.writerows(
+            ["" if isinstance(cell, float) and math.isnan(cell) else cell for cell in row]
+            for row in self.rows
+        )
+        return text.getvalue()
+
+
+class Titled(Protocol):
+    """What a row of a table is named after."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def title(self) -> str: ...
+
+
+Columns = Sequence[tuple[Column, Callable[[Rows], Cell]]]
+"""Columns, and what each makes of the rows of one method."""
+
+
+def average(title: str, style: str, name: Any, **wanted: Any) -> tuple[Column, Any]:
+    """Make the column of the mean of a value, over the rows that have the wanted values."""
+    return Column(title, style), lambda rows: mean(where(rows, **wanted), name)
+
+
+def single(title: str, style: str, name: Any, **wanted: Any) -> tuple[Column, Any]:
+    """Make the column of a value of the one row that has the wanted values."""
+
+    def cell(rows: Rows) -> Cell:
+        found = where(rows, **wanted)
+        value: Cell = found[0][name] if found else None
+        return value
+
+    return Column(title, style), cell
+
+
+def tabulate(
+    key: str, title: str, methods: Sequence[Titled], rows: Rows, columns: Columns, note: str = ""
+) -> Table:
+    """Make a table with a line for each method.
+
+    Args:
+        key, title, note: as of `Table`.
+        methods: in the order of the lines.
+        rows: of `Run.rows`.
+        columns: those after the method's title.
+    """
+    lines = []
+    for method in methods:
+        own = where(rows, method=method.name)
+        lines.append((method.title, *(cell(own) for _, cell in columns)))
+    heads = (Column("method"), *(column for column, _ in columns))
+    return Table(key, title, heads, tuple(lines), note)
 
 
 @dataclass(frozen=True)
@@ -113,18 +202,12 @@ class Figure:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report.
-
-    Attributes:
-        title: its heading.
-        text: paragraphs.
-        tables, figures: in order; the tables come first.
-    """
+    """A part of a report: a heading, paragraphs, tables, then figures."""
 
     title: str
     text: tuple[str, ...] = ()
-    tables: tuple[Table, ...] = ()
-    figures: tuple[Figure, ...] = ()
+    tables: Sequence[Table] = ()
+    figures: Sequence[Figure] = ()
 
 
 @dataclass(frozen=True)
@@ -141,9 +224,9 @@ class Report:
 
     title: str
     metadata: dict[str, str]
-    sections: tuple[Section, ...]
-    skipped: tuple[str, ...] = ()
-    failures: tuple[str, ...] = ()
+    sections: Sequence[Section]
+    skipped: Sequence[str] = ()
+    failures: Sequence[str] = ()
 
     def tables(self) -> list[Table]:
         """Return the tables of all sections."""
@@ -155,21 +238,12 @@ class Report:
 
     def values(self) -> dict[str, Any]:
         """Return the report as plain values: each row a dict by the columns' titles."""
-        tables = {
-            table.key: {
-                "title": table.title,
-                "note": table.note,
-                "rows": [
-                    {c.title: _finite(cell) for c, cell in zip(table.columns, row, strict=True)}
-                    for row in table.rows
-                ],
-            }
-            for table in self.tables()
-        }
         return {
             "title": self.title,
             "metadata": self.metadata,
-            "tables": tables,
+            "tables": {
+                t.key: {"title": t.title, "note": t.note, "rows": t.values()} for t in self.tables()
+            },
             "figures": {figure.key: figure.title for figure in self.figures()},
             "skipped": list(self.skipped),
         }
@@ -180,54 +254,23 @@ class Report:
         Returns:
             The files, report.md first.
         """
-        return [
-            *_save_markdown(self, folder),
-            *(_save_csv(table, folder) for table in self.tables()),
-            _save_text(folder / "report.json", json.dumps(self.values(), indent=1) + "\n"),
-        ]
+        files = {"report.md": self._markdown().encode()}
+        files |= {f"figures/{figure.key}.png": figure.png for figure in self.figures()}
+        files |= {f"tables/{table.key}.csv": table.to_csv().encode() for table in self.tables()}
+        files["report.json"] = (json.dumps(self.values(), indent=1) + "\n").encode()
+        for name, content in files.items():
+            with atomic_path(folder / name) as temporary:
+                temporary.write_bytes(content)
+        return [folder / name for name in files]
 
-
-def _finite(cell: Cell) -> Cell:
-    """JSON has no word for infinity and NaN."""
-    return None if isinstance(cell, float) and not math.isfinite(cell) else cell
-
-
-def _save_text(path: Path, text: str) -> Path:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return path
-
-
-def _save_markdown(report: Report, folder: Path) -> list[Path]:
-    parts = [f"# {report.title}"]
-    for section in report.sections:
-        parts += [f"## {section.title}", *section.text]
-        for table in section.tables:
-            shown = table.to_markdown() if table.in_text else f"In `tables/{table.key}.csv`."
-            parts += [f"**{table.title}**", shown, *filter(None, [table.note])]
-        parts += [f"![{f.title}](figures/{f.key}.png)\n\n{f.title}" for f in section.figures]
-    parts += ["## Skipped", "\n".join(f"- {reason}" for reason in report.skipped) or "- nothing"]
-    parts += ["## How this was made"]
-    parts += ["\n".join(f"- {name}: {text}" for name, text in report.metadata.items())]
-    paths = [_save_text(folder / "report.md", "\n\n".join(parts) + "\n")]
-    for figure in report.figures():
-        paths.append(folder / "figures" / f"{figure.key}.png")
-        with atomic_path(paths[-1]) as temporary:
-            temporary.write_bytes(figure.png)
-    return paths
-
-
-def _save_csv(table: Table, folder: Path) -> Path:
-    """Write all digits; an unknown value is an empty cell."""
-    path = folder / "tables" / f"{table.key}.csv"
-    with (
-        atomic_path(path) as temporary,
-        temporary.open("w", newline="", encoding="utf-8") as file,
-    ):
-        writer = csv.writer(file)
-        writer.writerow(column.title for column in table.columns)
-        writer.writerows(
-            ["" if isinstance(cell, float) and math.isnan(cell) else cell for cell in row]
-            for row in table.rows
-        )
-    return path
+    def _markdown(self) -> str:
+        parts = [f"# {self.title}"]
+        for section in self.sections:
+            parts += [f"## {section.title}", *section.text]
+            for table in section.tables:
+                shown = table.to_markdown() if table.in_text else f"In `tables/{table.key}.csv`."
+                parts += [f"**{table.title}**", shown, *filter(None, [table.note])]
+            parts += [f"![{f.title}](figures/{f.key}.png)\n\n{f.title}" for f in section.figures]
+        skipped = "\n".join(f"- {reason}" for reason in self.skipped) or "- nothing"
+        made = "\n".join(f"- {name}: {text}" for name, text in self.metadata.items())
+        return "\n\n".join([*parts, "## Skipped", skipped, "## How this was made", made]) + "\n"

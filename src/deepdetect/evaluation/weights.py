@@ -2,33 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from .._shared.errors import ImageError, OptionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from ..datasets.foreground import MaskedPhotograph, load_foreground
 from ..datasets.oxford import load_oxford
-from ..datasets.types import PlanarScene
+from ..datasets.types import PlanarPair, PlanarScene
 from ..detector.detector import DeepDetect
 from ..features.selection import SelectionOptions
 from ..io.image import find_images, load_image
 from .baselines.method import LocalFeature, heatmap_feature
-from .context import BenchmarkContext
 from .metrics.calibration import Calibration
 from .metrics.masks import MaskScore
 from .options import PAPER_RESOLUTION_PX, THRESHOLDS
-from .planar_benchmarks import select_pairs
-from .protocols.foreground import photograph_foreground
 from .protocols.masks import (
     LabelDensityDetector,
     ScaleScore,
+    Scored,
     check_scales,
     has_samples,
     load_sample,
@@ -37,8 +32,10 @@ from .protocols.masks import (
     score_at_scale,
     score_samples,
 )
-from .protocols.paper import OXFORD_PAIRS, mean_correct_matches, pair_repeatability
-from .tasks import ProgressBar
+from .protocols.paper import OXFORD_PAIRS, foreground_row, mean_correct_matches, pair_repeatability
+from .protocols.planar import pairs_of, select_pairs
+from .report import Row, mean, where
+from .run import Run
 
 
 @dataclass(frozen=True)
@@ -158,33 +155,27 @@ def evaluate(
             "one of them, too"
         )
     scenes = None if oxford is None else load_oxford(oxford)  # before hours of work
-    photographs = None if foreground is None else load_foreground(foreground)
+    masked = None if foreground is None else load_foreground(foreground)
     detector = DeepDetect() if detector is None else detector
-    masks: dict[str, MaskScore] = {}
+    scored: dict[str, Scored] = {}
     rows: list[ScaleScore] = []
     failures: tuple[str, ...] = ()
-    calibration: dict[str, Calibration] = {}
     if samples is not None:
         if scales and not has_samples(samples):
             images, failures = readable_images(find_images(samples))
         else:
             images, failures = readable_images(sample_images(samples), load_sample)
             scored = score_samples(detector.heatmap, _shown(images, "scoring", quiet))
-            masks = {name: score for name, (score, _) in scored.items()}
-            calibration = {name: found for name, (_, found) in scored.items()}
         for scale in scales:
             rows += score_at_scale(detector, _shown(images, f"scale {scale:g}", quiet), scale)
+    how = {"equal_density": equal_density, "quiet": quiet}
     return Evaluation(
-        masks,
+        {name: score for name, (score, _) in scored.items()},
         tuple(rows),
-        None
-        if scenes is None
-        else evaluate_oxford(detector, scenes, equal_density=equal_density, quiet=quiet),
+        None if scenes is None else evaluate_oxford(detector, scenes, **how),
         failures,
-        calibration,
-        None
-        if photographs is None
-        else evaluate_foreground(detector, photographs, equal_density=equal_density, quiet=quiet),
+        {name: calibration for name, (_, calibration) in scored.items()},
+        None if masked is None else evaluate_foreground(detector, masked, **how),
     )
 
 
@@ -213,56 +204,44 @@ def evaluate_oxford(
         ImageError: there is no image that can be measured.
     """
     detector = _of_paper(detector, equal_density)
-    feature = _feature(detector)
+    features = [_feature(detector)]
     thresholds = THRESHOLDS[:1] if equal_density else THRESHOLDS
+    run = Run(Path(), quiet=quiet)
+
+    def densities(_: LocalFeature, image: Path) -> Row:
+        heatmap = detector.heatmap(load_image(image))
+        return {t: float((heatmap > t).mean()) for t in thresholds}
+
+    def repeatability(feature: LocalFeature, pair: PlanarPair) -> Row:
+        return {"scene": pair.scene, "value": pair_repeatability(run, feature, pair)}
+
+    def matches(feature: LocalFeature, pair: PlanarPair) -> Row:
+        correct, every = mean_correct_matches(run, feature, pair)
+        return {"correct": correct, "all": every}
+
     images = {f"{scene.name}/{path.name}": path for scene in scenes for path in scene.images}
-    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs()}
+    pairs = {pair.name: pair for pair in pairs_of(scenes)}
     matched = {pair.name: pair for pair in select_pairs(scenes, OXFORD_PAIRS)}
-    context = BenchmarkContext(Path())
-    with progress(len(images) + len(pairs) + len(matched), "Oxford", "step", quiet) as bar:
-
-        def over(what: str, items: Mapping[str, Any], measure: Callable[[Any], Any]) -> Any:
-            return _measured(context, bar, what, items, measure)
-
-        densities = over("density", images, lambda image: _densities(detector, image, thresholds))
-        repeatability = over(
-            "repeatability", pairs, lambda pair: pair_repeatability(context, feature, pair)
-        )
-        counts = over("matches", matched, lambda pair: mean_correct_matches(context, feature, pair))
-    if context.failures and not densities:
-        raise ImageError(context.failures[0])
-    by_scene: dict[str, list[float]] = {}
-    for name, value in repeatability.items():
-        by_scene.setdefault(pairs[name].scene, []).append(value)
+    density = run.rows("density of ", features, images, densities)
+    repeated = run.rows("repeatability of ", features, pairs, repeatability)
+    counts = run.rows("matches of ", features, matched, matches)
+    if run.failures and not density:
+        raise ImageError(run.failures[0])
     return OxfordScore(
-        {t: float(np.mean(of_t)) for t, *of_t in zip(thresholds, *densities.values(), strict=True)},
-        {name: float(np.mean(values)) for name, values in by_scene.items()},
-        {name: correct for name, (correct, _) in counts.items()},
-        {name: matches for name, (_, matches) in counts.items()},
-        tuple(context.failures),
+        {t: mean(density, t) or 0.0 for t in thresholds},
+        {
+            scene: mean(where(repeated, scene=scene), "value") or 0.0
+            for scene in dict.fromkeys(row["scene"] for row in repeated)
+        },
+        {row["item"]: row["correct"] for row in counts},
+        {row["item"]: row["all"] for row in counts},
+        tuple(run.failures),
     )
-
-
-def _measured(
-    context: BenchmarkContext,
-    bar: ProgressBar,
-    what: str,
-    items: Mapping[str, Any],
-    measure: Callable[[Any], Any],
-) -> dict[str, Any]:
-    """Return what was measured by the items' names; what could not be is in the context."""
-    found = {}
-    for name, item in items.items():
-        value = context.try_run(f"{what} of {name}", partial(measure, item))
-        if value is not None:
-            found[name] = value
-        bar.update(1)
-    return found
 
 
 def evaluate_foreground(
     detector: Any,
-    photographs: Sequence[MaskedPhotograph],
+    images: Sequence[MaskedPhotograph],
     *,
     equal_density: bool = False,
     quiet: bool = True,
@@ -270,31 +249,23 @@ def evaluate_foreground(
     """Measure how many keypoints lie on the foreground; arguments as of `evaluate_oxford`.
 
     Raises:
-        ImageError: there is no photograph that can be measured, or none has a keypoint.
+        ImageError: there is no image that can be measured, or none has a keypoint.
         OptionError: as of `evaluate_oxford`.
     """
-    feature, context = _feature(_of_paper(detector, equal_density)), BenchmarkContext(Path())
-    named = {photograph.image.name: photograph for photograph in photographs}
-
-    def measure(photograph: MaskedPhotograph) -> tuple[float, float, float]:
-        values = photograph_foreground(context, feature, photograph)
-        return *values, float(photograph.foreground().mean())
-
-    with progress(len(photographs), "foreground", "image", quiet) as bar:
-        found = _measured(context, bar, "foreground", named, measure)
-    rows = [row for row in found.values() if row[1] > 0]
-    if context.failures and not found:
-        raise ImageError(context.failures[0])
-    if not rows:
-        raise ImageError("no photograph with a foreground has a keypoint")
-    fraction, density, covered = np.array(rows).T
-    return ForegroundScore(
-        float(fraction.mean()),
-        float(density.mean()),
-        float(covered.mean()),
-        len(fraction),
-        tuple(context.failures),
+    run = Run(Path(), quiet=quiet)
+    rows = run.rows(
+        "foreground of ",
+        [_feature(_of_paper(detector, equal_density))],
+        {image.image.name: image for image in images},
+        lambda feature, image: foreground_row(run, feature, image),
     )
+    known = [row for row in rows if row["density"] > 0]
+    if run.failures and not rows:
+        raise ImageError(run.failures[0])
+    if not known:
+        raise ImageError("no photograph with a foreground has a keypoint")
+    fraction, density, covered = (mean(known, n) or 0.0 for n in ("fraction", "density", "covered"))
+    return ForegroundScore(fraction, density, covered, len(known), tuple(run.failures))
 
 
 def _of_paper(detector: Any, equal_density: bool) -> Any:
@@ -315,11 +286,9 @@ def _of_paper(detector: Any, equal_density: bool) -> Any:
 
 def _feature(detector: Any) -> LocalFeature:
     return heatmap_feature(
-        detector, SelectionOptions(THRESHOLDS[0]), name="evaluated", title="evaluated", version="1"
+        detector,
+        SelectionOptions(THRESHOLDS[0]),
+        name="evaluated",
+        title="the weights",
+        version="1",
     )
-
-
-def _densities(detector: Any, image: Path, thresholds: Sequence[float]) -> list[float]:
-    """Return the keypoints per pixel at each of the thresholds."""
-    heatmap = detector.heatmap(load_image(image))
-    return [float((heatmap > threshold).mean()) for threshold in thresholds]

@@ -13,7 +13,7 @@ from deepdetect import OptionError, WeightsError
 from deepdetect.evaluation.baselines.method import BaselineError
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.baselines.plugin import find_feature, plugin_feature
-from deepdetect.evaluation.context import BenchmarkContext, MatchSettings
+from deepdetect.evaluation.run import MatchSettings, Run
 from deepdetect.features.sift import root_sift_descriptors
 from deepdetect.io.image import luma
 
@@ -81,10 +81,8 @@ def test_own_descriptors_take_part_in_matching(
     np.testing.assert_array_equal(method.describe(crop, method.detect(crop)), np.eye(4, 8))
     for matcher, budget in (("exact", None), ("exact", 3), ("flann", None)):
         settings = MatchSettings(matcher, 0.9, budget=budget)
-        found = BenchmarkContext(photo_path.parent).matches(
-            method, (photo_path, photo_path), settings
-        )
-        assert len(found) == (budget or 4)
+        found = Run(photo_path.parent).matches(method, (photo_path, photo_path), settings)
+        assert len(found.points0) == (budget or 4)
         np.testing.assert_array_equal(found.points0, found.points1)
 
 

@@ -14,19 +14,17 @@ from deepdetect.datasets.low_visibility import load_low_visibility
 from deepdetect.datasets.types import PlanarPair
 from deepdetect.evaluation.baselines.method import with_common_descriptor
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
-from deepdetect.evaluation.cache import StageCache
-from deepdetect.evaluation.context import BenchmarkContext
 from deepdetect.evaluation.metrics import repeatability
 from deepdetect.evaluation.options import BenchmarkOptions
-from deepdetect.evaluation.planar_benchmarks import plan_oxford
 from deepdetect.evaluation.protocols.degraded import (
-    DEGRADED_BUDGETS,
+    BUDGETS,
     degraded_copy,
     degraded_pair,
-    degraded_part,
+    degraded_rows,
+    degraded_tables,
 )
-from deepdetect.evaluation.protocols.standard import measure_pair
-from deepdetect.evaluation.report import Table
+from deepdetect.evaluation.protocols.standard import pair_row
+from deepdetect.evaluation.run import Run
 from deepdetect.io.image import load_image
 
 FAST = with_common_descriptor(CLASSICAL["fast-low"])
@@ -72,62 +70,50 @@ def test_the_second_image_or_both_are_degraded_and_the_truth_stays(
 def test_tables_have_scores_and_their_fraction_of_daylight(
     pairs: list[PlanarPair], tmp_path: Path
 ) -> None:
-    context = BenchmarkContext(tmp_path, StageCache(tmp_path / "cache"))
-    part = degraded_part(context, [FAST], pairs, "key", "pairs")
-    assert len(part.tasks) == (1 + len(DEGRADATIONS)) * len(pairs)
-    found = {key: task.run() for key, task in part.tasks.items()}
-    overview, *tables = part.summarize(found)
+    run = Run(tmp_path, tmp_path / "cache")
+    rows = degraded_rows(run, [FAST], pairs)
+    assert len(rows) == (1 + len(DEGRADATIONS)) * len(pairs)
+    overview, *tables = degraded_tables([FAST], rows, "key", "pairs")
     assert [table.key for table in tables] == [f"key_{name}" for name in DEGRADATIONS]
     for table, one in zip(tables, DEGRADATIONS.values(), strict=True):
-        assert isinstance(table, Table)
         row = dict(zip([c.title for c in table.columns], table.rows[0], strict=True))
-        dark = [degraded_pair(pair, one, context.files_folder()) for pair in pairs]
+        dark = [degraded_pair(pair, one, run.files_folder()) for pair in pairs]
         scores = [
-            [measure_pair(context, FAST, pair, DEGRADED_BUDGETS) for pair in chosen]
-            for chosen in (dark, pairs)
+            [pair_row(run, FAST, pair, BUDGETS) for pair in chosen] for chosen in (dark, pairs)
         ]
-        now, then = (np.mean([p.repeatability[512][0].value for p in two]) for two in scores)
+        now, then = (np.mean([p["repeated", 512, 1.0] for p in two]) for two in scores)
         assert row["@1 px, 512"] == pytest.approx(now)
         assert row["@1 px, 512: of daylight"] == pytest.approx(now / then)
         assert 0 < now < then
         assert row["@3 px, 8,192"] is None, "small images do not fill it"
-        correct = [np.mean([p.matches.correct[0] for p in two]) for two in scores]
+        correct = [np.mean([p["correct", 1] for p in two]) for two in scores]
         assert row["correct at 1 px, 2,048"] == pytest.approx(correct[0])
         assert row["correct at 1 px, 2,048: of daylight"] == pytest.approx(correct[0] / correct[1])
         place = [c.title for c in overview.columns].index(f"{one.title}: correct at 1 px")
         assert overview.rows[0][place] == row["correct at 1 px, 2,048: of daylight"]
-    made = context.cache.made
-    for task in part.tasks.values():
-        task.run()
-    assert context.cache.made == made, "all of it is cached"
+    made = run.made
+    degraded_rows(run, [FAST], pairs)
+    assert run.made == made, "all of it is cached"
 
 
 def test_pairs_that_could_not_be_measured_in_both_ways_are_left_out(
     pairs: list[PlanarPair], tmp_path: Path
 ) -> None:
-    context = BenchmarkContext(tmp_path)
-    part = degraded_part(context, [FAST], pairs, "key", "pairs")
-    found = {
-        key: task.run()
-        for key, task in part.tasks.items()
-        if key[1] in ("dusty 1-2, daylight", "dusty 1-2, dark-4", "smoky 1-2, dark-4")
-    }
-    tables = {table.key: table for table in part.summarize(found)}
+    run = Run(tmp_path)
+    rows = [
+        row
+        for row in degraded_rows(run, [FAST], pairs)
+        if row["item"] in ("dusty 1-2, daylight", "dusty 1-2, dark-4", "smoky 1-2, dark-4")
+    ]
+    tables = {table.key: table for table in degraded_tables([FAST], rows, "key", "pairs")}
     assert tables["key_dark-4"].rows[0][1] == 1
     assert tables["key_dark-8"].rows[0][1] == 0
     assert set(tables["key_dark-8"].rows[0][2:]) == {None}
-    assert context.files_folder().is_dir(), "without a cache the copies are in a temporary folder"
+    assert run.files_folder().is_dir(), "without a cache the copies are in a temporary folder"
 
 
-def test_it_is_a_section_of_its_own_when_asked_for(
-    oxford_folder: Path, edge_detector: DeepDetect
-) -> None:
+def test_it_runs_only_when_asked_for(edge_detector: DeepDetect) -> None:
     options = BenchmarkOptions(edge_detector, classical=("fast",))
     assert "degraded" not in options.protocols
-    asked = dataclasses.replace(options, protocols=("degraded",), degraded_images="both")
-    (plan,) = plan_oxford(BenchmarkContext(oxford_folder), asked)
-    assert plan.title == "Oxford, published homographies, dark and blurred"
-    assert len(plan) == len(options.standard_features()) * 40 * (1 + len(DEGRADATIONS))
-    assert "Both images" in plan.text[1]
     with pytest.raises(OptionError, match="did you mean 'second'"):
         dataclasses.replace(options, degraded_images="secondd")

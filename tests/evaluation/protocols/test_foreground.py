@@ -1,7 +1,7 @@
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,9 +12,8 @@ from deepdetect.datasets.foreground import MaskedPhotograph, load_foreground
 from deepdetect.evaluation.baselines.method import LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.baselines.random import all_pixels_feature
-from deepdetect.evaluation.cache import StageCache
-from deepdetect.evaluation.context import BenchmarkContext
-from deepdetect.evaluation.protocols.foreground import foreground_part
+from deepdetect.evaluation.protocols.paper import foreground
+from deepdetect.evaluation.run import Run
 
 
 @pytest.fixture
@@ -27,13 +26,10 @@ def photographs(tmp_path: Path, photo: np.ndarray) -> list[MaskedPhotograph]:
     return load_foreground(tmp_path)
 
 
-def measured(
-    context: BenchmarkContext, feature: LocalFeature, photographs: list[MaskedPhotograph]
-) -> list[float]:
+def measured(run: Run, feature: LocalFeature) -> list[float]:
     """Return fraction on the foreground, fraction over that of random points, and density."""
-    part = foreground_part(context, [feature], photographs)
-    found = {k: context.try_run(task.name, task.run) for k, task in part.tasks.items()}
-    (table,) = part.summarize({k: value for k, value in found.items() if value is not None})
+    (section,) = foreground(run, SimpleNamespace(density_features=lambda: (feature,)))
+    (table,) = section.tables
     titles = [column.title for column in table.columns]
     assert titles[1:3] == ["fraction on the foreground", "fraction on the foreground, in the paper"]
     (row,) = table.rows
@@ -41,7 +37,7 @@ def measured(
 
 
 def test_the_share_equals_a_count_under_the_mask(photographs, tmp_path: Path) -> None:
-    found = measured(BenchmarkContext(tmp_path), CLASSICAL["fast"], photographs)
+    found = measured(Run(tmp_path), CLASSICAL["fast"])
     shares, densities, covered = [], [], []
     for photograph in photographs:
         gray = cv2.cvtColor(cv2.imread(str(photograph.image)), cv2.COLOR_BGR2GRAY)
@@ -55,35 +51,26 @@ def test_the_share_equals_a_count_under_the_mask(photographs, tmp_path: Path) ->
 
 
 def test_all_pixels_reach_what_random_points_do(photographs, tmp_path: Path) -> None:
-    found = measured(BenchmarkContext(tmp_path), all_pixels_feature(), photographs)
+    found = measured(Run(tmp_path), all_pixels_feature())
     np.testing.assert_allclose(found, (40 * 40 / 4800, 1, 1))
 
 
-def test_photographs_without_a_keypoint_are_skipped_and_said(photographs, tmp_path: Path) -> None:
+def test_images_without_a_keypoint_are_skipped_and_said(photographs, tmp_path: Path) -> None:
     Image.fromarray(np.full((60, 80, 3), 90, np.uint8)).save(photographs[0].image)
-    context = BenchmarkContext(tmp_path)
-    found = measured(context, CLASSICAL["fast"], photographs)
-    alone = measured(BenchmarkContext(tmp_path), CLASSICAL["fast"], photographs[1:])
+    run = Run(tmp_path)
+    found = measured(run, CLASSICAL["fast"])
+    photographs[0].image.unlink()
+    photographs[0].mask.unlink()
+    alone = measured(Run(tmp_path), CLASSICAL["fast"])
     assert found[:2] == alone[:2]
     assert found[2] == alone[2] / 2
-    (note,) = context.skipped
-    assert "1 photographs without a keypoint" in note
-
-
-def test_another_mask_is_evaluated_again(photographs, tmp_path: Path) -> None:
-
-    context = BenchmarkContext(tmp_path, StageCache(tmp_path / "cache"))
-    every = all_pixels_feature()
-    before = measured(context, every, photographs[:1])
-    swapped = dataclasses.replace(photographs[0], mask=photographs[1].mask)
-    after = measured(context, every, [swapped])
-    assert before[0] == pytest.approx(40 * 30 / 4800)
-    assert after[0] == pytest.approx(40 * 50 / 4800)
+    (note,) = run.skipped
+    assert "1 images without a keypoint" in note
 
 
 def test_a_mask_of_another_size_is_skipped(photographs, tmp_path: Path) -> None:
     """It would be read at the wrong places."""
     Image.fromarray(np.full((30, 40), 255, np.uint8)).save(photographs[0].mask)
-    context = BenchmarkContext(tmp_path)
-    measured(context, CLASSICAL["fast"], photographs)
-    assert any("a.png" in note for note in context.skipped)
+    run = Run(tmp_path)
+    measured(run, CLASSICAL["fast"])
+    assert any("a.png" in note for note in run.skipped)

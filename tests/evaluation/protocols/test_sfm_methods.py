@@ -16,11 +16,7 @@ from deepdetect.evaluation.protocols.sfm_methods import (
     find_sift,
     match_features,
     match_sift,
-    part_of_model,
 )
-from deepdetect.geometry.camera import Camera
-from deepdetect.geometry.posed_view import PosedView
-from deepdetect.sfm.mapping import Observations, SparseModel
 from deepdetect.sfm.options import MultiViewOptions
 from deepdetect.sfm.stages import Stages
 
@@ -112,18 +108,3 @@ def test_sift_is_matched_by_its_own_matcher(scene, tmp_path: Path) -> None:
     assert list(matches) == pairs  # also the other way round
     assert min(len(rows) for rows in matches.values()) > 50
     assert min(agreement(scene, stages, matches)) > 0.85
-
-
-def test_a_part_of_a_model_sees_what_its_photographs_see() -> None:
-    camera = Camera((64, 48), 50.0)
-    views = {k: PosedView(f"{k}", camera, np.eye(3), np.array([-k, 0.0, 0])) for k in range(3)}
-    points, xy = np.array([0, 0, 1, 1, 1]), np.arange(10.0).reshape(5, 2)
-    seen = Observations(points, np.array([0, 1, 0, 1, 2]), xy, np.arange(5))
-    intrinsics = dict.fromkeys(views)
-    sparse = SparseModel(views, intrinsics, np.ones((2, 3)), np.zeros(2), seen)  # type: ignore[arg-type]
-    part = part_of_model(sparse, [0, 2])
-    assert list(part.views) == list(part.intrinsics) == [0, 2]
-    np.testing.assert_array_equal(part.seen.points, [0, 1, 1])
-    np.testing.assert_array_equal(part.seen.views, [0, 0, 2])
-    np.testing.assert_array_equal(part.seen.xy[:, 0], [0, 4, 8])
-    assert part.points is sparse.points

@@ -17,21 +17,20 @@ from deepdetect.evaluation.baselines.method import (
 )
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.baselines.random import random_feature
-from deepdetect.evaluation.cache import StageCache
-from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.benchmarks import run_benchmarks
 from deepdetect.evaluation.metrics import repeatability
 from deepdetect.evaluation.metrics.repeatability import mutual_nn_repeatability
 from deepdetect.evaluation.options import BenchmarkOptions
-from deepdetect.evaluation.protocols import standard_figures
-from deepdetect.evaluation.protocols.standard import measure_pair, standard_part
-from deepdetect.evaluation.protocols.standard_results import BUDGETS, FeatureResult, PairResult
-from deepdetect.evaluation.protocols.standard_tables import (
-    homography_table,
-    kind_table,
-    matching_table,
+from deepdetect.evaluation.protocols import standard
+from deepdetect.evaluation.protocols.standard import (
+    BUDGETS,
+    median_seconds,
+    repeated,
+    standard_rows,
+    standard_tables,
 )
-from deepdetect.evaluation.report import Report, Table
-from deepdetect.evaluation.runner import run_benchmarks
+from deepdetect.evaluation.report import Report, Rows, where
+from deepdetect.evaluation.run import Run
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.io.image import load_image
 
@@ -50,56 +49,52 @@ def few_random_points():
         yield
 
 
-def measure(
-    context: BenchmarkContext,
-    feature: LocalFeature,
-    pairs: list[PlanarPair],
-    budgets: tuple[int | None, ...],
-) -> FeatureResult:
-    return FeatureResult(feature, [measure_pair(context, feature, pair, budgets) for pair in pairs])
+def table_of(feature: LocalFeature, rows: Rows, key: str) -> dict[str, object]:
+    """Return the line of a table by column."""
+    (table,) = [
+        t for t in standard_tables([feature], rows, "key", "pairs") if t.key == f"key_{key}"
+    ]
+    return dict(zip([column.title for column in table.columns], table.rows[0], strict=True))
 
 
 def test_budgets_repeatability_and_coverage_are_those_of_the_best_points(
     pairs: list[PlanarPair], tmp_path: Path
 ) -> None:
-    context = BenchmarkContext(tmp_path, StageCache(tmp_path / "cache"))
+    run = Run(tmp_path, tmp_path / "cache")
     method = with_common_descriptor(CLASSICAL["fast-low"])
-    result = measure(context, method, pairs, (64, None))
-    for index, pair in enumerate(pairs):
+    for pair, row in zip(pairs, standard_rows(run, [method], pairs, (64, None)), strict=True):
         for budget in (64, None):
             points = []
             for path in (pair.first, pair.second):
-                features = context.keypoints(method, path).features
-                assert len(np.unique(features.xy, axis=0)) == len(features)
-                points.append(features.best(budget or len(features)).xy)
-            expected = mutual_nn_repeatability(*points, np.eye(3), ((80, 64), (80, 64)))
-            found = result.pairs[index].repeatability[budget]
-            assert [e.radius_px for e in found] == [1, 2, 3]
-            for one, other in zip(found, expected, strict=True):
-                assert (one.repeated, one.fewest) == (other.repeated, other.fewest)
-                assert one.localization_px == pytest.approx(other.localization_px, nan_ok=True)
-                assert one.chance == pytest.approx(other.chance, abs=1e-12)
+                keypoints = run.keypoints(method, path).keypoints
+                assert len(np.unique(keypoints.xy, axis=0)) == len(keypoints)
+                points.append(keypoints.best(budget or len(keypoints)).xy)
+            for one in mutual_nn_repeatability(*points, np.eye(3), ((80, 64), (80, 64))):
+                at = budget, one.radius_px
+                assert row["repeated", *at] == one.value
+                assert row["localization", *at] == pytest.approx(one.localization_px, nan_ok=True)
+                assert row["chance", *at] == pytest.approx(one.chance, abs=1e-12)
             cells = {(int(x + 0.5) // 32, int(y + 0.5) // 32) for x, y in points[0]}
-            assert result.pairs[index].coverage[budget] == pytest.approx(len(cells) / 6)
-    assert result.pairs[0].repeatability[64][0].fewest == 64
+            assert row["coverage", budget] == pytest.approx(len(cells) / 6)
+        assert row["keypoints", 64] == 64
 
 
 def test_of_equal_images_all_is_repeated_and_the_homography_exact(
     pairs: list[PlanarPair], tmp_path: Path
 ) -> None:
-    result = measure(BenchmarkContext(tmp_path), FAST, pairs[:1], (512,))
-    (found,) = result.pairs
-    assert [(e.value, e.localization_px) for e in found.repeatability[512]] == [(1, 0)] * 3
-    assert found.matches.matches == found.matches.correct[0] > 10
-    assert found.all_matches.matches >= found.matches.matches
-    assert len(found.corner_errors_px) == 5
-    assert max(found.corner_errors_px) < 1e-3
-    row = {}
-    for table in (matching_table([result], "a", ""), homography_table([result], "b", "")):
-        row |= dict(zip([c.title for c in table.columns], table.rows[0], strict=True))
-    assert row["precision at 1 px"] == row["accuracy at 1 px"] == 1
-    assert row["AUC at 3 px"] == pytest.approx(1, abs=1e-3)
-    assert row["± of AUC 3"] == pytest.approx(0, abs=1e-3)
+    rows = standard_rows(Run(tmp_path), [FAST], pairs[:1])
+    (row,) = rows
+    for radius in (1.0, 2.0, 3.0):
+        assert row["repeated", 512, radius] == 1
+        assert row["localization", 512, radius] == 0
+    assert row["matches"] == row["correct", 1] > 10
+    assert row["all matches"] >= row["matches"]
+    assert len(row["corner errors"]) == 5
+    assert max(row["corner errors"]) < 1e-3
+    matching, homography = (table_of(FAST, rows, key) for key in ("matching", "homography"))
+    assert matching["precision at 1 px"] == homography["accuracy at 1 px"] == 1
+    assert homography["AUC at 3 px"] == pytest.approx(1, abs=1e-3)
+    assert homography["± of AUC 3"] == pytest.approx(0, abs=1e-3)
 
 
 def test_learned_descriptors_are_matched_without_a_ratio_test(
@@ -107,44 +102,42 @@ def test_learned_descriptors_are_matched_without_a_ratio_test(
 ) -> None:
     method = with_common_descriptor(CLASSICAL["fast-low"])
     tested, untested = (
-        measure(
-            BenchmarkContext(tmp_path), dataclasses.replace(method, learned=learned), pairs, (512,)
-        )
+        standard_rows(Run(tmp_path), [dataclasses.replace(method, learned=learned)], pairs, (512,))[
+            1
+        ]
         for learned in (False, True)
     )
-    assert untested.pairs[1].matches.matches > tested.pairs[1].matches.matches
-    assert untested.pairs[1].all_matches == tested.pairs[1].all_matches
+    assert untested["matches"] > tested["matches"]
+    assert untested["all matches"] == tested["all matches"]
 
 
 def test_kinds_of_pairs_have_their_own_means(pairs: list[PlanarPair], tmp_path: Path) -> None:
     kinds = "still", "darker"
     chosen = [dataclasses.replace(p, kind=k) for p, k in zip(pairs, kinds, strict=True)]
-    result = measure(BenchmarkContext(tmp_path), FAST, chosen, (64, 2048))
-    still, darker = result.pairs
-    kind = kind_table([result], "key", "pairs")
-    assert [column.title for column in kind.columns[2:]] == [
-        f"{kind}: {what}" for kind in kinds for what in ("@1 px", "@3 px", "correct")
-    ]
-    # The budget of the table is not filled by these small images.
-    assert kind.rows[0][2:] == (
-        *(None, None, still.matches.correct[0]),
-        *(None, None, darker.matches.correct[0]),
-    )
-    (only,) = result.of_kind("darker").pairs
-    assert only is darker
-    value, chance = result.of_kind("darker").repeatability(64, 0) or (0, 0)
-    assert value == darker.repeatability[64][0].value > chance
-    assert result.repeatability(2048, 0) is None
+    rows = standard_rows(Run(tmp_path), [FAST], chosen)
+    of_kinds = table_of(FAST, rows, "kinds")
+    for kind, row in zip(kinds, rows, strict=True):
+        # The budget of the table is not filled by these small images.
+        assert of_kinds[f"{kind}: @1 px"] is of_kinds[f"{kind}: @3 px"] is None
+        assert of_kinds[f"{kind}: correct"] == row["correct", 1]
+    darker = where(rows, kind="darker")
+    assert repeated(darker, None, 1.0) == rows[1]["repeated", None, 1.0]
+    assert repeated(rows, 2048, 1.0) is None
 
 
 def test_the_time_of_a_pair_is_that_of_all_stages(pairs: list[PlanarPair], tmp_path: Path) -> None:
-    result = measure(BenchmarkContext(tmp_path), FAST, pairs, (64,))
-    one = result.pairs[0]
-    stages = [one.profiles[stage].seconds for stage in ("detect", "describe", "match")]
-    assert one.seconds == pytest.approx(2 * stages[0] + stages[1] + stages[2])
-    assert result.median_seconds() == pytest.approx(np.mean([p.seconds for p in result.pairs]))
-    assert dataclasses.replace(result, feature=random_feature(FAST)).median_seconds() is None
-    assert FeatureResult(FAST, []).median_seconds() is None
+    random = random_feature(FAST)
+    rows = standard_rows(Run(tmp_path), [FAST, random], pairs)
+    own = where(rows, method=FAST.name)
+    seconds = [
+        2 * row["seconds", "detect"] + row["seconds", "describe"] + row["seconds", "match"]
+        for row in own
+    ]
+    assert median_seconds(own) == pytest.approx(np.mean(seconds))
+    assert table_of(FAST, rows, "cost")["pair, s"] == median_seconds(own)
+    chance = table_of(random, rows, "cost")
+    assert chance["pair, s"] is chance["detect, s"] is None
+    assert chance["match, s"] > 0
 
 
 def test_a_pair_that_fails_is_skipped_and_the_others_count(
@@ -158,15 +151,10 @@ def test_a_pair_that_fails_is_skipped_and_the_others_count(
         return CLASSICAL["fast"].detect(rgb)
 
     feature = dataclasses.replace(FAST, detect=detect, detection="fails")
-    context = BenchmarkContext(tmp_path)
-    part = standard_part(context, [feature], pairs, "key", "pairs")
-    assert len(part.tasks) == 2
-    found = {key: context.try_run(task.name, task.run) for key, task in part.tasks.items()}
-    (kept,) = [result for result in found.values() if result is not None]
-    assert isinstance(kept, PairResult)
-    tables = part.summarize({key: value for key, value in found.items() if value is not None})
-    assert all(table.rows[0][1] == 1 for table in tables if isinstance(table, Table))
-    (note,) = context.skipped
+    run = Run(tmp_path)
+    rows = standard_rows(run, [feature], pairs)
+    assert all(t.rows[0][1] == 1 for t in standard_tables([feature], rows, "key", "pairs"))
+    (note,) = run.skipped
     assert "smoky 1-2" in note
     assert "not this one" in note
 
@@ -177,15 +165,13 @@ def test_a_pair_without_keypoints_counts_as_wrong_and_is_no_error(
     def nothing(rgb: np.ndarray) -> Keypoints:
         return Keypoints.empty((rgb.shape[1], rgb.shape[0]))
 
-    method = dataclasses.replace(
-        with_common_descriptor(CLASSICAL["fast"]), detect=nothing, detection="nothing"
-    )
-    result = measure(BenchmarkContext(tmp_path), method, pairs, (64, None))
-    assert [pair.matches.matches for pair in result.pairs] == [0, 0]
-    assert {error for pair in result.pairs for error in pair.corner_errors_px} == {math.inf}
-    assert matching_table([result], "key", "what").rows[0][2:] == (0,) * 8
-    assert homography_table([result], "key", "what").rows[0][2:] == (0,) * 12
-    assert math.isnan(result.pairs[0].repeatability[64][0].localization_px)
+    method = dataclasses.replace(FAST, detect=nothing, detection="nothing")
+    rows = standard_rows(Run(tmp_path), [method], pairs)
+    assert [row["matches"] for row in rows] == [0, 0]
+    assert {error for row in rows for error in row["corner errors"]} == {math.inf}
+    assert set(list(table_of(method, rows, "matching").values())[2:]) == {0}
+    assert set(list(table_of(method, rows, "homography").values())[2:]) == {0}
+    assert math.isnan(rows[0]["localization", 512, 1.0])
 
 
 @pytest.fixture(scope="module")
@@ -231,28 +217,23 @@ def test_rows_with_the_same_keypoints_are_one_line(
     pairs: list[PlanarPair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawn = []
-    monkeypatch.setattr(
-        standard_figures, "line_chart", lambda lines, *_, **__: drawn.append(lines) or b""
-    )
-    again = dataclasses.replace(FAST, name="again", title="Described otherwise")
-    context = BenchmarkContext(tmp_path)
-    results = [measure(context, feature, pairs, (32, 64, None)) for feature in (FAST, again)]
-    for k in (0, 2):
-        standard_figures.repeatability_figure(results, k, "key", "pairs", (32, 64, None))
+    monkeypatch.setattr(standard, "line_chart", lambda lines, *_, **__: drawn.append(lines) or b"")
+    monkeypatch.setattr(standard, "BUDGETS", (32, 64, None))
+    features = [FAST, dataclasses.replace(FAST, name="again", title="Described otherwise")]
+    rows = standard_rows(Run(tmp_path), features, pairs, (32, 64, None))
+    for radius in (1.0, 3.0):
+        standard.repeatability_figure(features, rows, radius, "key", "pairs")
         (numbers, values) = drawn[-1]["FAST"]
         assert list(drawn[-1]) == ["FAST"]
         assert numbers == [32, 64]
-        expected = [
-            np.mean([p.repeatability[n][k].value for p in results[0].pairs]) for n in numbers
-        ]
-        assert values == pytest.approx(expected)
+        assert values == pytest.approx([repeated(rows[:2], n, radius) for n in numbers])
 
 
 def test_a_method_that_never_works_has_dashes(report: Report) -> None:
     for table in report.tables():
-        for row in table.shown():
+        for row in table.rows:
             if row[0] == "Never works":
-                assert set(row[1:]) <= {"–", "0"}
+                assert set(row[1:]) <= {None, 0}
 
 
 def test_baselines_are_worth_what_chance_is(report: Report) -> None:

@@ -57,6 +57,11 @@ class LocalFeature:
         if not self.detection:
             object.__setattr__(self, "detection", f"{self.name} {self.version}")
 
+    @property
+    def key(self) -> tuple[str, str]:
+        """What results depend on besides the images."""
+        return self.name, self.version
+
 
 @dataclass(frozen=True)
 class PointDescriptor:

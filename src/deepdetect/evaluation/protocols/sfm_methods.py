@@ -10,8 +10,9 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,20 +26,20 @@ from ...features.sift import describe_keypoints
 from ...geometry.camera import Camera
 from ...io.image import load_image, luma
 from ...sfm.colmap import PIXEL_CENTRE, quiet_pycolmap
-from ...sfm.fusion import DensePoints
 from ...sfm.intrinsics import initial_intrinsics
-from ...sfm.mapping import SparseModel, read_sparse_model
+from ...sfm.mapping import read_sparse_model
 from ...sfm.options import MultiViewOptions
 from ...sfm.pipeline import MAX_KEYPOINTS
 from ...sfm.stages import Stages
-from ..metrics.multi_view import cloud_agreement
 from ..profiling import peak_memory
-from .sfm_results import SfmModel, SfmResult
 
 FEATURES, DATABASE = "features.h5", "sift.db"
 
 OPTIONS = MultiViewOptions(pairs="all")
 """Of all methods: those of `reconstruct_many`, but every pair is matched."""
+
+KINDS = ("true", "estimated")
+"""Intrinsics that models are made with."""
 
 Pair = tuple[str, str]
 Finder = Callable[[Stages, Path], None]
@@ -68,6 +69,11 @@ class SfmMethod:
     depends: str = ""
     chance: bool = False
 
+    @property
+    def name(self) -> str:
+        """By which the rows know it."""
+        return self.title
+
 
 @dataclass(frozen=True, eq=False)
 class SfmTask:
@@ -77,13 +83,11 @@ class SfmTask:
         method: whose keypoints.
         photographs: their files.
         cameras: the true cameras, by the names of the files.
-        dense: whether dense points are made of two halves of the photographs.
     """
 
     method: SfmMethod
     photographs: tuple[Path, ...]
     cameras: Mapping[str, Camera]
-    dense: bool = True
 
 
 @dataclass
@@ -187,8 +191,14 @@ def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
     }
 
 
-def run_method(task: SfmTask) -> SfmResult:
-    """Reconstruct photographs by a method; to be called in a process of its own."""
+def run_method(task: SfmTask) -> dict[str, np.ndarray]:
+    """Reconstruct images by a method; to be called in a process of its own.
+
+    Returns:
+        By name "keypoints", mean number in an image, "matches", of all pairs together, "seconds"
+        and "cpu seconds" of both, "memory", the most bytes that the process held; for each kind of
+        intrinsics the "names", "poses" and "numbers" of `_map`.
+    """
     with tempfile.TemporaryDirectory(prefix="deepdetect-sfm-") as scratch:
         stages = Stages(Path(scratch) / "model", OPTIONS, 1, True)
         folder = stages.folder_of(task.photographs)
@@ -201,37 +211,17 @@ def run_method(task: SfmTask) -> SfmResult:
         names = sorted(sizes)
         with clock.running():
             matches = task.method.match(stages, stages.choose_pairs(names))
-        models, sparse = [], None
-        for known in (task.cameras, {}):
-            model, found = _map(stages, folder, names, sizes, matches, known)
-            models.append(model)
-            sparse = found if known else sparse
-        result = SfmResult(
-            float(np.mean(counts)),
-            sum(len(rows) for rows in matches.values()),
-            clock.seconds,
-            clock.cpu_seconds,
-            models[0],
-            models[1],
-            peak_memory(),
-        )
-        if sparse is None or not task.dense:
-            return result
-        clock = _Clock()
-        with clock.running():
-            halves = _dense_halves(stages, folder, sparse)
-        views = list(sparse.views.values())
-        agreement = tuple(
-            cloud_agreement(one.points, other.points, views)
-            for one, other in (halves, halves[::-1])
-        )
-        return replace(
-            result,
-            dense_points=(len(halves[0]), len(halves[1])),
-            dense_cpu_seconds=clock.cpu_seconds,
-            dense_memory=peak_memory(),
-            agreement=agreement if all(map(len, halves)) else (),
-        )
+        values: dict[str, Any] = {
+            "keypoints": np.mean(counts),
+            "matches": sum(len(rows) for rows in matches.values()),
+            "seconds": clock.seconds,
+            "cpu seconds": clock.cpu_seconds,
+        }
+        for kind, known in zip(KINDS, (task.cameras, {}), strict=True):
+            model = _map(stages, folder, names, sizes, matches, known)
+            values |= {f"{kind} {name}": array for name, array in model.items()}
+        values["memory"] = peak_memory()
+        return {name: np.asarray(value) for name, value in values.items()}
 
 
 def _sizes_and_counts(path: Path) -> tuple[dict[str, tuple[int, int]], list[int]]:
@@ -248,57 +238,30 @@ def _map(
     sizes: Mapping[str, tuple[int, int]],
     matches: Mapping[Pair, np.ndarray],
     known: Mapping[str, Camera],
-) -> tuple[SfmModel, SparseModel | None]:
-    """Map with known cameras, or with those that are estimated; no model is a result, too."""
+) -> dict[str, Any]:
+    """Map with known cameras, or with those that are estimated; no model is a result, too.
+
+    Returns:
+        The "names" of the registered images, (N, 12) "poses", rotation and translation, and
+        "numbers": sparse points, mean track length, mean reprojection error and CPU seconds.
+    """
     intrinsics = initial_intrinsics(folder, {name: sizes[name] for name in names}, known)
     clock = _Clock()
     try:
         with clock.running():
             model, _, _ = stages.map(folder, intrinsics, matches, bool(known))
     except NoDepthError:
-        return SfmModel({}, 0, float("nan"), float("nan"), clock.seconds, clock.cpu_seconds), None
+        numbers = (0, np.nan, np.nan, clock.cpu_seconds)
+        return {"names": np.empty(0, np.str_), "poses": np.empty((0, 12)), "numbers": numbers}
     sparse = read_sparse_model(model)
-    views = {view.name: view for view in sparse.views.values()}
-    return SfmModel(
-        dict(sorted(views.items())),
-        len(sparse.points),
-        float(sparse.tracks.mean()),
-        float(sparse.errors.mean()),
-        clock.seconds,
-        clock.cpu_seconds,
-    ), sparse
-
-
-def _dense_halves(
-    stages: Stages, folder: Path, sparse: SparseModel
-) -> tuple[DensePoints, DensePoints]:
-    """Make dense points of every second photograph, and of the others; all poses are those of all.
-
-    Each half is made as that of a model of its own, so that no photograph has a part in both.
-    """
-    order = sorted(sparse.views, key=lambda number: sparse.views[number].name)
-    first, second = (
-        Stages(stages.output / name, stages.options, 1, True).dense(
-            folder, part_of_model(sparse, order[start::2])
-        )
-        for start, name in enumerate(("even", "odd"))
-    )
-    return first, second
-
-
-def part_of_model(sparse: SparseModel, numbers: Sequence[int]) -> SparseModel:
-    """Return some of the photographs of a model, with what they see of its points."""
-    rows = np.isin(sparse.seen.views, numbers)
-    seen = replace(
-        sparse.seen,
-        points=sparse.seen.points[rows],
-        views=sparse.seen.views[rows],
-        xy=sparse.seen.xy[rows],
-        keypoints=sparse.seen.keypoints[rows],
-    )
-    return replace(
-        sparse,
-        views={number: sparse.views[number] for number in numbers},
-        intrinsics={number: sparse.intrinsics[number] for number in numbers},
-        seen=seen,
-    )
+    views = sorted(sparse.views.values(), key=lambda view: view.name)
+    return {
+        "names": [view.name for view in views],
+        "poses": [[*view.rotation.ravel(), *np.ravel(view.translation)] for view in views],
+        "numbers": (
+            len(sparse.points),
+            sparse.tracks.mean(),
+            sparse.errors.mean(),
+            clock.cpu_seconds,
+        ),
+    }

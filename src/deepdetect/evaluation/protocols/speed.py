@@ -2,84 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import Any
-
-import numpy as np
-
+from ..._shared.errors import ImageError
+from ...datasets.oxford import load_oxford
 from ...datasets.types import PlanarPair
 from ..baselines.method import LocalFeature
-from ..context import BenchmarkContext, ImageKeypoints, PairMatches
-from ..report import Cell, Column, Figure, Table
-from ..tasks import Part, Task
+from ..options import BenchmarkOptions
+from ..report import Cell, Column, Columns, Row, Rows, Section, tabulate
+from ..run import Run
 from .paper import PAPER_MATCHING
+from .planar import select_pairs
+from .standard import STAGES, stage_columns
 
 PAIR = ("graf", 3)
 ROUNDS = 3
-STAGES = ("detect", "describe", "match")
-
-Round = tuple[ImageKeypoints, PairMatches]
 
 
-def speed_part(features: Sequence[LocalFeature], pair: PlanarPair) -> Part:
+def speed(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Run all features on one pair in turn, so that a busy machine affects them equally.
 
     Nothing is read from the cache. The first round warms up and is not counted.
+
+    Raises:
+        ImageError: the pair is missing.
     """
-    tasks = {
-        (turn, feature.name): Task(f"speed of {feature.title}", partial(_run, feature, pair))
-        for turn in range(ROUNDS + 1)
-        for feature in features
-    }
+    folder = run.folder("oxford")
+    pairs = select_pairs(load_oxford(folder), [PAIR])
+    if not pairs:
+        raise ImageError(f"speed is measured on {PAIR[0]} of Oxford, which is not in {folder}")
+    features = options.matching_features()
+    rows: Rows = []
+    for turn in range(ROUNDS + 1):
+        found = run.rows("speed of ", features, {pairs[0].name: pairs[0]}, _measure)
+        rows += found if turn else []
+    chance = {feature.name for feature in features if feature.chance}
 
-    def summarize(found: Mapping[Any, Round]) -> Sequence[Table | Figure]:
-        rows = []
-        for feature in features:
-            keys = [(turn, feature.name) for turn in range(1, ROUNDS + 1)]
-            rows.append((feature.title, *_row(feature, [found[k] for k in keys if k in found])))
-        columns = (
-            Column("method"),
-            Column("keypoints", ",d"),
-            Column("matches", ",d"),
-            *(Column(f"{stage}, s", ".3f") for stage in STAGES),
-            Column("slowest over fastest round", ".2f"),
-            *(Column(f"{stage}, MB", ",.0f") for stage in STAGES),
-        )
-        note = (
-            f"{pair.name}, the paper's matching. Medians of {ROUNDS} rounds over all methods; "
-            "detecting in the first image, describing both, matching the pair. Memory: the "
-            "largest growth of the process during the stage."
-        )
-        return [Table("speed", "Seconds and memory of each stage", columns, tuple(rows), note)]
+    def slowest(own: Rows) -> Cell:
+        totals = [sum(row["seconds", stage] for stage in STAGES) for row in own]
+        return max(totals) / min(totals) if totals else None
 
-    return Part(tasks, summarize)
-
-
-def _run(feature: LocalFeature, pair: PlanarPair) -> Round:
-    nothing_kept = BenchmarkContext(pair.first.parent)
-    images = (pair.first, pair.second)
-    return (
-        nothing_kept.keypoints(feature, pair.first),
-        nothing_kept.matches(feature, images, PAPER_MATCHING),
+    columns: Columns = [
+        (Column("keypoints", ",d"), lambda own: own[0]["keypoints"] if own else None),
+        (Column("matches", ",d"), lambda own: own[0]["matches"] if own else None),
+        *stage_columns("seconds", chance),
+        (Column("slowest over fastest round", ".2f"), slowest),
+        *stage_columns("memory", chance),
+    ]
+    note = (
+        f"{pairs[0].name}, the paper's matching. Medians of {ROUNDS} rounds over all methods; "
+        "detecting in the first image, describing both, matching the pair. Memory: the largest "
+        "growth of the process during the stage."
     )
+    table = tabulate("speed", "Seconds and memory of each stage", features, rows, columns, note)
+    return [Section("Speed", (), [table])]
 
 
-def _row(feature: LocalFeature, runs: Sequence[Round]) -> tuple[Cell, ...]:
-    if not runs:
-        return (None,) * 9
-    profiles = [(k.profile, m.describe, m.match) for k, m in runs]
-    times = np.array([[profile.seconds for profile in run] for run in profiles])
-    memory = np.array([[profile.memory for profile in run] for run in profiles])
-    total = times.sum(1)
-    medians: list[Cell] = [float(value) for value in np.median(times, axis=0)]
-    if feature.chance:  # random points are counted by running the detector that they follow
-        medians[0] = None
-    keypoints, matches = runs[0]
-    return (
-        len(keypoints.features),
-        len(matches),
-        *medians,
-        float(total.max() / total.min()),
-        *(float(value) / 1e6 for value in memory.max(axis=0)),
-    )
+def _measure(feature: LocalFeature, pair: PlanarPair) -> Row:
+    fresh = Run(pair.first.parent)
+    detected = fresh.keypoints(feature, pair.first)
+    found = fresh.matches(feature, (pair.first, pair.second), PAPER_MATCHING)
+    row: Row = {"keypoints": len(detected.keypoints), "matches": len(found.points0)}
+    for stage, profile in zip(STAGES, (detected.profile, found.describe, found.match), strict=True):
+        row["seconds", stage], row["memory", stage] = profile.seconds, profile.memory
+    return row

@@ -2,132 +2,119 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+import math
+from collections.abc import Callable, Container, Sequence
+from functools import partial
+from typing import Literal
 
 import numpy as np
 
 from ...datasets.types import PlanarPair
 from ...features.keypoints import Keypoints
 from ...geometry import GeometryOptions, estimate_geometry
-from ...io.image import load_image
 from ..baselines.method import LocalFeature
-from ..cache import matrix_digest
-from ..context import BenchmarkContext, MatchSettings, PairMatches
+from ..charts import line_chart
 from ..metrics.coverage import coverage
-from ..metrics.homography import Sizes, corner_error
+from ..metrics.homography import (
+    CORNER_THRESHOLDS_PX,
+    Sizes,
+    accuracy_at,
+    area_under_curve,
+    corner_error,
+)
 from ..metrics.matching import MatchAccuracy, match_accuracy
-from ..metrics.repeatability import Repeatability, mutual_nn_repeatability
-from ..tasks import Part, Shown, feature_part
-from .standard_figures import accuracy_figure, repeatability_figure, time_figure
-from .standard_results import (
-    BUDGETS,
-    INLIER_THRESHOLD_PX,
-    MATCHING_BUDGET,
-    PROFILED_STAGES,
-    RADII_PX,
-    RATIO,
-    SEEDS,
-    FeatureResult,
-    PairResult,
-)
-from .standard_tables import (
-    accuracy_table,
-    cost_table,
-    homography_table,
-    kind_table,
-    kinds_of,
-    matching_table,
-    repeatability_table,
+from ..metrics.repeatability import mutual_nn_repeatability
+from ..report import Cell, Column, Columns, Figure, Row, Rows, Table, average, mean, tabulate, where
+from ..run import MatchSettings, PairMatches, Run
+
+BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
+"""Numbers of keypoints; None: all."""
+
+RADII_PX = (1.0, 2.0, 3.0)
+SEEDS = 5
+MATCHING_BUDGET = 2048
+RATIO = 0.85
+INLIER_THRESHOLD_PX = 3.0
+MATCH_THRESHOLDS_PX = tuple(range(1, 11))
+
+MIN_FILLED = 0.9
+"""A budget is shown where a method fills at least this fraction of it, on average."""
+
+MAX_CHANCE = 0.95
+"""Chance beyond which nothing can be distinguished from it."""
+
+STAGES = ("detect", "describe", "match")
+
+MATCHING_NOTE = (
+    f"The best {MATCHING_BUDGET:,} keypoints of each image; the same upright RootSIFT of size "
+    "4 for all, except in the rows that name others; mutual nearest neighbours, "
+    f"ratio {RATIO} (none for learned descriptors). Means over the pairs; no matches count as "
+    "a precision of 0."
 )
 
 
-def standard_part(
-    context: BenchmarkContext,
+def standard_rows(
+    run: Run,
     features: Sequence[LocalFeature],
     pairs: Sequence[PlanarPair],
-    key: str,
-    what: str,
     budgets: Sequence[int | None] = BUDGETS,
-) -> Part:
-    """Measure all features on all pairs.
-
-    Args:
-        context: data and cache.
-        features: what is compared.
-        pairs: what it is measured on.
-        key: beginning of the tables' keys.
-        what: the data, for the tables' titles.
-        budgets: numbers of keypoints; None: all.
-    """
-
-    def measure(feature: LocalFeature, pair: PlanarPair) -> PairResult:
-        return measure_pair(context, feature, pair, budgets)
-
-    def summarize(found: Mapping[tuple[str, str], PairResult]) -> Shown:
-        results = [
-            FeatureResult(f, [found[f.name, p.name] for p in pairs if (f.name, p.name) in found])
-            for f in features
-        ]
-        repeatability_figures = [
-            repeatability_figure(results, k, key, what, budgets) for k in (0, len(RADII_PX) - 1)
-        ]
-        return [
-            *(repeatability_table(results, k, key, what, budgets) for k in range(len(RADII_PX))),
-            *([kind_table(results, key, what)] if kinds_of(results) else []),
-            matching_table(results, key, what),
-            homography_table(results, key, what),
-            accuracy_table(results, key, what),
-            cost_table(results, key, budgets),
-            accuracy_figure(results, key, what),
-            *repeatability_figures,
-            time_figure(results, key, what),
-        ]
-
-    return feature_part(features, {pair.name: pair for pair in pairs}, "", measure, summarize)
-
-
-def measure_pair(
-    context: BenchmarkContext,
-    feature: LocalFeature,
-    pair: PlanarPair,
-    budgets: Sequence[int | None] = BUDGETS,
-) -> PairResult:
-    """Measure a feature on a pair."""
-    images = (pair.first, pair.second)
-    sizes = (_image_size(pair.first), _image_size(pair.second))
-    found = [context.keypoints(feature, image) for image in images]
-    # Each position once: another orientation of SIFT's is not another place.
-    places = [one.features.distinct() for one in found]
-    fewest = min(len(features) for features in places)
-    ratio = 1.0 if feature.learned else RATIO
-    settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
-    matches = context.matches(feature, images, settings)
-    unfiltered = MatchSettings("exact", 1.0, mutual=True, budget=MATCHING_BUDGET)
-    everything = context.matches(feature, images, unfiltered)
-    profiles = found[0].profile, matches.describe, matches.match
-    return PairResult(
-        repeatability={
-            b: _repeatability(context, feature, pair, sizes, places, b) for b in budgets
-        },
-        coverage={
-            b: _coverage(context, feature, pair.first, sizes[0], places[0], b) for b in budgets
-        },
-        counts={b: fewest if b is None else min(fewest, b) for b in (*budgets, MATCHING_BUDGET)},
-        matches=_evaluate(matches, pair, sizes),
-        all_matches=_evaluate(everything, pair, sizes),
-        corner_errors_px=_corner_errors(context, feature, pair, matches, settings, sizes[0]),
-        profiles=dict(zip(PROFILED_STAGES, profiles, strict=True)),
-        kind=pair.kind,
+) -> Rows:
+    """Measure all features on all pairs: see `pair_row`."""
+    return run.rows(
+        "",
+        features,
+        {pair.name: pair for pair in pairs},
+        lambda feature, pair: pair_row(run, feature, pair, budgets),
     )
 
 
-def _image_size(path: Path) -> tuple[int, int]:
-    height, width = load_image(path).shape[:2]
-    return width, height
+def pair_row(
+    run: Run, feature: LocalFeature, pair: PlanarPair, budgets: Sequence[int | None] = BUDGETS
+) -> Row:
+    """Measure a feature on a pair.
+
+    Returns:
+        By name: "kind"; ("keypoints", budget) in the image that has fewer; ("repeated", budget,
+        radius), and the same of "chance" and "localization"; ("coverage", budget) of the first
+        image; "matches", and ("correct", px), ("precision", px) and ("score", px); "all matches"
+        and ("accuracy", px) without a ratio test; "corner errors" by seed; ("seconds", stage) and
+        ("memory", stage).
+    """
+    images = (pair.first, pair.second)
+    found = [run.keypoints(feature, image) for image in images]
+    sizes = found[0].keypoints.image_size, found[1].keypoints.image_size
+    # Each position once: another orientation of SIFT's is not another place.
+    places = [one.keypoints.distinct() for one in found]
+    fewest = min(map(len, places))
+    ratio = 1.0 if feature.learned else RATIO
+    settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
+    matches = run.matches(feature, images, settings)
+    unfiltered = MatchSettings("exact", 1.0, mutual=True, budget=MATCHING_BUDGET)
+    accuracy = _accuracy(matches, pair, sizes)
+    without_ratio = _accuracy(run.matches(feature, images, unfiltered), pair, sizes)
+    row: Row = {
+        "kind": pair.kind,
+        "matches": accuracy.matches,
+        "all matches": without_ratio.matches,
+        "corner errors": _corner_errors(run, feature, pair, matches, settings, sizes[0]),
+    }
+    for budget in {*budgets, MATCHING_BUDGET}:
+        row["keypoints", budget] = fewest if budget is None else min(fewest, budget)
+    for budget in budgets:
+        row |= _repeatability(run, feature, pair, sizes, places, budget)
+        row["coverage", budget] = coverage(_best(places[0], budget), sizes[0])
+    for px in MATCH_THRESHOLDS_PX:
+        row["correct", px] = accuracy.correct[px - 1]
+        row["precision", px] = accuracy.precision(px)
+        row["score", px] = accuracy.matching_score(px)
+        row["accuracy", px] = without_ratio.accuracy[px - 1]
+    profiles = found[0].profile, matches.describe, matches.match
+    for stage, profile in zip(STAGES, profiles, strict=True):
+        row["seconds", stage], row["memory", stage] = profile.seconds, profile.memory
+    return row
 
 
-def _evaluate(matches: PairMatches, pair: PlanarPair, sizes: Sizes) -> MatchAccuracy:
+def _accuracy(matches: PairMatches, pair: PlanarPair, sizes: Sizes) -> MatchAccuracy:
     return match_accuracy(
         matches.points0,
         matches.points1,
@@ -139,13 +126,15 @@ def _evaluate(matches: PairMatches, pair: PlanarPair, sizes: Sizes) -> MatchAccu
 
 
 def _corner_errors(
-    context: BenchmarkContext,
+    run: Run,
     feature: LocalFeature,
     pair: PlanarPair,
     matches: PairMatches,
     settings: MatchSettings,
     size: tuple[int, int],
 ) -> list[float]:
+    """Return the corner error of the homography that each seed of MAGSAC gives."""
+
     def error(seed: int) -> float:
         estimated = estimate_geometry(
             matches.points0,
@@ -156,16 +145,11 @@ def _corner_errors(
         ).matrix
         return corner_error(estimated, pair.homography, size)
 
-    depends = {
-        "homography": matrix_digest(pair.homography),
-        "settings": vars(settings),
-        "estimate": [INLIER_THRESHOLD_PX, SEEDS],
-    }
-    found = context.metric(
+    images = (pair.first, pair.second)
+    estimate = (INLIER_THRESHOLD_PX, SEEDS)
+    found = run.cached(
         "corner_errors",
-        feature,
-        (pair.first, pair.second),
-        depends,
+        (*feature.key, images, pair.homography, settings, estimate),
         lambda: {"errors": np.array([error(seed) for seed in range(SEEDS)])},
     )
     errors: list[float] = found["errors"].tolist()
@@ -173,43 +157,286 @@ def _corner_errors(
 
 
 def _repeatability(
-    context: BenchmarkContext,
+    run: Run,
     feature: LocalFeature,
     pair: PlanarPair,
     sizes: Sizes,
     places: Sequence[Keypoints],
     budget: int | None,
-) -> list[Repeatability]:
+) -> Row:
     def make() -> dict[str, np.ndarray]:
-        first, second = (_best(features, budget) for features in places)
+        first, second = (_best(keypoints, budget) for keypoints in places)
         found = mutual_nn_repeatability(first, second, pair.homography, sizes, RADII_PX)
-        rows = [(e.radius_px, e.repeated, e.fewest, e.localization_px, e.chance) for e in found]
-        return {"rows": np.array(rows, np.float64)}
+        return {"rows": np.array([(e.value, e.chance, e.localization_px) for e in found])}
 
-    depends = {
-        "homography": matrix_digest(pair.homography),
-        "budget": budget,
-        "radii": list(RADII_PX),
+    depends = (feature.detection, (pair.first, pair.second), pair.homography, budget, RADII_PX)
+    rows = run.cached("repeatability_mutual_nn", depends, make)["rows"].tolist()
+    names = ("repeated", "chance", "localization")
+    return {
+        (name, budget, radius): value
+        for radius, values in zip(RADII_PX, rows, strict=True)
+        for name, value in zip(names, values, strict=True)
     }
-    images = (pair.first, pair.second)
-    rows = context.metric("repeatability_mutual_nn", feature, images, depends, make)["rows"]
-    return [Repeatability(r, int(n), int(f), away, chance) for r, n, f, away, chance in rows]
 
 
-def _coverage(
-    context: BenchmarkContext,
-    feature: LocalFeature,
-    image: Path,
-    size: tuple[int, int],
-    places: Keypoints,
-    budget: int | None,
-) -> float:
-    def make() -> dict[str, np.ndarray]:
-        return {"value": np.array(coverage(_best(places, budget), size))}
-
-    found = context.metric("coverage", feature, (image,), {"budget": budget}, make)
-    return float(found["value"])
+def _best(keypoints: Keypoints, budget: int | None) -> np.ndarray:
+    return (keypoints if budget is None else keypoints.best(budget)).xy
 
 
-def _best(features: Keypoints, budget: int | None) -> np.ndarray:
-    return (features if budget is None else features.best(budget)).xy
+def repeated(rows: Rows, budget: int | None, radius: float, name: str = "repeated") -> float | None:
+    """Return the mean repeatability, or its "chance"; None where the budget is not filled."""
+    filled = mean(rows, ("keypoints", budget))
+    if filled is None or (budget is not None and filled < MIN_FILLED * budget):
+        return None
+    return mean(rows, (name, budget, radius))
+
+
+def correct(rows: Rows) -> float | None:
+    """Return the mean number of correct matches at 1 px."""
+    return mean(rows, ("correct", 1))
+
+
+def budget_name(budget: int | None) -> str:
+    """Return how tables name a budget."""
+    return "all" if budget is None else f"{budget:,}"
+
+
+def standard_tables(
+    features: Sequence[LocalFeature], rows: Rows, key: str, what: str
+) -> list[Table]:
+    """Tabulate the rows; `what` names the data in the titles."""
+    chance = {feature.name for feature in features if feature.chance}
+    tables = [
+        (
+            f"repeatability_{radius:g}px",
+            f"Mutual-NN repeatability within {radius:g} px, {what}",
+            _repeatability_columns(radius),
+            REPEATABILITY_NOTE,
+        )
+        for radius in RADII_PX
+    ]
+    if kinds := list(dict.fromkeys(row["kind"] for row in rows if row["kind"])):
+        title = f"By kind of pair, {what}"
+        tables.append(("kinds", title, _kind_columns(kinds), KIND_NOTE))
+    tables += [
+        ("matching", f"Matches, {what}", MATCHING_COLUMNS, MATCHING_NOTE),
+        ("homography", f"Homographies, {what}", _homography_columns(), HOMOGRAPHY_NOTE),
+        ("accuracy", f"Mean matching accuracy, {what}", ACCURACY_COLUMNS, ACCURACY_NOTE),
+        ("cost", "Coverage, time and memory", _cost_columns(chance), COST_NOTE),
+    ]
+    return [
+        tabulate(f"{key}_{name}", title, features, rows, [PAIRS, *columns], note)
+        for name, title, columns, note in tables
+    ]
+
+
+def _repeatability_columns(radius: float) -> Columns:
+    def corrected(own: Rows, budget: int | None) -> Cell:
+        value, chance = (repeated(own, budget, radius, name) for name in ("repeated", "chance"))
+        if value is None or chance is None or chance > MAX_CHANCE:
+            return None
+        return (value - chance) / (1 - chance)
+
+    columns: list[tuple[Column, Callable[[Rows], Cell]]] = []
+    for budget in BUDGETS:
+        of = partial(repeated, budget=budget, radius=radius)
+        name = budget_name(budget)
+        columns += [
+            (Column(name, ".3f"), of),
+            (Column(f"{name}: chance", ".3f"), partial(of, name="chance")),
+            (Column(f"{name}: chance-corrected", ".3f"), partial(corrected, budget=budget)),
+        ]
+    localization = ("localization", MATCHING_BUDGET, radius)
+    return [
+        *columns,
+        average("keypoints of all", ",.0f", ("keypoints", None)),
+        average(f"localization at {MATCHING_BUDGET:,}, px", ".2f", localization),
+    ]
+
+
+def _kind_columns(kinds: Sequence[str]) -> Columns:
+    def of_kind(own: Rows, kind: str, cell: Callable[[Rows], Cell]) -> Cell:
+        return cell(where(own, kind=kind))
+
+    values: list[tuple[str, str, Callable[[Rows], Cell]]] = [
+        (f"@{radius:g} px", ".3f", partial(repeated, budget=MATCHING_BUDGET, radius=radius))
+        for radius in (RADII_PX[0], RADII_PX[-1])
+    ]
+    return [
+        (Column(f"{kind}: {title}", style), partial(of_kind, kind=kind, cell=cell))
+        for kind in kinds
+        for title, style, cell in [*values, ("correct", ",.0f", correct)]
+    ]
+
+
+def _homography_columns() -> Columns:
+    def over_seeds(
+        own: Rows, metric: Callable[[Sequence[float], float], float], px: float, spread: bool
+    ) -> Cell:
+        if not own:
+            return None
+        seeds = zip(*(row["corner errors"] for row in own), strict=True)
+        values = [metric(errors, px) for errors in seeds]
+        return float(np.std(values, ddof=1) if spread else np.mean(values))
+
+    return [
+        (
+            Column(title.format(name, px), ".3f"),
+            partial(over_seeds, metric=metric, px=px, spread=spread),
+        )
+        for name, metric in (("accuracy", accuracy_at), ("AUC", area_under_curve))
+        for px in CORNER_THRESHOLDS_PX
+        for title, spread in (("{} at {:g} px", False), ("± of {} {:g}", True))
+    ]
+
+
+def _cost_columns(chance: Container[str]) -> Columns:
+    return [
+        *(average(f"coverage, {budget_name(b)}", ".3f", ("coverage", b)) for b in BUDGETS),
+        *stage_columns("seconds", chance),
+        (
+            Column("pair, s", ".3f"),
+            lambda own: None if own and own[0]["method"] in chance else median_seconds(own),
+        ),
+        (Column("correct at 1 px", ",.0f"), correct),
+        *stage_columns("memory", chance),
+    ]
+
+
+def stage_columns(what: Literal["seconds", "memory"], chance: Container[str]) -> Columns:
+    """Make the columns of the median seconds, or of the largest memory, of each stage.
+
+    The seconds of detecting random points, those of the detector that they follow, mean nothing.
+    """
+
+    def seconds(own: Rows, stage: str) -> Cell:
+        if not own or (stage == "detect" and own[0]["method"] in chance):
+            return None
+        return float(np.median([row["seconds", stage] for row in own]))
+
+    def megabytes(own: Rows, stage: str) -> Cell:
+        return max((row["memory", stage] / 1e6 for row in own), default=None)
+
+    if what == "seconds":
+        return [(Column(f"{s}, s", ".3f"), partial(seconds, stage=s)) for s in STAGES]
+    return [(Column(f"{s}, MB", ",.0f"), partial(megabytes, stage=s)) for s in STAGES]
+
+
+PAIRS: tuple[Column, Callable[[Rows], Cell]] = (Column("pairs", ",d"), len)
+
+MATCHING_COLUMNS: Columns = (
+    average("keypoints", ",.0f", ("keypoints", MATCHING_BUDGET)),
+    average("matches", ",.0f", "matches"),
+    *(
+        average(f"{title} at {px} px", style, (name, px))
+        for title, style, name in (
+            ("correct", ",.0f", "correct"),
+            ("precision", ".3f", "precision"),
+            ("matching score", ".3f", "score"),
+        )
+        for px in (1, 3)
+    ),
+)
+
+ACCURACY_COLUMNS: Columns = (
+    average("matches", ",.0f", "all matches"),
+    *(average(f"{px} px", ".3f", ("accuracy", px)) for px in MATCH_THRESHOLDS_PX),
+)
+
+REPEATABILITY_NOTE = (
+    "Keypoints that are mutual nearest neighbours, at most the radius apart, over the fewer of "
+    "the keypoints that both images show, each position once; mean over the pairs. Chance: the "
+    f"same number of random points. Chance-corrected: 0 is chance, 1 is all; a dash where "
+    f"chance is over {MAX_CHANCE:.0%}. A budget that a method does not fill to "
+    f"{MIN_FILLED:.0%} is a dash. Localization: mean distance of the pairs of keypoints."
+)
+
+KIND_NOTE = (
+    f"By what changes between the two images, at {MATCHING_BUDGET:,} keypoints: mutual-NN "
+    "repeatability, and correct matches at 1 px. Means over the pairs of a kind."
+)
+
+HOMOGRAPHY_NOTE = (
+    f"{MATCHING_NOTE} MAGSAC at {INLIER_THRESHOLD_PX:g} px. Error: mean distance of the first "
+    "image's corners from where the true homography takes them, at the images' own size; a "
+    "pair without a homography counts as wrong. Accuracy: fraction of the pairs within a "
+    "threshold; AUC: exact area under it, up to the threshold. Mean and standard deviation (±) "
+    f"over {SEEDS} seeds of MAGSAC."
+)
+
+ACCURACY_NOTE = (
+    f"Mutual nearest neighbours of the best {MATCHING_BUDGET:,} keypoints, no ratio test for "
+    "any method: fraction of the matches within each distance, mean over the pairs."
+)
+
+COST_NOTE = (
+    "Coverage: fraction of the cells of 32x32 px that hold a keypoint of the first image. "
+    "Seconds: the median when the results were made, on whatever else the machine did then; "
+    "detecting in one image, describing both, matching the pair at "
+    f"{MATCHING_BUDGET:,} keypoints (`deepdetect benchmark speed` compares on equal terms). "
+    "Pair: detecting in both images, describing and matching them. "
+    "Memory: the largest growth of the process."
+)
+
+
+def median_seconds(rows: Rows) -> float | None:
+    """Return the median time of a pair: detecting twice, describing both, matching."""
+    if not rows:
+        return None
+    detect, describe, match = (np.array([row["seconds", s] for row in rows]) for s in STAGES)
+    return float(np.median(2 * detect + describe + match))
+
+
+def standard_figures(
+    features: Sequence[LocalFeature], rows: Rows, key: str, what: str
+) -> list[Figure]:
+    """Draw accuracy, repeatability and time; their numbers are in the tables."""
+    measured = [(feature, own) for feature in features if (own := where(rows, method=feature.name))]
+    accuracy = {
+        feature.title: (
+            MATCH_THRESHOLDS_PX,
+            [mean(own, ("accuracy", px)) or 0.0 for px in MATCH_THRESHOLDS_PX],
+        )
+        for feature, own in measured
+    }
+    png = line_chart(accuracy, "error up to, px", "mean matching accuracy")
+    figures = [Figure(f"{key}_accuracy", f"Mean matching accuracy, {what}", png)]
+    figures += [
+        repeatability_figure(features, rows, radius, key, what)
+        for radius in (RADII_PX[0], RADII_PX[-1])
+    ]
+    points = {
+        feature.title: ([seconds], [count])
+        for feature, own in measured
+        if not feature.chance
+        and (seconds := median_seconds(own))
+        and (count := correct(own)) is not None
+    }
+    label = f"correct matches at 1 px of {MATCHING_BUDGET:,} keypoints"
+    x_label = "detecting, describing and matching a pair, s"
+    png = line_chart(points, x_label, label, logarithmic=True)
+    return [*figures, Figure(f"{key}_time", f"Time against correct matches, {what}", png)]
+
+
+def repeatability_figure(
+    features: Sequence[LocalFeature], rows: Rows, radius: float, key: str, what: str
+) -> Figure:
+    """Draw the repeatability at a radius against the number of keypoints.
+
+    Of rows with the same keypoints, which differ in their descriptors, the first one is drawn.
+    """
+    numbers = [budget for budget in BUDGETS if budget is not None]
+    lines = {}
+    drawn: set[str] = set()
+    for feature in features:
+        if feature.detection in drawn:
+            continue
+        drawn.add(feature.detection)
+        own = where(rows, method=feature.name)
+        values = [repeated(own, budget, radius) for budget in numbers]
+        if any(value is not None for value in values):
+            lines[feature.title] = numbers, [math.nan if v is None else v for v in values]
+    label = f"mutual-NN repeatability within {radius:g} px"
+    png = line_chart(lines, "keypoints per image", label, logarithmic=True, ticks=numbers)
+    title = f"Repeatability within {radius:g} px against the number of keypoints, {what}"
+    return Figure(f"{key}_repeatability_{radius:g}px", title, png)

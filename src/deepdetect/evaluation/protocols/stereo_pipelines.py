@@ -13,6 +13,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from ..._shared.opencv import cv2
+from ..._shared.records import file_digest
 from ...datasets.types import CalibratedStereoPair
 from ...detector.detector import AnyDetector, DeepDetect
 from ...detector.heatmap import HeatmapOptions
@@ -25,7 +26,6 @@ from ...reconstruction.pipeline import reconstruct
 from ..baselines.method import LocalFeature, deepdetect_feature
 from ..baselines.opencv import self_described
 from ..baselines.random import AllPixels, RandomDetector
-from ..cache import file_digest
 from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from ..profiling import Profile, StageProfiler
 from .paper_numbers import FIGURE_8
@@ -81,36 +81,20 @@ class Pipeline:
     paper: Mapping[str, float] = field(default_factory=dict)
     every_pixel: bool = False
 
-
-@dataclass(frozen=True)
-class PaperSettings:
-    """What the authors' notebooks chose for a scene.
-
-    Attributes:
-        ratio: of the ratio test.
-        focal_px: focal length.
-        center_px: (x, y) of the principal point.
-    """
-
-    ratio: float
-    focal_px: float
-    center_px: tuple[float, float]
-
     @property
-    def camera_matrix(self) -> np.ndarray:
-        """(3, 3) camera matrix of both images."""
-        (x, y), focal = self.center_px, self.focal_px
-        return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]], float)
+    def name(self) -> str:
+        """By which the cache and the rows know it."""
+        return self.title
 
 
-PAPER_SETTINGS: dict[str, PaperSettings] = {
-    "cones": PaperSettings(0.9, 360, (225, 188)),
-    "dolls": PaperSettings(0.85, 1512, (695, 555)),
-    "moebius": PaperSettings(0.77, 1512, (695, 555)),
-    "rocks": PaperSettings(0.9, 1512, (638, 555)),
-    "cloth": PaperSettings(0.9, 1050, (641, 555)),
+PAPER_SETTINGS: dict[str, tuple[float, float, float, float]] = {
+    "cones": (0.9, 360, 225, 188),
+    "dolls": (0.85, 1512, 695, 555),
+    "moebius": (0.77, 1512, 695, 555),
+    "rocks": (0.9, 1512, 638, 555),
+    "cloth": (0.9, 1050, 641, 555),
 }
-"""Of the paper's five scenes, from the authors' notebooks."""
+"""Ratio, focal length and principal point in px, by scene, of the authors' notebooks."""
 
 PAPER_FLANN_TREES = 10
 PAPER_FLANN_CHECKS = 100
@@ -129,7 +113,11 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
     found: list[Pipeline] = []
     for (name, detector), version in zip(detectors.items(), versions, strict=True):
         drawn = "" if found else "ours"
-        found.append(Pipeline(f"ours, weights {name}", _ours(detector), version, drawn=drawn))
+        found.append(
+            Pipeline(
+                f"ours, weights {name}", partial(_ours, detector=detector), version, drawn=drawn
+            )
+        )
     for name, detector in detectors.items():
         squashed = detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, "bgr"))
         feature = deepdetect_feature(squashed, title=f"the paper's pipeline, weights {name}")
@@ -142,37 +130,19 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
             found.append(_paper(self_described(name, title), drawn, FIGURE_8[title]))
     found.append(Pipeline("OpenCV's SGBM", sgbm, every_pixel=True))
     detector = next(iter(detectors.values()))
+    every = partial(_ours, detector=AllPixels())
     title = "baseline: as many random pixels as ours"
-    found.append(Pipeline(title, _random(detector), versions[0], 1))
-    found.append(Pipeline("baseline: all pixels", _ours(AllPixels())))
-    found.append(
-        Pipeline("all pixels, --density 1", _ours(AllPixels(), density=1), every_pixel=True)
-    )
+    found.append(Pipeline(title, partial(_random, like=detector), versions[0], 1))
+    found.append(Pipeline("baseline: all pixels", every))
+    found.append(Pipeline("all pixels, --density 1", partial(every, density=1), every_pixel=True))
     return found
 
 
 def _ours(
-    detector: AnyDetector, density: float | None = None
-) -> Callable[[CalibratedStereoPair], StereoPoints]:
-    def run(scene: CalibratedStereoPair) -> StereoPoints:
-        _compile_kernels()
-        return _reconstruct(scene, detector, density)
-
-    return run
-
-
-def _random(like: DeepDetect) -> Callable[[CalibratedStereoPair], StereoPoints]:
-    def run(scene: CalibratedStereoPair) -> StereoPoints:
-        _compile_kernels()
-        density = float((like.heatmap(scene.left) > 0.5).mean())
-        return _reconstruct(scene, RandomDetector(), density)
-
-    return run
-
-
-def _reconstruct(
-    scene: CalibratedStereoPair, detector: AnyDetector, density: float | None
+    scene: CalibratedStereoPair, *, detector: AnyDetector, density: float | None = None
 ) -> StereoPoints:
+    """Reconstruct as `deepdetect reconstruct --rectified`."""
+    _compile_kernels()
     with StageProfiler() as profiler:
         found = reconstruct(
             scene.left,
@@ -187,6 +157,12 @@ def _reconstruct(
     assert found.disparity is not None
     filled = int(np.count_nonzero(~found.matched))
     return StereoPoints(found.pixels, found.disparity, filled, profiler.stages, profiler.memory)
+
+
+def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> StereoPoints:
+    """Reconstruct as many random pixels as a detector finds keypoints."""
+    density = float((like.heatmap(scene.left) > 0.5).mean())
+    return _ours(scene, detector=RandomDetector(), density=density)
 
 
 def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = {}) -> Pipeline:
@@ -216,28 +192,29 @@ def paper_points(
         (M, 2) and (M, 2) float64 positions of the matches that are left.
     """
     images = scene.left, scene.right
-    settings = paper_settings(scene)
+    ratio, camera_matrix = paper_settings(scene)
     features = [feature.detect(rgb) for rgb in images]
     profiler.record("keypoints")
     check_memory([len(one) for one in features])
     first, second = (feature.describe(rgb, one) for rgb, one in zip(images, features, strict=True))
     flann = partial(flann_neighbours, trees=PAPER_FLANN_TREES, checks=PAPER_FLANN_CHECKS)
-    found = match_descriptors(first, second, flann, ratio=settings.ratio)
+    found = match_descriptors(first, second, flann, ratio=ratio)
     profiler.record("matching")
     kept = essential_inliers(
         features[0].xy[found.indices0].astype(np.float64),
         features[1].xy[found.indices1].astype(np.float64),
-        settings.camera_matrix,
+        camera_matrix,
     )
     profiler.record("geometry")
     return kept
 
 
-def paper_settings(scene: CalibratedStereoPair) -> PaperSettings:
-    """Return the authors' settings; for other scenes their most frequent ratio."""
+def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
+    """Return the authors' ratio and camera matrix; of other scenes their most frequent ratio."""
     camera = scene.calibration.camera0.matrix
-    center = float(camera[0, 2]), float(camera[1, 2])
-    return PAPER_SETTINGS.get(scene.name, PaperSettings(0.9, float(camera[0, 0]), center))
+    own = 0.9, camera[0, 0], camera[0, 2], camera[1, 2]
+    ratio, focal, x, y = PAPER_SETTINGS.get(scene.name, own)
+    return ratio, np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]], float)
 
 
 def essential_inliers(

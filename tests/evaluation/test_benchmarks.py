@@ -17,17 +17,15 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from deepdetect import DeepDetect, DeepDetectError, ImageError, MissingExtraError, OptionError
-from deepdetect.evaluation import runner
+from deepdetect.evaluation import benchmarks
 from deepdetect.evaluation.baselines.method import BaselineError, LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
-from deepdetect.evaluation.benchmarks import BENCHMARKS, Benchmark
-from deepdetect.evaluation.cache import StageCache
-from deepdetect.evaluation.context import BenchmarkContext
+from deepdetect.evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from deepdetect.evaluation.metrics import repeatability
 from deepdetect.evaluation.options import PROTOCOLS, BenchmarkOptions
-from deepdetect.evaluation.protocols.paper_numbers import NOTEBOOK_MATCHES
+from deepdetect.evaluation.protocols import speed
+from deepdetect.evaluation.protocols.paper_numbers import NUMBERS
 from deepdetect.evaluation.report import Report
-from deepdetect.evaluation.runner import run_benchmarks
 from deepdetect.features.keypoints import Keypoints
 
 MADE = "results made, not found in the cache"
@@ -48,13 +46,11 @@ def broken_feature(error: Exception) -> LocalFeature:
 
 @dataclass
 class Runs:
-    """One cache, filled by one run after the other; with the steps that the bar saw."""
+    """One cache, filled by one run after the other."""
 
     first: Report
     again: Report
     more: Report
-    total: int
-    done: list[int]
 
 
 @pytest.fixture(scope="module")
@@ -67,30 +63,6 @@ def more_options(options: BenchmarkOptions) -> BenchmarkOptions:
     return dataclasses.replace(options, others=(CLASSICAL["orb"],))
 
 
-class Bar:
-    """A progress bar that keeps account."""
-
-    def __init__(self) -> None:
-        self.total = 0
-        self.done: list[int] = []
-
-    def __call__(self, total: int, *_: object) -> Bar:
-        self.total = total
-        return self
-
-    def __enter__(self) -> Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def update(self, steps: int) -> None:
-        self.done.append(steps)
-
-    def set_postfix_str(self, text: str, refresh: bool) -> None:
-        assert text
-
-
 @pytest.fixture(scope="module")
 def runs(
     oxford_folder: Path,
@@ -99,15 +71,8 @@ def runs(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Runs:
     cache = tmp_path_factory.mktemp("cache")
-    bar = Bar()
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(runner, "progress", bar)
-        first = run_benchmarks(["oxford"], oxford_folder, options, cache=cache)
-    again, more = (
-        run_benchmarks(["oxford"], oxford_folder, chosen, cache=cache)
-        for chosen in (options, more_options)
-    )
-    return Runs(first, again, more, bar.total, bar.done)
+    chosen = (options, options, more_options)
+    return Runs(*(run_benchmarks(["oxford"], oxford_folder, one, cache=cache) for one in chosen))
 
 
 def table(report: Report, key: str) -> dict[str, dict[str, object]]:
@@ -152,8 +117,7 @@ def test_all_rows_and_columns_are_there(runs: Runs) -> None:
     matches = table(runs.first, "oxford_matches")
     kd_trees = "ORB, low settings, bytes by kd-trees"
     assert measured(matches) == ["ORB, low settings", kd_trees, OURS[0], RANDOM, ALL_PIXELS]
-    for title, known in NOTEBOOK_MATCHES.items():
-        correct, of_all = known["wall 1-6"]
+    for title, (correct, of_all) in NUMBERS["notebooks"]["wall 1-6"].items():
         cells = matches[f"{title}, in the authors' notebook"]
         assert cells["wall 1-6"] == correct
         assert cells["wall 1-6, precision"] == pytest.approx(correct / of_all)
@@ -259,11 +223,6 @@ def test_the_papers_numbers_are_beside_ours(runs: Runs) -> None:
     assert paper["boat 1-2"] == 47_447
     assert paper["graf 1-6, precision"] is None
     assert table(runs.first, "oxford_repeatability")["R2D2, in the paper"]["wall"] == 0.71
-
-
-def test_the_tasks_done_add_up_to_the_total(runs: Runs) -> None:
-    assert sum(runs.done) == runs.total > 0
-    assert all(steps >= 0 for steps in runs.done)
 
 
 def test_a_second_run_makes_nothing_and_says_the_same(runs: Runs) -> None:
@@ -373,13 +332,9 @@ def test_every_benchmark_does_all_its_tasks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(repeatability, "CHANCE_POINTS", 200)
-    context = BenchmarkContext(write_few(name), StageCache(tmp_path / "cache"))
     all_protocols = dataclasses.replace(options, protocols=PROTOCOLS, classical=())
-    plans = BENCHMARKS[name].plan(context, all_protocols)
-    bar = Bar()
-    sections = [plan.run(context, bar) for plan in plans]
-    assert sum(bar.done) == sum(map(len, plans)) > 0
-    keys = [table.key for section in sections for table in section.tables]
+    report = run_benchmarks([name], write_few(name), all_protocols, cache=tmp_path / "cache")
+    keys = [table.key for table in report.tables()]
     assert keys
     assert len(set(keys)) == len(keys)
 
@@ -435,11 +390,13 @@ def test_a_cache_that_cannot_be_written_ends_the_run(
 def test_a_missing_package_stops_only_the_benchmark_that_needs_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, edge_detector: DeepDetect
 ) -> None:
-    def lacks(context: BenchmarkContext, options: BenchmarkOptions) -> list:
+    def lacks(run: object, options: object) -> list:
         raise MissingExtraError("this needs pycolmap")
 
-    known = {"one": Benchmark("one", lacks), "other": Benchmark("other", lambda *_: [])}
-    monkeypatch.setattr(runner, "BENCHMARKS", known)
+    known = {"one": ("speed", "lacks"), "other": ("speed", "works")}
+    monkeypatch.setattr(benchmarks, "BENCHMARKS", known)
+    monkeypatch.setattr(speed, "lacks", lacks, raising=False)
+    monkeypatch.setattr(speed, "works", lambda *_: [], raising=False)
     options = BenchmarkOptions(edge_detector)
     report = run_benchmarks(["one", "other"], tmp_path, options)
     assert report.failures == ("the benchmark one: this needs pycolmap",)

@@ -1,0 +1,334 @@
+"""The benchmarks of image pairs with homographies: Oxford, HPatches, dust and smoke."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ...datasets.hpatches import in_d2net_subset, is_illumination, load_hpatches
+from ...datasets.low_visibility import load_low_visibility
+from ...datasets.oxford import SCENES, load_oxford
+from ...datasets.types import PlanarPair, PlanarScene
+from ..baselines.method import LocalFeature
+from ..baselines.opencv import CLASSICAL, with_kd_trees
+from ..charts import bar_chart
+from ..options import BenchmarkOptions
+from ..report import Cell, Column, Figure, Section, Table
+from ..run import Run
+from . import paper
+from .paper_numbers import (
+    DEEPDETECT,
+    FIGURE_6,
+    HPATCHES_REPEATABILITY,
+    MATCHES,
+    NUMBERS,
+    OXFORD_REPEATABILITY,
+    with_paper_rows,
+)
+
+KEYPOINT_SCENES = ("graf", "bikes", "leuven")
+"""Of Figure 2."""
+
+GUIDED_PAIRS = (*paper.OXFORD_PAIRS, ("boat", 6), ("bark", 6))
+
+FIGURE_7_SCENES = 4
+"""Half of each kind."""
+
+TRUTHS = {
+    "published": (
+        "Evaluated by the homographies that the data set ships, for comparison with papers. They "
+        "are wrong by up to 26 px in places, so figures at 1 px are limited by them."
+    ),
+    "refined": (
+        "Evaluated by more accurate homographies, estimated from the images by "
+        "`benchmarks/refine_oxford.py` with no detector of ours in the loop."
+    ),
+}
+
+NOTHING_MOVES = "Nothing moves between the two images of a scene."
+
+
+def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
+    """Tables I and II, the Oxford half of III, Figures 1, 2, 4 and 6; the other protocols."""
+    folder = run.folder("oxford")
+    by_truth = {
+        "published": [scene.with_max_pairs(options.max_pairs) for scene in load_oxford(folder)],
+        "refined": [
+            scene.with_max_pairs(options.max_pairs) for scene in load_oxford(folder, "refined")
+        ],
+    }
+    scenes = by_truth["published"]
+    if missing := [name for name in SCENES if name not in {scene.name for scene in scenes}]:
+        run.skipped.append(f"Oxford's {', '.join(missing)}: not in {folder}")
+    pairs = pairs_of(scenes)
+    unrefined = [
+        pair.name
+        for pair in pairs
+        if not (pair.first.parent / f"H1to{pair.number}p.refined").exists()
+    ]
+    if len(unrefined) == len(pairs):
+        del by_truth["refined"]
+    sections = []
+    if "paper" in options.protocols:
+        sections.append(_oxford_paper(run, options, scenes))
+    if "standard" in options.protocols:
+        for truth, of_truth in by_truth.items():
+            title = f"Oxford, {truth} homographies"
+            text = TRUTHS[truth]
+            sections.append(_standard(run, options, of_truth, f"oxford_{truth}", title, text))
+        if "refined" not in by_truth:
+            run.skipped.append(
+                "Oxford evaluated by refined homographies: there are no files H1toKp.refined; "
+                "benchmarks/refine_oxford.py makes them"
+            )
+        elif unrefined:
+            run.skipped.append(
+                f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined"
+                "; these pairs are evaluated by the published one in that section too"
+            )
+    if "guided" in options.protocols:
+        from .guided import guided_section
+
+        chosen = {t: select_pairs(by_truth[t], GUIDED_PAIRS) for t in reversed(by_truth)}
+        sections.append(guided_section(run, options, chosen, "oxford_guided", "Oxford"))
+    if "degraded" in options.protocols:
+        truth, of_truth = list(by_truth.items())[-1]
+        title = f"Oxford, {truth} homographies"
+        sections.append(_degraded(run, options, of_truth, "oxford_degraded", title))
+    return sections
+
+
+def _oxford_paper(run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarScene]) -> Section:
+    features, matching = options.density_features(), with_kd_trees(options.matching_features())
+    pairs = select_pairs(scenes, paper.OXFORD_PAIRS)
+    density = paper.density_table(run, features, scenes, "oxford_density", with_paper=True)
+    repeatability = paper.repeatability_table(run, features, scenes, "oxford_repeatability")
+    matches = paper.matches_table(run, matching, pairs, "oxford_matches")
+    figure_6_pairs = select_pairs(scenes, (*paper.OXFORD_PAIRS, ("graf", 3)))
+    drawn = [scene for scene in scenes if scene.name in KEYPOINT_SCENES]
+    figure_6, figures = _figures(run, options, figure_6_pairs, "oxford", drawn)
+    masks = run.attempt("Figure 4, the masks", paper.mask_figure, scenes[0])
+    text = (
+        "Tables I and II, the Oxford half of III, Figures 1, 2, 4 and 6. DeepDetect sees images "
+        f"squashed to 480x480 as {options.channels.upper()}; the classical detectors see them as "
+        "they are. The paper's numbers are beside ours, and so are those that its authors' public "
+        "notebooks print."
+    )
+    tables = [
+        density,
+        with_paper_rows(repeatability, OXFORD_REPEATABILITY),
+        _with_notebooks(with_paper_rows(matches, MATCHES), pairs),
+        figure_6,
+    ]
+    figures = [_repeatability_figure(repeatability), *figures, *filter(None, [masks])]
+    return Section("Oxford, the paper's protocol", (text,), tables, figures)
+
+
+def _with_notebooks(table: Table, pairs: Sequence[PlanarPair]) -> Table:
+    """Add what the authors' notebooks print."""
+    rows = list(table.rows)
+    for method in dict.fromkeys(m for of_pair in NUMBERS["notebooks"].values() for m in of_pair):
+        cells: list[Cell] = [f"{method}, in the authors' notebook"]
+        for pair in pairs:
+            correct, matches = NUMBERS["notebooks"].get(pair.name, {}).get(method, (None, None))
+            cells += [correct, correct / matches if matches else None]
+        rows.append(tuple(cells))
+    return Table(table.key, table.title, table.columns, tuple(rows), table.note)
+
+
+def _repeatability_figure(table: Table) -> Figure:
+    values = {str(row[0]): float(row[1]) for row in table.rows if isinstance(row[1], float)}
+    ours = [name for name in values if name.startswith("DeepDetect")]
+    png = bar_chart(values, "repeatability as in the paper, mean of the scenes", ours)
+    mean = OXFORD_REPEATABILITY[DEEPDETECT]["mean"]
+    title = f"Figure 1: average repeatability, with baselines; in the paper DeepDetect has {mean}"
+    return Figure("oxford_repeatability", title, png)
+
+
+def _figures(
+    run: Run,
+    options: BenchmarkOptions,
+    pairs: Sequence[PlanarPair],
+    key: str,
+    drawn: Sequence[PlanarScene],
+) -> tuple[Table, list[Figure]]:
+    """Make Figure 6 with its table, and Figure 2 of some scenes."""
+    features = CLASSICAL["sift"], CLASSICAL["sift-low"], options.deepdetect_480()
+    title = "Figure 6: correct matches"
+    table = paper.matches_table(run, features, pairs, f"{key}_figure6", title)
+    keypoints = [
+        run.attempt(
+            f"Figure 2, keypoints of {scene.name}", paper.keypoint_figure, run, features, scene
+        )
+        for scene in drawn
+    ]
+    matches = _match_figures(run, features[-1], pairs, "Figure 6")
+    return with_paper_rows(table, FIGURE_6), [*filter(None, keypoints), *matches]
+
+
+def _match_figures(
+    run: Run, feature: LocalFeature, pairs: Sequence[PlanarPair], number: str
+) -> list[Figure]:
+    figures = [
+        run.attempt(
+            f"{number}, matches of {pair.name}", paper.match_figure, run, feature, pair, number
+        )
+        for pair in pairs
+    ]
+    return [figure for figure in figures if figure is not None]
+
+
+def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
+    """Table III and Figure 7, and the other protocols on 116 scenes and on the D2-Net subset."""
+    found = load_hpatches(run.folder("hpatches"))
+    scenes = [scene.with_max_pairs(options.max_pairs) for scene in found]
+    last = [list(scene.pairs())[-1] for scene in scenes]
+    sections = []
+    if "paper" in options.protocols:
+        sections.append(_hpatches_paper(run, options, scenes, last))
+    if "standard" in options.protocols:
+        text = "Evaluated by its own files."
+        for name, subset in hpatches_subsets(scenes):
+            key, title = f"hpatches_{len(subset)}", f"HPatches, {name}"
+            sections.append(_standard(run, options, subset, key, title, text))
+    if "guided" in options.protocols:
+        from .guided import guided_section
+
+        truths = {"published": last}
+        sections.append(guided_section(run, options, truths, "hpatches_guided", "HPatches"))
+    if "degraded" in options.protocols:
+        sections.append(_degraded(run, options, scenes, "hpatches_degraded", "HPatches"))
+    return sections
+
+
+def hpatches_subsets(scenes: Sequence[PlanarScene]) -> list[tuple[str, list[PlanarScene]]]:
+    """Return all scenes, and the D2-Net subset of them where it is smaller."""
+    subset = [scene for scene in scenes if in_d2net_subset(scene)]
+    subsets = [(f"all {len(scenes)} scenes", list(scenes))]
+    if 0 < len(subset) < len(scenes):
+        subsets.append((f"the {len(subset)} scenes of D2-Net", subset))
+    return subsets
+
+
+def _hpatches_paper(
+    run: Run,
+    options: BenchmarkOptions,
+    scenes: Sequence[PlanarScene],
+    last: Sequence[PlanarPair],
+) -> Section:
+    features = options.density_features()
+    light = [is_illumination(scene) for scene in scenes]
+    repeatability = paper.repeatability_table(run, features, scenes, "hpatches_repeatability")
+    of_kind = [[p for p, one in zip(last, light, strict=True) if one is k] for k in (True, False)]
+    drawn = [pair for pairs in of_kind for pair in pairs[: FIGURE_7_SCENES // 2]]
+    text = (
+        f"{len(scenes)} scenes, of 116 in the whole set. Matches of images 1 and 6. The paper "
+        f"reports {NUMBERS['max_matches']:,} as the most correct matches of a pair."
+    )
+    tables = [
+        _table_3(repeatability, light),
+        repeatability,
+        paper.density_table(run, features, scenes, "hpatches_density"),
+        paper.matches_table(run, options.matching_features(), last, "hpatches_matches"),
+    ]
+    figures = _match_figures(run, options.deepdetect_480(), drawn, "Figure 7")
+    return Section("HPatches, the paper's protocol", (text,), tables, figures)
+
+
+def _table_3(by_scene: Table, light: Sequence[bool]) -> Table:
+    """Average the repeatability by kind of scene; `light` says which change in illumination."""
+    kinds = {"illumination": True, "viewpoint": False}
+    titles = {kind: f"{kind}, {light.count(wanted)} scenes" for kind, wanted in kinds.items()}
+    rows: list[tuple[Cell, ...]] = []
+    for row in by_scene.rows:
+        cells: list[Cell] = [row[0]]
+        for wanted in kinds.values():
+            values = [v for v, one in zip(row[2:], light, strict=True) if one is wanted]
+            known = [value for value in values if isinstance(value, float)]
+            cells.append(sum(known) / len(known) if known else None)
+        rows.append(tuple(cells))
+    table = Table(
+        "hpatches_table3",
+        "Table III: repeatability as in the paper, by kind of scene",
+        (Column("method"), *(Column(title, ".4f") for title in titles.values())),
+        tuple(rows),
+        f"{by_scene.note} The paper's numbers are of 57 and 59 scenes.",
+    )
+    numbers = {
+        title: {titles[kind]: value for kind, value in of_method.items()}
+        for title, of_method in HPATCHES_REPEATABILITY.items()
+    }
+    return with_paper_rows(table, numbers)
+
+
+def low_visibility(run: Run, options: BenchmarkOptions) -> list[Section]:
+    """Run the protocols on the dusty and the smoky pair (Figure 6)."""
+    scenes = load_low_visibility(run.folder("low-visibility"))
+    pairs = pairs_of(scenes)
+    key, title = "low_visibility", "Low visibility"
+    sections = []
+    if "paper" in options.protocols:
+        features = options.density_features()
+        figure_6, figures = _figures(run, options, pairs, key, scenes)
+        tables = [
+            paper.density_table(run, features, scenes, f"{key}_density"),
+            paper.repeatability_table(run, features, scenes, f"{key}_repeatability"),
+            paper.matches_table(run, options.matching_features(), pairs, f"{key}_matches"),
+            figure_6,
+        ]
+        text = (NOTHING_MOVES,)
+        sections.append(Section(f"{title}, the paper's protocol", text, tables, figures))
+    if "standard" in options.protocols:
+        sections.append(_standard(run, options, scenes, key, title, NOTHING_MOVES))
+    if "guided" in options.protocols:
+        from .guided import guided_section
+
+        truths = {"published": pairs}
+        sections.append(guided_section(run, options, truths, f"{key}_guided", title))
+    return sections
+
+
+def _standard(
+    run: Run,
+    options: BenchmarkOptions,
+    scenes: Sequence[PlanarScene],
+    key: str,
+    title: str,
+    text: str,
+) -> Section:
+    from . import standard
+
+    pairs, features = pairs_of(scenes), options.standard_features()
+    rows = standard.standard_rows(run, features, pairs)
+    what = f"{title} ({len(pairs)} pairs)"
+    return Section(
+        f"{title}, the standard protocol",
+        (text,),
+        standard.standard_tables(features, rows, key, what),
+        standard.standard_figures(features, rows, key, what),
+    )
+
+
+def _degraded(
+    run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarScene], key: str, title: str
+) -> Section:
+    from . import degraded
+
+    pairs, features = pairs_of(scenes), options.standard_features()
+    rows = degraded.degraded_rows(run, features, pairs, options.degraded_images)
+    what = f"{title} ({len(pairs)} pairs)"
+    text = (degraded.TEXT, degraded.WHICH_TEXT[options.degraded_images])
+    tables = degraded.degraded_tables(features, rows, key, what)
+    return Section(f"{title}, dark and blurred", text, tables)
+
+
+def pairs_of(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:
+    """Return the pairs of all scenes."""
+    return [pair for scene in scenes for pair in scene.pairs()]
+
+
+def select_pairs(
+    scenes: Sequence[PlanarScene], chosen: Sequence[tuple[str, int]]
+) -> list[PlanarPair]:
+    """Return the pairs of scenes and numbers, as those of Table II; those that are there."""
+    found = {(pair.scene, pair.number): pair for pair in pairs_of(scenes)}
+    return [found[name] for name in chosen if name in found]

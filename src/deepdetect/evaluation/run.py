@@ -1,0 +1,335 @@
+"""A run of benchmarks: its data, cached results of stages, and what could not be measured."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from .._shared.errors import DeepDetectError, OptionError
+from .._shared.opencv import cv2
+from .._shared.progress import progress
+from .._shared.records import Arrays, file_digest, key, load_arrays, save_arrays
+from ..features.keypoints import Keypoints
+from ..features.matchers import get_matcher, match_descriptors
+from ..io.image import load_image
+from ..matching.unguided import check_memory
+from .baselines.method import BaselineError, LocalFeature
+from .profiling import Profile, profiled
+from .report import Row, Rows
+
+Result = TypeVar("Result")
+
+STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
+    "keypoints": (1, ()),
+    "matches": (1, ("keypoints",)),
+    "guided": (4, ("keypoints",)),
+    "stereo": (1, ()),
+    "repeatability_paper": (1, ("keypoints",)),
+    "repeatability_mutual_nn": (1, ("keypoints",)),
+    "corner_errors": (1, ("matches",)),
+    "pose": (1, ("matches", "guided")),
+    "sfm": (1, ()),
+}
+"""Version of each stage, and the stages it is made from.
+
+Raise the version when a change of the code changes the stage's results: cached ones of another
+version are not used, nor what was made from them.
+"""
+
+OPTIONAL = ("logits", "sizes", "angles", "octaves", "descriptors")
+"""Columns that keypoints may have."""
+
+RECENT_IMAGES = 8
+"""Images whose keypoints are kept in memory."""
+
+
+class CacheError(DeepDetectError):
+    """A result cannot be kept: the folder cannot be written."""
+
+
+class Method(Protocol):
+    """A row of a table: what is compared."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def title(self) -> str: ...
+
+
+AnyMethod = TypeVar("AnyMethod", bound=Method)
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """How the descriptors of a pair are matched.
+
+    Attributes:
+        matcher: for Euclid's distances; binary descriptors are matched by Hamming's, exactly.
+        ratio: the ratio test keeps matches strictly under it.
+        mutual: keep only mutual nearest neighbours.
+        budget: only the best this many keypoints of each image are matched; None: all.
+        seed: of a matcher that is random.
+    """
+
+    matcher: str = "flann"
+    ratio: float = 0.99
+    mutual: bool = False
+    budget: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class ImageKeypoints:
+    """The keypoints of an image, and what detecting them took when it was done."""
+
+    keypoints: Keypoints
+    profile: Profile
+
+
+@dataclass(frozen=True, eq=False)
+class PairMatches:
+    """The matches of a pair.
+
+    Attributes:
+        points0, points1: (M, 2) float32 matched positions.
+        keypoints0, keypoints1: all keypoints that were matched, (N0, 2) and (N1, 2).
+        describe, match: what describing both images and matching took when it was done.
+    """
+
+    points0: np.ndarray
+    points1: np.ndarray
+    keypoints0: np.ndarray
+    keypoints1: np.ndarray
+    describe: Profile
+    match: Profile
+
+
+class Run:
+    """A run of benchmarks.
+
+    Args:
+        data: folder of the data sets, or of the only one that is needed.
+        cache: folder of the results of stages, each under a digest of all that it depends on; a
+            damaged file is made again, old ones are never removed. None keeps nothing.
+        quiet: show no progress bars.
+
+    Attributes:
+        made: number of results that were computed, not found in the cache.
+        skipped: what was not measured, each with the reason.
+        failures: of that, what was wanted and could not be measured.
+
+    Example:
+        >>> run = Run(Path("data"))
+        >>> run.cached("stereo", {"of": [1, 2]}, lambda: {"value": np.array(3)})["value"].item()
+        3
+    """
+
+    def __init__(self, data: Path, cache: Path | None = None, quiet: bool = True) -> None:
+        self.data, self.cache, self.quiet = data, cache, quiet
+        self.made = 0
+        self.skipped: list[str] = []
+        self.failures: list[str] = []
+        self._temporary: Path | None = None
+        self._recent: OrderedDict[str, ImageKeypoints] = OrderedDict()
+        self._described: tuple[str, list[np.ndarray], Profile] | None = None
+
+    def folder(self, name: str) -> Path:
+        """Return the folder of a data set: below `data`, or `data` itself."""
+        below = self.data / name
+        return below if below.is_dir() else self.data
+
+    def files_folder(self) -> Path:
+        """Return a folder for images that are made: the cache's, or a temporary one."""
+        if self.cache is not None:
+            return self.cache
+        if self._temporary is None:
+            self._temporary = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
+            weakref.finalize(self, shutil.rmtree, self._temporary, ignore_errors=True)
+        return self._temporary
+
+    def attempt(self, name: str, work: Callable[..., Result], *arguments: Any) -> Result | None:
+        """Do a piece of work; when it cannot be done, note that it is skipped and why.
+
+        Only errors of data and of detectors from outside are noted. Any other is a bug and passes,
+        an error of options too: those of the user were checked before the run.
+
+        Returns:
+            Its result, or None.
+        """
+        try:
+            return work(*arguments)
+        except (CacheError, OptionError):
+            raise
+        except DeepDetectError as error:
+            self.fail(f"{name}: {error}")
+            return None
+
+    def fail(self, reason: str) -> None:
+        """Note what was wanted and cannot be measured."""
+        self.skipped.append(reason)
+        self.failures.append(reason)
+
+    def rows(
+        self,
+        what: str,
+        methods: Sequence[AnyMethod],
+        items: Mapping[str, Item],
+        measure: Callable[[AnyMethod, Item], Row],
+    ) -> Rows:
+        """Measure each method on each item.
+
+        Args:
+            what: the beginning of what the progress bar shows and of the reason of a failure.
+            methods: what is compared.
+            items: what it is measured on, by name.
+            measure: returns the values of a row by name.
+
+        Returns:
+            The rows with "method" and "item", the names; those that failed are missing.
+        """
+        rows: Rows = []
+        with progress(len(methods) * len(items), "benchmark", "task", self.quiet) as bar:
+            for method in methods:
+                for name, item in items.items():
+                    task = f"{what}{method.title} on {name}"
+                    bar.set_postfix_str(task, refresh=False)
+                    values = self.attempt(task, measure, method, item)
+                    if values is not None:
+                        rows.append({"method": method.name, "item": name, **values})
+                    bar.update(1)
+        return rows
+
+    def cached(self, stage: str, depends: object, make: Callable[[], Arrays]) -> Arrays:
+        """Find a result, or make and keep it.
+
+        Args:
+            stage: one of `STAGES`.
+            depends: all that the result depends on, as for `records.key`: of a path its content.
+            make: makes the arrays.
+
+        Raises:
+            CacheError: the result cannot be written.
+        """
+        path = None
+        if self.cache is not None:
+            path = self.cache / stage / f"{key(stage_versions(stage), depends)}.npz"
+            found = load_arrays(path)
+            if found is not None:
+                return found
+        made = make()
+        self.made += 1
+        if path is not None:
+            try:
+                save_arrays(path, made)
+            except DeepDetectError as error:
+                raise CacheError(str(error)) from None
+        return made
+
+    def keypoints(self, feature: LocalFeature, image: Path) -> ImageKeypoints:
+        """Find the keypoints of an image, or read them from the cache."""
+        name = f"{feature.detection} {file_digest(image)}"
+        if name not in self._recent:
+            self._recent[name] = self._keypoints(feature, image)
+        self._recent.move_to_end(name)
+        if len(self._recent) > RECENT_IMAGES:
+            self._recent.popitem(last=False)
+        return self._recent[name]
+
+    def _keypoints(self, feature: LocalFeature, image: Path) -> ImageKeypoints:
+        def make() -> Arrays:
+            rgb = load_image(image)
+            with profiled() as profile:
+                found = feature.detect(rgb)
+            optional = {n: part for n in OPTIONAL if (part := getattr(found, n)) is not None}
+            return {
+                "xy": found.xy,
+                "scores": found.scores,
+                "image_size": np.array(found.image_size),
+                **optional,
+                "profile": profile.packed(),
+            }
+
+        kept = dict(self.cached("keypoints", (feature.detection, image), make))
+        profile = Profile.unpacked(kept.pop("profile"))
+        width, height = kept.pop("image_size").tolist()
+        return ImageKeypoints(Keypoints(image_size=(width, height), **kept), profile)
+
+    def matches(
+        self, feature: LocalFeature, images: tuple[Path, Path], settings: MatchSettings
+    ) -> PairMatches:
+        """Match two images, or read their matches from the cache."""
+        both = [self.keypoints(feature, image).keypoints for image in images]
+        if settings.budget is not None:
+            both = [keypoints.best(settings.budget) for keypoints in both]
+
+        def make() -> Arrays:
+            check_memory([len(keypoints) for keypoints in both])
+            descriptors, describe = self._descriptors(feature, images, both)
+            matcher = get_matcher("hamming" if feature.binary else settings.matcher)
+            with profiled() as match:
+                found = match_descriptors(
+                    descriptors[0],
+                    descriptors[1],
+                    matcher,
+                    ratio=settings.ratio,
+                    mutual=settings.mutual,
+                    seed=settings.seed,
+                    positions=(both[0].xy, both[1].xy),
+                )
+            profiles = np.array([describe.packed(), match.packed()])
+            return {"rows0": found.indices0, "rows1": found.indices1, "profiles": profiles}
+
+        kept = self.cached("matches", (*feature.key, images, settings), make)
+        return PairMatches(
+            both[0].xy[kept["rows0"]],
+            both[1].xy[kept["rows1"]],
+            both[0].xy,
+            both[1].xy,
+            *map(Profile.unpacked, kept["profiles"]),
+        )
+
+    def _descriptors(
+        self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
+    ) -> tuple[list[np.ndarray], Profile]:
+        """Describe both images; those of the last pair are kept for other settings of matching."""
+        name = key(*feature.key, images, [len(keypoints) for keypoints in both])
+        if self._described is None or self._described[0] != name:
+            self._described = None  # frees its memory before more is needed
+            rgb = [load_image(image) for image in images]
+            with profiled() as profile:
+                descriptors = [
+                    feature.describe(pixels, keypoints)
+                    for pixels, keypoints in zip(rgb, both, strict=True)
+                ]
+            for image, keypoints, rows in zip(images, both, descriptors, strict=True):
+                if len(rows) != len(keypoints):
+                    raise BaselineError(
+                        f"{feature.name} made {len(rows)} descriptors for {len(keypoints)} "
+                        f"keypoints in {image}: there must be one for each"
+                    )
+            self._described = name, descriptors, profile
+        return self._described[1:]
+
+
+def stage_versions(stage: str) -> dict[str, Any]:
+    """Return the versions that a stage's results depend on: its own, its sources', the packages'.
+
+    Example:
+        >>> sorted(stage_versions("matches"))
+        ['keypoints', 'matches', 'numpy', 'opencv']
+    """
+    version, sources = STAGES[stage]
+    versions = {"numpy": np.__version__, "opencv": cv2.__version__, stage: version}
+    for source in sources:
+        versions |= stage_versions(source)
+    return versions
