@@ -258,13 +258,13 @@ def published_points(
     Returns:
         (M, 2) and (M, 2) float64 positions of the matches that are left.
     """
-    settings = paper_settings(scene)
+    ratio, camera_matrix = paper_settings(scene)
     first, second, good = published_matches(
-        (scene.left, scene.right), detector, settings.ratio, PAPER_FLANN_TREES, PAPER_FLANN_CHECKS
+        (scene.left, scene.right), detector, ratio, PAPER_FLANN_TREES, PAPER_FLANN_CHECKS
     )
     points0 = np.array([first[match.queryIdx].pt for match in good]).reshape(-1, 2)
     points1 = np.array([second[match.trainIdx].pt for match in good]).reshape(-1, 2)
-    return essential_inliers(points0, points1, settings.camera_matrix)
+    return essential_inliers(points0, points1, camera_matrix)
 
 
 if __name__ == "__main__":

@@ -64,8 +64,9 @@ def score(image: SourceImage, weights: str, labels: LabelOptions) -> list[Scored
     rgb = load_image(image.path)
     rows = []
     for view in image.validation_views:
-        heatmap = detector(weights).heatmap(render(rgb, view))
-        label = label_view(rgb, view, labels)
+        seen = render(rgb, view)
+        heatmap = detector(weights).heatmap(seen)
+        label = label_view(seen, view, labels)
         rows.append((score_heatmap(heatmap, label), calibration_of(heatmap, label)))
     return rows
 

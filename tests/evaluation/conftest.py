@@ -15,7 +15,7 @@ from deepdetect.detector.backends import RuntimeOptions
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.features import select_keypoints
-from deepdetect.io.image import luma
+from deepdetect.io.image import load_image, luma
 
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
 MOVES = {
@@ -35,14 +35,24 @@ class EdgeDetector(DeepDetect):
         self.heatmap_options = HeatmapOptions()
         self._runtime = RuntimeOptions()  # of `with_weights`
 
-    def _run(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        gray = luma(rgb).astype(np.float32)
+    def heatmap_and_logits(
+        self, image: np.ndarray, *, channels: str = "rgb"
+    ) -> tuple[np.ndarray, np.ndarray]:
+        gray = luma(load_image(image)).astype(np.float32)
         strength = np.hypot(cv2.Sobel(gray, -1, 1, 0), cv2.Sobel(gray, -1, 0, 1))
         return 1 - np.exp(-strength / 150), strength
 
-    def _dense(self, rgb: np.ndarray, options: SelectionOptions) -> Keypoints:
-        heatmap, logits = self._run(rgb)
-        return select_keypoints(heatmap, options, logits)
+    def heatmap(self, image: np.ndarray, *, channels: str = "rgb") -> np.ndarray:
+        return self.heatmap_and_logits(image)[0]
+
+    def select(
+        self,
+        rgb: np.ndarray,
+        options: SelectionOptions = SelectionOptions(),
+        ignore: np.ndarray | None = None,
+    ) -> Keypoints:
+        heatmap, logits = self.heatmap_and_logits(rgb)
+        return select_keypoints(heatmap, options, logits, ignore=ignore)
 
 
 @pytest.fixture(scope="session")

@@ -155,7 +155,7 @@ class DeepDetect:
     @suggest_keywords
     def configured(self, heatmap_options: HeatmapOptions) -> DeepDetect:
         """Return a detector with the same loaded network and other heat map options."""
-        other = object.__new__(DeepDetect)
+        other = object.__new__(type(self))
         other.__dict__.update(self.__dict__, heatmap_options=heatmap_options)
         return other
 

@@ -259,7 +259,7 @@ class Run:
                 "profile": profile.packed(),
             }
 
-        kept = dict(self.cached("keypoints", (feature.detection, image), make))
+        kept: dict[str, Any] = dict(self.cached("keypoints", (feature.detection, image), make))
         profile = Profile.unpacked(kept.pop("profile"))
         width, height = kept.pop("image_size").tolist()
         return ImageKeypoints(Keypoints(image_size=(width, height), **kept), profile)

@@ -89,7 +89,7 @@ def test_random_points_differ_from_ours_in_nothing_but_their_places(scene, tmp_p
         expected /= np.linalg.norm(expected, axis=1, keepdims=True)
         np.testing.assert_allclose(its["descriptors"].T, expected, atol=1e-6)
     first, second = (both[1][f"{name}.jpg"]["keypoints"] for name in NAMES[:2])
-    assert np.abs(first - second).max() > 10  # other places in each photograph
+    assert np.abs(first[:100] - second[:100]).max() > 10  # other places in each photograph
     pairs = [("0004.jpg", "0005.jpg"), ("0005.jpg", "0006.jpg")]
     ratios = [agreement(scene, s, match_features(s, pairs)) for s in (ours, random)]
     assert min(ratios[0]) > max(ratios[1])
