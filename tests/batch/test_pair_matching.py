@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetectError, OptionError, PointDetector
+from deepdetect import DeepDetectError, Keypoints, OptionError, PointDetector
 from deepdetect.batch import PairMatchingOptions, extract_features, match_pairs
 from deepdetect.batch.pair_list import pair_name, read_pairs
-from deepdetect.batch.pair_matching import match_rows
+from deepdetect.batch.pair_matching import _match
 
 PAIR = ("a/00.png", "b/01.png")
 
@@ -165,11 +165,11 @@ def test_more_keypoints_than_int16_holds() -> None:
     many = generator.integers(0, 256, (40_000, 16), np.uint8)
     positions = generator.uniform(0, 500, (40_000, 2)).astype(np.float32)
     last = np.array([39_999, 39_998])
-    matches, scores = match_rows(
-        (positions[last], many[last]),
-        (positions, many),
-        PairMatchingOptions(matcher="exact"),
+    features0, features1 = (
+        Keypoints(positions[rows], np.ones(len(rows)), (501, 501), descriptors=many[rows])
+        for rows in (last, np.arange(len(many)))
     )
+    matches, scores = _match(features0, features1, PairMatchingOptions(matcher="exact"))
     assert matches.tolist() == last.tolist()
     assert scores.tolist() == [1, 1]
 
@@ -214,9 +214,9 @@ def test_features_that_do_not_fit_do_not_stop_the_others(tmp_path: Path) -> None
     report = match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5", workers=1)
     assert report.counts == {("good", "same"): 40}
     told = {failure.split(": ")[0]: failure for failure in report.failures}
-    assert "descriptors of good have 8 numbers, those of wide have 9" in told["good wide"]
-    assert "(40, 2) and descriptors of shape (8, 20)" in told["good few"]
-    assert "keypoints of shape (40,)" in told["good flat"]
+    assert "their descriptors differ" in told["good wide"]
+    assert "few is damaged" in told["good few"]
+    assert "flat is damaged" in told["good flat"]
     assert "no features of same/keypoints" in told["good same/keypoints"]
 
 
@@ -324,7 +324,7 @@ def test_features_that_are_no_numbers_do_not_stop_the_others(tmp_path: Path) -> 
     pairs = [("good", name) for name in ("same", "unknown")]
     report = match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5", workers=1)
     assert report.counts == {("good", "same"): 40}
-    assert "the features of unknown are not all finite numbers" in report.failures[0]
+    assert "unknown is damaged" in report.failures[0]
 
 
 def test_damaged_features_do_not_stop_the_others(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from .._shared.records import file_state
 from ..detector.detector import DeepDetect, check_selection, find_keypoints
 from ..detector.heatmap import MAX_AUTO_PIXELS
 from ..detector.point_detector import PointDetector
-from ..features.keypoints import Keypoints
+from ..features.keypoints import UNSET_ANGLE, Keypoints
 from ..features.selection import SelectionOptions
 from ..features.sift import describe_keypoints
 from ..io.image import find_images, load_image, luma
@@ -39,6 +39,9 @@ MIN_SHARDS = 256
 """Of a collection that has as many images, so that all workers have something to do."""
 
 DESCRIPTOR = "rootsift"
+
+ROOT_SIFT_NORM = 512
+"""Length of these as bytes."""
 
 
 @suggest_keywords
@@ -217,3 +220,40 @@ def feature_group(
     if keypoints.sizes is not None and keypoints.angles is not None:
         arrays |= {"scales": keypoints.sizes / 2, "oris": keypoints.angles}
     return Group(name, arrays, state, {"keypoints": {"uncertainty": np.float32(uncertainty)}})
+
+
+def keypoints_of(group: Any, descriptor_type: str | None = None) -> Keypoints:
+    """Return the keypoints in hloc's group of an image.
+
+    Args:
+        group: of an open file.
+        descriptor_type: "rootsift": descriptors become bytes again.
+
+    Raises:
+        ValueError, TypeError, KeyError, or what h5py raises: it holds something else.
+    """
+    arrays = {name: group[name][()] for name in group if name != "colors"}
+    xy = np.asarray(arrays["keypoints"], np.float32)
+    size, scales = arrays.get("image_size"), arrays.get("scales")
+    if size is None:  # the smallest that holds them
+        size = np.ceil(xy.max(axis=0, initial=0)) + 1
+    angles = arrays.get("oris")
+    if angles is not None:
+        angles = np.asarray(angles, np.float32)
+        angles = np.where(angles == UNSET_ANGLE, angles, angles % 360)
+    descriptors = arrays.get("descriptors")
+    if descriptors is not None:
+        descriptors = np.ascontiguousarray(descriptors.T, np.float32)
+        if not np.isfinite(descriptors).all():
+            raise ValueError("its descriptors are not all finite numbers")
+        if descriptor_type == DESCRIPTOR:
+            descriptors = np.rint(descriptors * ROOT_SIFT_NORM).clip(0, 255).astype(np.uint8)
+    return Keypoints(
+        xy,
+        arrays.get("scores", np.ones(len(xy), np.float32)),
+        (int(size[0]), int(size[1])),
+        sizes=None if scales is None else 2 * np.asarray(scales, np.float32),
+        angles=angles,
+        descriptors=descriptors,
+        descriptor_type=descriptor_type,
+    )

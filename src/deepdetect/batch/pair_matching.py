@@ -17,20 +17,19 @@ from .._shared.parallel import TaskMap
 from .._shared.progress import progress
 from .._shared.records import key
 from .._shared.registry import look_up
-from ..features.matchers import MATCHERS, get_matcher, match_descriptors
+from ..features.keypoints import Keypoints
+from ..features.matchers import MATCHERS, get_matcher
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
+from ..matching.unguided import match_features
 from .engines import get_engine
-from .extraction import DESCRIPTOR, shards_of
+from .extraction import DESCRIPTOR, keypoints_of, shards_of
 from .hdf5 import SETTINGS, Group, ShardedWriter, damaged, open_hdf5, state_of, write_groups
 from .pair_list import Pair, check_pairs, pair_name, read_pairs
 from .report import BatchReport
 
 PAIRS_PER_SHARD = 64
 """At most."""
-
-ROOT_SIFT_NORM = 512
-"""Length of RootSIFT descriptors as bytes."""
 
 MATCHERS_OF_FLOATS = {name: MATCHERS[name] for name in MATCHERS if name != "hamming"}
 """Features in files are no bits."""
@@ -217,23 +216,18 @@ def _match_shard(
 
     def groups() -> Iterator[Group]:
         with open_hdf5(features) as file:
-            first: tuple[str, Features] | None = None  # pairs are sorted by their first image
+            first: tuple[str, Keypoints] | None = None  # pairs are sorted by their first image
             for (name0, name1), state in pairs:
                 try:
                     if first is None or first[0] != name0:
                         first = name0, _read_features(file, name0)
                     features0, features1 = first[1], _read_features(file, name1)
-                    widths = features0[1].shape[1], features1[1].shape[1]
-                    if widths[0] != widths[1]:
-                        raise InvalidFileError(
-                            f"the descriptors of {name0} have {widths[0]} numbers, those of "
-                            f"{name1} have {widths[1]}: extract both alike"
-                        )
+                    if np.shape(features0.descriptors)[1:] != np.shape(features1.descriptors)[1:]:
+                        raise InvalidFileError("their descriptors differ: extract both alike")
                 except InvalidFileError as error:
                     failures.append(f"{name0} {name1}: {error}")
                     continue
-                scaled = any("scales" in file[name] for name in (name0, name1))
-                matches, scores = match_rows(features0, features1, options, scaled=scaled)
+                matches, scores = _match(features0, features1, options)
                 counts[name0, name1] = int(np.count_nonzero(matches >= 0))
                 arrays = {"matches0": matches, "matching_scores0": scores}
                 yield Group(pair_name(name0, name1), arrays, state)
@@ -242,87 +236,29 @@ def _match_shard(
     return counts, failures
 
 
-Features = tuple[np.ndarray, np.ndarray]
-
-
-def _read_features(file: Any, name: str) -> Features:
-    """Return positions (N, 2) and descriptors (N, D), as bytes where that is what they were."""
+def _read_features(file: Any, name: str) -> Keypoints:
+    ours = DESCRIPTOR in str(file.attrs.get(SETTINGS, ""))
     try:
-        keypoints = file[name]["keypoints"][()]
-        descriptors = file[name]["descriptors"][()]
-        shapes, kinds = (keypoints.shape, descriptors.shape), keypoints.dtype.kind
-        if (
-            not {kinds, descriptors.dtype.kind} <= set("fiu")
-            or keypoints.shape != (descriptors.shape[-1], 2)
-            or descriptors.ndim != 2
-        ):
-            raise InvalidFileError(
-                f"the features of {name} are keypoints of shape {shapes[0]} and descriptors of "
-                f"shape {shapes[1]}, not (N, 2) and (D, N) numbers: extract them again"
-            )
-        keypoints = keypoints.astype(np.float32)
-        descriptors = np.ascontiguousarray(descriptors.T, np.float32)
-    except InvalidFileError:
-        raise
+        return keypoints_of(file[name], DESCRIPTOR if ours else None)
     # h5py raises any of these, by what is damaged; a wrong shape asks for too much memory.
-    except (
-        OSError,
-        RuntimeError,
-        KeyError,
-        ValueError,
-        TypeError,
-        MemoryError,
-        IndexError,
-    ) as error:
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:
         raise damaged(Path(f"{file.filename}, {name}"), error) from error
-    if not (np.isfinite(keypoints).all() and np.isfinite(descriptors).all()):
-        raise InvalidFileError(
-            f"the features of {name} are not all finite numbers: extract them again"
-        )
-    if DESCRIPTOR in str(file.attrs.get(SETTINGS, "")):
-        descriptors = np.rint(descriptors * ROOT_SIFT_NORM).clip(0, 255).astype(np.uint8)
-    return keypoints, descriptors
 
 
-def match_rows(
-    features0: Features,
-    features1: Features,
-    options: PairMatchingOptions = PairMatchingOptions(),
-    *,
-    scaled: bool = False,
+def _match(
+    features0: Keypoints, features1: Keypoints, options: PairMatchingOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match the features of two images.
-
-    Args:
-        features0, features1: positions (N, 2) in pixels, and descriptors (N, D) uint8 or float32.
-        options: how.
-        scaled: keypoints have sizes of their own, as points do and dense keypoints do not.
-
-    Returns:
-        (N0,) int32 rows of the second image, -1 where there is no match, and (N0,) float32 scores.
-
-    Example:
-        >>> features = np.array([[1, 2], [3, 4], [5, 6]], np.float32), np.eye(3, dtype=np.float32)
-        >>> match_rows(features, (features[0], features[1][::-1]))[0].tolist()
-        [2, 1, 0]
-    """
-    found = match_descriptors(
-        features0[1],
-        features1[1],
-        get_matcher(options.matcher),
-        ratio=options.ratio,
-        mutual=options.mutual,
-        seed=options.seed,
-        positions=None if scaled else (features0[0], features1[0]),
-    )
-    rows0, rows1, ratios = found.indices0, found.indices1, found.ratios
+    """Return (N0,) int32 rows of the second image, -1 without a match, and (N0,) float32 scores."""
+    how = {name: getattr(options, name) for name in ("matcher", "ratio", "mutual", "seed")}
+    found = match_features(features0, features1, **how)
+    kept = found.inliers
     if options.verify != "none":
-        how = GeometryOptions(inlier_threshold=options.inlier_threshold)
+        geometry = GeometryOptions(inlier_threshold=options.inlier_threshold)
         kept = estimate_geometry(
-            features0[0][rows0], features1[0][rows1], options.verify, seed=options.seed, options=how
+            found.points0, found.points1, options.verify, seed=options.seed, options=geometry
         ).inliers
-        rows0, rows1, ratios = rows0[kept], rows1[kept], ratios[kept]
-    matches = np.full(len(features0[0]), -1, np.int32)
-    scores = np.zeros(len(features0[0]), np.float32)
-    matches[rows0], scores[rows0] = rows1, 1 - ratios
+    matches = np.full(len(features0), -1, np.int32)
+    scores = np.zeros(len(features0), np.float32)
+    rows = found.indices0[kept]
+    matches[rows], scores[rows] = found.indices1[kept], found.scores[kept]
     return matches, scores

@@ -11,13 +11,13 @@ import numpy as np
 
 from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
-from ..batch.extraction import extract_features
+from ..batch.extraction import extract_features, keypoints_of
 from ..batch.hdf5 import import_h5py, open_hdf5
 from ..batch.pair_list import read_pairs
 from ..batch.pair_matching import match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
-from ..features.keypoints import UNSET_ANGLE, Keypoints
+from ..features.keypoints import Keypoints
 from ..features.matches import Matches
 from ..io.image import find_images
 from ..io.tables import load_keypoints, load_matches
@@ -95,7 +95,7 @@ def read_features_file(path: Path) -> dict[str, Keypoints]:
         file.visititems(note)
         for name in sorted(names):
             try:
-                found[name] = _features(file[name])
+                found[name] = keypoints_of(file[name])
             except (OptionError, ValueError, TypeError) as error:
                 reason = str(error).splitlines()[0]
                 raise InvalidFileError(
@@ -104,29 +104,6 @@ def read_features_file(path: Path) -> dict[str, Keypoints]:
     if not found:
         raise InvalidFileError(f"{path} holds no features: give a file of deepdetect extract")
     return found
-
-
-def _features(group: Any) -> Keypoints:
-    """Return the keypoints in hloc's group of an image."""
-    arrays = {name: group[name][()] for name in group}
-    xy = np.asarray(arrays["keypoints"], np.float32).reshape(-1, 2)
-    scores = arrays.get("scores")
-    size = arrays.get("image_size")
-    if size is None:  # the smallest that holds them
-        size = np.ceil(xy.max(axis=0, initial=0)) + 1
-    descriptors, scales = arrays.get("descriptors"), arrays.get("scales")
-    angles = arrays.get("oris")
-    if angles is not None:
-        angles = np.asarray(angles, np.float32)
-        angles = np.where(angles == UNSET_ANGLE, angles, angles % 360)
-    return Keypoints(
-        xy,
-        np.ones(len(xy), np.float32) if scores is None else scores,
-        (int(size[0]), int(size[1])),
-        sizes=None if scales is None else 2 * np.asarray(scales, np.float32),
-        angles=angles,
-        descriptors=None if descriptors is None else np.ascontiguousarray(descriptors.T),
-    )
 
 
 def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pair, PairMatches]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,51 +90,36 @@ class SparseModel:
         return np.bincount(self.seen.points, minlength=len(self.points))
 
 
-def verify_pairs(
-    database: Path, seed: int = 0, verified: Callable[[int], object] = lambda count: None
-) -> dict[Pair, int]:
+def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
     """Estimate the two-view geometries of matched pairs, and store them in the database.
 
     Args:
         database: with matches.
         seed: of the random samples.
-        verified: called with 1 after each pair.
+        workers: number of threads; None: one per processor.
 
     Returns:
         The number of matches that agree with its geometry, of each pair where enough do.
     """
-    found: dict[Pair, int] = {}
-    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(database) as opened:
-        how = pycolmap.TwoViewGeometryOptions()
-        how.min_num_inliers = MIN_VERIFIED
+    with quiet_pycolmap() as pycolmap:
+        how = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_VERIFIED)
         how.ransac.max_error = MAX_VERIFICATION_ERROR_PX
         how.ransac.random_seed = seed
-        images = {image.image_id: image for image in opened.read_all_images()}
-        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-        xy = {
-            number: np.asarray(opened.read_keypoints(number), np.float64)[:, :2]
-            for number in images
-        }
-        for identifier, matches in zip(*opened.read_all_matches(), strict=True):
-            pair = pycolmap.pair_id_to_image_pair(identifier)
-            views = [
-                argument
-                for number in pair
-                for argument in (cameras[images[number].camera_id], xy[number])
-            ]
-            geometry = pycolmap.estimate_two_view_geometry(*views, matches, how)
-            opened.write_two_view_geometry(*pair, geometry)
-            if len(geometry.inlier_matches):
-                names = images[pair[0]].name, images[pair[1]].name
-                found[names] = len(geometry.inlier_matches)
-            verified(1)
-    return found
+        verifier = pycolmap.GeometricVerifierOptions(num_threads=workers or -1)
+        pairing = pycolmap.ExistingMatchedPairingOptions()
+        pycolmap.geometric_verification(database, verifier, pairing, how)
+        with pycolmap.Database.open(database) as opened:
+            names = {image.image_id: image.name for image in opened.read_all_images()}
+            numbers = zip(*opened.read_two_view_geometry_num_inliers(), strict=True)
+            pairs = [(pycolmap.pair_id_to_image_pair(pair), count) for pair, count in numbers]
+    return {(names[a], names[b]): count for (a, b), count in pairs if count >= MIN_VERIFIED}
 
 
 def map_images(
     database: Path,
     folder: Path,
     workspace: Path,
+    verified: Iterable[Pair],
     known_cameras: bool,
     seed: int = 0,
     registered: Callable[[int], object] = lambda count: None,
@@ -145,6 +130,7 @@ def map_images(
         database: with verified matches.
         folder: of the images.
         workspace: an empty folder, for COLMAP's own files.
+        verified: pairs with enough matches that agree with a geometry.
         known_cameras: whether the intrinsics stay as they are.
         seed: of all random choices.
         registered: called with the number of images that were added.
@@ -166,7 +152,6 @@ def map_images(
         if known_cameras:
             how.ba_refine_focal_length = False
             how.ba_refine_extra_params = False
-        verified = _verified_pairs(pycolmap, database)
         found: list[Any] = []
         for forward in (False, True):
             if forward:
@@ -182,15 +167,15 @@ def map_images(
                 initial_image_pair_callback=lambda: registered(2),
                 next_image_callback=lambda: registered(1),
             )
-            attempt = sorted(models.values(), key=lambda model: -model.num_reg_images())
-            if _largest(attempt) > _largest(found):
+            attempt = sorted(models.values(), key=_size, reverse=True)
+            if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
             # What is left may be more than the model: a drive beside some images of a house.
             mapped = frozenset[str]().union(*map(_names, found))
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
-            if found and largest_component(left) <= _largest(found):
+            if found and largest_component(left) <= _size(found[0]):
                 break
-    if not found or found[0].num_reg_images() < MIN_VIEWS:
+    if not found or _size(found[0]) < MIN_VIEWS:
         raise NoDepthError(
             "the images do not hang together: take them so that each shows most of what the "
             "one before shows, from another place"
@@ -198,22 +183,8 @@ def map_images(
     return found[0], [_names(model) for model in found[1:]]
 
 
-def _largest(models: Sequence[Any]) -> int:
-    """Return the number of images of the first of some models, the largest ones first."""
-    return models[0].num_reg_images() if models else 0
-
-
-def _verified_pairs(pycolmap: Any, database: Path) -> list[Pair]:
-    """Return the names of the pairs with enough matches that agree with their geometry."""
-    with pycolmap.Database.open(database) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        found = zip(*opened.read_two_view_geometry_num_inliers(), strict=True)
-        pairs = [
-            pycolmap.pair_id_to_image_pair(number)
-            for number, count in found
-            if count >= MIN_VERIFIED
-        ]
-    return [(names[first], names[second]) for first, second in pairs]
+def _size(model: Any) -> int:
+    return int(model.num_reg_images())
 
 
 def _names(model: Any) -> frozenset[str]:
@@ -253,21 +224,14 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
         xy[rows_in] = own.to_pinhole(xy[rows_in])
     points = np.array([model.points3D[number].xyz for number in numbers]).reshape(-1, 3)
     seen = Observations(seen_points, seen_in, xy, keypoints)
-    errors = _mean_errors(points, views, seen)
-    return SparseModel(views, intrinsics, points, errors, seen)
-
-
-def _mean_errors(
-    points: np.ndarray, views: Mapping[int, PosedView], seen: Observations
-) -> np.ndarray:
-    """Return the mean distance of each point's projections from where it is seen, in pixels."""
-    distances = np.empty(len(seen.xy))
+    distances = np.empty(len(xy))
     for number, view in views.items():
-        own = np.flatnonzero(seen.views == number)
-        projected = view.project(points[seen.points[own]])[0]
-        distances[own] = np.linalg.norm(projected - seen.xy[own], axis=1)
-    sums = np.bincount(seen.points, distances, minlength=len(points))
-    return sums / np.maximum(np.bincount(seen.points, minlength=len(points)), 1)
+        rows_in = seen_in == number
+        projected = view.project(points[seen_points[rows_in]])[0]
+        distances[rows_in] = np.linalg.norm(projected - xy[rows_in], axis=1)
+    counts = np.bincount(seen_points, minlength=len(points))
+    errors = np.bincount(seen_points, distances, minlength=len(points)) / np.maximum(counts, 1)
+    return SparseModel(views, intrinsics, points, errors, seen)
 
 
 def adjust(model: Any, known_cameras: bool) -> None:
@@ -290,14 +254,10 @@ def adjust(model: Any, known_cameras: bool) -> None:
         model.update_point_3d_errors()
 
 
-def normalise_model(model: Any) -> str:
-    """Bring a model into the frame of a camera in its middle; 1 is the spacing of its cameras.
+def normalise_model(model: Any) -> None:
+    """Bring a `pycolmap.Reconstruction` into the frame of the camera that sees most points.
 
-    Args:
-        model: a `pycolmap.Reconstruction`, which is changed.
-
-    Returns:
-        Name of the image whose camera it is: the one that sees most points.
+    1 is the spacing of its cameras.
     """
     sparse = read_sparse_model(model)
     seen = np.bincount(sparse.seen.views)
@@ -310,7 +270,6 @@ def normalise_model(model: Any) -> str:
                 scale, pycolmap.Rotation3d(view.rotation), scale * np.asarray(view.translation)
             )
         )
-    return view.name
 
 
 def camera_spacing(views: Sequence[PosedView]) -> float:

@@ -237,8 +237,7 @@ class Stages:
         with atomic_path(self.output / "database.db") as path:
             path.unlink()
             write_database(path, images, matches)
-            with progress(len(matches), "verifying", "pair", self.quiet) as bar:
-                verified = verify_pairs(path, self.seed, bar.update)
+            verified = verify_pairs(path, self.seed, self.workers)
         space = self.work / "mapping"
         shutil.rmtree(space, ignore_errors=True)
         space.mkdir()
@@ -247,6 +246,7 @@ class Stages:
                 self.output / "database.db",
                 folder,
                 space,
+                verified,
                 known,
                 self.seed,
                 # Those of an attempt that is given up are counted again in the next.
