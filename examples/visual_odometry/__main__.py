@@ -26,6 +26,7 @@ from deepdetect import Camera, DeepDetectError, Keypoints, load_image
 from deepdetect.geometry.relative_pose import rotation_angle
 from deepdetect.io.image import find_images, luma
 from deepdetect.tracking import Tracker, TrackingOptions, point_candidates
+from deepdetect.tracking.tracker import CANDIDATES
 
 SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's own, 100 to 800 m, are longer than a clip
 COLORS = {"DeepDetect": "C0", "SIFT": "C1", "ORB": "C2"}
@@ -35,7 +36,7 @@ HEADER = "method               frames    end %    mean %   end °/m  segments % 
 def methods(count: int) -> dict[str, Callable[[np.ndarray], Keypoints]]:
     """Return what finds keypoints of an RGB image, by name."""
     options = TrackingOptions(max_keypoints=count)
-    sift, orb = (make(options.candidates * count) for make in (cv2.SIFT_create, cv2.ORB_create))
+    sift, orb = (make(CANDIDATES * count) for make in (cv2.SIFT_create, cv2.ORB_create))
 
     def opencv(feature: cv2.Feature2D, rgb: np.ndarray) -> Keypoints:
         points = feature.detect(luma(rgb), None)

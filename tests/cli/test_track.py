@@ -120,7 +120,6 @@ def test_recordings_of_a_camera_are_kept(run, tmp_path: Path, monkeypatch) -> No
         ("text.mp4", "is no video"),
         ("{frames} -o a.gif", "must end in"),
         ("{frames} --every 0", "--every"),
-        ("{frames} --window-px 4", "--window-px must be odd"),
         ("{frames} --max-side 3", "--max-side"),
         ("{frames}/0.png", "one image"),
     ],

@@ -56,8 +56,7 @@ def test_positions_are_of_the_frame_not_of_the_small_one(frame_folder) -> None:
         return Keypoints([[0, 0], [width - 1, height - 1]], [1, 1], (width, height))
 
     with FrameSource(frame_folder, max_frames=1) as source:
-        options = TrackingOptions(border_px=0)
-        ((_, found),) = track_frames(source, Tracker(corners, options), max_side=160)
+        ((_, found),) = track_frames(source, Tracker(corners), max_side=160)
     np.testing.assert_allclose(found.xy, [[0.5, 0.5], [318.5, 238.5]])
 
 

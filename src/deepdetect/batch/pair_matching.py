@@ -222,7 +222,8 @@ def _match_shard(
                     if first is None or first[0] != name0:
                         first = name0, _read_features(file, name0)
                     features0, features1 = first[1], _read_features(file, name1)
-                    if np.shape(features0.descriptors)[1:] != np.shape(features1.descriptors)[1:]:
+                    both = features0.descriptors, features1.descriptors
+                    if len({np.asarray(each).shape[-1:] for each in both}) > 1:
                         raise InvalidFileError("their descriptors differ: extract both alike")
                 except InvalidFileError as error:
                     failures.append(f"{name0} {name1}: {error}")

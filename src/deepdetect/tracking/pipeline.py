@@ -20,7 +20,7 @@ from .._shared.signals import ENDING, exit_by_signal, handle_signals
 from ..detector.detector import Detector
 from ..detector.point_detector import PointDetector
 from .frames import FrameSource
-from .tracker import Detect, Tracker, TrackingOptions
+from .tracker import CANDIDATES, Detect, Tracker, TrackingOptions
 from .tracks import TrackedFrame, write_tracks
 from .video import TrackDrawer, check_video_name, write_video
 
@@ -61,7 +61,7 @@ class TrackingReport:
 
 def point_candidates(options: TrackingOptions = TrackingOptions()) -> Detect:
     """Return what finds the best points of a frame, as a `Tracker` wants it."""
-    return PointDetector(options.candidates * options.max_keypoints).detect
+    return PointDetector(CANDIDATES * options.max_keypoints).detect
 
 
 @suggest_keywords
@@ -148,14 +148,14 @@ def track(
         detect = point_candidates(options) if detector is None else detector.detect
         tracker = Tracker(detect, options)
         stopped = stack.enter_context(_ended_by_signals(opened.live))
-        writer = stack.enter_context(write_tracks(table))
+        write = stack.enter_context(write_tracks(table))
         drawn: Any = None
         if video is not None:
             drawn = stack.enter_context(write_video(video, opened.fps))
         drawer, ticks = TrackDrawer(tail), deque([begun], RATE_FRAMES + 1)
         bar = stack.enter_context(progress(opened.count, "tracking", "frame", quiet))
         for rgb, frame in track_frames(opened, tracker, max_side=max_side):
-            writer.write(frame)
+            write(frame)
             ticks.append(time.perf_counter())
             rate = (len(ticks) - 1) / max(1e-9, ticks[-1] - ticks[0])
             if drawn is not None:

@@ -26,6 +26,32 @@ Detect = Callable[[np.ndarray], Keypoints]
 """Keypoints of a (H, W, 3) uint8 RGB image."""
 
 
+CANDIDATES = 3
+"""Keypoints that are detected for each track that is wanted: the best well apart are taken."""
+
+MIN_DISTANCE_PX = 8.0
+"""Smallest distance of a new point from all tracks."""
+
+WINDOW_PX = 21
+"""Side of the patch that is followed."""
+
+PYRAMID_LEVELS = 4
+"""Images, each half as large as the one before, on which a point is looked for: the more, the
+farther it may move."""
+
+MAX_ITERATIONS = 30
+"""Largest number of steps on each level."""
+
+MIN_STEP_PX = 0.01
+"""A smaller step ends the iterations."""
+
+MIN_EIGENVALUE = 1e-4
+"""Smallest of the patch's gradients (OpenCV's minEigThreshold): flat patches are not followed."""
+
+BORDER_PX = 2.0
+"""Points nearer to the border of the image are dropped."""
+
+
 @suggest_keywords
 @dataclass(frozen=True)
 class TrackingOptions:
@@ -33,57 +59,32 @@ class TrackingOptions:
 
     Attributes:
         max_keypoints: tracks at a time.
-        candidates: keypoints that are detected for each track that is wanted: the best of them that
-            are well apart are taken.
         detect_every: new points are looked for after this many frames, or earlier where many tracks
             are lost.
         min_kept: share of the tracks after the last search; with fewer, new points are looked for
             at once.
-        min_distance_px: smallest distance of a new point from all tracks.
-        window_px: side of the patch that is followed, odd.
-        pyramid_levels: number of images, each half as large as the one before, on which a point is
-            looked for: the more, the farther it may move.
-        max_iterations: largest number of steps on each level.
-        min_step_px: a smaller step ends the iterations.
         max_return_error_px: largest distance of a point from where it is found when it is followed
             back.
-        min_eigenvalue: smallest eigenvalue of the patch's gradients, as OpenCV's minEigThreshold:
-            flat patches cannot be followed.
-        border_px: points nearer to the border of the image are dropped.
 
     Raises:
         OptionError: a value is out of its range.
     """
 
     max_keypoints: int = 1000
-    candidates: int = 3
     detect_every: int = 5
     min_kept: float = 0.4
-    min_distance_px: float = 8.0
-    window_px: int = 21
-    pyramid_levels: int = 4
-    max_iterations: int = 30
-    min_step_px: float = 0.01
     max_return_error_px: float = 0.5
-    min_eigenvalue: float = 1e-4
-    border_px: float = 2.0
 
     def __post_init__(self) -> None:
         check_ranges(
             self,
-            positive=(
-                *("max_keypoints", "candidates", "detect_every", "max_iterations", "min_step_px"),
-            ),
-            not_negative=("min_distance_px", "max_return_error_px", "min_eigenvalue", "border_px"),
+            positive=("max_keypoints", "detect_every"),
+            not_negative=("max_return_error_px",),
             fractions=("min_kept",),
-            between={"window_px": (3, 101), "pyramid_levels": (1, 10)},
         )
-        whole = ("max_keypoints", "candidates", "detect_every", "max_iterations", "pyramid_levels")
-        for name in whole:
+        for name in ("max_keypoints", "detect_every"):
             if getattr(self, name) % 1:
                 raise OptionError(f"`{name}` must be a whole number, not {getattr(self, name)}")
-        if self.window_px % 2 != 1:
-            raise OptionError(f"`window_px` must be odd, not {self.window_px}")
 
 
 class Tracker:
@@ -170,23 +171,22 @@ class Tracker:
 
     def _follow(self, gray: np.ndarray) -> None:
         """Move the points to where the next frame shows them; drop those that are lost."""
-        options = self.options
         assert self._gray is not None
         there, errors = track_round_trip(
             self._gray,
             gray,
             self._xy,
-            options.window_px,
-            levels=options.pyramid_levels - 1,
-            iterations=options.max_iterations,
-            step_px=options.min_step_px,
-            min_eigenvalue=options.min_eigenvalue,
+            WINDOW_PX,
+            levels=PYRAMID_LEVELS - 1,
+            iterations=MAX_ITERATIONS,
+            step_px=MIN_STEP_PX,
+            min_eigenvalue=MIN_EIGENVALUE,
             back_to_start=True,
         )
         assert self._size is not None
-        low, high = options.border_px, np.array(self._size) - 1 - options.border_px
+        low, high = BORDER_PX, np.array(self._size) - 1 - BORDER_PX
         kept = (
-            (errors <= options.max_return_error_px)
+            (errors <= self.options.max_return_error_px)
             & (there >= low).all(axis=1)
             & (there <= high).all(axis=1)
         )
@@ -196,10 +196,8 @@ class Tracker:
 
     def _add(self, keypoints: Keypoints) -> None:
         """Begin tracks with the best keypoints that are far enough from all tracks."""
-        options = self.options
-        assert self._size is not None
-        room = options.max_keypoints - len(self._xy)
-        rows = free_keypoints(keypoints, self._xy, options.min_distance_px, room)
+        room = self.options.max_keypoints - len(self._xy)
+        rows = free_keypoints(keypoints, self._xy, MIN_DISTANCE_PX, room)
         count = len(rows)
         self._tracks = np.append(self._tracks, np.arange(count) + self._next_track)
         self._next_track += count

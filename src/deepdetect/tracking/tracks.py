@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
@@ -56,28 +55,15 @@ class TrackedFrame:
         return int(np.count_nonzero(self.ages == 0))
 
 
-class TracksWriter:
-    """Writes the table of tracks frame by frame: columns frame, track, x, y and score."""
-
-    def __init__(self, file: TextIO) -> None:
-        self._file = file
-        file.write(f"{HEADER}\n")
-
-    def write(self, frame: TrackedFrame) -> None:
-        """Write the rows of a frame."""
-        columns = zip(frame.tracks.tolist(), frame.xy.tolist(), frame.scores.tolist(), strict=True)
-        self._file.writelines(
-            f"{frame.number},{track},{x:.3f},{y:.3f},{score:.6g}\n"
-            for track, (x, y), score in columns
-        )
-
-
 @contextmanager
-def write_tracks(path: str | Path) -> Iterator[TracksWriter]:
+def write_tracks(path: str | Path) -> Iterator[Callable[[TrackedFrame], None]]:
     """Open a CSV file of tracks, which appears when the block ends, whole or not at all.
 
     Args:
         path: ending in .csv.
+
+    Yields:
+        What writes the rows of a frame: columns frame, track, x, y and score.
 
     Raises:
         OptionError: the ending is another.
@@ -86,7 +72,16 @@ def write_tracks(path: str | Path) -> Iterator[TracksWriter]:
     if Path(path).suffix.lower() != ".csv":
         raise OptionError(f"{path} must end in .csv")
     with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
-        yield TracksWriter(file)
+        file.write(f"{HEADER}\n")
+
+        def write(frame: TrackedFrame) -> None:
+            rows = zip(frame.tracks.tolist(), frame.xy.tolist(), frame.scores.tolist(), strict=True)
+            file.writelines(
+                f"{frame.number},{track},{x:.3f},{y:.3f},{score:.6g}\n"
+                for track, (x, y), score in rows
+            )
+
+        yield write
 
 
 @suggest_keywords
@@ -101,26 +96,9 @@ def save_tracks(frames: Iterable[TrackedFrame], path: str | Path) -> None:
         OptionError: the ending is another.
         DeepDetectError: the file cannot be written.
     """
-    with write_tracks(path) as writer:
+    with write_tracks(path) as write:
         for frame in frames:
-            writer.write(frame)
-
-
-def read_table(file: TextIO, columns: int, delimiter: str | None = None) -> np.ndarray:
-    """Read the rest of a text file as rows of so many numbers; there may be none.
-
-    Raises:
-        ValueError: a row has something else.
-    """
-    begin = file.tell()
-    empty = not file.readline().strip()  # of which NumPy warns
-    file.seek(begin)
-    if empty:
-        return np.empty((0, columns))
-    table = np.loadtxt(file, delimiter=delimiter, ndmin=2)
-    if table.shape[1] != columns:
-        raise ValueError(f"its lines have {table.shape[1]} numbers, not {columns}")
-    return table
+            write(frame)
 
 
 @suggest_keywords
@@ -145,7 +123,8 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
         with Path(path).open(encoding="ascii") as file:
             if file.readline().strip() != HEADER:
                 raise ValueError(f"its first line is not {HEADER}")
-            table = read_table(file, len(HEADER.split(",")), delimiter=",")
+            lines = [line.split(",") for line in file]
+            table = np.array(lines, float).reshape(len(lines), len(HEADER.split(",")))
             if not np.isfinite(table).all():
                 raise ValueError("a number is not finite")
     except FileNotFoundError:
@@ -159,15 +138,16 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
     numbers, begins = np.unique(table[:, 0].astype(np.int64), return_index=True)
     born: dict[int, int] = {}
     frames = []
-    for place, (number, rows) in enumerate(zip(numbers, np.split(table, begins[1:]), strict=True)):
-        tracks = rows[:, 1].astype(np.int64)
+    parts = np.split(table, begins[1:])
+    for place, (number, part) in enumerate(zip(numbers, parts, strict=True)):
+        tracks = part[:, 1].astype(np.int64)
         ages = np.array([place - born.setdefault(track, place) for track in tracks.tolist()])
         frames.append(
             TrackedFrame(
                 int(number),
                 tracks,
-                rows[:, 2:4].astype(np.float32),
-                rows[:, 4].astype(np.float32),
+                part[:, 2:4].astype(np.float32),
+                part[:, 4].astype(np.float32),
                 ages,
             )
         )
