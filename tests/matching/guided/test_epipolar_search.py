@@ -39,7 +39,7 @@ def random_pair(count: int, seed: int = 0) -> tuple[Keypoints, Keypoints]:
 def by_loops(first: Keypoints, second: Keypoints) -> list[tuple]:
     """Search as the documentation says it, one keypoint at a time; lines are the rows."""
     a, b = first.descriptors.astype(float), second.descriptors.astype(float)
-    distance = np.linalg.norm(a[:, None] - b[None], axis=2)
+    distance = np.stack([np.linalg.norm(one - b, axis=1) for one in a])
     near = np.abs(first.xy[:, None, 1] - second.xy[None, :, 1]) < module.MAX_DISTANCE_PX
     inside, outside = np.where(near, distance, np.inf), np.where(near, np.inf, distance)
     found = []
