@@ -6,7 +6,7 @@ import inspect
 import math
 import pkgutil
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,52 +14,7 @@ import pytest
 
 import deepdetect
 from deepdetect._shared.errors import OptionError
-from deepdetect._shared.options import check_ranges, replace_options, suggest_keywords
-
-
-@dataclass(frozen=True)
-class Inner:
-    depth: int = 1
-    name: str = "inner"
-
-
-@dataclass(frozen=True)
-class Outer:
-    name: str = "outer"
-    inner: Inner = field(default_factory=Inner)
-    plain: int = 2
-
-    def __post_init__(self) -> None:
-        if self.plain < 0:
-            raise OptionError(f"plain must be 0 or more, not {self.plain}")
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({}, Outer()),
-        ({"plain": 5}, Outer(plain=5)),
-        ({"depth": 7}, Outer(inner=Inner(depth=7))),
-        ({"depth": 7, "plain": 5}, Outer(inner=Inner(depth=7), plain=5)),
-        ({"inner": Inner(9, "x")}, Outer(inner=Inner(9, "x"))),
-        # A name that both have is the outer one's.
-        ({"name": "new"}, Outer(name="new")),
-        # New inner options and a value of theirs: both hold.
-        ({"inner": Inner(name="x"), "depth": 7}, Outer(inner=Inner(7, "x"))),
-    ],
-)
-def test_replace_options(changes: dict[str, object], expected: Outer) -> None:
-    options = Outer()
-    assert replace_options(options, **changes) == expected
-    assert options == Outer()
-
-
-@pytest.mark.parametrize(
-    ("given", "meant"), [("plane", "plain"), ("dept", "depth"), ("iner", "inner")]
-)
-def test_an_unknown_name(given: str, meant: str) -> None:
-    with pytest.raises(OptionError, match=f"unknown option '{given}': did you mean '{meant}'"):
-        replace_options(Outer(), **{given: 1})
+from deepdetect._shared.options import check_ranges, suggest_keywords
 
 
 def test_a_decorated_function_suggests_the_right_keyword() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import multiprocessing
 import pickle
 from collections.abc import Iterable
@@ -15,7 +16,6 @@ from torch import Tensor  # noqa: E402
 from torch.utils.data import DataLoader  # noqa: E402
 
 from deepdetect import ImageError  # noqa: E402
-from deepdetect._shared.options import replace_options  # noqa: E402
 from deepdetect.io.image import luma  # noqa: E402
 from deepdetect.labels import LabelOptions, visibility_of  # noqa: E402
 from deepdetect.training.dataset import (  # noqa: E402
@@ -122,7 +122,7 @@ def _found(image: np.ndarray, mask: np.ndarray, view: np.ndarray, label: np.ndar
 
 def test_mirrors_come_only_when_asked_for(source: FolderSource) -> None:
     """Without flips and transpositions each crop is a part of a view as it is."""
-    options = replace_options(OPTIONS, flips=False, transpositions=False)
+    options = dataclasses.replace(OPTIONS, flips=False, transpositions=False)
     views = all_views(source)
     for image in batches(source, options, first=1, last=2)[0][0]:
         assert any(
@@ -168,7 +168,9 @@ def test_all_mirrors_come_when_asked_for(flips: bool, transpositions: bool, coun
 
 def test_dark_crops_keep_their_luma_to_the_level(source: FolderSource) -> None:
     plain, gray = (
-        batches(source, replace_options(OPTIONS, dark_fraction=1.0, color_jitter=share), last=1)[0]
+        batches(
+            source, dataclasses.replace(OPTIONS, dark_fraction=1.0, color_jitter=share), last=1
+        )[0]
         for share in (0.0, 1.0)
     )
     for image, other in zip(plain[0], gray[0], strict=True):
@@ -177,7 +179,7 @@ def test_dark_crops_keep_their_luma_to_the_level(source: FolderSource) -> None:
 
 
 def test_colors_change_and_labels_do_not(source: FolderSource) -> None:
-    colored = replace_options(OPTIONS, color_jitter=1.0)
+    colored = dataclasses.replace(OPTIONS, color_jitter=1.0)
     gray = 0
     for (images, masks), (others, same_masks) in zip(
         batches(source, last=4), batches(source, colored, last=4), strict=True
@@ -190,7 +192,7 @@ def test_colors_change_and_labels_do_not(source: FolderSource) -> None:
 
 
 def test_a_stage_can_take_some_views_only(source: FolderSource) -> None:
-    options = replace_options(OPTIONS, stages=(Stage(64, 12, 1, sides=(64,)),))
+    options = dataclasses.replace(OPTIONS, stages=(Stage(64, 12, 1, sides=(64,)),))
     small = [view for view, _ in all_views(source) if min(view.shape[:2]) == 64]
     for image in batches(source, options)[0][0]:
         turned = (image, image.transpose(1, 0, 2))
@@ -204,7 +206,7 @@ def test_a_stage_can_take_some_views_only(source: FolderSource) -> None:
 
 
 def test_interleaved_batches_are_those_of_the_stages_in_turn(source: FolderSource) -> None:
-    mixed = batches(source, replace_options(OPTIONS, interleave=True))
+    mixed = batches(source, dataclasses.replace(OPTIONS, interleave=True))
     sums = sorted(int(images.sum()) for images, _ in mixed)
     assert sums == sorted(int(images.sum()) for images, _ in batches(source))
     sizes = [len(masks[0]) for _, masks in mixed]

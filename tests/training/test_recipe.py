@@ -1,11 +1,11 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 
 from deepdetect._shared.errors import OptionError
-from deepdetect._shared.options import replace_options
 from deepdetect.cli._options import chosen_recipe
 from deepdetect.labels import LabelOptions, find_label_settings
 from deepdetect.training.recipe import (
@@ -53,7 +53,7 @@ def test_bad_options_are_refused(bad: dict) -> None:
 
 def test_an_unknown_option_names_the_nearest() -> None:
     with pytest.raises(OptionError, match="did you mean 'learning_rate'"):
-        replace_options(TrainingOptions(), learning_rat=1)
+        dataclasses.replace(TrainingOptions(), learning_rat=1)
 
 
 def test_the_papers_recipe() -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect import OptionError
-from deepdetect._shared.options import replace_options
 from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.sampler import CropSampler, Schedule, epoch_order
 
@@ -71,7 +72,7 @@ def test_crops_are_counted() -> None:
 def test_interleaved_stages_advance_together(photos: int, stages: list[tuple[int, int]]) -> None:
     made = tuple(Stage(16, batch, epochs) for batch, epochs in stages)
     options = TrainingOptions(stages=made, short_sides=(16,))
-    mixed = Schedule(replace_options(options, interleave=True), photos)
+    mixed = Schedule(dataclasses.replace(options, interleave=True), photos)
     plain = Schedule(options, photos)
     positions = [mixed.position(step) for step in range(mixed.steps)]
     expected = [plain.position(step) for step in range(plain.steps)]

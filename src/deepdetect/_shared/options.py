@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import inspect
 import math
@@ -12,7 +11,6 @@ from typing import Any, ParamSpec, TypeVar
 
 from .errors import OptionError, unknown_name
 
-Options = TypeVar("Options")
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
@@ -99,65 +97,10 @@ def check_ranges(
             raise OptionError(f"`{name}` must {expected}, not {value}")
 
 
-def _numbers(value: object) -> list[float]:
+def _numbers(value: object) -> list[Any]:
     """Return a number, or those of nested tuples; NaN for anything else."""
     if isinstance(value, tuple):
         return [number for one in value for number in _numbers(one)]
     if not isinstance(value, Real):
         return [math.nan]
-    try:
-        return [float(value)]
-    except OverflowError:  # an integer of over 308 digits, which is in no range
-        return [math.nan]
-
-
-def replace_options(options: Options, **changes: Any) -> Options:
-    """Return options with some values replaced, including those of nested options.
-
-    Args:
-        options: a frozen dataclass, some of whose fields may be such dataclasses.
-        changes: new values by field name.
-
-    Raises:
-        OptionError: a name is unknown (the nearest right one is suggested), or a value is not
-            valid.
-
-    Example:
-        >>> from deepdetect.geometry import GeometryOptions
-        >>> replace_options(GeometryOptions(), estimator="ransac").estimator
-        'ransac'
-        >>> replace_options(GeometryOptions(), estimater="ransac")
-        Traceback (most recent call last):
-        ...
-        deepdetect.OptionError: unknown option 'estimater': did you mean 'estimator'? \
-(known: estimator, inlier_threshold, homography, camera0, camera1, confidence, iterations)
-    """
-    names = option_names(options)
-    for name in changes:
-        if name not in names:
-            raise unknown_name("option", name, names)
-    return _rebuild(options, changes)
-
-
-def option_names(options: Any) -> list[str]:
-    """List the names that `replace_options` accepts for these options, outer ones first."""
-    fields = [field.name for field in dataclasses.fields(options) if field.init]
-    inner = [getattr(options, name) for name in fields]
-    nested = [option_names(value) for value in inner if dataclasses.is_dataclass(value)]
-    return list(dict.fromkeys(fields + [name for names in nested for name in names]))
-
-
-def _rebuild(options: Any, changes: dict[str, Any]) -> Any:
-    """Apply each change to the outermost field of its name; a new group before its members."""
-    fields = [field.name for field in dataclasses.fields(options) if field.init]
-    values = {name: changes[name] for name in fields if name in changes}
-    left = {name: value for name, value in changes.items() if name not in values}
-    for name in fields:
-        group = values.get(name, getattr(options, name))
-        if dataclasses.is_dataclass(group):
-            own = {key: left.pop(key) for key in option_names(group) if key in left}
-            if own:
-                values[name] = _rebuild(group, own)
-    if left:
-        raise unknown_name("option", next(iter(left)), option_names(options))
-    return dataclasses.replace(options, **values)
+    return [value]
