@@ -17,8 +17,9 @@ from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift_detector import SiftOptions, detect_sift
 from deepdetect.geometry.camera import Calibration, calibration_from_focal
+from deepdetect.geometry.parallax import TwoViewModel
 from deepdetect.geometry.relative_pose import estimate_relative_pose
-from deepdetect.geometry.two_view import TwoViewModel, fit_model, has_foreground, is_planar
+from deepdetect.geometry.two_view import fit_model, has_foreground, is_planar
 from deepdetect.io.image import load_image, luma
 from deepdetect.reconstruction.checks import check_focal, check_images, check_matches, check_pose
 from deepdetect.reconstruction.subpixel import refine_matches

@@ -67,6 +67,30 @@ class Parallax:
         return most and self.exceeds(MIN_FRACTION_OF_PLANE)
 
 
+@dataclass(frozen=True, eq=False)
+class TwoViewModel:
+    """The model of a pair, and the evidence for it.
+
+    Attributes:
+        model: "homography", "fundamental", or "none" where nothing could be estimated.
+        matrix: (3, 3) float64, or None.
+        inliers: (M,) bool, the matches that agree with it.
+        log10_nfa: decimal logarithm of its number of false alarms.
+        parallax: of a homography that was chosen, not asked for: what it leaves.
+    """
+
+    model: str
+    matrix: np.ndarray | None
+    inliers: np.ndarray
+    log10_nfa: float
+    parallax: Parallax | None = None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether chance does not explain it."""
+        return self.log10_nfa < MAX_LOG10_NFA
+
+
 def measure_parallax(
     points0: np.ndarray,
     points1: np.ndarray,

@@ -22,6 +22,7 @@ import numpy as np
 from .._shared.opencv import cv2
 from .acontrario import log10_nfa
 from .camera import Calibration, Camera
+from .parallax import TwoViewModel
 from .relative_pose import best_of_four, moved_pose
 from .residuals import epipolar_errors, signed_epipolar_errors
 from .triangulation import cross_matrix
@@ -67,28 +68,13 @@ MAX_ITERATIONS = 20
 """Of each fit (Levenberg-Marquardt)."""
 
 
-@dataclass(frozen=True, eq=False)
-class SemiCalibratedGeometry:
-    """A relative pose with the cameras that fit it.
-
-    Attributes:
-        matrix: (3, 3) fundamental matrix, x1^T F x0 = 0.
-        inliers: (M,) bool, the matches that agree with it.
-        log10_nfa: decimal logarithm of its number of false alarms, of all that were tried.
-    """
-
-    matrix: np.ndarray
-    inliers: np.ndarray
-    log10_nfa: float
-
-
 def estimate_semi_calibrated(
     points0: np.ndarray,
     points1: np.ndarray,
     sizes: tuple[Size, Size],
     inlier_threshold: float = 1.5,
     seed: int = 0,
-) -> SemiCalibratedGeometry | None:
+) -> TwoViewModel | None:
     """Estimate a fundamental matrix from matches, many of which may be wrong.
 
     Args:
@@ -291,12 +277,12 @@ def _judge(
     points0: np.ndarray,
     points1: np.ndarray,
     inlier_threshold: float,
-) -> SemiCalibratedGeometry:
+) -> TwoViewModel:
     """Count the matches that agree, and how likely that is by chance."""
     inliers = epipolar_errors(points0, points1, fundamental) < inlier_threshold
     tried = MODELS_PER_SAMPLE * len(FOCAL_LENGTHS)
     alarms = log10_nfa(inliers, "essential", inlier_threshold, sizes[1], tried)
-    return SemiCalibratedGeometry(fundamental, inliers, alarms)
+    return TwoViewModel("fundamental", fundamental, inliers, alarms)
 
 
 def _fit(

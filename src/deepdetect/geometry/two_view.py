@@ -15,7 +15,7 @@ import numpy as np
 from .acontrario import MAX_LOG10_NFA, log10_nfa
 from .camera import Calibration
 from .estimation import GeometryOptions, estimate_geometry
-from .parallax import MIN_FRACTION_OF_PLANE, Parallax, measure_parallax
+from .parallax import MIN_FRACTION_OF_PLANE, TwoViewModel, measure_parallax
 from .residuals import transfer_errors
 from .semi_calibrated import estimate_semi_calibrated
 
@@ -51,30 +51,6 @@ MIN_FOREGROUND_ON_LINES = 0.8
 """Of the matches clearly off the plane, explained by the fundamental matrix. On planes wrong
 matches are this far off, and fewer lie on their lines: up to 0.65 of them on sixteen pairs of
 Oxford."""
-
-
-@dataclass(frozen=True, eq=False)
-class TwoViewModel:
-    """The model of a pair, and the evidence for it.
-
-    Attributes:
-        model: "homography", "fundamental", or "none" where nothing could be estimated.
-        matrix: (3, 3) float64, or None.
-        inliers: (M,) bool, the matches that agree with it.
-        log10_nfa: decimal logarithm of its number of false alarms.
-        parallax: of a homography that was chosen, not asked for: what it leaves.
-    """
-
-    model: str
-    matrix: np.ndarray | None
-    inliers: np.ndarray
-    log10_nfa: float
-    parallax: Parallax | None = None
-
-    @property
-    def trusted(self) -> bool:
-        """Whether chance does not explain it."""
-        return self.log10_nfa < MAX_LOG10_NFA
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +129,7 @@ def choose_model(
     if semi_calibrated:
         known = estimate_semi_calibrated(points0, points1, sizes, threshold_px, seed)
         if known is not None and known.log10_nfa < depth.log10_nfa:
-            depth = TwoViewModel("fundamental", known.matrix, known.inliers, known.log10_nfa)
+            depth = known
     return depth if depth.trusted or depth.log10_nfa < plane.log10_nfa else plane
 
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..geometry.windows import window_sums
@@ -60,42 +59,29 @@ class PointFilterOptions:
         check_ranges(self, not_negative=("sor_neighbors", *limits), odd=("sor_window_px",))
 
 
-DEFAULTS = PointFilterOptions()
-
-
 def sor_inliers(
-    points: np.ndarray,
-    neighbors: int = DEFAULTS.sor_neighbors,
-    std_ratio: float = DEFAULTS.sor_std_ratio,
+    points: np.ndarray, point_filter: PointFilterOptions = PointFilterOptions()
 ) -> np.ndarray:
     """Return which points have others around them.
 
     Args:
         points: (N, 3) in a space where the spacing is about the same everywhere.
-        neighbors: nearest points that are compared with.
-        std_ratio: standard deviations above the mean distance; fewer remove more.
+        point_filter: how many nearest points are compared with, and how strictly.
 
     Returns:
         (N,) bool. Points that are not finite are outliers and count for no other.
 
-    Raises:
-        OptionError: there are no neighbors, or the ratio is negative.
-
     Example:
         >>> row = np.column_stack([np.arange(100.0), np.zeros(100), np.zeros(100)])
         >>> row[50, 1] = 30
-        >>> np.flatnonzero(~sor_inliers(row, 4)).tolist()
+        >>> np.flatnonzero(~sor_inliers(row, PointFilterOptions(sor_neighbors=4))).tolist()
         [50]
     """
-    if neighbors < 1:
-        raise OptionError(f"neighbors must be at least 1, not {neighbors}")
-    if not std_ratio >= 0:
-        raise OptionError(f"std_ratio must not be negative, but is {std_ratio}")
-    points = np.asarray(points).reshape(-1, 3)
     inliers = np.isfinite(points).all(1)
     if np.count_nonzero(inliers) > 1:
-        distances = mean_neighbor_distances(points[inliers], neighbors)
-        inliers[inliers] = distances <= distances.mean() + std_ratio * distances.std()
+        distances = mean_neighbor_distances(points[inliers], point_filter.sor_neighbors)
+        limit = distances.mean() + point_filter.sor_std_ratio * distances.std()
+        inliers[inliers] = distances <= limit
     return inliers
 
 
@@ -103,8 +89,7 @@ def sor_inliers_on_grid(
     pixels: np.ndarray,
     disparity: np.ndarray,
     size: tuple[int, int],
-    window_px: int = DEFAULTS.sor_window_px,
-    std_ratio: float = DEFAULTS.sor_std_ratio,
+    point_filter: PointFilterOptions = PointFilterOptions(),
 ) -> np.ndarray:
     """Return which keypoints of a rectified pair have about the depth of those around them.
 
@@ -115,8 +100,7 @@ def sor_inliers_on_grid(
         pixels: (N, 2) whole pixels of the left image.
         disparity: (N,) in pixels.
         size: (width, height) of the image.
-        window_px: side of the window.
-        std_ratio: standard deviations above the mean distance; fewer remove more.
+        point_filter: the window, and how strictly.
 
     Returns:
         (N,) bool. A keypoint with no other in its window is an outlier only where most have some.
@@ -134,7 +118,8 @@ def sor_inliers_on_grid(
     middle = float(np.median(disparity))  # float32 squares of large numbers lose the differences
     centred = (disparity - middle).astype(np.float64)
     others, total, squares = (
-        window_sums(places, values, size[::-1], window_px) for values in (1.0, centred, centred**2)
+        window_sums(places, values, size[::-1], point_filter.sor_window_px)
+        for values in (1.0, centred, centred**2)
     )
     others = others - 1
     differences = squares - 2 * centred * total + (others + 1) * centred**2
@@ -144,7 +129,7 @@ def sor_inliers_on_grid(
         return np.ones(len(pixels), bool)
     near = distances[accompanied]
     isolated = ~accompanied & (accompanied.mean() > 0.5)
-    return (distances <= near.mean() + std_ratio * near.std() + 1e-6) & ~isolated
+    return (distances <= near.mean() + point_filter.sor_std_ratio * near.std() + 1e-6) & ~isolated
 
 
 def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
@@ -170,10 +155,9 @@ def disparity_space(
     points: np.ndarray,
     focal_px: float,
     baseline: float = 1.0,
-    disparity_weight: float = DEFAULTS.sor_disparity_weight,
+    disparity_weight: float = PointFilterOptions.sor_disparity_weight,
 ) -> np.ndarray:
     """Return (N, 3) points as (x, y, weight * disparity) in pixels of the first camera."""
-    points = np.asarray(points, np.float64).reshape(-1, 3)
     with np.errstate(divide="ignore", invalid="ignore"):
         across = points[:, :2] / points[:, 2:] * focal_px
         disparity = focal_px * baseline / points[:, 2]

@@ -208,11 +208,7 @@ def _from_disparities(
     if point_filter.sor_neighbors and how.discontinuity_margin_px:
         with timer.stage("outlier removal"):
             inliers = sor_inliers_on_grid(
-                pixels[kept],
-                disparity[kept],
-                grays[0].shape[::-1],
-                point_filter.sor_window_px,
-                point_filter.sor_std_ratio,
+                pixels[kept], disparity[kept], grays[0].shape[::-1], point_filter
             )
         dropped["statistical outlier"] = int(np.count_nonzero(~inliers))
         kept[kept] = inliers

@@ -138,7 +138,9 @@ class Reconstruction:
             "density": round(len(self) / (self.size[0] * self.size[1]), 6),
             "rectified": self.rectified,
             "rectified_why": self._why(),
-            "rectification": _rectification_values(self.rectification),
+            "rectification": None
+            if self.rectification is None
+            else {k: _finite(v) for k, v in dataclasses.asdict(self.rectification).items()},
             "unit": self.unit,
             "scale": SCALE[self.unit],
             "depth": _percentiles(self.points[:, 2]),
@@ -152,12 +154,11 @@ class Reconstruction:
 
     def _why(self) -> str:
         """Say why the pair was treated as rectified or not."""
-        found = self.rectification
-        if found is None:
+        rows = self.rectification
+        if rows is None:
             return "as asked for"
-        if found.rectified:
-            return f"{found.on_rows:,} of {found.matches:,} sparse matches are on the same row"
-        return found.reason
+        on_rows = f"{rows.on_rows:,} of {rows.matches:,} sparse matches are on the same row"
+        return on_rows if rows.rectified else rows.reason
 
     def _map(self, values: np.ndarray) -> np.ndarray:
         """Return values of the points at their pixels, (H, W) float32, NaN elsewhere."""
@@ -165,12 +166,6 @@ class Reconstruction:
         columns, rows = np.rint(self.pixels).astype(np.int64).T
         result[rows, columns] = values
         return result
-
-
-def _rectification_values(rectification: Rectification | None) -> dict[str, Any] | None:
-    if rectification is None:
-        return None
-    return {name: _finite(value) for name, value in dataclasses.asdict(rectification).items()}
 
 
 def _pose_values(pose: RelativePose | None) -> dict[str, Any] | None:

@@ -73,12 +73,10 @@ class RefinedMatches:
         points1: (N, 2) float64 positions in the second image; as they were where the alignment
             did not converge.
         converged: (N,) bool.
-        correlation: (N,) float32 of both patches, in [-1, 1]; 0 where there was nothing to align.
     """
 
     points1: np.ndarray
     converged: np.ndarray
-    correlation: np.ndarray
 
 
 def refine_matches(
@@ -122,15 +120,14 @@ def refine_matches(
     known[known] = ((start[known] >= 0) & (start[known] < gray1.shape[::-1])).all(1)
     if not known.all():
         found = refine_matches(gray0, gray1, pixels0[known], start[known])
-        result = RefinedMatches(start.copy(), known.copy(), np.zeros(len(start), np.float32))
+        result = RefinedMatches(start.copy(), known.copy())
         result.points1[known], result.converged[known] = found.points1, found.converged
-        result.correlation[known] = found.correlation
         return result
     if not len(pixels0):
-        return RefinedMatches(start, known, np.zeros(0, np.float32))
+        return RefinedMatches(start, known)
     images = gray0.astype(np.float32), gray1.astype(np.float32)
     overall = similarity(pixels0, start)
-    result = RefinedMatches(start.copy(), np.zeros(len(start), bool), np.zeros(len(start), "f4"))
+    result = RefinedMatches(start.copy(), np.zeros(len(start), bool))
     step = COARSE_STEP_PX if len(pixels0) > MIN_MATCHES_OF_LATTICE else 1
     # In bands of rows, for which the memory is small; neighbours beyond their edges are seen, too.
     rows = pixels0[:, 1]
@@ -143,7 +140,6 @@ def refine_matches(
         found = _refine_band(images, pixels0[near], start[near], own, overall, step)
         result.points1[near[own]] = found.points1
         result.converged[near[own]] = found.converged
-        result.correlation[near[own]] = found.correlation
     return result
 
 
@@ -269,23 +265,9 @@ def _align(
     converged = np.empty(len(pixels0), bool)
     correlation = np.empty(len(pixels0), np.float32)
 
-    def run(first: int, last: int) -> None:
-        align(
-            first,
-            last,
-            *images,
-            pixels0,
-            start,
-            affinities,
-            window,
-            MAX_ITERATIONS,
-            convergence_px,
-            MAX_SHIFT_PX,
-            np.float32(MIN_CORRELATION),
-            refined,
-            converged,
-            correlation,
-        )
-
-    parallel_for(len(pixels0), run)
-    return RefinedMatches(refined, converged, correlation)
+    limits = MAX_ITERATIONS, convergence_px, MAX_SHIFT_PX, np.float32(MIN_CORRELATION)
+    written = refined, converged, correlation
+    parallel_for(
+        len(pixels0), align, *images, pixels0, start, affinities, window, *limits, *written
+    )
+    return RefinedMatches(refined, converged)

@@ -145,7 +145,7 @@ def reconstruct_two_view(
             space = disparity_space(
                 made.points[kept], focal, baseline, point_filter.sor_disparity_weight
             )
-            inliers = sor_inliers(space, point_filter.sor_neighbors, point_filter.sor_std_ratio)
+            inliers = sor_inliers(space, point_filter)
         dropped["statistical outlier"] = int(np.count_nonzero(~inliers))
         kept[kept] = inliers
     if not kept.any():
