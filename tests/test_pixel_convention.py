@@ -5,14 +5,20 @@ The images are not square and nothing is drawn on a diagonal, so that swapped ax
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 
-from deepdetect.detector.heatmap import HeatmapOptions, compute_heatmap
+from deepdetect.detector.heatmap import HeatmapOptions, compute_maps
 from deepdetect.features.selection import select_keypoints
 from deepdetect.labels import DETECTORS
 from deepdetect.labels.detectors import keypoints_mask, pixels_mask
+
+
+def compute_heatmap(*arguments: Any) -> np.ndarray:
+    return compute_maps(*arguments).both()[0]
 
 
 def to_logits(probability: np.ndarray) -> np.ndarray:

@@ -40,7 +40,7 @@ OPTIONS = (
 
 
 def compare(run_node: Any, logits: np.ndarray, options: dict[str, Any]) -> int:
-    from deepdetect.features.maps import sigmoid
+    from deepdetect.features.selection import sigmoid
 
     expected = select_keypoints(sigmoid(logits), SelectionOptions(**options), logits)
     found = select_in_node(run_node, logits, options)

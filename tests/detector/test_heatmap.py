@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -8,7 +10,16 @@ from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
 from deepdetect.detector import heatmap
-from deepdetect.detector.heatmap import HeatmapOptions, compute_heatmap, compute_heatmap_and_logits
+from deepdetect.detector.heatmap import HeatmapOptions, compute_maps
+
+
+def compute_heatmap_and_logits(*arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+    return compute_maps(*arguments).both()
+
+
+def compute_heatmap(*arguments: Any) -> np.ndarray:
+    return compute_maps(*arguments).both()[0]
+
 
 RGB = np.random.default_rng(11).integers(0, 256, (61, 90, 3), dtype=np.uint8)
 

@@ -12,8 +12,7 @@ from deepdetect.detector import HeatmapOptions, heatmap, tiling
 from deepdetect.detector import detector as detector_module
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.detector.tiling import TiledNetwork, open_tiled
-from deepdetect.features.maps import Maps
-from deepdetect.features.selection import select_from_maps
+from deepdetect.features.selection import Maps, select_from_maps
 
 
 @pytest.fixture(scope="module")

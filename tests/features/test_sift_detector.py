@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.features.sift_detector import SiftOptions, detect_sift, spread_over_grid
+from deepdetect.features.sift import GRID_CELLS, detect_sift, spread_over_grid
 from deepdetect.io.image import luma
 
 
@@ -17,7 +17,7 @@ def blob(x: float, y: float, sigma: float, shape: tuple[int, int] = (120, 140)) 
 
 
 def cells_of(xy: np.ndarray, size: tuple[int, int]) -> list[tuple[int, int]]:
-    side = max(size) / SiftOptions.grid_cells
+    side = max(size) / GRID_CELLS
     return [(int(x // side), int(y // side)) for x, y in xy]
 
 
@@ -33,7 +33,7 @@ def test_a_blob_is_found_at_its_centre(x: float, y: float, sigma: float) -> None
 def test_there_is_one_descriptor_for_each_position(photo: np.ndarray) -> None:
     gray = luma(photo)
     found = detect_sift(gray)
-    assert 100 < len(found) == len(found.xy) == len(found.descriptors) <= SiftOptions.max_keypoints
+    assert 100 < len(found) == len(found.xy) == len(found.descriptors) <= 4000
     assert found.xy.dtype == np.float32
     assert found.descriptors.dtype == np.uint8
     assert found.descriptors.shape[1] == 128
@@ -60,19 +60,19 @@ def test_descriptors_turn_with_the_image(photo: np.ndarray) -> None:
 
 @pytest.mark.parametrize("most", [0, 1, 7, 120])
 def test_there_are_no_more_than_asked_for(photo: np.ndarray, most: int) -> None:
-    assert len(detect_sift(luma(photo), SiftOptions(max_keypoints=most))) == most
+    assert len(detect_sift(luma(photo), most)) == most
 
 
 def test_faint_parts_have_keypoints_too(photo: np.ndarray) -> None:
     """The strongest of all would nearly all be right of the middle."""
     gray = luma(photo)
     gray[:, :128] = 90 + gray[:, :128] // 4
-    xy = detect_sift(gray, SiftOptions(max_keypoints=150)).xy
+    xy = detect_sift(gray, 150).xy
     assert (xy[:, 0] < 120).mean() > 0.15
 
 
 def test_is_the_same_on_repetition(photo: np.ndarray) -> None:
-    first, second = (detect_sift(luma(photo), SiftOptions(max_keypoints=90)) for _ in range(2))
+    first, second = (detect_sift(luma(photo), 90) for _ in range(2))
     np.testing.assert_array_equal(first.xy, second.xy)
     np.testing.assert_array_equal(first.descriptors, second.descriptors)
 

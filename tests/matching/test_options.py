@@ -6,6 +6,7 @@ import pytest
 
 from deepdetect import MatchingOptions, OptionError
 from deepdetect.matching import PUBLISHED_MATCHING
+from deepdetect.matching.pipeline import guiding_model
 
 
 def test_the_published_options_are_what_the_published_code_runs() -> None:
@@ -56,9 +57,9 @@ def test_wrong_options_say_what_is_wrong(values: dict[str, Any], message: str) -
 def test_the_model_chooses_what_guides_unless_it_is_named(
     model: str, given: str, expected: str
 ) -> None:
-    assert MatchingOptions(two_view_model=given).guiding_model(model) == expected
+    assert guiding_model(model, MatchingOptions(two_view_model=given)) == expected
 
 
 def test_what_guides_may_not_contradict_the_model() -> None:
     with pytest.raises(OptionError, match="contradicts the model homography"):
-        MatchingOptions(two_view_model="fundamental").guiding_model("homography")
+        guiding_model("homography", MatchingOptions(two_view_model="fundamental"))

@@ -15,7 +15,7 @@ from PIL import Image
 from deepdetect import DeepDetect, MatchingOptions, SelectionOptions, match_images
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
-from deepdetect.features.sift_detector import SiftOptions, detect_sift
+from deepdetect.features.sift import detect_sift
 from deepdetect.geometry.camera import Calibration, calibration_from_focal
 from deepdetect.geometry.parallax import TwoViewModel
 from deepdetect.geometry.relative_pose import estimate_relative_pose
@@ -33,9 +33,7 @@ def detector() -> DeepDetect:
 
 
 def sparse(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    described = [
-        detect_sift(luma(image), SiftOptions(max_keypoints=2000)) for image in (first, second)
-    ]
+    described = [detect_sift(luma(image), 2000) for image in (first, second)]
     found = match_descriptors(
         *(features.descriptors for features in described),
         get_matcher("exact"),

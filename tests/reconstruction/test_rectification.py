@@ -10,7 +10,7 @@ import pytest
 
 from deepdetect.datasets import load_stereo_pair
 from deepdetect.features.matchers import get_matcher, match_descriptors
-from deepdetect.features.sift_detector import SiftOptions, detect_sift
+from deepdetect.features.sift import detect_sift
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided import find_tentative_matches
 from deepdetect.reconstruction.rectification import (
@@ -33,7 +33,7 @@ QUICK = (("boat", 6), ("graf", 6), ("ubc", 6))
 def sparse_matches(first: Path, second: Path) -> tuple[np.ndarray, ...]:
     """Match SIFT keypoints without any geometry; positions and (width, height) of both images."""
     grays = [luma(load_image(path)) for path in (first, second)]
-    described = [detect_sift(gray, SiftOptions(max_keypoints=2000)) for gray in grays]
+    described = [detect_sift(gray, 2000) for gray in grays]
     found = match_descriptors(
         *(features.descriptors for features in described),
         get_matcher("exact"),

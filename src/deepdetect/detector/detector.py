@@ -14,16 +14,15 @@ from .._shared.errors import OptionError
 from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
-from ..features.maps import Maps
-from ..features.selection import SelectionOptions, select_from_maps, select_keypoints
+from ..features.selection import Maps, SelectionOptions, select_from_maps, select_keypoints
 from ..features.sift import describe_keypoints
 from ..io.image import load_image, luma
 from .backends import RuntimeOptions, open_network
 from .heatmap import (
     HeatmapOptions,
-    compute_heatmap_and_logits,
     compute_maps,
     compute_maps_of_batch,
+    memory_named,
     seen_size,
 )
 from .image_lists import (
@@ -34,7 +33,6 @@ from .image_lists import (
     image_list,
     image_named,
     load_each,
-    memory_named,
 )
 from .pretrained import PRETRAINED, resolve_weights
 
@@ -204,7 +202,7 @@ class DeepDetect:
         """
         rgb = load_image(image, channels=channels)
         with memory_named(rgb.shape):
-            return compute_heatmap_and_logits(rgb, self._network, self.heatmap_options)
+            return compute_maps(rgb, self._network, self.heatmap_options).both()
 
     @suggest_keywords
     def heatmap_batch(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,12 +12,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import DeepDetectError, OptionError, unknown_name
 from .._shared.image_array import Channels, check_channels
 from .._shared.memory import available_memory, release_freed_memory
-from .._shared.opencv import cv2
+from .._shared.opencv import cv2, is_lack_of_memory
 from .._shared.options import check_ranges, suggest_keywords
-from ..features.maps import Maps, Rows, bands, sigmoid
+from ..features.selection import Maps, Rows, bands, sigmoid
 from .backends import Network
 
 if TYPE_CHECKING:
@@ -88,9 +89,9 @@ class HeatmapOptions:
             check_ranges(self, between={"tile_megapixels": (MIN_TILE_MEGAPIXELS, math.inf)})
 
 
-def compute_heatmap(
+def compute_maps(
     rgb: np.ndarray, network: Network, options: HeatmapOptions = HeatmapOptions()
-) -> np.ndarray:
+) -> Maps:
     """Run the network on an image.
 
     Args:
@@ -99,32 +100,9 @@ def compute_heatmap(
         options: the resolution and the order of the channels.
 
     Returns:
-        (H, W) float32 probability in [0, 1], at the image's own pixels. A constant
+        The heat map and its logits, at the image's own pixels. Where the network sees a smaller
+        image, only what it says of that is kept, and enlarged when a map is asked for. A constant
         image holds nothing to detect: its map is 0 throughout.
-    """
-    return compute_heatmap_and_logits(rgb, network, options)[0]
-
-
-def compute_heatmap_and_logits(
-    rgb: np.ndarray, network: Network, options: HeatmapOptions = HeatmapOptions()
-) -> tuple[np.ndarray, np.ndarray]:
-    """Run the network on an image; arguments as of `compute_heatmap`.
-
-    Returns:
-        The heat map, and the (H, W) float32 logits of its probabilities. Float32 rounds the
-        highest probabilities to 1; logits still distinguish them, so keypoints are ranked by them.
-    """
-    return compute_maps(rgb, network, options).both()
-
-
-def compute_maps(
-    rgb: np.ndarray, network: Network, options: HeatmapOptions = HeatmapOptions()
-) -> Maps:
-    """Run the network on an image; arguments as of `compute_heatmap`.
-
-    Returns:
-        The heat map and its logits. Where the network sees a smaller image, only what it
-        says of that is kept, and enlarged when a map is asked for.
     """
     return compute_maps_of_batch([rgb], network, options)[0]
 
@@ -136,7 +114,7 @@ def compute_maps_of_batch(
 
     Args:
         images: (H, W, 3) uint8 RGB each, of which `seen_size` is the same.
-        network, options: as of `compute_heatmap`.
+        network, options: as of `compute_maps`.
 
     Returns:
         As `compute_maps`, of each image. Of images run together the last bits may be others.
@@ -171,6 +149,29 @@ def compute_maps_of_batch(
             native = _is_native(shape, options)
             maps[number] = Maps.of_logits(logits) if native else _enlarged(logits, shape)
     return [one for one in maps if one is not None]
+
+
+@contextmanager
+def memory_named(shape: tuple[int, ...], images: int = 1) -> Iterator[None]:
+    """Make lack of memory, in work on images of this shape, an error of one sentence."""
+    try:
+        yield
+        return
+    except MemoryError:
+        pass
+    except Exception as error:
+        if not is_lack_of_memory(error):
+            raise
+    height, width = shape[:2]
+    if images > 1:
+        raise DeepDetectError(
+            f"there is not enough memory for {images} images of {width}x{height} pixels at once: "
+            "use a smaller `batch_size`"
+        )
+    raise DeepDetectError(
+        f"there is not enough memory for an image of {width}x{height} pixels: "
+        "use `resolution='auto'`, fewer keypoints, or a smaller image"
+    )
 
 
 def seen_size(shape: tuple[int, ...], options: HeatmapOptions) -> tuple[int, int]:

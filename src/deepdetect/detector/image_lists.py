@@ -8,9 +8,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError, ImageError, OptionError
+from .._shared.errors import ImageError, OptionError
 from .._shared.image_array import Channels
-from .._shared.opencv import is_lack_of_memory
 from ..io.image import load_image
 
 Images = list[Any] | tuple[Any, ...] | np.ndarray
@@ -98,26 +97,3 @@ def ignore_masks(ignore: Any, images: int) -> list[Any]:
     if len(ignore) != images:
         raise OptionError(f"`ignore` holds {len(ignore)} masks for {images} images: give one each")
     return list(ignore)
-
-
-@contextmanager
-def memory_named(shape: tuple[int, ...], images: int = 1) -> Iterator[None]:
-    """Make lack of memory, in work on images of this shape, an error of one sentence."""
-    try:
-        yield
-        return
-    except MemoryError:
-        pass
-    except Exception as error:
-        if not is_lack_of_memory(error):
-            raise
-    height, width = shape[:2]
-    if images > 1:
-        raise DeepDetectError(
-            f"there is not enough memory for {images} images of {width}x{height} pixels at once: "
-            "use a smaller `batch_size`"
-        )
-    raise DeepDetectError(
-        f"there is not enough memory for an image of {width}x{height} pixels: "
-        "use `resolution='auto'`, fewer keypoints, or a smaller image"
-    )

@@ -80,7 +80,7 @@ class TiledNetwork:
         """Compute the logits.
 
         Args:
-            rgb: (H, W, 3) uint8, of any size; it is padded as `compute_heatmap` does.
+            rgb: (H, W, 3) uint8, of any size; it is padded as `compute_maps` does.
             tile_megapixels: how much of the image is run at a time; None: 2.7.
 
         Returns:

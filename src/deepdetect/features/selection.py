@@ -2,16 +2,67 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .keypoints import Keypoints, bayer_order
-from .maps import Maps, bands
-from .peaks import highest_in_window, peak_offset
+
+MAX_OFFSET_PX = 0.499
+"""The nearest pixel of a refined keypoint is still the one that it was found at."""
+
+Rows = Callable[[slice], np.ndarray]
+"""What gives the rows of a map that are asked for."""
+
+BAND_PIXELS = 4_000_000
+"""Of a map that are looked at at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Maps:
+    """A heat map and the logits by which its pixels are ranked, each made when it is asked for.
+
+    Of a large image either takes more memory than most of its keypoints: one is held at a time.
+
+    Attributes:
+        shape: (H, W).
+        heatmap: makes the map, (H, W) float32, and gives its rows.
+        logits: makes the logits, (H, W) float32.
+    """
+
+    shape: tuple[int, ...]
+    heatmap: Callable[[], Rows]
+    logits: Callable[[], np.ndarray]
+
+    @classmethod
+    def of_logits(cls, logits: np.ndarray) -> Maps:
+        """Return maps whose heat map is the sigmoid of the logits, and is never held whole."""
+        return cls(logits.shape, lambda: lambda rows: sigmoid(logits[rows]), lambda: logits)
+
+    def both(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the whole heat map and the logits, (H, W) float32 both."""
+        heatmap, rows_of = np.empty(self.shape, np.float32), self.heatmap()
+        for rows in bands(self.shape):
+            heatmap[rows] = rows_of(rows)
+        del rows_of  # it may hold another map
+        return heatmap, self.logits()
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Return the probabilities of logits; the exponent is never positive: nothing overflows."""
+    decay = np.exp(-np.abs(logits))
+    return np.where(logits >= 0, np.float32(1), decay) / (1 + decay)
+
+
+def bands(shape: tuple[int, ...]) -> Iterator[slice]:
+    """Yield rows of a map in bands, to bound the memory of what is made of them."""
+    rows = max(1, BAND_PIXELS // max(1, shape[1]))
+    for start in range(0, shape[0], rows):
+        yield slice(start, min(start + rows, shape[0]))
 
 
 def check_max_keypoints(count: int | None) -> None:
@@ -128,7 +179,7 @@ def select_from_maps(
         if options.subpixel:
             row, column = np.divmod(pixels, width)
             for k, axis in ((0, 1), (1, 0)):
-                xy[part, k] = peak_offset(ranking, row + rows.start, column, axis)
+                xy[part, k] = _peak_offset(ranking, row + rows.start, column, axis)
     del ranking
     heatmap = maps.heatmap()
     for rows, part in parts:
@@ -181,7 +232,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
         pixels = _unpack(passing[seen], width)
         if radius and len(pixels):
             near = ranking[seen]
-            found = highest_in_window(
+            found = _highest_in_window(
                 pixels, near.ravel()[pixels], near.shape, radius, seen.start, height
             )
             pixels = pixels[found]
@@ -224,6 +275,66 @@ def _least_of_the_best(parts: Iterable[np.ndarray], count: int, kind: np.dtype) 
         if len(best) > count:
             best = np.partition(best, len(best) - count)[len(best) - count :]
     return best.min() if len(best) >= count else kind.type(-np.inf)
+
+
+def _highest_in_window(
+    pixels: np.ndarray,
+    scores: np.ndarray,
+    shape: tuple[int, ...],
+    radius: int,
+    first_row: int,
+    height: int,
+) -> np.ndarray:
+    """Return which pixels of a band rank highest in the window around them.
+
+    The band has this shape, and begins with this row of an image of this height.
+
+    Of equal scores the one that comes first in `bayer_order` ranks higher: one pixel of a plateau
+    is kept.
+    """
+    kind = np.float32 if scores.dtype == np.float32 else np.float64
+    image = np.full(shape, -np.inf, kind)
+    image.ravel()[pixels] = np.maximum(scores, np.finfo(kind).min)
+    window = np.ones((2 * radius + 1,) * 2, np.uint8)  # a box is dilated in linear time
+    highest = cv2.dilate(image, window) == image  # beyond the border is -infinity
+    kept = highest.ravel()[pixels]
+    rows = np.flatnonzero(kept)
+    row, column = np.divmod(pixels[rows], shape[1])
+    padded = np.pad(image, radius, constant_values=-np.inf)
+    own = image[row, column]
+    for y, x in np.ndindex(window.shape):
+        down, across = y - radius, x - radius
+        tied = np.flatnonzero(padded[row + y, column + x] == own)
+        if not len(tied) or (down, across) == (0, 0):
+            continue
+        here = np.column_stack([column[tied], row[tied] + first_row])
+        first, second = (
+            bayer_order(xy, (shape[1], height)) for xy in (here, here + (across, down))
+        )
+        before = second <= first if (down, across) < (0, 0) else second < first
+        kept[rows[tied[before]]] = False
+    return kept
+
+
+def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
+    """Return the offset of the maximum of a parabola through pixels and their neighbours.
+
+    It is 0 on the image's border, and where a pixel is not a maximum along the axis.
+    """
+    position, last = (row, column)[axis], ranking.shape[axis] - 1
+    inner = (position > 0) & (position < last)
+    before, after = (
+        ranking[
+            np.clip(row + step * (axis == 0), 0, ranking.shape[0] - 1),
+            np.clip(column + step * (axis == 1), 0, ranking.shape[1] - 1),
+        ].astype(np.float64)
+        for step in (-1, 1)
+    )
+    middle = ranking[row, column].astype(np.float64)
+    bend = 2 * middle - before - after
+    peaked = inner & (middle >= before) & (middle >= after) & (bend > 0)
+    offset = np.where(peaked, (after - before) / np.where(peaked, 2 * bend, 1), 0)
+    return np.clip(offset, -MAX_OFFSET_PX, MAX_OFFSET_PX).astype(np.float32)
 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

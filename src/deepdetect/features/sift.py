@@ -1,4 +1,4 @@
-"""SIFT descriptors at keypoints of one size and angle (paper, Section III-C) or of their own.
+"""SIFT descriptors of any keypoints (paper, Section III-C), and well-spread keypoints of SIFT.
 
 To add a descriptor, write a function `(gray, xy, size, angle) -> (N, D) uint8 or float32` and add
 it to `DESCRIPTORS`.
@@ -22,6 +22,17 @@ from .scale_space import LAYERS, nearest_layers
 
 ROOT_SIFT = "rootsift"
 """`Keypoints.descriptor_type` of RootSIFT."""
+
+CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
+"""Of SIFT (Lowe: 0.04), in the order in which they are tried; the contrast of a keypoint is
+compared after multiplication by the number of layers."""
+
+MIN_KEYPOINTS = 1000
+"""With fewer the next lower contrast threshold is tried."""
+
+GRID_CELLS = 24
+"""Along the longer side of the image; each cell gives its strongest keypoints in turn, so that all
+parts of the image have some."""
 
 MIN_DENSE_DENSITY = 0.02
 """Keypoints per pixel from which all at once (`dense_sift`) is faster than one by one."""
@@ -241,3 +252,81 @@ def get_descriptor(name: str) -> Descriptor:
         OptionError: the name is unknown.
     """
     return look_up("descriptor", name, DESCRIPTORS)
+
+
+def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:
+    """Detect SIFT keypoints, spread over the image, and describe them by RootSIFT.
+
+    Args:
+        gray: (H, W) uint8 luma.
+        max_keypoints: at most this many.
+
+    Returns:
+        Keypoints with sizes, angles, octaves and (N, 128) uint8 descriptors, which are rotated to
+        the keypoints' angles.
+
+    Example:
+        >>> gray = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
+        >>> detect_sift(gray, 20)
+        Keypoints(20 keypoints in 99x99 pixels, scores 0.0135 to 0.0788, 128-D uint8 descriptors)
+    """
+    size = (gray.shape[1], gray.shape[0])
+    # Found once: nearly all of the time goes into the pyramid, whatever the threshold.
+    # Without precise upscaling OpenCV's positions are a quarter of a pixel off, right and down.
+    sift = cv2.SIFT_create(
+        nOctaveLayers=LAYERS,
+        contrastThreshold=min(CONTRAST_THRESHOLDS),
+        enable_precise_upscale=True,
+    )
+    every = sift.detect(gray, None)
+    contrasts = LAYERS * np.array([keypoint.response for keypoint in every])
+    enough = min(MIN_KEYPOINTS, max_keypoints)
+    keypoints = every
+    for threshold in CONTRAST_THRESHOLDS:
+        if np.count_nonzero(contrasts >= threshold) >= enough:
+            keypoints = [every[k] for k in np.flatnonzero(contrasts >= threshold)]
+            break
+    if not len(keypoints) or max_keypoints < 1:
+        none = np.empty((0, 128), np.uint8)
+        return replace(Keypoints.empty(size), descriptors=none, descriptor_type=ROOT_SIFT)
+    strength = np.array([keypoint.response for keypoint in keypoints])
+    xy = cv2.KeyPoint_convert(keypoints)
+    chosen = spread_over_grid(xy, strength, size, max_keypoints)
+    kept, descriptors = sift.compute(gray, [keypoints[k] for k in chosen])
+    found = Keypoints.from_opencv(kept, size)
+    root = to_root_sift(descriptors.astype(np.uint8))
+    return replace(found, descriptors=root, descriptor_type=ROOT_SIFT)
+
+
+def spread_over_grid(
+    xy: np.ndarray,
+    scores: np.ndarray,
+    image_size: tuple[int, int],
+    max_keypoints: int,
+    grid_cells: int = GRID_CELLS,
+) -> np.ndarray:
+    """Choose keypoints by score, in turn from all cells of a grid.
+
+    Args:
+        xy: (N, 2) positions.
+        scores: (N,), the higher the better.
+        image_size: (width, height) of the image.
+        max_keypoints: how many to choose.
+        grid_cells: along the longer side.
+
+    Returns:
+        (M,) rows, M <= `max_keypoints`: first the best of each cell, then the second-best, ...
+
+    Example:
+        >>> xy = np.array([[1, 1], [2, 1], [99, 99]])
+        >>> spread_over_grid(xy, np.array([3.0, 2.0, 1.0]), (100, 100), 2).tolist()
+        [0, 2]
+    """
+    side = max(image_size) / grid_cells
+    cell = np.floor(np.maximum(xy, 0) / side).astype(np.int64)
+    cell = cell[:, 1] * (grid_cells + 1) + cell[:, 0]
+    order = np.lexsort((-scores, cell))
+    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    begins = np.repeat(first, np.diff(first, append=len(order)))
+    rank = np.arange(len(order)) - begins
+    return order[np.lexsort((-scores[order], rank))][:max_keypoints]

@@ -18,8 +18,7 @@ from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS, STRIDE
 from ..detector.pretrained import resolve_weights
 from ..features.keypoints import Keypoints
-from ..features.maps import Maps
-from ..features.selection import SelectionOptions, select_from_maps
+from ..features.selection import Maps, SelectionOptions, select_from_maps
 from ..io.image import load_image
 from .packages import base_class, import_package
 from .tensors import image_from_tensor

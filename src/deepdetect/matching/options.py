@@ -12,14 +12,6 @@ from ..geometry import GeometryOptions
 
 TWO_VIEW_MODELS = ("auto", "homography", "fundamental")
 
-TWO_VIEW_MODEL_OF = {
-    "homography": "homography",
-    "fundamental": "fundamental",
-    "essential": "fundamental",
-}
-"""The geometry that guides for each `model`: a plane would drop what is off it. The other models
-leave it open."""
-
 UNGUIDED_ONLY = ("descriptor", "keypoint_size", "angle", "matcher", "ratio")
 """Options of `MatchingOptions` that do not apply to guided matching."""
 
@@ -74,20 +66,6 @@ class MatchingOptions:
             raise OptionError(f"the angle must lie in [0, 360) or be -1, not {self.angle}")
         if not 0 < self.ratio <= 1:
             raise OptionError(f"the ratio must be above 0 and at most 1, not {self.ratio}")
-
-    def guiding_model(self, model: str) -> str:
-        """Return the geometry that guides where `model` is asked for.
-
-        Raises:
-            OptionError: the two contradict each other.
-        """
-        fitting = TWO_VIEW_MODEL_OF.get(model, self.two_view_model)
-        if self.two_view_model not in ("auto", fitting):
-            raise OptionError(
-                f"`two_view_model={self.two_view_model!r}` contradicts the model {model}: leave "
-                "one of them out"
-            )
-        return fitting
 
 
 PUBLISHED_MATCHING = MatchingOptions(angle=-1.0, ratio=0.99, matcher="flann")

@@ -15,7 +15,7 @@ from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
 from .._shared.timing import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
-from ..detector.image_lists import Images, ignore_masks
+from ..detector.image_lists import Images
 from ..features.keypoints import Keypoints
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
@@ -140,13 +140,15 @@ def match_pair(
 ) -> Matches:
     """Match two loaded images; all else as of `match_images`."""
     check_model(model, seed, options.geometry)
-    guiding = options.guiding_model(model)
+    guiding = guiding_model(model, options)
     if tentative_matches is not None and not guided_matching:
         raise OptionError("`tentative_matches` guide: leave them out, or `guided_matching=False`")
     timer = StageTimer(progress)
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
-    masks = ignore_masks(ignore, 2)
+    masks = ignore if isinstance(ignore, (list, tuple)) else (ignore, ignore)
+    if len(masks) != 2:
+        raise OptionError(f"`ignore` holds {len(masks)} masks for two images: give one each")
     find = [
         partial(find_keypoints, detector, rgb, selection, mask)
         for rgb, mask in zip(pair.rgb, masks, strict=True)
@@ -232,6 +234,22 @@ def match_pair(
 
 def _ordered(both: tuple[Item, Item], swapped: bool) -> tuple[Item, Item]:
     return (both[1], both[0]) if swapped else both
+
+
+def guiding_model(model: str, options: MatchingOptions) -> str:
+    """Return the geometry that guides: a plane would drop what is off it, so the model decides.
+
+    Raises:
+        OptionError: the model and the options contradict each other.
+    """
+    open_to = options.two_view_model
+    fitting = {"essential": "fundamental", "auto": open_to, "none": open_to}.get(model, model)
+    if options.two_view_model not in ("auto", fitting):
+        raise OptionError(
+            f"`two_view_model={options.two_view_model!r}` contradicts the model {model}: leave "
+            "one of them out"
+        )
+    return fitting
 
 
 def _no_matches(

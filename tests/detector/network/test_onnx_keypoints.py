@@ -18,8 +18,11 @@ from deepdetect.detector.network.onnx_keypoints import MAX_KEYPOINTS, add_keypoi
 from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 from deepdetect.features.keypoints import Keypoints  # noqa: E402
-from deepdetect.features.maps import sigmoid  # noqa: E402
-from deepdetect.features.selection import SelectionOptions, select_keypoints  # noqa: E402
+from deepdetect.features.selection import (  # noqa: E402
+    SelectionOptions,
+    select_keypoints,
+    sigmoid,
+)
 
 COUNT = 90
 SIZES = [(64, 96), (123, 157), (17, 23), (80, 41)]

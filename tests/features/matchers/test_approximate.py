@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 from deepdetect import MissingExtraError
 from deepdetect.features.matchers import match_descriptors
 from deepdetect.features.matchers.approximate import faiss_neighbours, flann_neighbours
-from deepdetect.features.matchers.brute_force import exact_neighbours
+from deepdetect.features.matchers.matching import exact_neighbours
 
 
 def sift_like(seed: int, count: int) -> np.ndarray:

@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 
 from deepdetect import OptionError
 from deepdetect.features.matchers import MATCHERS, brute_force, get_matcher, match_descriptors
-from deepdetect.features.matchers.brute_force import exact_neighbours, hamming_neighbours
+from deepdetect.features.matchers.matching import exact_neighbours, hamming_neighbours
 from deepdetect.io.image import luma
 
 

@@ -16,7 +16,7 @@ from deepdetect.features.matchers import (
     matching,
 )
 from deepdetect.features.matchers.approximate import flann_neighbours
-from deepdetect.features.matchers.brute_force import exact_neighbours
+from deepdetect.features.matchers.matching import exact_neighbours
 
 
 def fixed_matcher(

@@ -11,7 +11,7 @@ from deepdetect import OptionError
 from deepdetect._shared import parallel
 from deepdetect.features.dense_sift import dense_sift
 from deepdetect.features.matchers import match_descriptors
-from deepdetect.features.matchers.brute_force import exact_neighbours
+from deepdetect.features.matchers.matching import exact_neighbours
 from deepdetect.features.matchers.patchmatch import patchmatch_neighbours
 from deepdetect.io.image import luma
 

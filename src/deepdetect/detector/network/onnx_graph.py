@@ -45,7 +45,7 @@ def add_padding(model: ModelProto) -> None:
     """Let a network take any height and width, and give probabilities that are at most 1.
 
     The image is padded by repeating its last row and column to multiples of 8, and the maps are
-    cropped, as `compute_heatmap` does it. Batch normalisation is folded, and numbers for each
+    cropped, as `compute_maps` does it. Batch normalisation is folded, and numbers for each
     channel have four dimensions.
 
     Args:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...features.keypoints import bayer_order
-from ...features.peaks import MAX_OFFSET_PX
+from ...features.selection import MAX_OFFSET_PX
 from .onnx_graph import LOGITS, add_constants, replace_nodes
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..._shared.errors import ImageError, OptionError
 from ...detector.detector import DeepDetect
-from ...detector.heatmap import HeatmapOptions, compute_heatmap
+from ...detector.heatmap import HeatmapOptions, compute_maps
 from ...io.image import MINIMUM_SIDE, load_image, luma, scale_short_side
 from ...io.masks import load_mask
 from ...labels import LabelOptions, fuse, visibility_of
@@ -143,7 +143,7 @@ class LabelDetector:
         """Return the label as (H, W) float32, 0 or 1."""
         rgb = load_image(image)
         if self.heatmap_options is not None:
-            return compute_heatmap(rgb, self._network, self.heatmap_options)
+            return compute_maps(rgb, self._network, self.heatmap_options).both()[0]
         return fuse(luma(rgb), self.options).mask.astype(np.float32)
 
     def _network(self, image: np.ndarray) -> np.ndarray:

@@ -16,28 +16,27 @@ from ..._shared.opencv import cv2
 
 FLANN_INDEX_KDTREE = 1
 
+TREES, CHECKS = 5, 50
+"""Of FLANN: random trees, and leaves that are visited for each query (paper's code)."""
+
+LISTS_PER_ROOT, PROBES, TRAINING_PER_LIST = 4, 16, 40
+"""Of faiss: lists of the inverted file, in units of the square root of the descriptors; lists that
+are searched for each query; descriptors that the centre of each list is trained on."""
+
+MIN_INDEXED = 4096
+"""With fewer descriptors faiss compares all: an inverted file would save nothing."""
+
 
 def flann_neighbours(
-    queries: np.ndarray,
-    base: np.ndarray,
-    count: int,
-    seed: int,
-    positions: object = None,
-    trees: int = 5,
-    checks: int = 50,
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`.
-
-    Args:
-        trees: number of trees.
-        checks: leaves that are visited for each query.
-    """
+    """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`."""
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
 
     def search() -> tuple[np.ndarray, np.ndarray]:
         cv2.setRNGSeed(seed)
-        index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
-        return index.knnSearch(queries, count, params={"checks": checks})
+        index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": TREES})
+        return index.knnSearch(queries, count, params={"checks": CHECKS})
 
     # OpenCV has one random number generator per thread: that of the caller is left alone.
     with ThreadPoolExecutor(1) as thread:
@@ -46,26 +45,11 @@ def flann_neighbours(
 
 
 def faiss_neighbours(
-    queries: np.ndarray,
-    base: np.ndarray,
-    count: int,
-    seed: int,
-    positions: object = None,
-    lists_per_root: float = 4,
-    probes: int = 16,
-    training_per_list: int = 40,
-    min_indexed: int = 4096,
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find approximate nearest neighbours in an inverted file; otherwise as `Matcher`.
 
     About one neighbour in fifty is missed.
-
-    Args:
-        lists_per_root: lists of the inverted file, in units of the square root of M.
-        probes: lists that are searched for each query.
-        training_per_list: descriptors that the centre of each list is trained on.
-        min_indexed: with fewer descriptors than this all are compared: an inverted file would
-            save nothing.
 
     Raises:
         MissingExtraError: faiss is not installed.
@@ -82,14 +66,14 @@ def faiss_neighbours(
     width = base.shape[1]
     centres = faiss.IndexFlatL2(width)
     index: Any = centres
-    if len(base) >= min_indexed:
-        lists = min(int(lists_per_root * np.sqrt(len(base))), len(base) // training_per_list)
+    if len(base) >= MIN_INDEXED:
+        lists = min(int(LISTS_PER_ROOT * np.sqrt(len(base))), len(base) // TRAINING_PER_LIST)
         index = faiss.IndexIVFScalarQuantizer(centres, width, lists, kind, faiss.METRIC_L2, False)
         index.cp.seed = seed
         index.cp.niter = 5
-        index.nprobe = probes
+        index.nprobe = PROBES
         order = np.random.default_rng(seed).permutation(len(base))
-        index.train(base[np.sort(order[: lists * training_per_list])])
+        index.train(base[np.sort(order[: lists * TRAINING_PER_LIST])])
     index.add(base)
     squared, rows = index.search(queries, count)
     missing = rows < 0  # the lists that were searched held too few

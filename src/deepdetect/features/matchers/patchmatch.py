@@ -8,48 +8,24 @@ one spreads to those around it. It does not suit few or scattered keypoints.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 
 from ..._shared.errors import OptionError
-from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.parallel import parallel_for
 from ..keypoints import on_pixels
 
+SWEEPS = 4
+"""Over all queries, down and up in turn."""
 
-@suggest_keywords
-@dataclass(frozen=True)
-class PatchMatchOptions:
-    """How neighbours are searched.
+OFFSETS_PX = (1, 4, 12)
+"""Distances to the queries whose neighbours are tried; one pixel where keypoints are dense."""
 
-    Attributes:
-        sweeps: over all queries, down and up in turn.
-        offsets_px: distances to the queries whose neighbours are tried; one pixel where keypoints
-            are dense.
-        band_height_px: of a part that one thread works on; the result depends on it.
-        line_tries: random places on its epipolar line that a query starts with.
-        search_shrink: random tries begin in the whole image around the best neighbour; each next
-            one is this many times nearer.
+BAND_HEIGHT_PX = 96
+"""Of a part that one thread works on; the result depends on it."""
 
-    Raises:
-        OptionError: a value is out of its range.
-    """
-
-    sweeps: int = 4
-    offsets_px: tuple[int, ...] = (1, 4, 12)
-    band_height_px: int = 96
-    line_tries: int = 16
-    search_shrink: int = 3
-
-    def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            positive=("offsets_px", "band_height_px"),
-            not_negative=("sweeps", "line_tries"),
-            between={"search_shrink": (2, math.inf)},
-        )
+SEARCH_SHRINK = 3
+"""Random tries begin in the whole image around the best neighbour; each next one is so many times
+nearer."""
 
 
 def patchmatch_neighbours(
@@ -58,7 +34,6 @@ def patchmatch_neighbours(
     count: int,
     seed: int,
     positions: tuple[np.ndarray, np.ndarray] | None = None,
-    options: PatchMatchOptions = PatchMatchOptions(),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find two approximate nearest neighbours of each query by spreading good ones.
 
@@ -80,44 +55,6 @@ def patchmatch_neighbours(
         )
     if count > 2 or len(base) < 2:
         raise OptionError("the matcher patchmatch finds one or two neighbours, of two or more")
-    rows, distances = _search(queries, base, seed, positions, None, np.inf, options)
-    return rows[:, :count], distances[:, :count]
-
-
-def epipolar_neighbours(
-    queries: np.ndarray,
-    base: np.ndarray,
-    seed: int,
-    positions: tuple[np.ndarray, np.ndarray],
-    fundamental: np.ndarray,
-    max_epipolar_distance: float,
-    options: PatchMatchOptions = PatchMatchOptions(),
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find the approximate nearest neighbour of each query near its epipolar line.
-
-    Args:
-        queries, base, seed, positions, options: as of `patchmatch_neighbours`.
-        fundamental: (3, 3) with x1^T F x0 = 0.
-        max_epipolar_distance: of a neighbour from the line, in pixels.
-
-    Returns:
-        (N,) int32 rows of `base` and (N,) float32 distances, infinite where none was found.
-    """
-    rows, distances = _search(
-        queries, base, seed, positions, fundamental, max_epipolar_distance, options
-    )
-    return rows[:, 0], distances[:, 0]
-
-
-def _search(
-    queries: np.ndarray,
-    base: np.ndarray,
-    seed: int,
-    positions: tuple[np.ndarray, np.ndarray],
-    fundamental: np.ndarray | None,
-    max_epipolar_distance: float,
-    options: PatchMatchOptions,
-) -> tuple[np.ndarray, np.ndarray]:
     from . import patchmatch_kernel as kernel
 
     xy0, xy1 = (_pixels(xy) for xy in positions)
@@ -126,34 +63,23 @@ def _search(
     if order is not None:
         queries, xy0 = queries[order], xy0[order]
     at0, at1 = _grid(xy0), _grid(xy1)
-    edges = np.arange(0, at0.shape[0] + options.band_height_px, options.band_height_px)
+    edges = np.arange(0, at0.shape[0] + BAND_HEIGHT_PX, BAND_HEIGHT_PX)
     bands = np.searchsorted(xy0[:, 1], edges)
     rows = np.empty((len(queries), 2), np.int32)
     distances = np.empty((len(queries), 2), np.int32)
-    matrix = np.zeros((3, 3)) if fundamental is None else np.asarray(fundamental, np.float64)
-    offsets = np.array(options.offsets_px)
-    radii = _radii(max(at1.shape), options.search_shrink)
-
-    if fundamental is None:
-        parallel_for(len(queries), kernel.start, queries, base, seed, rows, distances)
-    else:
-        lines = matrix, options.line_tries, seed
-        parallel_for(
-            len(queries), kernel.start_on_lines, queries, base, xy0, at1, *lines, rows, distances
-        )
+    offsets, radii = np.array(OFFSETS_PX), _radii(max(at1.shape))
+    parallel_for(len(queries), kernel.start, queries, base, seed, rows, distances)
     images = queries, base, xy0, xy1, at0, at1
-    epipolar = matrix, float(max_epipolar_distance)
-    for turn in range(options.sweeps):
+    for turn in range(SWEEPS):
         tries = offsets, turn, seed, radii
         found = rows.copy(), rows, distances
-        parallel_for(len(bands) - 1, kernel.sweep, bands, *images, *tries, *found, *epipolar)
+        parallel_for(len(bands) - 1, kernel.sweep, bands, *images, *tries, *found)
     gaps = np.sqrt(distances.astype(np.float32))
-    gaps[distances == kernel.FAR] = np.inf
     if order is not None:
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
         rows, gaps = rows[back], gaps[back]
-    return rows, gaps
+    return rows[:, :count], gaps[:, :count]
 
 
 def _row_major_order(pixels: np.ndarray) -> np.ndarray | None:
@@ -178,8 +104,8 @@ def _grid(xy: np.ndarray) -> np.ndarray:
     return grid
 
 
-def _radii(longest_side: int, shrink: int) -> np.ndarray:
+def _radii(longest_side: int) -> np.ndarray:
     radii = [longest_side // 2]
-    while radii[-1] > shrink:
-        radii.append(radii[-1] // shrink)
+    while radii[-1] > SEARCH_SHRINK:
+        radii.append(radii[-1] // SEARCH_SHRINK)
     return np.maximum(radii, 1)

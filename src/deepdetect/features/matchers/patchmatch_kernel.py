@@ -6,12 +6,6 @@ import numpy as np
 
 from ..._shared.kernels import compiled
 
-FAR = np.int32(2**31 - 1)
-"""The distance of a neighbour that was not found."""
-
-UNBOUNDED = 1e9
-"""Pixels from the epipolar line from which on it does not matter."""
-
 
 @compiled(nogil=True, inline="always")
 def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
@@ -45,46 +39,6 @@ def _hash(number):  # type: ignore[no-untyped-def]
     return number
 
 
-@compiled(nogil=True, inline="always")
-def _line(matrix, x, y):  # type: ignore[no-untyped-def]
-    """Return the epipolar line of a pixel, with a normal of length 1."""
-    a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2]
-    b = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2]
-    c = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2]
-    length = max(np.sqrt(a * a + b * b), 1e-12)
-    return a / length, b / length, c / length
-
-
-@compiled(nogil=True)
-def start_on_lines(  # type: ignore[no-untyped-def]
-    first, last, queries, base, xy0, at1, matrix, tries, seed, rows, distances
-):
-    """Give the queries from `first` to before `last` the best of some rows near their lines."""
-    height, width = at1.shape
-    for query in range(first, last):
-        a, b, c = _line(matrix, xy0[query, 0], xy0[query, 1])
-        state = _hash(np.uint32(query) ^ _hash(np.uint32(seed)))
-        best, second, nearer, farther = 0, 1, FAR, FAR
-        for _ in range(tries):
-            state = _hash(state + np.uint32(1))
-            if abs(b) > abs(a):
-                x = np.int64(state % np.uint32(width))
-                y = np.int64(np.rint(-(a * x + c) / b))
-            else:
-                y = np.int64(state % np.uint32(height))
-                x = np.int64(np.rint(-(b * y + c) / a))
-            if x < 0 or y < 0 or x >= width or y >= height:
-                continue
-            row = at1[y, x]
-            if row >= 0 and row != best and row != second:
-                distance = _distance(queries, query, base, row)
-                best, second, nearer, farther = _insert(
-                    row, distance, best, second, nearer, farther
-                )
-        rows[query, 0], rows[query, 1] = best, second
-        distances[query, 0], distances[query, 1] = nearer, farther
-
-
 @compiled(nogil=True)
 def start(first, last, queries, base, seed, rows, distances):  # type: ignore[no-untyped-def]
     """Give the queries from `first` to before `last` two random rows of the base."""
@@ -108,7 +62,7 @@ def start(first, last, queries, base, seed, rows, distances):  # type: ignore[no
 @compiled(nogil=True)
 def sweep(  # type: ignore[no-untyped-def]
     first, last, bands, queries, base, xy0, xy1, at0, at1, offsets, turn, seed, radii, before, rows,
-    distances, matrix, max_distance,
+    distances,
 ):  # fmt: skip
     """Improve the queries of the bands from `first` to before `last`, one after the other.
 
@@ -125,10 +79,7 @@ def sweep(  # type: ignore[no-untyped-def]
         before: (N, 2) rows as they were before this sweep, for queries of other bands: so the
             bands may be done in any order.
         rows, distances: (N, 2) best and second-best row and squared distances; improved.
-        matrix: (3, 3) fundamental matrix.
-        max_distance: of neighbours from their query's line in pixels; infinite: anywhere.
     """
-    bound = max_distance < UNBOUNDED
     (height0, width0), (height1, width1) = at0.shape, at1.shape
     direction = 1 - 2 * (turn % 2)
     spread = 4 * len(offsets)
@@ -138,7 +89,6 @@ def sweep(  # type: ignore[no-untyped-def]
             query = begin + step if direction == 1 else end - 1 - step
             best, second = rows[query, 0], rows[query, 1]
             nearer, farther = distances[query, 0], distances[query, 1]
-            a, b, c = _line(matrix, xy0[query, 0], xy0[query, 1])
             state = _hash(np.uint32(query) ^ _hash(np.uint32(seed + 7919 * (turn + 1))))
             for trial in range(spread + len(radii)):
                 if trial < spread:  # what two queries beside this one found, moved along
@@ -159,16 +109,9 @@ def sweep(  # type: ignore[no-untyped-def]
                     state = _hash(state + np.uint32(1))
                     along = np.int64(state % np.uint32(2 * radius + 1)) - radius
                     state = _hash(state + np.uint32(1))
-                    if bound:  # along the line, and a little aside
-                        aside = np.int64(state % np.uint32(3)) - 1
-                        x = xy1[best, 0] + np.int64(np.rint(b * along + a * aside))
-                        y = xy1[best, 1] + np.int64(np.rint(-a * along + b * aside))
-                    else:
-                        x = xy1[best, 0] + along
-                        y = xy1[best, 1] + np.int64(state % np.uint32(2 * radius + 1)) - radius
+                    x = xy1[best, 0] + along
+                    y = xy1[best, 1] + np.int64(state % np.uint32(2 * radius + 1)) - radius
                 if x < 0 or y < 0 or x >= width1 or y >= height1:
-                    continue
-                if bound and abs(a * x + b * y + c) > max_distance:
                     continue
                 row = at1[y, x]
                 if row >= 0 and row != best and row != second:

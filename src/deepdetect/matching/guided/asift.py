@@ -15,7 +15,7 @@ import numpy as np
 from ..._shared.opencv import cv2
 from ..._shared.parallel import processor_count
 from ...features.keypoints import Keypoints
-from ...features.sift_detector import SiftOptions, detect_sift
+from ...features.sift import detect_sift
 
 BLUR = 0.8
 """Sigma of the blur before an image is shortened, in units of sqrt(tilt^2 - 1)."""
@@ -38,7 +38,7 @@ def simulated_views(gray: np.ndarray, tilt: float, max_keypoints: int) -> Iterat
 
     def see(rotation_deg: float) -> Keypoints:
         view, to_view = simulate_view(gray, tilt, rotation_deg)
-        found = detect_sift(view, SiftOptions(max_keypoints=max_keypoints))
+        found = detect_sift(view, max_keypoints)
         back = cv2.invertAffineTransform(to_view)
         xy = found.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
         inside = ((xy > 0) & (xy < np.array(gray.shape[::-1]) - 1)).all(1)

@@ -9,8 +9,7 @@ import numpy as np
 
 from ...features.keypoints import Keypoints
 from ...features.matchers import get_matcher, match_descriptors
-from ...features.sift import describe_keypoints
-from ...features.sift_detector import SiftOptions, detect_sift
+from ...features.sift import describe_keypoints, detect_sift
 from ...geometry.rescaling import downscale, scaled_points
 
 Points = tuple[np.ndarray, np.ndarray]
@@ -97,7 +96,7 @@ def find_tentative_matches(
     """
     (view0, scale0), (view1, scale1) = (downscale(gray, max_side_px) for gray in (gray0, gray1))
     if features is None:
-        sift = SiftOptions(max_keypoints=max_keypoints)
+        sift = max_keypoints
         with ThreadPoolExecutor(2) as pool:  # OpenCV's SIFT leaves a second processor idle
             of_first = pool.submit(detect_sift, view0, sift)
             of_second = detect_sift(view1, sift)

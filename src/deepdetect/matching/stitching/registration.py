@@ -17,8 +17,7 @@ from ..._shared.errors import RegistrationError
 from ...detector.detector import AnyDetector, find_keypoints
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
-from ...features.sift import describe_keypoints
-from ...features.sift_detector import SiftOptions, detect_sift
+from ...features.sift import describe_keypoints, detect_sift
 from ...io.image import luma
 from ..guided import TentativeMatches, find_tentative_matches, guided_matches
 from ..guided.initial_geometry import estimate_initial_geometry
@@ -29,7 +28,7 @@ from .bundle_adjustment import (
     adjust_homographies,
 )
 
-SIFT = SiftOptions(max_keypoints=2000)
+SIFT_KEYPOINTS = 2000
 """Sparse keypoints by which overlaps are found."""
 
 MAX_KEYPOINTS = 30_000
@@ -149,7 +148,7 @@ def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
         return _Image(gray, points, np.rint(points.xy))
     # Without suppression: neighbouring pixels are what the verification compares.
     keypoints = find_keypoints(detector, image, SelectionOptions(max_keypoints=MAX_KEYPOINTS))
-    return _Image(gray, detect_sift(gray, SIFT), keypoints.xy)
+    return _Image(gray, detect_sift(gray, SIFT_KEYPOINTS), keypoints.xy)
 
 
 def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair]:
