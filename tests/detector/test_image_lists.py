@@ -6,7 +6,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from deepdetect import (
     DeepDetect,
@@ -111,13 +110,6 @@ def test_sizes_agree_where_the_network_sees_them(photo: np.ndarray) -> None:
         np.testing.assert_allclose(maps[1], detector.heatmap(pieces[1]), atol=1e-5)
 
 
-def test_one_by_one_unless_asked(detector: DeepDetect, images: list[np.ndarray]) -> None:
-    own = DeepDetect(backend="onnxruntime")
-    shapes = count_runs(own)
-    own.detect_batch([images[0]] * 3)
-    assert [shape[0] for shape in shapes] == [1, 1, 1]
-
-
 @pytest.mark.parametrize("size", [0, -1, 1.5, "8"])
 def test_a_batch_size_is_a_number(detector: DeepDetect, size: Any, one_line) -> None:
     for call in (detector.detect_batch, detector.heatmap_batch):
@@ -155,16 +147,6 @@ def count_runs(detector: DeepDetect) -> list[tuple[int, ...]]:
 
     detector._network = counted
     return shapes
-
-
-def test_files_and_arrays_may_be_mixed(
-    detector: DeepDetect, images: list[np.ndarray], tmp_path: Path
-) -> None:
-    path = tmp_path / "one.png"
-    Image.fromarray(images[1]).save(path)
-    found = detector.detect_batch([path, images[0], Image.fromarray(images[1])])
-    same(found[0], found[2])
-    same(found[1], detector.detect(images[0]))
 
 
 def test_no_image_gives_nothing(detector: DeepDetect) -> None:
@@ -243,12 +225,3 @@ def test_a_kept_heat_map_is_selected_from_again(
         expected = seen.detect(images[1], ignore=ignore, **options)
         chosen = SelectionOptions(**options)
         same(select_keypoints(heatmap, chosen, logits, ignore=ignore), expected)
-
-
-@pytest.mark.parametrize(
-    ("image", "words"),
-    [(None, "cv2.imread"), (["a.png", "b.png"], "")],
-)
-def test_what_is_no_image_is_named(detector: DeepDetect, image: object, words: str) -> None:
-    with pytest.raises(ImageError, match=words):
-        detector.detect(image)

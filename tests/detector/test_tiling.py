@@ -76,29 +76,6 @@ def test_each_length_is_written_once_and_seen_with_its_margins() -> None:
             assert seen.stop == min(length, inner.stop + margin)
 
 
-def test_the_bar_ends_at_the_end(strip: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    bars = []
-
-    class Bar:
-        def __init__(self, total: int, *_: object, **__: object) -> None:
-            self.total, self.done = total, 0
-            bars.append(self)
-
-        def __enter__(self) -> Bar:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            pass
-
-        def update(self, count: int) -> None:
-            self.done += count
-
-    monkeypatch.setattr(tiling, "progress", Bar)
-    open_bundled()(strip, tile_megapixels=0.05)
-    (bar,) = bars
-    assert bar.done == bar.total > 20
-
-
 @pytest.mark.parametrize("options", [{}, {"density": 0.1}, {"nms_radius": 2}])
 def test_images_larger_than_the_memory_are_tiled(
     options: dict[str, float],
@@ -149,12 +126,6 @@ def test_other_networks_are_not_tiled(tmp_path: Path) -> None:
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     onnx.save(model, str(tmp_path / "mean.onnx"))
     assert open_tiled(tmp_path / "mean.onnx") is None
-
-
-@pytest.mark.parametrize("size", [0.5, 0, -1, float("nan"), "all"])
-def test_tiles_too_small(size: object) -> None:
-    with pytest.raises(OptionError, match=r"`tile_megapixels` must be at least 1\.5"):
-        HeatmapOptions(tile_megapixels=size)
 
 
 def test_flips_of_sides_that_are_no_multiples_of_eight_are_symmetric(photo: np.ndarray) -> None:

@@ -71,16 +71,6 @@ def test_does_not_depend_on_the_number_of_threads(
     np.testing.assert_array_equal(found[0], found[2])
 
 
-def test_a_flat_image_has_no_gradient(photo: np.ndarray) -> None:
-    flat = np.full((60, 60), 90, np.uint8)
-    assert not dense_sift(flat, every_pixel(flat)).any()
-    assert not to_root_sift(dense_sift(flat, every_pixel(flat))).any()
-
-
-def test_no_keypoints_give_no_descriptors() -> None:
-    assert dense_sift(np.zeros((9, 9), np.uint8), np.empty((0, 2))).shape == (0, 128)
-
-
 @pytest.mark.parametrize(
     ("xy", "size"),
     [([[3.5, 2]], 3), ([[-1, 2]], 3), ([[2, 9]], 3), ([[2, 2]], 1.9), ([[2, 2]], 8.1)],
@@ -88,16 +78,6 @@ def test_no_keypoints_give_no_descriptors() -> None:
 def test_what_it_cannot_describe_is_refused(xy: list, size: float) -> None:
     with pytest.raises(OptionError):
         dense_sift(np.zeros((9, 9), np.uint8), np.array(xy), size)
-
-
-def test_root_in_place_is_the_same(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    sift = dense_sift(gray, every_pixel(gray)[:500])
-    kept = sift.copy()
-    expected = to_root_sift(sift)
-    np.testing.assert_array_equal(sift, kept)
-    assert to_root_sift(sift, overwrite=True) is sift
-    np.testing.assert_array_equal(sift, expected)
 
 
 def test_root_is_the_root_of_each_share(photo: np.ndarray) -> None:

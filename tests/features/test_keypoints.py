@@ -1,15 +1,12 @@
 from __future__ import annotations
 
-import sys
-
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect import MissingExtraError, OptionError
-from deepdetect.evaluation.baselines.opencv import CLASSICAL
+from deepdetect import OptionError
 from deepdetect.features.keypoints import Keypoints, bayer_order, on_pixels
 from deepdetect.io.image import luma
 
@@ -63,10 +60,6 @@ def test_no_keypoints_of_opencv() -> None:
     assert len(nothing.best(5)) == 0
 
 
-def test_the_best_are_those_with_the_highest_scores_in_their_own_order() -> None:
-    assert some([0.1, 0.9, 0.5, 0.7]).best(2).xy[:, 0].tolist() == [1, 3]
-
-
 def test_ties_for_the_best_are_spread_over_the_image() -> None:
     xy = np.stack(np.meshgrid(np.arange(64), np.arange(48)), -1).reshape(-1, 2)
     best = Keypoints(xy, np.ones(len(xy)), (64, 48)).best(12)
@@ -99,28 +92,6 @@ def test_choosing_rows_keeps_what_is_not_there_away() -> None:
     assert plain.image_size == (10, 10)
 
 
-def test_density_is_keypoints_per_pixel() -> None:
-    assert some([1.0] * 10).density == 10 / 5000
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"xy": np.zeros((3, 3))},
-        {"xy": np.zeros(6)},
-        {"scores": np.zeros(2)},
-        {"scores": np.zeros((3, 1))},
-        {"sizes": np.zeros(4)},
-        {"descriptors": np.zeros((2, 8))},
-    ],
-)
-def test_shapes_that_do_not_fit_are_an_error(change, one_line) -> None:
-    right = {"xy": np.zeros((3, 2)), "scores": np.zeros(3), "image_size": (10, 10)}
-    with pytest.raises(OptionError) as caught:
-        Keypoints(**{**right, **change})
-    one_line(caught.value)
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_numbers_that_are_not_finite_are_an_error(value: float) -> None:
     with pytest.raises(OptionError, match="finite"):
@@ -129,35 +100,7 @@ def test_numbers_that_are_not_finite_are_an_error(value: float) -> None:
         Keypoints(np.zeros((1, 2)), np.array([value]), SIZE)
 
 
-def test_descriptors_and_sizes_as_lists_can_be_chosen_from() -> None:
-    lists = Keypoints([[1, 2], [3, 4]], [0.1, 0.9], (8, 8), descriptors=[[1.0, 2.0], [3.0, 4.0]])
-    assert np.asarray(lists.best(1).descriptors).tolist() == [[3, 4]]
-
-
-def test_every_classical_method_keeps_its_points_inside_the_image(photo: np.ndarray) -> None:
-    for method in CLASSICAL.values():
-        if method.name.startswith("brisk"):
-            continue  # it is slow and checked elsewhere
-        xy = method.detect(photo[:128, :100]).xy
-        assert ((xy > -0.5) & (xy < (99.5, 127.5))).all(), method.name
-
-
 POINTS = Keypoints([[1, 2], [3, 4], [5, 0]], [0.9, 0.6, 0.7], (8, 5))
-
-
-def test_values_are_kept_as_float32() -> None:
-    assert POINTS.xy.dtype == np.float32
-    assert POINTS.scores.dtype == np.float32
-    assert POINTS.xy.tolist() == [[1, 2], [3, 4], [5, 0]]
-    assert POINTS.image_size == (8, 5)
-    assert len(POINTS) == 3
-    assert POINTS.density == pytest.approx(3 / 40)
-
-
-def test_iteration_goes_over_rows() -> None:
-    assert [tuple(point.tolist()) for point in POINTS] == [(1, 2), (3, 4), (5, 0)]
-    x, y = next(iter(POINTS))
-    assert (x, y) == (1, 2)
 
 
 @pytest.mark.parametrize(
@@ -183,12 +126,6 @@ def test_indexing(index: object, kept: list[int]) -> None:
     assert part.xy.shape == (len(kept), 2)
     np.testing.assert_array_equal(part.xy, POINTS.xy[kept].reshape(-1, 2))
     np.testing.assert_array_equal(part.scores, POINTS.scores[kept])
-
-
-@pytest.mark.parametrize("index", [3, -4, [7], np.array([True])])
-def test_indexing_out_of_range(index: object) -> None:
-    with pytest.raises(IndexError):
-        POINTS[index]
 
 
 @pytest.mark.parametrize(
@@ -248,10 +185,6 @@ def test_positions_between_pixels_go_with_the_nearest() -> None:
     np.testing.assert_array_equal(bayer_order(between, (16, 16)), bayer_order(whole, (16, 16)))
 
 
-def test_no_positions_have_no_ranks() -> None:
-    assert bayer_order(np.empty((0, 2)), (8, 8)).shape == (0,)
-
-
 def test_the_logits_rank_where_there_are_any() -> None:
     points = Keypoints(np.zeros((3, 2)), [1, 1, 1], (8, 8), logits=[20, 30, 25])
     assert points.best(2).logits.tolist() == [30, 25]
@@ -263,14 +196,6 @@ def test_every_column_needs_one_row_per_keypoint(name: str, one_line) -> None:
         Keypoints(np.zeros((3, 2)), np.zeros(3), SIZE, **{name: np.zeros((2, 4))})
     assert name in str(caught.value)
     one_line(caught.value)
-
-
-def test_the_text_of_keypoints_is_one_short_line() -> None:
-    assert repr(Keypoints.empty((640, 480))) == "Keypoints(0 keypoints in 640x480 pixels)"
-    described = Keypoints([[1, 2]], [0.25], (640, 480), descriptors=np.zeros((1, 128), np.uint8))
-    assert repr(described) == (
-        "Keypoints(1 keypoint in 640x480 pixels, scores 0.25 to 0.25, 128-D uint8 descriptors)"
-    )
 
 
 def test_whole_pixels_are_told_from_others() -> None:
@@ -323,13 +248,6 @@ def test_lightglue_takes_them() -> None:
     with torch.inference_mode():
         found = matcher({"image0": features[0], "image1": features[1]})
     assert found["matches0"].shape == (1, 40)
-
-
-def test_without_torch_it_is_one_sentence(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(MissingExtraError, match=r"pip install torch, .*/whl/cpu") as caught:
-        POINTS.to_lightglue()
-    one_line(caught.value)
 
 
 def test_lightglue_gets_no_angle_that_is_unset() -> None:

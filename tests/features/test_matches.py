@@ -64,22 +64,6 @@ def test_indexing_is_that_of_numpy(index: Any, kept: list[int]) -> None:
     assert part.seconds == MATCHES.seconds
 
 
-@pytest.mark.parametrize("index", [4, -5, [7], np.array([True])])
-def test_indexing_out_of_range(index: Any) -> None:
-    with pytest.raises(IndexError):
-        MATCHES[index]
-
-
-def test_iteration_ends() -> None:
-    assert [one.indices0.tolist() for one in MATCHES] == [[5], [6], [7], [8]]
-
-
-def test_values_have_their_types() -> None:
-    lists = Matches([[0, 0]], [[4, 4]], [0.5], [1], "none", None, KEYPOINTS, KEYPOINTS)
-    assert [lists.points0.dtype, lists.scores.dtype, lists.inliers.dtype] == ["f4", "f4", "?"]
-    assert [lists.indices0.dtype, lists.indices1.dtype] == ["i4", "i4"]
-
-
 @pytest.mark.parametrize(
     ("indices", "words"),
     [
@@ -154,13 +138,6 @@ def test_unique_matches_are_one_to_one(pairs: list[tuple[int, int]], scores: Any
     if pairs:  # the best of all stays
         assert found.scores.max() == all_.scores.max()
     assert len(found.unique()) == len(found)
-
-
-def test_the_text_is_one_short_line() -> None:
-    text = repr(MATCHES)
-    assert len(text) < 120
-    assert "\n" not in text
-    assert "4 matches" in text
 
 
 def test_pickles_are_whole_and_equality_is_that_of_objects() -> None:

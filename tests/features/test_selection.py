@@ -8,7 +8,6 @@ from hypothesis.extra.numpy import arrays
 
 from deepdetect import DeepDetect
 from deepdetect._shared.errors import OptionError
-from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.selection import SelectionOptions, grid_subsample, select_keypoints
 
 
@@ -96,14 +95,6 @@ def test_suppressed_keypoints_keep_their_distance(heatmap: np.ndarray, radius: i
         assert keypoints.scores.max() == heatmap.max()
 
 
-def test_a_ramp_keeps_its_top() -> None:
-    """Pixels that are suppressed suppress, too: the rest of a slope is no maximum."""
-    heatmap = np.zeros((16, 16), np.float32)
-    heatmap[4, 2:12] = np.linspace(0.6, 0.9, 10)
-    keypoints = select_keypoints(heatmap, SelectionOptions(nms_radius=1))
-    assert keypoints.xy.tolist() == [[11, 4]]
-
-
 def test_the_threshold_is_strict() -> None:
     heatmap = np.zeros((16, 20), np.float32)
     heatmap[3, 4] = 0.5
@@ -121,14 +112,6 @@ def test_the_density_is_exact(density: float) -> None:
     assert len(keypoints) == count
     # They are the most probable ones.
     assert keypoints.scores.min() == np.sort(heatmap.ravel())[-count]
-
-
-def test_a_density_of_less_than_half_a_pixel_leaves_none() -> None:
-    heatmap = np.linspace(0.1, 0.9, 400, dtype=np.float32).reshape(20, 20)
-    assert len(select_keypoints(heatmap, SelectionOptions(density=1e-9))) == 0
-    assert select_keypoints(heatmap, SelectionOptions(density=0.002)).xy.tolist() == [[19, 19]]
-    whole = SelectionOptions(max_keypoints=5.0, threshold=0.0, nms_radius=0)  # type: ignore[arg-type]
-    assert len(select_keypoints(heatmap, whole)) == 5
 
 
 def test_a_density_takes_no_impossible_pixel() -> None:
@@ -168,12 +151,6 @@ def test_ties_are_spread_over_the_image(radius: int, count: int) -> None:
     cells = (xy // (50, 60)).astype(int)
     share = np.bincount(cells[:, 1] * 4 + cells[:, 0], minlength=8) / count
     np.testing.assert_allclose(share, 1 / 8, atol=1.1 / count + 0.03)
-
-
-def test_the_network_s_best_keypoints_span_a_photograph(photo: np.ndarray) -> None:
-    keypoints = DeepDetect().detect(photo, max_keypoints=300)
-    cells = (keypoints.xy // 64).astype(int)
-    assert len(np.unique(cells[:, 1] * 4 + cells[:, 0])) >= 14
 
 
 def test_a_plateau_leaves_its_first_pixel() -> None:
@@ -237,13 +214,6 @@ def test_options_out_of_range(changes: dict[str, float], words: str) -> None:
     assert words in str(caught.value)
 
 
-def test_the_heat_map_is_left_as_it_was() -> None:
-    heatmap = np.random.default_rng(5).random((20, 20)).astype(np.float32)
-    before = heatmap.copy()
-    select_keypoints(heatmap, SelectionOptions(0.2, max_keypoints=9, nms_radius=2))
-    np.testing.assert_array_equal(heatmap, before)
-
-
 # Ranking by logits, and positions between pixels.
 
 
@@ -305,13 +275,6 @@ def test_a_refined_keypoint_stays_with_its_pixel(heatmap: np.ndarray) -> None:
     height, width = heatmap.shape
     assert (refined.xy >= 0).all()
     assert (refined.xy <= (width - 1, height - 1)).all()
-
-
-def test_logits_of_another_size() -> None:
-    with pytest.raises(OptionError, match="must be equal"):
-        select_keypoints(np.zeros((4, 5), np.float32), logits=np.zeros((5, 4), np.float32))
-    with pytest.raises(OptionError, match="as many logits as scores"):
-        Keypoints([[1, 2]], [0.5], (8, 5), [1.0, 2.0])
 
 
 def test_grid_subsample_takes_one_of_each_cell() -> None:

@@ -7,14 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from deepdetect import OptionError
 from deepdetect.features.dense_sift import dense_sift
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.scale_space import nearest_layers
 from deepdetect.features.sift import (
     DESCRIPTORS,
     correlation_distance,
-    get_descriptor,
     opencv_sift_descriptors,
     root_sift_descriptors,
     scaled_sift_descriptors,
@@ -59,11 +57,6 @@ def test_sift_equals_opencv_with_handmade_keypoints(size: float, angle: float) -
     np.testing.assert_array_equal(sift_descriptors(gray, xy, size, angle), expected)
 
 
-def test_sift_defaults_are_size_3_and_upright() -> None:
-    gray, xy = make_gray(), make_points()
-    np.testing.assert_array_equal(sift_descriptors(gray, xy), opencv_sift(gray, xy, 3.0, 0.0))
-
-
 def test_sift_follows_the_order_and_repetition_of_the_points() -> None:
     gray, xy = make_gray(), make_points(count=60)
     order = np.random.default_rng(2).integers(0, len(xy), 100)  # shuffled, with repeats
@@ -78,29 +71,6 @@ def test_every_point_of_the_image_gets_a_row(describe) -> None:
     descriptors = describe(gray, xy)
     assert descriptors.shape == (480, 128)
     assert np.isfinite(descriptors).all()
-
-
-def test_sift_holds_whole_numbers_of_a_byte() -> None:
-    descriptors = sift_descriptors(make_gray(), make_points())
-    assert descriptors.dtype == np.uint8
-    # Not a trivial 0: OpenCV scales the length to about 512.
-    assert (np.linalg.norm(descriptors.astype(int), axis=1) > 400).all()
-
-
-@pytest.mark.parametrize("describe", [sift_descriptors, root_sift_descriptors])
-@pytest.mark.parametrize("xy", [np.empty((0, 2), np.float32), np.empty((0, 2)), []])
-def test_no_points_give_an_empty_array(describe, xy) -> None:
-    descriptors = describe(make_gray(), xy)
-    assert descriptors.shape == (0, 128)
-    assert descriptors.dtype == np.uint8
-
-
-@pytest.mark.parametrize("kind", [int, np.int32, np.float32, np.float64])
-def test_positions_may_have_any_number_type(kind: type) -> None:
-    gray, xy = make_gray(), make_points()
-    np.testing.assert_array_equal(
-        sift_descriptors(gray, xy.astype(kind)), sift_descriptors(gray, xy)
-    )
 
 
 def test_the_unset_angle_is_a_turn_of_one_degree() -> None:
@@ -195,14 +165,6 @@ def test_root_sift_distances_are_hellinger_distances_of_sift() -> None:
     np.testing.assert_allclose(squared, 2 - 2 * affinity, atol=0.01)
 
 
-def test_root_sift_follows_size_and_angle() -> None:
-    gray, xy = make_gray(), make_points()
-    sift = sift_descriptors(gray, xy, 5.0, 30.0).astype(float)
-    root = root_sift_descriptors(gray, xy, 5.0, 30.0)
-    expected = 512 * np.sqrt(sift / sift.sum(1, keepdims=True))
-    np.testing.assert_allclose(root, np.minimum(expected, 255), atol=0.51)
-
-
 def test_many_keypoints_are_done_at_once_and_few_by_opencv() -> None:
     gray = make_gray()
     everywhere = np.stack(np.meshgrid(np.arange(90), np.arange(70)), -1).reshape(-1, 2)
@@ -248,21 +210,6 @@ def test_takes_the_rows_it_is_told(photo: np.ndarray) -> None:
     np.testing.assert_allclose(found, 1 - (a * b).sum(axis=1) / lengths, atol=1e-5)
 
 
-def test_what_is_the_mean_tells_nothing() -> None:
-    same = np.full((1, 128), 20, np.uint8)
-    other = np.arange(128, dtype=np.uint8)[None]
-    row, mean = np.array([0]), np.full(128, 20, np.float32)
-    for pair in ((same, same), (same, other), (other, same)):
-        assert correlation_distance(pair[0], row, pair[1], row, mean).tolist() == [1.0]
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_takes_none_and_one(count: int) -> None:
-    some = np.arange(128, dtype=np.uint8)[None]
-    rows = np.zeros(count, np.int64)
-    assert correlation_distance(some, rows, some, rows, np.zeros(128, np.float32)).shape == (count,)
-
-
 def test_equal_descriptors_have_no_distance() -> None:
     """Null pairs that are all the same differ from ones that are nearly so."""
     generator = np.random.default_rng(0)
@@ -270,35 +217,6 @@ def test_equal_descriptors_have_no_distance() -> None:
     rows = np.arange(len(first))
     for mean in (np.zeros(128, np.float32), first.mean(axis=0).astype(np.float32)):
         assert not correlation_distance(first, rows, first.copy(), rows, mean).any()
-
-
-def test_the_documented_names_exist() -> None:
-    assert get_descriptor("sift") is sift_descriptors
-    assert get_descriptor("rootsift") is root_sift_descriptors
-    assert get_descriptor("sift-opencv") is opencv_sift_descriptors
-
-
-@pytest.mark.parametrize(
-    ("name", "hint"),
-    [
-        ("siift", "did you mean 'sift'?"),
-        ("SIFT", "did you mean 'sift'?"),
-        ("root_sift", "did you mean 'rootsift'?"),
-        ("RootSIFT", "did you mean 'rootsift'?"),
-    ],
-)
-def test_an_unknown_name_brings_the_nearest(name: str, hint: str) -> None:
-    with pytest.raises(OptionError) as caught:
-        get_descriptor(name)
-    assert repr(name) in str(caught.value)
-    assert hint in str(caught.value)
-
-
-@pytest.mark.parametrize("name", ["", "qqq", None, 3])
-def test_a_name_like_no_other_brings_the_whole_list(name: object) -> None:
-    with pytest.raises(OptionError, match="known: sift, rootsift") as caught:
-        get_descriptor(name)
-    assert "did you mean" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", DESCRIPTORS)

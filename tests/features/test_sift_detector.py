@@ -71,12 +71,6 @@ def test_faint_parts_have_keypoints_too(photo: np.ndarray) -> None:
     assert (xy[:, 0] < 120).mean() > 0.15
 
 
-def test_is_the_same_on_repetition(photo: np.ndarray) -> None:
-    first, second = (detect_sift(luma(photo), 90) for _ in range(2))
-    np.testing.assert_array_equal(first.xy, second.xy)
-    np.testing.assert_array_equal(first.descriptors, second.descriptors)
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (5, 5), (1, 9), (64, 80)])
 def test_a_flat_image_has_no_keypoints(shape: tuple[int, int]) -> None:
     found = detect_sift(np.full(shape, 90, np.uint8))
@@ -85,30 +79,11 @@ def test_a_flat_image_has_no_keypoints(shape: tuple[int, int]) -> None:
     assert found.descriptors.dtype == np.uint8
 
 
-@given(
-    shape=st.tuples(st.integers(1, 12), st.integers(1, 12)),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_tiny_images_are_taken(shape: tuple[int, int], seed: int) -> None:
-    gray = np.random.default_rng(seed).integers(0, 256, shape).astype(np.uint8)
-    found = detect_sift(gray)
-    assert found.xy.shape == (len(found), 2)
-    assert found.descriptors.shape == (len(found), 128)
-
-
 def test_spread_takes_the_strongest_of_each_cell_before_any_second() -> None:
     xy = np.array([[1, 1], [2, 2], [3, 1], [50, 50], [51, 50], [95, 5]], float)
     strength = np.array([9.0, 8, 7, 2, 3, 1])
     assert spread_over_grid(xy, strength, (100, 100), 6).tolist() == [0, 4, 5, 1, 3, 2]
     assert spread_over_grid(xy, strength, (100, 100), 3).tolist() == [0, 4, 5]
-
-
-def test_spread_has_square_cells() -> None:
-    """24 of them along the longer side, here of 10 pixels each way."""
-    xy = np.array([[5, 5], [5, 9], [5, 11], [9, 5], [11, 5]], float)
-    strength = np.arange(5, 0, -1.0)
-    assert spread_over_grid(xy, strength, (240, 40), 3).tolist() == [0, 2, 4]
-    assert spread_over_grid(xy[:, ::-1], strength, (40, 240), 3).tolist() == [0, 2, 4]
 
 
 @given(

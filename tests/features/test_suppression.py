@@ -34,10 +34,6 @@ def test_of_two_radii_the_smaller_one_counts(seed: int) -> None:
     assert suppress_neighbors(xy, scores, radii).tolist() == kept
 
 
-def test_no_points() -> None:
-    assert len(suppress_neighbors(np.empty((0, 2)), np.empty(0), 2)) == 0
-
-
 @pytest.mark.parametrize("radius", [0.7, 3.0, "own"])
 def test_compiled_and_not_are_the_same(
     radius: float | str, monkeypatch: pytest.MonkeyPatch

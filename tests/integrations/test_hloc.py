@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import OptionError, PointDetector
+from deepdetect import PointDetector
 from deepdetect.integrations import hloc
 
 from .conftest import Views
@@ -90,12 +90,6 @@ def test_the_extractor_gives_described_points(views: Views, load: Callable[..., 
     assert torch.allclose(turned["oris"], torch.deg2rad(found["oris"]))
 
 
-def test_grey_images_are_taken(views: Views, load: Callable[..., Any]) -> None:
-    gray = batch(views.first).mean(1, keepdim=True)
-    found = load("extractors", {"name": "deepdetect", "max_keypoints": 50})({"image": gray})
-    assert found["keypoints"].shape == (1, 50, 2)
-
-
 def test_matches_of_two_views(views: Views, load: Callable[..., Any]) -> None:
     extractor = load("extractors", {"name": "deepdetect", "max_keypoints": 500})
     features = [extractor({"image": batch(image)}) for image in (views.first, views.second)]
@@ -123,20 +117,6 @@ def test_dense_matches_of_two_views(views: Views, load: Callable[..., Any]) -> N
     points0, points1 = found["keypoints0"].numpy(), found["keypoints1"].numpy()
     assert len(points0) == len(points1) == len(found["scores"]) > 3000
     assert views.correct(points0, points1) > 0.95
-
-
-def test_wrong_use(load: Callable[..., Any]) -> None:
-    with pytest.raises(OptionError, match="did you mean 'max_keypoints'"):
-        load("extractors", {"name": "deepdetect", "max_keypoint": 9})
-    with pytest.raises(OptionError, match="up to 32767 keypoints, not 40000"):
-        load("extractors", {"name": "deepdetect", "max_keypoints": 40_000})
-    with pytest.raises(OptionError, match="did you mean 'radians'"):
-        load("extractors", {"name": "deepdetect", "angle_unit": "radian"})
-    with pytest.raises(OptionError, match="`ratio` must lie"):
-        load("matchers", {"name": "deepdetect", "ratio": 2})
-    large = {"descriptors0": torch.zeros(1, 128, 2), "descriptors1": torch.zeros(1, 128, 32768)}
-    with pytest.raises(OptionError, match="not 32768: extract fewer"):
-        load("matchers", {"name": "deepdetect"})(large)
 
 
 @pytest.mark.skipif(

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import MissingExtraError, OptionError, PointDetector
+from deepdetect import OptionError, PointDetector
 from deepdetect.integrations.kornia import DeepDetectDetector, DeepDetectFeature
 from deepdetect.io.image import luma
 
@@ -101,9 +101,3 @@ def test_a_mask_hides(views: Views) -> None:
     assert kornia_feature.get_laf_center(lafs)[..., 0].max() < 101
     with pytest.raises(OptionError, match="the mask must have the shape"):
         DeepDetectDetector(PointDetector(50))(tensor(views.first), mask[0])
-
-
-def test_the_error_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match="run pip install kornia"):
-        DeepDetectDetector()

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import Keypoints, OptionError, PointDetector
+from deepdetect import Keypoints, PointDetector
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.integrations.lightglue import DeepDetectExtractor, to_lightglue
 from deepdetect.io.image import luma
@@ -84,14 +84,3 @@ def test_lightglue_runs_on_our_points(views: Views) -> None:
     rows0, rows1 = found["matches"][0].T
     assert len(rows0) > 0
     assert int(max(rows0.max(), rows1.max())) < 60
-
-
-def test_wrong_use(views: Views) -> None:
-    with pytest.raises(OptionError, match="up to 4096 keypoints, not 5000"):
-        DeepDetectExtractor(PointDetector(5000))
-    with pytest.raises(OptionError, match="did you mean 'sigma'"):
-        DeepDetectExtractor(scale="sigmas")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="takes one image, not 2"):
-        DeepDetectExtractor().extract(torch.zeros(2, 3, 32, 32))
-    with pytest.raises(OptionError, match="sizes, angles and descriptors"):
-        to_lightglue(Keypoints([[1, 2]], [1], (8, 8)))

@@ -76,8 +76,3 @@ def test_classes_derived_from_a_missing_one(one_line: Callable[[BaseException], 
         assert "run pip install no_such_package" in one_line(caught.value)
     with pytest.raises(MissingExtraError):
         import_package("no_such_package.models")
-
-
-def test_installed_packages_are_imported() -> None:
-    assert import_package("json") is json
-    assert base_class("collections", "OrderedDict").__name__ == "OrderedDict"

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import Keypoints, OptionError, PointDetector
+from deepdetect import Keypoints, PointDetector
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.integrations.skimage import DeepDetectFeatures
 from deepdetect.io.image import luma
@@ -40,26 +40,6 @@ def test_a_bright_spot_is_found_in_its_row_and_column() -> None:
     assert features.keypoints == pytest.approx(np.array([[20, 70]]), abs=0.2)
     # Scikit-image finds it in the same place.
     assert feature.peak_local_max(image).tolist() == [[20, 70]]
-
-
-def test_it_has_the_methods_and_attributes_of_sift(views: Views) -> None:
-    sift, ours = feature.SIFT(), DeepDetectFeatures(PointDetector(50))
-    for name in ("detect", "extract", "detect_and_extract"):
-        assert callable(getattr(sift, name))
-        assert callable(getattr(ours, name))
-    gray = luma(views.first) / 255
-    sift.detect_and_extract(gray)
-    ours.detect_and_extract(gray)
-    for name in ("keypoints", "orientations", "descriptors"):
-        theirs, own = getattr(sift, name), getattr(ours, name)
-        assert own.ndim == theirs.ndim
-        assert own.shape[1:] == theirs.shape[1:]
-    assert ours.descriptors.dtype == sift.descriptors.dtype
-    # The same unit: where both found a place, sigmas agree.
-    distances = np.hypot(*(sift.positions[:, None] - ours.keypoints[None]).transpose(2, 0, 1))
-    theirs, own = np.nonzero(distances < 0.5)
-    assert len(own) > 5
-    assert np.median(ours.scales[own] / sift.sigmas[theirs]) == pytest.approx(1.25, rel=0.2)
 
 
 def test_matches_of_two_views(views: Views) -> None:
@@ -99,19 +79,3 @@ def test_keypoints_of_scikit_images_corners_are_described(views: Views) -> None:
     )
     assert features.descriptors.shape == (len(corners), 128)
     assert np.array_equal(features_turned.descriptors, expected.descriptors)
-
-
-def test_wrong_use(views: Views) -> None:
-    features = DeepDetectFeatures()
-    with pytest.raises(OptionError, match="call detect first"):
-        features.extract(views.first)
-    with pytest.raises(OptionError, match="need scales"):
-        features.extract(views.first, np.array([[5, 5]]))
-    with pytest.raises(OptionError, match="belong to keypoints"):
-        features.extract(views.first, scales=4.0)
-    with pytest.raises(OptionError, match=r"`keypoints` has the shape \(2, 3\)"):
-        features.extract(views.first, np.ones((2, 3)), 4.0)
-    with pytest.raises(OptionError, match=r"`scales` has the shape \(3,\)"):
-        features.extract(views.first, np.ones((2, 2)), np.ones(3))
-    with pytest.raises(OptionError, match=r"`orientations` .* each of the 2 keypoints"):
-        features.extract(views.first, np.ones((2, 2)), 4.0, np.ones(1))

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, OptionError, WeightsError
+from deepdetect import DeepDetect, OptionError
 from deepdetect.integrations.transformers import (
-    DeepDetectConfig,
     DeepDetectForKeypointDetection,
     DeepDetectImageProcessor,
     register,
@@ -132,17 +131,6 @@ def test_images_scaled_down_keep_their_pixel_centres(model: Any, views: Views) -
     assert torch.allclose(found["keypoints"], 3 * small["keypoints"] + 1, atol=1e-3)
 
 
-def test_images_of_all_kinds(processor: Any, views: Views, tmp_path: Path) -> None:
-    Image.fromarray(views.first).save(tmp_path / "photo.png")
-    tensor = torch.from_numpy(views.first.copy()).permute(2, 0, 1).float() / 255
-    images = [views.first, tmp_path / "photo.png", Image.fromarray(views.first), tensor]
-    for image in [*images, images, tensor[None]]:
-        values = processor(image, return_tensors="np")["pixel_values"]
-        assert np.array_equal(values[-1], np.float32(views.first.transpose(2, 0, 1)) / 255) or (
-            np.abs(values[-1] - views.first.transpose(2, 0, 1) / 255).max() < 1e-6
-        )
-
-
 def test_it_can_be_trained(views: Views, processor: Any) -> None:
     model = DeepDetectForKeypointDetection.from_deepdetect()
     inputs = processor(views.first, return_tensors="pt")
@@ -171,16 +159,3 @@ def test_options(views: Views, processor: Any) -> None:
         views.first, max_keypoints=50, nms_radius=3
     )
     assert np.abs(found["keypoints"].numpy() - expected.xy).max() < 1e-2
-
-
-def test_wrong_use() -> None:
-    with pytest.raises(OptionError, match="max_keypoints"):
-        DeepDetectConfig(max_keypoints=0)
-    with pytest.raises(OptionError, match="max_pixels"):
-        DeepDetectImageProcessor(max_pixels=0)
-    with pytest.raises(WeightsError, match="there is no weights file"):
-        DeepDetectForKeypointDetection.from_deepdetect("missing/weights.safetensors")
-    with pytest.raises(OptionError, match="did you mean 'max_keypoints'"):
-        DeepDetectForKeypointDetection.from_deepdetect(max_keypoint=9)
-    with pytest.raises(OptionError, match="there are no images"):
-        DeepDetectImageProcessor()([])

@@ -11,7 +11,6 @@ import pytest
 
 from deepdetect import (
     DeepDetect,
-    ImageError,
     Keypoints,
     Matches,
     MatchingOptions,
@@ -340,16 +339,6 @@ def test_mutual_leaves_one_to_one(photo: np.ndarray) -> None:
     assert len(np.unique(every.points1, axis=0)) < len(every)
 
 
-def test_the_seed_reaches_the_matcher(photo: np.ndarray) -> None:
-    second = warped(photo, WARP)
-    found = [
-        unguided(photo, second, Corners(), density=0.1, model="none", seed=seed) for seed in (0, 1)
-    ]
-    assert found[0].points1.shape != found[1].points1.shape or not np.array_equal(
-        found[0].points1, found[1].points1
-    )
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -370,22 +359,6 @@ def test_wrong_options(photo: np.ndarray, values: dict[str, Any], message: str) 
 
 
 # Detectors
-
-
-def test_a_stand_in_sees_8_bit_rgb(photo: np.ndarray, photo_path: Path) -> None:
-    corners = Corners()
-    gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
-    match(photo_path, gray, corners, max_keypoints=10)
-    np.testing.assert_array_equal(corners.seen[0], photo)
-    np.testing.assert_array_equal(corners.seen[1], np.dstack([gray] * 3))
-    assert all(image.dtype == np.uint8 for image in corners.seen)
-
-
-def test_a_detector_keeps_its_own_resolution(photo: np.ndarray) -> None:
-    squashing = DeepDetect(resolution=64, network_channels="bgr")
-    chosen = {"max_keypoints": 100}
-    matches = match(photo, photo, squashing, **chosen)
-    np.testing.assert_array_equal(matches.keypoints0.xy, squashing.detect(photo, **chosen).xy)
 
 
 @pytest.mark.parametrize("guided", [True, False])
@@ -434,14 +407,6 @@ def test_the_same_image_in_other_forms(photo: np.ndarray, photo_path: Path) -> N
     for image in forms:
         assert_same(unguided(image, photo, Corners(), max_keypoints=200), expected)
         assert_same(unguided(photo, image, Corners(), max_keypoints=200), expected)
-
-
-@pytest.mark.parametrize("place", [0, 1])
-def test_a_missing_image_is_an_image_error(photo: np.ndarray, tmp_path: Path, place: int) -> None:
-    images: list[Any] = [photo, photo]
-    images[place] = tmp_path / "no.png"
-    with pytest.raises(ImageError, match=r"no\.png"):
-        match(*images, Corners())
 
 
 @pytest.mark.parametrize("settings", [{}, PUBLISHED], ids=["default", "published"])
@@ -557,12 +522,6 @@ def test_seeds_that_are_no_matches_are_refused(photo: np.ndarray, seeds, message
         match(photo, photo, RandomDetector(), tentative_matches=seeds)
 
 
-def test_seeds_guide_nothing_without_guided_matching(photo: np.ndarray) -> None:
-    seeds = np.zeros((9, 2)), np.zeros((9, 2))
-    with pytest.raises(OptionError, match="`tentative_matches` guide"):
-        match(photo, photo, RandomDetector(), tentative_matches=seeds, guided_matching=False)
-
-
 def test_a_pair_without_a_geometry_has_no_matches() -> None:
     rng = np.random.default_rng(0)
     first, second = (rng.integers(0, 256, (120, 160, 3), np.uint8) for _ in range(2))
@@ -598,16 +557,6 @@ def test_a_pair_without_a_geometry_needs_no_keypoints_before_they_are_asked_for(
     np.testing.assert_array_equal(again.keypoints0.xy, detector.detect(first).xy)
     assert not again.success
     assert len(matches[:0]) == len(matches.unique()) == 0
-
-
-def test_a_mask_of_another_size_is_an_error_of_a_pair_without_a_geometry(
-    one_line: OneLine,
-) -> None:
-    rng = np.random.default_rng(0)
-    first, second = (rng.integers(0, 256, (120, 160, 3), np.uint8) for _ in range(2))
-    with pytest.raises(OptionError) as caught:
-        match(first, second, ignore=np.zeros((5, 5), bool))
-    assert "ignore" in one_line(caught.value)
 
 
 @pytest.mark.parametrize("mutual", [False, True])

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import cv2
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from deepdetect import MissingExtraError
 from deepdetect.features.matchers import match_descriptors
 from deepdetect.features.matchers.approximate import faiss_neighbours, flann_neighbours
 from deepdetect.features.matchers.matching import exact_neighbours
@@ -72,15 +70,6 @@ def test_recall_is_high_on_clusters() -> None:
     assert np.quantile(excess, 0.95) < 1.5
 
 
-def test_finds_copies() -> None:
-    base = sift_like(0, 1500)
-    order = np.random.default_rng(1).permutation(1500)
-    rows, distances = flann_neighbours(base[order], base, 1, 0)
-    found = rows[:, 0] == order
-    assert found.mean() > 0.95
-    np.testing.assert_array_equal(distances[found], 0)
-
-
 @pytest.mark.parametrize(("size", "count"), [(1, 1), (2, 1), (2, 2), (3, 2)])
 def test_a_tiny_base_is_searched_exactly(size: int, count: int) -> None:
     queries, base = sift_like(1, 6), sift_like(2, size)
@@ -88,20 +77,6 @@ def test_a_tiny_base_is_searched_exactly(size: int, count: int) -> None:
     expected = exact_neighbours(queries, base, count, 0)
     np.testing.assert_array_equal(rows, expected[0])
     np.testing.assert_allclose(distances, expected[1], rtol=1e-6)
-
-
-def test_a_base_of_equal_descriptors() -> None:
-    equal = np.full((200, 16), 7, np.float32)
-    rows, distances = flann_neighbours(equal[:5], equal, 2, 0)
-    assert ((rows >= 0) & (rows < 200)).all()
-    assert (rows[:, 0] != rows[:, 1]).all()
-    np.testing.assert_array_equal(distances, 0)
-
-
-def test_shapes_and_types() -> None:
-    rows, distances = flann_neighbours(sift_like(1, 7), sift_like(2, 9), 2, 0)
-    assert (rows.shape, rows.dtype) == ((7, 2), np.int32)
-    assert (distances.shape, distances.dtype) == ((7, 2), np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -159,12 +134,6 @@ def test_a_neighbour_that_was_not_found_makes_no_match(monkeypatch: pytest.Monke
 
     descriptors = np.zeros((4, 8), np.float32)
     assert len(match_descriptors(descriptors, descriptors, half_blind)) == 0
-
-
-def test_without_faiss_one_sentence_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "faiss", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'deepdetect\[faiss\]'"):
-        faiss_neighbours(np.zeros((2, 8)), np.zeros((2, 8)), 2, 0)
 
 
 def test_flann_leaves_the_callers_random_numbers_alone() -> None:

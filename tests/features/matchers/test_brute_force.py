@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import tracemalloc
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,9 +10,8 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.distance import cdist
 
 from deepdetect import OptionError
-from deepdetect.features.matchers import MATCHERS, brute_force, get_matcher, match_descriptors
+from deepdetect.features.matchers import matching as brute_force
 from deepdetect.features.matchers.matching import exact_neighbours, hamming_neighbours
-from deepdetect.io.image import luma
 
 
 def naive_neighbours(
@@ -83,43 +81,6 @@ def test_the_lower_row_comes_first_among_many_equals(size: int) -> None:
     base = rng.integers(0, 2, (size, 3)).astype(np.float32)
     queries = rng.integers(0, 2, (40, 3)).astype(np.float32)
     assert_exact(queries, base, 2)
-
-
-def test_duplicates_are_at_distance_zero() -> None:
-    base = sift_like(np.random.default_rng(0), 30)
-    doubled = np.concatenate([base, base])
-    rows, distances = exact_neighbours(base, doubled, 2, 0)
-    np.testing.assert_array_equal(rows, np.stack([np.arange(30), np.arange(30, 60)], 1))
-    np.testing.assert_array_equal(distances, 0)
-
-
-@pytest.mark.parametrize(("size", "count"), [(1, 1), (2, 1), (2, 2), (3, 3)])
-def test_the_base_may_hold_no_more_than_asked(size: int, count: int) -> None:
-    rng = np.random.default_rng(size)
-    assert_exact(sift_like(rng, 4), sift_like(rng, size), count)
-
-
-def test_shapes_and_types() -> None:
-    rng = np.random.default_rng(0)
-    rows, distances = exact_neighbours(sift_like(rng, 7), sift_like(rng, 9), 2, 0)
-    assert (rows.shape, rows.dtype) == ((7, 2), np.int32)
-    assert (distances.shape, distances.dtype) == ((7, 2), np.float32)
-
-
-def test_no_queries_give_empty_arrays() -> None:
-    rows, distances = exact_neighbours(
-        np.empty((0, 8), np.float32), np.ones((3, 8), np.float32), 2, 0
-    )
-    assert rows.shape == distances.shape == (0, 2)
-
-
-def test_the_seed_plays_no_part() -> None:
-    rng = np.random.default_rng(0)
-    queries, base = sift_like(rng, 20), sift_like(rng, 30)
-    for one, other in zip(
-        exact_neighbours(queries, base, 2, 0), exact_neighbours(queries, base, 2, 7), strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("offset", [1.0, 30.0, 1000.0])
@@ -205,11 +166,6 @@ def test_blocks_do_not_change_the_hamming_result(
     assert_nearest(random_bytes(0, 60, 32), random_bytes(1, 80, 32), 2)
 
 
-def test_no_queries_have_no_neighbours() -> None:
-    rows, distances = hamming_neighbours(random_bytes(0, 0, 32), random_bytes(1, 5, 32), 2, 0)
-    assert rows.shape == distances.shape == (0, 2)
-
-
 def test_the_base_may_be_as_large_as_that_of_any_matcher() -> None:
     """OpenCV's brute force ends at 2^18 rows; ORB with low settings finds more."""
     base = random_bytes(0, (1 << 18) + 3, 8)
@@ -228,22 +184,3 @@ def test_descriptors_that_are_not_binary_are_an_error(dtype, one_line) -> None:
         with pytest.raises(OptionError, match="use exact or flann") as caught:
             hamming_neighbours(*pair, 2, 0)
         one_line(caught.value)
-
-
-def test_it_is_registered_and_serves_the_ratio_test(photo: np.ndarray) -> None:
-    assert get_matcher("hamming") is MATCHERS["hamming"] is hamming_neighbours
-    parts = [photo[:200, :200], photo[10:210, 5:205]]
-    described = [
-        cv2.ORB_create().detectAndCompute(luma(np.ascontiguousarray(part)), None)[1]
-        for part in parts
-    ]
-    found = match_descriptors(*described, hamming_neighbours, ratio=0.8, mutual=True)
-    every = bit_distances(*described)
-    ordered = np.sort(every, axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        kept = ordered[:, 0] / ordered[:, 1] < 0.8
-    mutual = (every.min(1) == every.min(0)[every.argmin(1)]) & kept
-    assert len(found) > 50
-    assert set(found.indices0) <= set(np.flatnonzero(kept))
-    # Ties among the columns' nearest alone may distinguish the two.
-    assert abs(len(found) - mutual.sum()) <= 0.02 * mutual.sum()

@@ -15,7 +15,6 @@ from deepdetect.features.matchers import (
     match_descriptors,
     matching,
 )
-from deepdetect.features.matchers.approximate import flann_neighbours
 from deepdetect.features.matchers.matching import exact_neighbours
 
 
@@ -112,38 +111,6 @@ def test_without_a_second_best_nothing_matches(
     assert matches.ratios.dtype == np.float32
 
 
-@pytest.mark.parametrize("name", ["flann", "exact"])
-@pytest.mark.parametrize("mutual", [False, True])
-def test_one_descriptor_matches_into_a_larger_set(name: str, mutual: bool) -> None:
-    """There is a second-best in the second set, whatever the size of the first."""
-    second = points((9, 9), (0, 1), (5, 5))
-    matches = match_descriptors(points((0, 0)), second, get_matcher(name), mutual=mutual)
-    assert pairs(matches) == {(0, 1)}
-
-
-def test_mutual_asks_the_matcher_the_other_way_with_the_same_seed() -> None:
-    calls: list[tuple[int, int, int, int]] = []
-
-    def spy(queries, base, count: int, seed: int, positions=None) -> tuple[np.ndarray, np.ndarray]:
-        calls.append((len(queries), len(base), count, seed))
-        return MATCHERS["exact"](queries, base, count, seed)
-
-    match_descriptors(random_descriptors(0, 5), random_descriptors(1, 7), spy, seed=3, mutual=True)
-    assert calls == [(5, 7, 2, 3), (7, 5, 1, 3)]
-
-
-def test_shapes_and_types() -> None:
-    matches = match_descriptors(
-        random_descriptors(0, 30), random_descriptors(1, 40), get_matcher("exact"), ratio=1.0
-    )
-    assert len(matches) == 30
-    assert matches.indices0.shape == matches.indices1.shape == matches.ratios.shape == (30,)
-    assert np.issubdtype(matches.indices0.dtype, np.integer)
-    assert np.issubdtype(matches.indices1.dtype, np.integer)
-    assert matches.ratios.dtype == np.float32
-    assert (np.diff(matches.indices0) > 0).all()
-
-
 seeds = st.integers(0, 10_000)
 counts = st.integers(2, 40)
 ratios = st.floats(0.05, 1.0)
@@ -174,22 +141,6 @@ def test_mutual_matches_are_the_same_both_ways(seed: int, count0: int, count1: i
     assert len(there) > 0
 
 
-@given(seed=seeds, count0=counts, count1=counts, ratio=ratios)
-def test_mutual_only_removes_matches_and_leaves_one_to_one(
-    seed: int, count0: int, count1: int, ratio: float
-) -> None:
-    first, second = random_descriptors(seed, count0), random_descriptors(seed + 1, count1)
-    every = match_descriptors(first, second, get_matcher("exact"), ratio=ratio)
-    mutual = match_descriptors(first, second, get_matcher("exact"), ratio=ratio, mutual=True)
-    assert pairs(mutual) <= pairs(every)
-    assert len(set(mutual.indices1.tolist())) == len(mutual)
-
-
-def test_the_documented_names_exist() -> None:
-    assert get_matcher("flann") is flann_neighbours
-    assert get_matcher("exact") is exact_neighbours
-
-
 @pytest.mark.parametrize(
     ("name", "hint"),
     [
@@ -203,13 +154,6 @@ def test_an_unknown_name_brings_the_nearest(name: str, hint: str) -> None:
         get_matcher(name)
     assert repr(name) in str(caught.value)
     assert hint in str(caught.value)
-
-
-@pytest.mark.parametrize("name", ["", "brute", None])
-def test_a_name_like_no_other_brings_the_whole_list(name: object) -> None:
-    with pytest.raises(OptionError, match="known: auto, flann, exact") as caught:
-        get_matcher(name)
-    assert "did you mean" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", MATCHERS)

@@ -17,7 +17,7 @@ from ..._shared.opencv import cv2
 FLANN_INDEX_KDTREE = 1
 
 TREES, CHECKS = 5, 50
-"""Of FLANN: random trees, and leaves that are visited for each query (paper's code)."""
+"""Of FLANN, as in the paper's code."""
 
 LISTS_PER_ROOT, PROBES, TRAINING_PER_LIST = 4, 16, 40
 """Of faiss: lists of the inverted file, in units of the square root of the descriptors; lists that
@@ -28,15 +28,26 @@ MIN_INDEXED = 4096
 
 
 def flann_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
+    queries: np.ndarray,
+    base: np.ndarray,
+    count: int,
+    seed: int,
+    positions: object = None,
+    trees: int = TREES,
+    checks: int = CHECKS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`."""
+    """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`.
+
+    Args:
+        trees: number of trees.
+        checks: leaves that are visited for each query.
+    """
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
 
     def search() -> tuple[np.ndarray, np.ndarray]:
         cv2.setRNGSeed(seed)
-        index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": TREES})
-        return index.knnSearch(queries, count, params={"checks": CHECKS})
+        index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
+        return index.knnSearch(queries, count, params={"checks": checks})
 
     # OpenCV has one random number generator per thread: that of the caller is left alone.
     with ThreadPoolExecutor(1) as thread:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...features.keypoints import Keypoints
-from ...features.matchers import get_matcher, match_descriptors
+from ...features.matchers import match_descriptors
+from ...features.matchers.matching import exact_neighbours
 from ...features.sift import describe_keypoints, detect_sift
 from ...geometry.rescaling import downscale, scaled_points
 
@@ -140,7 +141,7 @@ def match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
     found = match_descriptors(
         first.descriptors,
         second.descriptors,
-        get_matcher("exact"),
+        exact_neighbours,
         ratio=max(MAX_RATIOS),
         mutual=True,
     )
