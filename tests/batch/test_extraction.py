@@ -169,53 +169,6 @@ def test_images_that_are_gone_lose_their_features(
     assert names() == ["a/02.png", "b/01.png"]
 
 
-def test_what_the_network_is_fed_is_a_setting(
-    collection: Callable[..., Path], tmp_path: Path
-) -> None:
-    folder = collection(1)
-    for _ in range(2):
-        extract_features(folder, tmp_path / "f.h5", DeepDetect(), selection=PIXELS, workers=1)
-    other = DeepDetect(network_channels="bgr")
-    with pytest.raises(OptionError, match=r"other settings \(`network_channels`\)"):
-        extract_features(folder, tmp_path / "f.h5", other, selection=PIXELS, workers=1)
-
-
-def test_weights_that_have_changed_are_loaded_again(
-    collection: Callable[..., Path], tmp_path: Path
-) -> None:
-    import h5py
-
-    folder, weights = collection(1), tmp_path / "mine.onnx"
-    for name in ("default", "dense"):
-        original = DeepDetect(name, backend="onnxruntime", threads=1)
-        weights.write_bytes(original.weights.read_bytes())
-        extract_features(
-            folder,
-            tmp_path / f"{name}.h5",
-            DeepDetect(weights, backend="onnxruntime"),
-            selection=PIXELS,
-            workers=1,
-        )
-        expected = original.detect(folder / "a/00.png", max_keypoints=50)
-        with h5py.File(tmp_path / f"{name}.h5") as file:
-            np.testing.assert_array_equal(file["a/00.png/keypoints"], expected.xy)
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_too_large_images_are_failures(
-    workers: int, collection: Callable[..., Path], tmp_path: Path
-) -> None:
-    from PIL import Image
-
-    folder = collection(2)
-    Image.new("RGB", (200, 200)).save(folder / "large.png")
-    report = extract_features(folder, tmp_path / "f.h5", FEW, max_megapixels=0.03, workers=workers)
-    assert len(report.counts) == 2
-    assert "large.png has 200x200 pixels, which is over 0.03 megapixels" in report.failures[0]
-    with pytest.raises(OptionError, match="`max_megapixels` must be above 0"):
-        extract_features(folder, tmp_path / "f.h5", max_megapixels=0)
-
-
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 600, 5000])
 def test_parts(count: int) -> None:
     parts = shards_of(range(count), IMAGES_PER_SHARD)
@@ -251,33 +204,3 @@ def test_a_killed_run_goes_on(
     assert not parts.exists()
     extract_features(folder, tmp_path / "whole.h5", PointDetector(500), workers=2)
     assert same_content(tmp_path / "f.h5", tmp_path / "whole.h5")
-
-
-MEMORY = """
-import sys
-from pathlib import Path
-from deepdetect import PointDetector
-from deepdetect.batch import extract_features
-
-def peak():
-    status = Path("/proc/self/status").read_text()
-    return int(status.split("VmHWM:")[1].split()[0])
-
-for folder in sys.argv[1:]:
-    extract_features(folder, folder + ".h5", PointDetector(500), workers=1)
-    print(peak())
-"""
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_the_number_of_images(
-    collection: Callable[..., Path], tmp_path: Path
-) -> None:
-    if not Path("/proc/self/status").exists():
-        pytest.skip("needs /proc to see the memory")
-    folders = [str(collection(count, name=f"of{count}")) for count in (100, 400)]
-    code = subprocess.run(
-        [sys.executable, "-c", MEMORY, *folders], capture_output=True, text=True, check=True
-    )
-    few, many = map(int, code.stdout.split())
-    assert many < 1.1 * few

@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetectError, MissingExtraError, OptionError
+from deepdetect import DeepDetectError, OptionError
 from deepdetect.batch import hdf5
 from deepdetect.batch.hdf5 import Group, ShardedWriter, open_hdf5, state_of, write_groups
 
@@ -164,48 +162,6 @@ def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
         pass
 
 
-def test_one_process_at_a_time(tmp_path: Path) -> None:
-    pytest.importorskip("fcntl")
-    path = tmp_path / "out.h5"
-    code = (
-        "import sys; from pathlib import Path\n"
-        "from deepdetect.batch.hdf5 import ShardedWriter\n"
-        "with ShardedWriter(Path(sys.argv[1]), {}).opened(): print('opened')\n"
-    )
-    command = [sys.executable, "-c", code, str(path)]
-    with ShardedWriter(path, {}).opened():
-        other = subprocess.run(command, capture_output=True, text=True)
-        assert "is being written by another process" in other.stderr
-    assert subprocess.run(command, capture_output=True, text=True).stdout == "opened\n"
-
-
-def test_without_h5py(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    with (
-        pytest.raises(MissingExtraError, match="pip install h5py"),
-        ShardedWriter(tmp_path / "out.h5", {}).opened(),
-    ):
-        pass
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_replacing_goes_on_after_a_kill(tmp_path: Path) -> None:
-    path = tmp_path / "out.h5"
-    with ShardedWriter(path, {"ratio": 0.8}).opened() as file:
-        write_groups(file.shard(["x"]), [group("x", 1)])
-        file.merge()
-    new = {"ratio": 0.9}
-    with ShardedWriter(path, new, overwrite=True).opened() as file:
-        write_groups(file.shard(["x"]), [group("x", 2)])
-    with ShardedWriter(path, new, overwrite=True).opened() as file:  # as after a kill
-        assert file.done({"x": (1,), "y": (1,)}) == {"x"}
-    with ShardedWriter(path, {"ratio": 1}, overwrite=True).opened() as file:
-        assert file.done({"x": (1,)}) == set()
-        write_groups(file.shard(["x"]), [group("x", 3)])
-        file.merge()
-    assert values(path) == {"x": 3}
-
-
 def test_shards_of_other_settings_are_not_used(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
     for ratio in (0.8, 0.9):
@@ -231,14 +187,3 @@ def test_only_named_groups_stay(tmp_path: Path) -> None:
         write_groups(file.shard(["z"]), [group("y/2", 2), group("z", 2)])
         file.merge(stays={"y/2"}.__contains__)
     assert values(path) == {"y/2": 2}
-
-
-@pytest.mark.parametrize("overwrite", [False, True])
-def test_a_folder_is_no_file(overwrite: bool, tmp_path: Path) -> None:
-    with (
-        pytest.raises(OptionError, match="is a folder: name a file in it with -o"),
-        ShardedWriter(tmp_path, {}, overwrite).opened(),
-    ):
-        pass
-    with pytest.raises(DeepDetectError, match="is a folder"), open_hdf5(tmp_path):
-        pass

@@ -112,16 +112,6 @@ def test_two_pairs_of_one_name_are_not_mixed_up(features: Path, tmp_path: Path) 
     assert "is that of a/00.png b/01.png, too" in report.failures[0]
 
 
-def test_several_processes_give_the_same(
-    features: Path, tmp_path: Path, same_content: Callable[..., bool]
-) -> None:
-    names = ["a/00.png", "b/01.png", "a/02.png", "b/03.png", "a/04.png"]
-    pairs = [(a, b) for a in names for b in names if a < b]
-    for workers in (1, 2):
-        match_pairs(features, pairs, tmp_path / f"{workers}.h5", workers=workers)
-    assert same_content(tmp_path / "1.h5", tmp_path / "2.h5")
-
-
 def test_features_of_other_programs(tmp_path: Path) -> None:
     """As SuperPoint's: float16, negative numbers, 256 of them, and no attributes of ours."""
     import h5py
@@ -209,57 +199,24 @@ def test_features_that_do_not_fit_do_not_stop_the_others(tmp_path: Path) -> None
         wide=(whole[0], generator.normal(size=(9, 40))),
         few=(whole[0], whole[1][:, :20]),
         flat=(whole[0][:, 0], whole[1]),
+        unknown=(np.where(np.arange(80).reshape(40, 2) == 7, np.nan, whole[0]), whole[1]),
     )
-    pairs = [("good", name) for name in ("same", "wide", "few", "flat", "same/keypoints")]
+    others = ("same", "wide", "few", "flat", "unknown", "same/keypoints")
+    pairs = [("good", name) for name in others]
     report = match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5", workers=1)
     assert report.counts == {("good", "same"): 40}
     told = {failure.split(": ")[0]: failure for failure in report.failures}
     assert "their descriptors differ" in told["good wide"]
     assert "few is damaged" in told["good few"]
     assert "flat is damaged" in told["good flat"]
+    assert "unknown is damaged" in told["good unknown"]
     assert "no features of same/keypoints" in told["good same/keypoints"]
-
-
-def test_pairs_from_python(features: Path, tmp_path: Path) -> None:
-    pairs = [PAIR, PAIR[::-1], list(PAIR)]
-    report = match_pairs(features, pairs, tmp_path / "m.h5", workers=1)
-    assert (list(report.counts), report.skipped) == ([PAIR], 0)
 
 
 @pytest.mark.parametrize("pairs", [["a.jpg"], ["ab"], [("a", "b", "c")], [("a", "a")], [("a", "")]])
 def test_wrong_pairs_from_python(pairs: object, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="in `pairs` is no pair"):
         match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5")
-
-
-@pytest.mark.parametrize("matcher", ["auto", "patchmatch"])
-def test_many_points_are_not_matched_by_patchmatch(matcher: str, tmp_path: Path) -> None:
-    """It needs a grid: `auto` takes FLANN there, which finds the matches."""
-    import h5py
-
-    pytest.importorskip("numba", reason="needs numba (the extra match)")
-    generator = np.random.default_rng(0)
-    descriptors = np.abs(generator.normal(size=(20_100, 16))).astype(np.float32)
-    descriptors /= 2 * np.linalg.norm(descriptors, axis=1, keepdims=True)
-    order = generator.permutation(len(descriptors))
-    with h5py.File(tmp_path / "f.h5", "w") as file:
-        file.attrs["deepdetect"] = '{"descriptor": "rootsift"}'  # so they are bytes
-        for name, rows in (("x.jpg", np.arange(len(order))), ("y.jpg", order)):
-            file[f"{name}/descriptors"] = descriptors[rows].T
-            file[f"{name}/keypoints"] = generator.uniform(0, 999, (len(order), 2)).astype("f4")
-            file[f"{name}/scales"] = np.ones(len(order), np.float32)
-    options = PairMatchingOptions(matcher=matcher, mutual=False)
-    arguments = tmp_path / "f.h5", [("x.jpg", "y.jpg")], tmp_path / "m.h5"
-    if matcher == "patchmatch":
-        with pytest.raises(OptionError, match="dense keypoints of one scale and angle"):
-            match_pairs(*arguments, options=options, workers=1)
-        return
-    match_pairs(*arguments, options=options, workers=1)
-    with h5py.File(tmp_path / "m.h5") as file:
-        matches = file["x.jpg/y.jpg/matches0"][()]
-    found = matches >= 0
-    assert found.mean() > 0.5
-    assert (order[matches[found]] == np.flatnonzero(found)).mean() > 0.95
 
 
 def test_lists_of_pairs(tmp_path: Path) -> None:
@@ -314,17 +271,6 @@ def test_matches_of_features_that_are_gone_go_too(features: Path, tmp_path: Path
     assert (report.counts, len(report.failures)) == ({}, 1)
     with h5py.File(path) as file:
         assert pair_name(*PAIR) not in file
-
-
-def test_features_that_are_no_numbers_do_not_stop_the_others(tmp_path: Path) -> None:
-    generator = np.random.default_rng(0)
-    whole = generator.uniform(0, 99, (40, 2)), generator.normal(size=(8, 40))
-    unknown = np.where(np.arange(80).reshape(40, 2) == 7, np.nan, whole[0])
-    write_foreign(tmp_path / "f.h5", good=whole, same=whole, unknown=(unknown, whole[1]))
-    pairs = [("good", name) for name in ("same", "unknown")]
-    report = match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5", workers=1)
-    assert report.counts == {("good", "same"): 40}
-    assert "unknown is damaged" in report.failures[0]
 
 
 def test_damaged_features_do_not_stop_the_others(tmp_path: Path) -> None:

@@ -24,11 +24,6 @@ def test_the_engines() -> None:
         get_engine("process")
 
 
-def test_too_few_workers() -> None:
-    with pytest.raises(OptionError, match="workers must be at least 1, not 0"):
-        list(map_on_ray(math.sqrt, [1.0], 0))
-
-
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"deepdetect\[ray\]"):
@@ -151,46 +146,6 @@ def test_a_worker_is_killed_half_way(
         check(process, folder, output, same_content)
     finally:
         process.kill()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc to find the worker")
-@pytest.mark.usefixtures("_ray")
-@pytest.mark.parametrize(
-    ("words", "pattern", "count"),
-    [(("label",), "*.png", 60), (("shards", "--shard-size", "2"), "*.tar", 40)],
-)
-def test_a_worker_that_makes_labels_is_killed_half_way(
-    words: Sequence[str],
-    pattern: str,
-    count: int,
-    collection: Callable[..., Path],
-    tmp_path: Path,
-) -> None:
-    """Of a training set: masks, or shards; they are what the processes of one machine make."""
-    folder, output, whole = collection(120), tmp_path / "ray", tmp_path / "processes"
-    process = start(folder, output, words=words)
-    try:
-        wait_for_files(output, pattern, count // 2, process)
-        workers = descendants(process.pid, "ray::MapWorker")
-        assert len(workers) == 2
-        assert len(list(output.glob(pattern))) < count
-        os.kill(workers[0], signal.SIGKILL)
-        told, errors = process.communicate(timeout=600)
-        assert process.returncode == 0, errors
-    finally:
-        process.kill()
-    if words == ("label",):
-        labelled = [Path(report["mask"]).name for report in json.loads(told)["labelled"]]
-        assert sorted(labelled) == sorted(f"{k:02d}.png" for k in range(120))
-    command = [sys.executable, "-m", "deepdetect", words[0], folder, "-o", whole, *words[1:]]
-    subprocess.run(command, check=True, capture_output=True)
-    made, expected = (
-        {path.name: path.read_bytes() for path in made_in.iterdir() if path.is_file()}
-        for made_in in (output, whole)
-    )
-    assert len(expected) > count
-    assert made == expected
 
 
 @pytest.mark.slow

@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
 import sys
 
 import pytest
@@ -31,20 +28,3 @@ def test_errors_leave_standard_error_as_it_was(pycolmap, capfd: pytest.CaptureFi
     assert sys.stderr is before
     print("still there", file=sys.stderr)
     assert "still there" in capfd.readouterr().err
-
-
-@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
-@pytest.mark.parametrize("own", [False, True])
-def test_a_process_ends_without_a_stack_trace(own: bool) -> None:
-    """pycolmap takes SIGTERM for itself when it is imported."""
-    lines = [
-        "import os, signal",
-        "signal.signal(signal.SIGTERM, lambda *_: os._exit(7))" if own else "",
-        "from deepdetect.sfm.colmap import import_pycolmap",
-        "import_pycolmap()",
-        "os.kill(os.getpid(), signal.SIGTERM)",
-        "print('still here')",
-    ]
-    ended = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True)
-    assert ended.returncode == (7 if own else -signal.SIGTERM)
-    assert (ended.stdout, ended.stderr) == ("", "")

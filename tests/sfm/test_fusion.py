@@ -92,13 +92,6 @@ def test_points_without_parallax_or_behind_the_cameras_are_left_out(scene) -> No
     assert not fuse_matches(reference, xy, wide, behind)[2].any()
 
 
-def test_without_matches_there_are_no_points(scene) -> None:
-    reference, others, xy, _ = scene
-    for views in ([], others):
-        nothing = [np.full_like(xy, np.nan) for _ in views]
-        assert not fuse_matches(reference, xy, views, nothing)[2].any()
-
-
 def surface(reference: PosedView, depth: float = 6.0, stride: int = 2) -> DensePoints:
     """Return the points of a plane in the world that a view shows, one at each second pixel."""
     y, x = np.mgrid[0 : SIZE[1] : stride, 0 : SIZE[0] : stride]

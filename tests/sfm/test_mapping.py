@@ -74,18 +74,6 @@ def test_the_world_becomes_the_frame_of_one_camera(model) -> None:
     assert distances[0] / distances[1] == pytest.approx(scale)
 
 
-def test_the_last_adjustment_brings_cameras_back(model) -> None:
-    exact = read_sparse_model(model)
-    rng = np.random.default_rng(1)
-    for number in model.points3D:
-        model.points3D[number].xyz = model.points3D[number].xyz + rng.normal(0, 0.02, 3)
-    assert np.median(read_sparse_model(model).errors) > 0.3
-    adjust(model, True)
-    found = read_sparse_model(model)
-    assert found.errors.max() < 1e-3
-    assert found.views[1].camera == exact.views[1].camera
-
-
 def test_the_principal_point_is_estimated_from_many_images_only(model, monkeypatch) -> None:
     camera = model.cameras[1]
     camera.params = np.array([500.0, 500.0, 312.0, 236.0])

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import itertools
-
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +7,7 @@ import pytest
 from deepdetect import OptionError
 from deepdetect.features.sift import to_root_sift
 from deepdetect.sfm.options import MultiViewOptions
-from deepdetect.sfm.pair_selection import sequential_pairs, similar_pairs, vlad_vectors
+from deepdetect.sfm.pair_selection import similar_pairs, vlad_vectors
 
 
 def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> None:
@@ -22,12 +20,6 @@ def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> Non
 def test_wrong_options_are_refused(wrong: dict) -> None:
     with pytest.raises(OptionError, match=r"sequential|must be"):
         MultiViewOptions(**wrong)
-
-
-def test_a_sequence_is_matched_with_what_follows() -> None:
-    pairs = sequential_pairs("abcdef", 2)
-    assert len(pairs) == 2 * 6 - 3
-    assert all(0 < ord(b) - ord(a) <= 2 for a, b in pairs)
 
 
 def described(image: np.ndarray) -> np.ndarray:
@@ -54,16 +46,6 @@ def test_a_photograph_without_keypoints_is_like_no_other() -> None:
     vectors = vlad_vectors([one, one[:0], rng.random((30, 128), np.float32)])
     assert not vectors[1].any()
     assert (vectors @ vectors[1] == 0).all()
-
-
-def test_pairs_are_listed_once_and_the_vocabulary_repeats() -> None:
-    rng = np.random.default_rng(1)
-    sets = [rng.random((50, 16), np.float32) for _ in range(6)]
-    vectors = vlad_vectors(sets)
-    np.testing.assert_array_equal(vectors, vlad_vectors(sets))
-    names = list("abcdef")
-    pairs = similar_pairs(names, vectors, 10)  # more than there are
-    assert pairs == list(itertools.combinations(names, 2))
 
 
 @pytest.mark.parametrize("count", [51, 200])
