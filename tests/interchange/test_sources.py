@@ -163,7 +163,7 @@ def test_the_folder_of_other_photographs_is_refused(tmp_path: Path, one_line) ->
     _write_hloc_files(tmp_path, 5)
     (tmp_path / "photos").mkdir()
     for folder in ("photos", "none"):
-        with pytest.raises(OptionError, match="none of the photographs") as caught:
+        with pytest.raises(OptionError, match="none of the images") as caught:
             read_collection([tmp_path / "f.h5"], images=tmp_path / folder)
         one_line(caught.value)
     (tmp_path / "photos" / "2.jpg").write_bytes(b"")

@@ -1,4 +1,4 @@
-"""Photographs with their keypoints and matches: what all formats are written from."""
+"""Images with their keypoints and matches: what all formats are written from."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIFT_NUMBERS = 128
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """Matches of two photographs.
+    """Matches of two images.
 
     Attributes:
         rows: (K, 2) int32 keypoints of the first and of the second; each at most once.
@@ -62,16 +62,16 @@ class PairMatches:
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
 class Collection:
-    """Photographs with their keypoints and matches.
+    """Images with their keypoints and matches.
 
     Attributes:
-        keypoints: by the name of the photograph: its path below their folder, with "/".
-        matches: by the names of two photographs.
-        folder: of the photographs, where it is known.
-        failures: a sentence on each photograph or pair that could not be worked on.
+        keypoints: by the name of the image: its path below their folder, with "/".
+        matches: by the names of two images.
+        folder: of the images, where it is known.
+        failures: a sentence on each image or pair that could not be worked on.
 
     Raises:
-        OptionError: a match is of a photograph or a keypoint that is not there.
+        OptionError: a match is of an image or a keypoint that is not there.
     """
 
     keypoints: Mapping[str, Keypoints]
@@ -100,23 +100,23 @@ class Collection:
         return [path for name in self.keypoints if (path := self.path(name)) is not None]
 
     def path(self, name: str) -> Path | None:
-        """Return the file of a photograph, or None where it is not known."""
+        """Return the file of an image, or None where it is not known."""
         path = None if self.folder is None else self.folder / name
         return path if path is not None and path.is_file() else None
 
 
 def describe_collection(collection: Collection, quiet: bool = True) -> Collection:
-    """Return a collection whose keypoints have RootSIFT descriptors, as far as photographs allow.
+    """Return a collection whose keypoints have RootSIFT descriptors, as far as images allow.
 
     Keypoints with sizes and angles are described at these, others as dense keypoints are: upright,
     with a diameter of 3 pixels.
 
     Args:
-        collection: whose photographs without descriptors are read.
+        collection: whose images without descriptors are read.
         quiet: show no progress bar.
 
     Raises:
-        ImageError: a photograph has another size than its keypoints.
+        ImageError: an image has another size than its keypoints.
     """
     described = dict(collection.keypoints)
     left = [name for name, points in described.items() if points.descriptors is None]
@@ -129,7 +129,7 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
                 raise ImageError(
                     f"{path} has {gray.shape[1]}x{gray.shape[0]} pixels, its keypoints are of an "
                     f"image of {points.image_size[0]}x{points.image_size[1]}: name the folder of "
-                    "the photographs that they were found in"
+                    "the images that they were found in"
                 )
             described[name] = describe_keypoints(gray, points)
             bar.update()

@@ -43,7 +43,7 @@ def write_colmap(
     written where they are SIFT's.
 
     Args:
-        collection: the photographs.
+        collection: the images.
         output: ending in .db.
         intrinsics: of the camera of each image; those with the same object share one.
         verify: estimate the two-view geometry of each pair, without which COLMAP maps nothing.
@@ -53,7 +53,7 @@ def write_colmap(
         The file.
 
     Raises:
-        OptionError: the ending is another, or a photograph has no camera.
+        OptionError: the ending is another, or an image has no camera.
         MissingExtraError: pycolmap is not installed.
         DeepDetectError: the file cannot be written.
     """
@@ -98,15 +98,15 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
     """Write the text files of `colmap feature_importer` and `colmap matches_importer`.
 
     Args:
-        collection: the photographs, whose keypoints have SIFT descriptors.
-        output: folder: NAME.txt for each photograph, and matches.txt (`--match_type raw`).
+        collection: the images, whose keypoints have SIFT descriptors.
+        output: folder: NAME.txt for each image, and matches.txt (`--match_type raw`).
 
     Returns:
         The files.
 
     Raises:
         OptionError: keypoints have no SIFT descriptors, which this format always has; a name in
-            the list of matches has a blank; or a photograph is named "matches", without an ending.
+            the list of matches has a blank; or an image is named "matches", without an ending.
         DeepDetectError: a file cannot be written.
     """
     check_names(name for pair in collection.matches for name in pair)
@@ -122,7 +122,7 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
         if descriptors is None:
             raise OptionError(
                 f"the keypoints of {name} have no SIFT descriptors, which COLMAP's text files "
-                "need: name the folder of the photographs as `images`, or write a database"
+                "need: name the folder of the images as `images`, or write a database"
             )
         sizes = np.full(len(points), DEFAULT_SIZE_PX) if points.sizes is None else points.sizes
         frames = np.column_stack([points.xy + PIXEL_CENTRE, sizes / 2, orientations_of(points)])

@@ -28,7 +28,7 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
     They are the arguments of `hloc.reconstruction.main`. Each file appears whole, or not at all.
 
     Args:
-        collection: the photographs. Those without descriptors get none, which hloc needs to match,
+        collection: the images. Those without descriptors get none, which hloc needs to match,
             not to map.
         output: folder.
 
@@ -37,7 +37,7 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
 
     Raises:
         OptionError: two pairs would have one group in the file, a name in the list of pairs has a
-            blank, or a photograph is turned by EXIF.
+            blank, or an image is turned by EXIF.
         DeepDetectError: a file cannot be written.
         MissingExtraError: h5py is not installed.
     """

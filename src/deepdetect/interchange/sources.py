@@ -18,14 +18,13 @@ from ..batch.pair_matching import match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
-from ..features.matches import Matches
 from ..io.image import find_images
 from ..io.tables import load_keypoints, load_matches
 from ..sfm.pair_selection import sequential_pairs
 from .collection import Collection, Pair, PairMatches
 
 MAX_ALL_PAIRS = 50
-"""Photographs that are all matched with each other where no pairs are named."""
+"""Images that are all matched with each other where no pairs are named."""
 
 MATCHES_SUFFIX = "_matches"
 """With which names of files of `deepdetect match` end."""
@@ -44,8 +43,8 @@ def read_collection(
         files: one HDF5 file of `deepdetect extract` or hloc; or npz files of `deepdetect detect`
             (STEM.npz) and `deepdetect match` (STEM0_STEM1_matches.npz), which are read all.
         matches: HDF5 file of `deepdetect match-many` or hloc.
-        images: folder of the photographs: names of npz files are completed by it, and what needs
-            the photographs finds them.
+        images: folder of the images: names of npz files are completed by it, and what needs
+            the images finds them.
 
     Returns:
         The collection. Matches of npz files are those that agree with their geometry, at the
@@ -61,7 +60,7 @@ def read_collection(
     if not paths or (archives and len(archives) < len(paths)) or (not archives and len(paths) > 1):
         raise OptionError(
             "give one HDF5 file of features, or npz files of keypoints and matches, or a folder "
-            "of photographs"
+            "of images"
         )
     if archives:
         if matches is not None:
@@ -71,7 +70,7 @@ def read_collection(
     found = {} if matches is None else read_matches_file(Path(matches), keypoints)
     if folder is not None and not any((folder / name).is_file() for name in keypoints):
         raise OptionError(
-            f"none of the photographs of {paths[0]} is in {folder}, such as "
+            f"none of the images of {paths[0]} is in {folder}, such as "
             f"{next(iter(keypoints))}: name the folder that they were extracted from as `images`"
         )
     return Collection(keypoints, found, folder)
@@ -169,30 +168,25 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
     names = _names_by_stem(folder)
     keypoints: dict[str, Keypoints] = {}
     matches: dict[Pair, PairMatches] = {}
-    for path in paths:
+    for path in sorted(paths, key=lambda path: path.stem.endswith(MATCHES_SUFFIX)):
         if not path.stem.endswith(MATCHES_SUFFIX):
-            keypoints[_name(path.stem, names, path)] = load_keypoints(path)
-    for path in paths:
-        if not path.stem.endswith(MATCHES_SUFFIX):
+            if names is not None and path.stem not in names:
+                raise OptionError(f"{path} is of no image in the folder of `images`: give another")
+            keypoints[path.stem if names is None else names[path.stem]] = load_keypoints(path)
             continue
         loaded = load_matches(path)
         pair = _pair_of_stem(path.stem.removesuffix(MATCHES_SUFFIX), names, path)
         for name, own in zip(pair, (loaded.keypoints0, loaded.keypoints1), strict=True):
-            there = keypoints.setdefault(name, own)
-            if not (np.array_equal(there.xy, own.xy) and there.image_size == own.image_size):
+            before = keypoints.setdefault(name, own)
+            if not (np.array_equal(before.xy, own.xy) and before.image_size == own.image_size):
                 raise InvalidFileError(
                     f"{path} has other keypoints of {name} than another file: make all files with "
                     "the same options"
                 )
-        _add_matches(matches, pair, _pair_matches(loaded))
+        kept = loaded.inliers
+        rows = np.column_stack([loaded.indices0[kept], loaded.indices1[kept]])
+        _add_matches(matches, pair, PairMatches.one_to_one(rows, loaded.scores[kept]))
     return Collection(keypoints, matches, folder)
-
-
-def _pair_matches(matches: Matches) -> PairMatches:
-    """Return the matches that agree with their geometry, by the rows of the keypoints."""
-    kept = matches.inliers
-    rows = np.column_stack([matches.indices0[kept], matches.indices1[kept]])
-    return PairMatches.one_to_one(rows, matches.scores[kept])
 
 
 def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
@@ -211,20 +205,12 @@ def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
     return names
 
 
-def _name(stem: str, names: Mapping[str, str] | None, path: Path) -> str:
-    if names is None:
-        return stem
-    if stem not in names:
-        raise OptionError(f"{path} is of no image in the folder of `images`: give its folder")
-    return names[stem]
-
-
 def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pair:
     """Return the names of the two images whose stems are joined in one."""
     parts = stem.split("_")
     joined = [("_".join(parts[:k]), "_".join(parts[k:])) for k in range(1, len(parts))]
     if names is not None:
-        joined = [pair for pair in joined if all(each in names for each in pair)]
+        joined = [(names[a], names[b]) for a, b in joined if a in names and b in names]
     if len(joined) != 1:
         raise OptionError(
             f"it is not clear of which two images {path} is: name their folder as `images`"
@@ -232,8 +218,7 @@ def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pai
             else f"{path} is of no two images in the folder of `images`, or of several: name "
             "another folder"
         )
-    first, second = (_name(each, names, path) for each in joined[0])
-    return first, second
+    return joined[0]
 
 
 @suggest_keywords
@@ -246,26 +231,25 @@ def match_folder(
     workers: int | None = None,
     quiet: bool = True,
 ) -> Collection:
-    """Find and match the keypoints of all photographs below a folder.
+    """Find and match the keypoints of all images below a folder.
 
     As `extract_features` and `match_pairs` do, which keep what they made for large collections. A
     script must call this under `if __name__ == "__main__":`, since processes are started.
 
     Args:
-        folder: of the photographs.
+        folder: of the images.
         detector: as of `extract_features`.
-        pairs: of names, or a text file with one on each line; None: all, of up to 50 photographs.
-        sequential: number of following photographs that each is matched with, instead of `pairs`.
+        pairs: of names, or a text file with one on each line; None: all, of up to 50 images.
+        sequential: number of following images that each is matched with, instead of `pairs`.
         workers: number of processes; default one per processor.
         quiet: show no progress bars.
 
     Returns:
-        The collection. A photograph that cannot be read, or a pair that cannot be matched, does not
-        stop the others: they are in its `failures`.
+        The collection. What cannot be read or matched does not stop the others: see its `failures`.
 
     Raises:
         ImageError: the folder is missing, or holds no image.
-        OptionError: an option is out of its range, or there are too many photographs for all pairs.
+        OptionError: an option is out of its range, or there are too many images for all pairs.
         BatchError: no image can be read.
         MissingExtraError: h5py is not installed.
     """
@@ -279,7 +263,7 @@ def match_folder(
         pairs = read_pairs(pairs)  # what is wrong with them is said before the work
     if pairs is None and sequential is None and len(names) > MAX_ALL_PAIRS:
         raise OptionError(
-            f"all pairs of {len(names)} photographs would take long: name them by `pairs`, or "
+            f"all pairs of {len(names)} images would take long: name them by `pairs`, or "
             "give `sequential`"
         )
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
@@ -293,7 +277,7 @@ def match_folder(
             good = [name for name in names if name in keypoints]
             reach = len(good) if sequential is None else sequential
             wanted = sequential_pairs(good, reach)
-        else:  # a photograph that cannot be read is one failure, not one for each of its pairs
+        else:  # an image that cannot be read is one failure, not one for each of its pairs
             wanted = [pair for pair in pairs if unread.isdisjoint(pair)]
         if not wanted:
             return Collection(keypoints, {}, root, extracted.failures)
