@@ -7,6 +7,7 @@ VENV_RAY ?= .venv-ray
 VENV_INTEGRATIONS ?= .venv-integrations
 VENV_DOCS ?= .venv-docs
 DEMO_OUTPUT ?= demo-output
+DATA ?= data
 # What installs the lock files: uv is eight times as fast as pip, which does the same.
 INSTALLER ?= uv
 # Two processes, each with whole files (what a file sets up is set up once), on one thread each. One
@@ -34,7 +35,7 @@ install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requ
 install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
 
 .PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web coverage lint spelling types contracts check \
-	format lock upgrade check-lock audit sbom docs test-docs notebooks figures dist release-check clean
+	format lock upgrade check-lock audit sbom docs test-docs notebooks figures results dist release-check clean
 
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
@@ -139,6 +140,11 @@ notebooks: $(VENV_DOCS)/.test
 figures: $(VENV)/.test
 	$(VENV)/bin/python docs/figures/day_dark_blurred.py
 	$(VENV)/bin/python docs/figures/method.py
+
+# The tables that README.md and the pages quote, from the data sets in DATA: hours on two cores, and
+# what was interrupted goes on. ONLY="density speed" makes some; DATA= fills the pages alone.
+results: $(VENV)/.test
+	$(VENV)/bin/python benchmarks/results.py $(DATA) $(if $(ONLY),--only $(ONLY))
 
 dist: $(VENV)/.test
 	rm -rf dist

@@ -1,0 +1,283 @@
+"""Writes the tables that README.md and the pages quote, and puts them into these.
+
+    python benchmarks/results.py DATA [--only NAME ...] [--work build/results]
+    python benchmarks/results.py [--check]
+
+The first line (`make results DATA=... ONLY=...`) runs the benchmarks that the results are made of,
+each with a cache, so that what was interrupted goes on, and writes `docs/results/NAME.csv` with the
+command, commit, versions and machine of each in `docs/results/index.json`. The second one fills the
+blocks of README.md and docs/*.md between `<!-- results:NAME -->` and `<!-- /results -->` from these
+files; `<!-- results:NAME first|second -->` names the columns. With --check it only says whether
+the blocks are as the files have them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from deepdetect._shared.provenance import provenance
+
+ROOT = Path(__file__).parents[1]
+RESULTS_FOLDER = ROOT / "docs" / "results"
+BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: (.*?))? -->\n).*?(<!-- /results -->)", re.DOTALL)
+
+STAGES = {
+    "oxford-paper": "oxford --protocol paper",
+    "oxford-standard": "oxford --protocol standard",
+    "oxford-guided": "oxford --protocol guided",
+    "hpatches": "hpatches --protocol paper",
+    "foreground": "foreground",
+    "low-visibility": "low-visibility --protocol paper",
+    "speed": "speed",
+}
+"""Arguments of `deepdetect benchmark` by the stage's name."""
+
+RANDOM = "baseline: random points, same number"
+TITLES = {
+    "baseline: as many random points as DeepDetect, threshold 0.5": RANDOM,
+    "baseline: all pixels (a grid, where there is a budget)": "baseline: all pixels",
+}
+"""Shorter titles of rows."""
+
+CLASSICAL = ("SIFT", "ORB", "BRISK", "FAST", "AGAST", "Harris", "Shi-Tomasi")
+
+
+@dataclass(frozen=True)
+class Result:
+    """A table of docs/results.
+
+    Attributes:
+        stage: of `STAGES`.
+        table: key of the report's table.
+        columns: the table's columns by their titles in the result, each with the digits that are
+            printed; those that are not named are left out. Empty: all, with all digits.
+    """
+
+    stage: str
+    table: str
+    columns: dict[str, tuple[str, str]] = field(default_factory=dict)
+
+
+SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
+PAIRS = ("graf 1-6", "wall 1-6", "bikes 1-6", "leuven 1-6", "trees 1-6", "ubc 1-6", "boat 1-2")
+RESULTS = {
+    "density": Result(
+        "oxford-paper",
+        "oxford_density",
+        {
+            "mean": ("mean", ".4f"),
+            "without trees": ("mean without trees", ".4f"),
+            "in the paper": ("mean without trees, in the paper", ".4f"),
+            **{scene: (scene, ".3f") for scene in SCENES},
+        },
+    ),
+    "repeatability-paper": Result(
+        "oxford-paper",
+        "oxford_repeatability",
+        {"mean": ("mean", ".4f"), **{scene: (scene, ".3f") for scene in SCENES}},
+    ),
+    "correct-matches": Result(
+        "oxford-paper", "oxford_matches", {pair: (pair, ".0f") for pair in PAIRS}
+    ),
+    "repeatability-one-to-one": Result(
+        "oxford-standard",
+        "oxford_refined_repeatability_1px",
+        {
+            **{budget.replace(",", ""): (budget, ".3f") for budget in ("512", "1,024", "2,048")},
+            "chance at 2048": ("2,048: chance", ".3f"),
+            "8192": ("8,192", ".3f"),
+            "all": ("all", ".3f"),
+            "chance": ("all: chance", ".3f"),
+            "above chance": ("all: chance-corrected", ".3f"),
+            "keypoints of all": ("keypoints of all", ".0f"),
+        },
+    ),
+    "homographies-2048": Result(
+        "oxford-standard",
+        "oxford_refined_homography",
+        {
+            **{f"≤ {px} px": (f"accuracy at {px} px", ".3f") for px in (1, 3, 5)},
+            **{f"AUC {px} px": (f"AUC at {px} px", ".3f") for px in (1, 3, 5)},
+        },
+    ),
+    "matching-2048": Result(
+        "oxford-standard",
+        "oxford_refined_matching",
+        {
+            "matches": ("matches", ".0f"),
+            "correct, 1 px": ("correct at 1 px", ".0f"),
+            "correct, 3 px": ("correct at 3 px", ".0f"),
+            "precision, 3 px": ("precision at 3 px", ".3f"),
+            "score, 3 px": ("matching score at 3 px", ".3f"),
+        },
+    ),
+    "guided-all": Result("oxford-guided", "oxford_guided_refined"),
+    "repeatability-hpatches-kinds": Result("hpatches", "hpatches_table3"),
+    "foreground": Result(
+        "foreground",
+        "foreground",
+        {
+            "on the foreground": ("fraction on the foreground", ".3f"),
+            "in the paper": ("fraction on the foreground, in the paper", ".3f"),
+            "over random": ("over that of random points", ".2f"),
+            "density": ("keypoints per pixel", ".3f"),
+        },
+    ),
+    "low-visibility-matches": Result(
+        "low-visibility",
+        "low_visibility_matches",
+        {
+            "dusty": ("dusty 1-2", ".0f"),
+            "dusty, precision": ("dusty 1-2, precision", ".1%"),
+            "smoky": ("smoky 1-2", ".0f"),
+            "smoky, precision": ("smoky 1-2, precision", ".1%"),
+        },
+    ),
+    "speed": Result(
+        "speed",
+        "speed",
+        {
+            "keypoints": ("keypoints", ".0f"),
+            **{f"{s}, s": (f"{s}, s", ".3f") for s in ("detect", "describe", "match")},
+            "match, MB": ("match, MB", ".0f"),
+        },
+    ),
+}
+
+README_HEAD = (
+    *("", "paper", "published weights, here", "ours", "random pixels, same number"),
+    *("best classical detector", "command"),
+)
+README_ROWS = (
+    ("density (keypoints per pixel)", "density", "mean", "in the paper", "A"),
+    ("repeatability as in the paper", "repeatability-paper", "mean", "mean", "A"),
+    ("correct matches, leuven 1-6", "correct-matches", "leuven 1-6", "leuven 1-6", "A"),
+    ("correct matches, wall 1-6", "correct-matches", "wall 1-6", "wall 1-6", "A"),
+    ("correct matches, trees 1-6", "correct-matches", "trees 1-6", "trees 1-6", "A"),
+)
+"""Title, result, its column, that of the paper's number, and the command; the rows of
+`readme-others.csv` follow."""
+
+
+def main() -> None:
+    """Run what is asked for, then fill the blocks."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", nargs="?", type=Path, help="folder of the data sets")
+    parser.add_argument("--only", nargs="+", choices=sorted(RESULTS), default=sorted(RESULTS))
+    parser.add_argument("--work", type=Path, default=ROOT / "build" / "results")
+    parser.add_argument("--check", action="store_true", help="fill no block, compare them")
+    arguments = parser.parse_args()
+    if arguments.data is not None:
+        for stage in dict.fromkeys(RESULTS[name].stage for name in arguments.only):
+            run_stage(stage, arguments.data, arguments.work)
+        for name in arguments.only:
+            write_result(name, arguments.work)
+    stale = fill_blocks(write=not arguments.check)
+    if arguments.check and stale:
+        raise SystemExit(f"run python benchmarks/results.py: {', '.join(stale)} is out of date")
+
+
+def run_stage(stage: str, data: Path, work: Path) -> None:
+    """Run a benchmark; what its cache holds is not made again."""
+    words = [sys.executable, "-m", "deepdetect", "benchmark", *STAGES[stage].split()]
+    words += ["--data", str(data), "-o", str(work / stage)]
+    print(shlex.join(words[1:]), flush=True)
+    subprocess.run(words, check=True)
+
+
+def write_result(name: str, work: Path) -> None:
+    """Write a table of a report as docs/results/NAME.csv, and how it was made."""
+    result = RESULTS[name]
+    report = json.loads((work / result.stage / "report.json").read_text())
+    rows = report["tables"][result.table]["rows"]
+    method = next(iter(rows[0]))
+    columns = result.columns or {title: (title, "") for title in list(rows[0])[1:]}
+    lines = [[method, *columns]]
+    for row in rows:
+        cells = [
+            "" if row.get(title) is None else format(row[title], style)
+            for title, style in columns.values()
+        ]
+        lines.append([TITLES.get(row[method], row[method]), *cells])
+    with (RESULTS_FOLDER / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows(lines)
+    index = json.loads((RESULTS_FOLDER / "index.json").read_text())
+    made = provenance() | {"command": f"deepdetect benchmark {STAGES[result.stage]} --data DATA"}
+    index["results"][name] = made | {"weights": report["metadata"].get("weights (SHA-256)", "")}
+    index["results"] = dict(sorted(index["results"].items()))
+    text = json.dumps(index, indent=1, ensure_ascii=False) + "\n"
+    (RESULTS_FOLDER / "index.json").write_text(text, encoding="utf-8")
+
+
+def read_result(name: str) -> list[list[str]]:
+    """Read a table of docs/results, its heads first."""
+    with (RESULTS_FOLDER / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.reader(file))
+
+
+def fill_blocks(write: bool) -> list[str]:
+    """Fill the blocks of all pages, or say which pages have blocks that are out of date."""
+    stale = []
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        text = page.read_text(encoding="utf-8")
+        filled = BLOCK.sub(lambda m: f"{m[1]}{block(m[2], m[3])}\n{m[4]}", text)
+        if filled != text:
+            stale.append(page.name)
+            if write:
+                page.write_text(filled, encoding="utf-8")
+    return stale
+
+
+def block(name: str, columns: str | None) -> str:
+    """Return the Markdown table of a block."""
+    head, *rows = readme_table() if name == "readme" else read_result(name)
+    wanted = head if columns is None else [head[0], *columns.split("|")]
+    places = [head.index(title) for title in wanted]
+    lines = [[shown(row[k]) for k in places] for row in rows]
+    heads = [shown(title) if title else "" for title in wanted]
+    rule = "|---|" + "---:|" * (len(places) - 1)
+    first, *others = ("| " + " | ".join(line) + " |" for line in (heads, *lines))
+    return "\n".join([first.replace("|  |", "| |"), rule, *others])
+
+
+def shown(cell: str) -> str:
+    """Write a cell for a page: thousands apart, a dash for nothing.
+
+    Example:
+        >>> shown("192540 (.971)"), shown("0.25"), shown("")
+        ('192,540 (.971)', '0.25', '–')
+    """
+    apart = re.sub(r"(?<![\d.,])\d{4,}(?![\d.])", lambda m: f"{int(m[0]):,}", cell)
+    return apart.replace("|", "\\|") if cell else "–"
+
+
+def readme_table() -> list[list[str]]:
+    """Return the README's table of results."""
+    published = {row[0]: row[1] for row in read_result("published-weights")}
+    rows = [list(README_HEAD)]
+    for title, name, column, paper_column, command in README_ROWS:
+        head, *lines = read_result(name)
+        k = head.index(column)
+        values = {line[0]: line[k] for line in lines}
+        ours = "DeepDetect, threshold 0.5"
+        if paper_column == column:
+            paper = values.get(f"{ours}, in the paper") or values["DeepDetect, in the paper"]
+        else:
+            paper = next(line[head.index(paper_column)] for line in lines if line[0] == ours)
+        known = {t: v for t, v in values.items() if t.startswith(CLASSICAL) and "paper" not in t}
+        best = max(known, key=lambda t: float(known[t] or 0))
+        best = f"{known[best]} ({best})"
+        rows.append([title, paper, published[title], values[ours], values[RANDOM], best, command])
+    return rows + read_result("readme-others")[1:]
+
+
+if __name__ == "__main__":
+    main()
