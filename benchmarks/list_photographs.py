@@ -2,7 +2,7 @@
 
     python benchmarks/list_photographs.py CLONES OUTPUT.csv.gz --exclude data/oxford ...
 
-CLONES holds a clone of each repository of `deepdetect.datasets.photographs.SOURCES`, as
+CLONES holds a clone of each repository of `deepdetect.datasets.photographs.listed_sources`, as
 OWNER+NAME, with the commit that is named there. What is damaged, too small, no photograph, or
 nearly the same as an earlier picture is left out, and so is that of which the whole or the middle
 is nearly the same as a picture below the folders of --exclude. Prints what is left of each source.
@@ -30,10 +30,10 @@ from deepdetect.datasets.photographs import (
     CROP_SIDE_PX,
     PICTURE_SUFFIXES,
     RESTRICTED,
-    SOURCES,
     Crop,
     Source,
     cut,
+    listed_sources,
 )
 from deepdetect.io.image import find_images, load_image
 
@@ -63,7 +63,7 @@ def main() -> None:
     print(f"{len(excluded)} pictures to keep out")
     hashes: list[np.ndarray] = []
     rows: list[Crop] = []
-    for source in SOURCES:
+    for source in listed_sources():
         kept, reasons = list_source(source, arguments.clones, hashes, excluded)
         rows += kept
         pictures = len({crop.sha256 for crop in kept})
@@ -111,7 +111,7 @@ def list_source(
                 continue
             hashes.append(found)
             digest = hashlib.sha256(content).hexdigest()
-            licence = licences.get(Path(path).name) or source.licence_of(path)
+            licence = licences.get(Path(path).name) or licence_of(source, path)
             kept += [
                 Crop(source.name, path, digest, licence, *place) for place in places(picture.size)
             ]
@@ -146,6 +146,14 @@ def read_files(clone: Path, commit: str, paths: list[str]) -> Iterator[tuple[str
             process.stdout.read(1)
             yield path, content
         process.stdin.close()
+
+
+def licence_of(source: Source, path: str) -> str:
+    """Return the licence of a file, as its folder or the repository states it."""
+    for folder, licence in source.other_licences.items():
+        if path.startswith(f"{folder}/"):
+            return licence
+    return source.licence
 
 
 def file_licences(source: Source, clone: Path) -> dict[str, str]:

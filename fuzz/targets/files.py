@@ -108,7 +108,7 @@ def altered_arrays(generator: np.random.Generator) -> bytes:
 
 def masks(generator: np.random.Generator, folder: Path) -> None:
     """Load a damaged mask."""
-    content = encode_mask(generator.random((20, 24)) < 0.5, "settings")
+    content = encode_mask(generator.random((20, 24)) < 0.5)
     found = load_mask(mutate(content, generator))
     expect(found.dtype == bool and found.ndim == 2 and found.size > 0, "no mask")
 

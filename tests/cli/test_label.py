@@ -15,7 +15,7 @@ from deepdetect.labels import LabelOptions, fuse
 def test_writes_one_bit_masks(run, photos: Path) -> None:
     result = run("label", photos, "-o", "masks", "--workers", 1)
     assert result.exit_code == 0, result.output
-    assert {p.name for p in Path("masks").iterdir()} == {"cat.png", "left.png", "right.png"}
+    assert {p.name for p in Path("masks").glob("*.png")} == {"cat.png", "left.png", "right.png"}
     with Image.open("masks/cat.png") as mask:
         assert mask.mode == "1"
         expected = fuse(luma(load_image(photos / "cat.jpg"))).mask
@@ -26,7 +26,7 @@ def test_writes_one_bit_masks(run, photos: Path) -> None:
 def test_several_processes_give_the_same(run, photos: Path) -> None:
     run("label", photos, "-o", "one", "--workers", 1)
     run("label", photos, "-o", "two", "--workers", 2)
-    for path in Path("one").iterdir():
+    for path in Path("one").glob("*.png"):
         assert path.read_bytes() == (Path("two") / path.name).read_bytes()
 
 
@@ -84,7 +84,7 @@ def test_a_bad_image_is_reported_and_the_others_are_done(run, photos: Path) -> N
     *_, told, failure = result.stderr.splitlines()
     assert told == "deepdetect: 1 of 2 images failed, the others are done:"
     assert "bad.jpg" in failure
-    assert [p.name for p in Path("masks").iterdir()] == ["good.png"]
+    assert [p.name for p in Path("masks").glob("*.png")] == ["good.png"]
 
 
 def test_a_photograph_is_never_replaced_by_its_mask(run, photos: Path, tmp_path: Path) -> None:
@@ -114,7 +114,7 @@ def test_a_mask_of_another_image_is_not_passed_off(run, photos: Path) -> None:
     before = Path("masks/x.png").read_bytes()
     result = run("label", "b", "-o", "masks", "--workers", 1)
     assert result.exit_code == 2
-    assert "another image of the same name" in result.stderr
+    assert "made from" in result.stderr
     assert "--overwrite" in result.stderr
     assert Path("masks/x.png").read_bytes() == before
     assert run("label", "b", "-o", "masks", "--workers", 1, "--overwrite").exit_code == 0
@@ -129,18 +129,6 @@ def test_an_image_that_has_changed_is_labelled_again(run, photos: Path) -> None:
     assert "1 labelled, 0 already done" in result.stdout
     expected = fuse(luma(load_image(photos / "right.png"))).mask
     np.testing.assert_array_equal(np.asarray(Image.open("masks/x.png")), expected)
-
-
-def test_masks_without_a_note_of_their_image_are_kept(run, photos: Path) -> None:
-    """As of training, which knows images by their content."""
-    from dataclasses import asdict
-
-    from deepdetect.io.masks import save_mask
-
-    settings = json.dumps(asdict(LabelOptions(visibility="auto")), sort_keys=True)
-    save_mask(np.zeros((150, 200), bool), "masks/cat.png", settings)
-    result = run("label", photos / "cat.jpg", "-o", "masks", "--workers", 1)
-    assert "0 labelled, 1 already done" in result.stdout
 
 
 def test_a_figure_is_never_written_over_a_mask(run, photos: Path) -> None:

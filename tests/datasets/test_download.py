@@ -23,11 +23,11 @@ from PIL import Image
 import deepdetect.datasets.download as download
 from deepdetect import DeepDetectError, OptionError
 from deepdetect.datasets import (
-    REMOTE_DATASETS,
     RemoteDataset,
     RemoteFile,
     find_remote_dataset,
     get_dataset,
+    remote_datasets,
 )
 from deepdetect.datasets.download import content_digest
 
@@ -468,7 +468,7 @@ def test_names_are_looked_up() -> None:
     assert find_remote_dataset("coco").images == 118_287
     with pytest.raises(OptionError, match="did you mean 'coco'"):
         find_remote_dataset("cocoo")
-    for name, entry in REMOTE_DATASETS.items():
+    for name, entry in remote_datasets().items():
         assert name == entry.name
         for file in entry.files:
             # Of photographs each picture is checked when it is cropped.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from deepdetect import ImageError, OptionError
-from deepdetect.datasets.oxford import SCENES, find_scene, load_oxford
+from deepdetect.datasets.oxford import SCENES, load_oxford
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
 def test_scenes_have_six_images_and_five_pairs(folder: Path) -> None:
     scenes = load_oxford(folder)
     assert tuple(scene.name for scene in scenes) == SCENES
-    pairs = list(find_scene(scenes, "boat").pairs())
+    pairs = list(scenes[SCENES.index("boat")].pairs())
     assert [pair.name for pair in pairs] == [f"boat 1-{number}" for number in range(2, 7)]
     assert pairs[3].second.name == "img5.ppm"
     np.testing.assert_array_equal(pairs[3].homography, [[1, 0, 2], [0, 1, 5], [0, 0, 1]])
@@ -46,8 +46,8 @@ def test_every_pair_says_what_changes(folder: Path) -> None:
 
 
 def test_refined_homographies_are_taken_where_there_are(folder: Path) -> None:
-    published = find_scene(load_oxford(folder), "graf").homographies
-    refined = find_scene(load_oxford(folder, "refined"), "graf").homographies
+    published = load_oxford(folder)[SCENES.index("graf")].homographies
+    refined = load_oxford(folder, "refined")[SCENES.index("graf")].homographies
     assert refined[4][0, 2] == 0.5
     np.testing.assert_array_equal(published[:4], refined[:4])
 
@@ -55,8 +55,6 @@ def test_refined_homographies_are_taken_where_there_are(folder: Path) -> None:
 def test_what_is_missing_or_wrong_is_named(folder: Path) -> None:
     with pytest.raises(OptionError, match="did you mean 'refined'"):
         load_oxford(folder, "refine")
-    with pytest.raises(OptionError, match="known are bark"):
-        find_scene(load_oxford(folder), "grafitti")
     (folder / "wall" / "H1to3p").write_text("1 2 3")
     with pytest.raises(ImageError, match="nine numbers"):
         load_oxford(folder)

@@ -11,15 +11,13 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError
+from deepdetect.datasets import find_remote_dataset
 from deepdetect.datasets.photographs import (
     CROP_SIDE_PX,
-    FREE_SOURCES,
-    PHOTOGRAPHS,
-    PHOTOGRAPHS_FREE,
-    SOURCES,
     Crop,
     cut,
     listed_crops,
+    listed_sources,
     write_crops,
 )
 
@@ -63,18 +61,17 @@ def test_there_are_8000_photographs_and_more() -> None:
     pictures = {crop.sha256: (crop.source, crop.path) for crop in crops}
     assert len(pictures) >= 8000
     assert len({(crop.source, crop.path) for crop in crops}) == len(pictures)
-    assert PHOTOGRAPHS.images == len(crops)
     free = [crop for crop in crops if crop.is_free]
-    assert PHOTOGRAPHS_FREE.images == len(free)
-    assert {crop.source for crop in free} == set(FREE_SOURCES)
-    assert {crop.source for crop in crops} == {source.name for source in SOURCES}
+    assert {crop.source for crop in crops} == {source.name for source in listed_sources()}
+    for name, part in (("photographs", crops), ("photographs-free", free)):
+        dataset = find_remote_dataset(name)
+        assert dataset.images == len(part)
+        assert len(dataset.files) == len({crop.source for crop in part})
     # A picture is read once for all of its crops.
     runs = [digest for digest, _ in itertools.groupby(crop.sha256 for crop in crops)]
     assert len(runs) == len(set(runs))
     share = np.mean([crop.part == "val" for crop in crops])
     assert 0.03 < share < 0.07
-    assert len(PHOTOGRAPHS.files) == len(SOURCES)
-    assert len(PHOTOGRAPHS_FREE.files) == len(FREE_SOURCES)
 
 
 def test_licences_that_allow_any_use_are_told_from_others() -> None:

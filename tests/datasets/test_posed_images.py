@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from deepdetect import ImageError
-from deepdetect.datasets import load_posed_scenes
-from deepdetect.datasets.pair_selection import PairSelectionOptions
+from deepdetect.datasets import load_posed_scenes, posed_images
+from deepdetect.datasets.pair_selection import FRAME_DISTANCES
 from deepdetect.datasets.posed_images import PosedScene
 
 SIZE = (60, 40)
@@ -21,7 +21,6 @@ INTRINSICS = np.array([[50.0, 0, 31.25], [0, 52, 18.5], [0, 0, 1]])
 
 TURNS = np.array([[0.0, 0, 0], [0.1, -0.4, 0.05], [2.5, 0.3, -1]])
 CENTRES = np.array([[0.0, 0, 0], [1, -0.5, 2], [-4, 2, 1]])
-EVERY = PairSelectionOptions(frame_distances=(1, 2))
 
 
 def axes(number: int) -> np.ndarray:
@@ -85,6 +84,11 @@ def write_colmap(folder: Path, model: str = "sparse/0", images: str = "images") 
     return folder
 
 
+@pytest.fixture(autouse=True)
+def near_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(posed_images, "FRAME_DISTANCES", (1, 2))
+
+
 WRITERS: dict[str, Callable[[Path], Path]] = {
     "strecha": write_strecha,
     "kitti": write_kitti,
@@ -93,7 +97,7 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
 
 
 def load(folder: Path) -> PosedScene:
-    (scene,) = load_posed_scenes(folder, EVERY)
+    (scene,) = load_posed_scenes(folder)
     return scene
 
 
@@ -241,7 +245,7 @@ def test_damaged_files_are_named_in_one_sentence(case: str, tmp_path: Path, one_
     folder = WRITERS[layout](tmp_path / "scene")
     damage(folder, name, old, new)
     with pytest.raises(ImageError) as caught:
-        load_posed_scenes(folder, EVERY)
+        load_posed_scenes(folder)
     message = one_line(caught.value)
     assert hint in message
     assert str(tmp_path) in message
@@ -272,7 +276,9 @@ def test_images_that_are_missing_damaged_or_turned_are_refused(tmp_path: Path, o
         load(folder)
 
 
-def test_what_is_no_scene_is_said(tmp_path: Path, one_line) -> None:
+def test_what_is_no_scene_is_said(
+    tmp_path: Path, one_line, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(ImageError, match="no images with cameras") as caught:
             load_posed_scenes(folder)
@@ -282,12 +288,14 @@ def test_what_is_no_scene_is_said(tmp_path: Path, one_line) -> None:
     with pytest.raises(ImageError, match="model_converter"):
         load_posed_scenes(tmp_path)
     folder = write_kitti(tmp_path / "clip")
+    monkeypatch.setattr(posed_images, "FRAME_DISTANCES", (7,))
     with pytest.raises(ImageError, match=r"frame distances \(7,\)"):
-        load_posed_scenes(folder, PairSelectionOptions(frame_distances=(7,)))
+        load_posed_scenes(folder)
 
 
-def test_the_shared_scenes_are_read(shared: Path) -> None:
-    fountain, clip = load_posed_scenes(shared / "data")
+def test_the_shared_scenes_are_read(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(posed_images, "FRAME_DISTANCES", FRAME_DISTANCES)
+    fountain, clip = (load(shared / "data" / name) for name in ("fountain", "kitti-clip"))
     assert (len(fountain.images), len(fountain.pairs)) == (11, 55)
     expected = [[1379.74, 0, 760.095], [0, 1382.08, 503.155], [0, 0, 1]]
     np.testing.assert_allclose(fountain.images[0].intrinsics, expected, atol=1e-9)

@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from deepdetect._shared.errors import ImageError
-from deepdetect.io.masks import load_mask, load_mask_settings, save_mask
+from deepdetect.io.masks import load_mask, save_mask
 
 MASK = np.random.default_rng(3).random((19, 26)) > 0.6
 
@@ -60,7 +60,7 @@ def test_masks_of_too_many_pixels_are_not_decoded(
     tmp_path: Path, one_line: Callable[[BaseException], str]
 ) -> None:
     path = tmp_path / "mask.png"
-    save_mask(np.zeros((20, 30), bool), path, "settings")
+    save_mask(np.zeros((20, 30), bool), path)
     for source in (path, path.read_bytes(), io.BytesIO(path.read_bytes())):
         with pytest.raises(ImageError) as caught:
             load_mask(source, max_megapixels=599e-6)
@@ -73,4 +73,3 @@ def test_masks_of_too_many_pixels_are_not_decoded(
     with pytest.raises(ImageError) as caught:
         load_mask(path)
     assert "20000x20000 pixels" in one_line(caught.value)
-    assert load_mask_settings(path) is None

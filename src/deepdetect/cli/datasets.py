@@ -18,7 +18,7 @@ def datasets() -> None:
 @json_option
 def list_datasets(as_json: bool) -> None:
     """Show the data sets that can be downloaded."""
-    from ..datasets import REMOTE_DATASETS
+    from ..datasets import remote_datasets
 
     if as_json:
         print_json(
@@ -31,11 +31,11 @@ def list_datasets(as_json: bool) -> None:
                     "licence": dataset.licence,
                     "urls": [url for file in dataset.files for url in file.urls],
                 }
-                for dataset in REMOTE_DATASETS.values()
+                for dataset in remote_datasets().values()
             ]
         )
         return
-    for dataset in REMOTE_DATASETS.values():
+    for dataset in remote_datasets().values():
         rows = [
             ("images", f"{dataset.images:,}"),
             ("download", f"{dataset.size / 1e9:.1f} GB, and as much again unpacked"),

@@ -74,25 +74,16 @@ def label(
     """
     from .._shared.progress import progress
     from ..batch.engines import get_engine
-    from ..labels.batch import (
-        LabelTarget,
-        LabelTask,
-        image_state,
-        label_files,
-        unfinished_tasks,
-    )
+    from ..labels.batch import LabelTask, label_files
 
     map_tasks = get_engine(engine)
     options = replace(chosen_label_settings(detectors, label_settings), visibility=visibility)
     tasks = []
     for image in expand_images(images, output):
         figure = output / f"{image.stem}_labels.png" if visualize else None
-        target = LabelTarget(
-            output / f"{image.stem}.png", options, figure, image_state=image_state(image)
-        )
-        tasks.append(LabelTask(image, (target,)))
-    _check_outputs(tasks, overwrite)
-    left = tasks if overwrite else unfinished_tasks(tasks)
+        tasks.append(LabelTask(image, output / f"{image.stem}.png", options, figure, overwrite))
+    _check_outputs(tasks)
+    left = [task for task in tasks if task.outputs.find() is None]
     with progress(len(left), "labelling", "image") as bar:
         reports = label_files(left, workers, lambda _: bar.update(1), map_tasks)
     done = [report for report in reports if report.error is None]
@@ -124,15 +115,12 @@ def label(
     report_failures(failures, len(tasks))
 
 
-def _check_outputs(tasks: Sequence[LabelTask], overwrite: bool) -> None:
-    """Check that no image is replaced, no mask that is another's, and no output by another."""
+def _check_outputs(tasks: Sequence[LabelTask]) -> None:
+    """Check that no image is replaced, and no output by another."""
     images = {task.image.resolve() for task in tasks}
     makers: dict[Path, Path] = {}
     for task in tasks:
-        (target,) = task.targets
-        for path in (target.mask, target.figure):
-            if path is None:
-                continue
+        for path in task.outputs.paths:
             if path.resolve() in images:
                 raise OptionError(
                     f"{path} would replace an image that is to be labelled: "
@@ -144,13 +132,3 @@ def _check_outputs(tasks: Sequence[LabelTask], overwrite: bool) -> None:
                     "leave out --visualize"
                 )
             makers[path] = task.image
-        if not overwrite and target.is_of_another_image:
-            raise OptionError(
-                f"{target.mask} exists already, made from another image of the same name: "
-                "choose another folder with -o, or replace it with --overwrite"
-            )
-        if not overwrite and target.is_stale:
-            raise OptionError(
-                f"{target.mask} exists already, made with other settings: "
-                "choose another folder with -o, or replace it with --overwrite"
-            )

@@ -1,14 +1,15 @@
-"""Data sets with ground truth. To add one, write a module here and add a line below."""
+"""Data sets with ground truth, and those on the web (`known/datasets.json`)."""
 
+import json
 from collections.abc import Callable
+from functools import cache, partial
+from importlib import resources
+from typing import Any
 
 from .._shared.registry import look_up
-from .coco import COCO
+from . import photographs
 from .download import RemoteDataset, RemoteFile, get_dataset
-from .hpatches import HPATCHES
-from .middlebury import MIDDLEBURY, load_motorcycle
-from .oxford import OXFORD
-from .photographs import PHOTOGRAPHS, PHOTOGRAPHS_FREE
+from .middlebury import load_motorcycle
 from .posed_images import PosedImage, PosedScene, load_posed_scenes
 from .types import StereoPair
 
@@ -16,10 +17,22 @@ STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {
     "motorcycle": load_motorcycle,
 }
 
-REMOTE_DATASETS: dict[str, RemoteDataset] = {
-    dataset.name: dataset
-    for dataset in (COCO, PHOTOGRAPHS, PHOTOGRAPHS_FREE, OXFORD, HPATCHES, MIDDLEBURY)
-}
+
+@cache
+def remote_datasets() -> dict[str, RemoteDataset]:
+    """Return the data sets on the web by name."""
+    text = resources.files(__package__).joinpath("known/datasets.json").read_text("utf-8")
+    return {name: _remote_dataset(name, **entry) for name, entry in json.loads(text).items()}
+
+
+def _remote_dataset(name: str, files: Any = (), texts: Any = None, **values: Any) -> RemoteDataset:
+    if name.startswith("photographs"):
+        free = name.endswith("free")
+        prepare = partial(photographs.prepare, free=free)
+        return RemoteDataset(name, files=photographs.archives(free), prepare=prepare, **values)
+    made = tuple(RemoteFile(**{**file, "urls": tuple(file["urls"])}) for file in files)
+    written = {path: json.dumps(value, indent=1) + "\n" for path, value in (texts or {}).items()}
+    return RemoteDataset(name, files=made, texts=written, **values)
 
 
 def find_remote_dataset(name: str) -> RemoteDataset:
@@ -28,7 +41,7 @@ def find_remote_dataset(name: str) -> RemoteDataset:
     Raises:
         OptionError: the name is unknown.
     """
-    return look_up("data set", name, REMOTE_DATASETS)
+    return look_up("data set", name, remote_datasets())
 
 
 def load_stereo_pair(name: str) -> StereoPair:
@@ -41,7 +54,6 @@ def load_stereo_pair(name: str) -> StereoPair:
 
 
 __all__ = [
-    "REMOTE_DATASETS",
     "STEREO_PAIRS",
     "PosedImage",
     "PosedScene",
@@ -52,4 +64,5 @@ __all__ = [
     "get_dataset",
     "load_posed_scenes",
     "load_stereo_pair",
+    "remote_datasets",
 ]

@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from .._shared.errors import ImageError
-from .download import RemoteDataset, RemoteFile
 from .types import PlanarScene, load_planar_scene
 
 ILLUMINATION, VIEWPOINT = "illumination", "viewpoint"
@@ -70,22 +69,3 @@ def is_illumination(scene: PlanarScene) -> bool:
 def in_d2net_subset(scene: PlanarScene) -> bool:
     """Whether a scene is one of the 108 of the D2-Net subset, on which most papers report."""
     return scene.name not in NOT_IN_D2NET_SUBSET
-
-
-HPATCHES = RemoteDataset(
-    name="hpatches",
-    title="HPatches sequences, 116 scenes of six images with homographies",
-    files=(
-        RemoteFile(
-            (
-                "https://huggingface.co/datasets/vbalnt/hpatches/resolve/main/"
-                "hpatches-sequences-release.zip",
-                "http://icvl.ee.ic.ac.uk/vbalnt/hpatches/hpatches-sequences-release.tar.gz",
-            ),
-            size=1_400_000_000,
-            inside="hpatches-sequences-release",
-        ),
-    ),
-    images=696,
-    licence="MIT; Balntas et al., 2017",
-)

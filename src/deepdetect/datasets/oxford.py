@@ -8,8 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from .._shared.errors import ImageError, OptionError, unknown_name
-from .download import RemoteDataset, RemoteFile
+from .._shared.errors import ImageError, unknown_name
 from .types import PlanarScene, load_planar_scene
 
 KINDS = {
@@ -51,18 +50,6 @@ def load_oxford(
     return [_load_scene(root / name, truth) for name in there]
 
 
-def find_scene(scenes: list[PlanarScene], name: str) -> PlanarScene:
-    """Find a scene by name.
-
-    Raises:
-        OptionError: there is none of the name.
-    """
-    for scene in scenes:
-        if scene.name == name:
-            return scene
-    raise OptionError(f"there is no scene {name!r}: known are {', '.join(s.name for s in scenes)}")
-
-
 def _load_scene(folder: Path, truth: str) -> PlanarScene:
     homographies = [f"H1to{number}p" for number in range(2, 7)]
     if truth == "refined":
@@ -75,30 +62,3 @@ def _load_scene(folder: Path, truth: str) -> PlanarScene:
     return load_planar_scene(
         folder, images, homographies, SUFFIXES, LAYOUT, KINDS.get(folder.name, "")
     )
-
-
-_HOST = "https://www.robots.ox.ac.uk/~vgg/research/affine/det_eval_files"
-_CHECKSUMS = {
-    "graf": "sha256:999871b945ee968a00a0d5f9af957d1382fb9dae1511cdee9553366817b53b5b",
-    "boat": "sha256:6e5721f37fbf9c3e974fd05935a42c1670f3e71aa3e5b218807ea046a068c603",
-}
-"""Of the archives; what is in all of them is checked too."""
-
-OXFORD = RemoteDataset(
-    name="oxford",
-    title="Oxford Affine Covariant Regions, eight scenes of six images with homographies",
-    files=tuple(
-        RemoteFile(
-            (
-                f"{_HOST}/{scene}.tar.gz",
-                f"{_HOST.replace('https:', 'http:')}/{scene}.tar.gz",
-            ),
-            size=8_000_000,
-            checksum=_CHECKSUMS.get(scene),
-            into=scene,
-        )
-        for scene in SCENES
-    ),
-    images=48,
-    licence="research use; Mikolajczyk et al., 2005",
-)

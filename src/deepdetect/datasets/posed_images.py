@@ -21,7 +21,7 @@ from .._shared.errors import ImageError
 from ..geometry.triangulation import cross_matrix
 from ..io.image import load_image
 from ..io.image_file import open_image
-from .pair_selection import PairSelectionOptions, sequence_pairs, unordered_pairs
+from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
@@ -108,14 +108,13 @@ class PosedScene:
     pairs: tuple[PosedPair, ...]
 
 
-def load_posed_scenes(
-    folder: str | Path, options: PairSelectionOptions = PairSelectionOptions()
-) -> list[PosedScene]:
+def load_posed_scenes(folder: str | Path, max_pairs: int = 60) -> list[PosedScene]:
     """Read the scene that a folder is, or those that its subfolders are.
 
     Args:
         folder: a scene in one of the three layouts, or a folder of scenes.
-        options: which pairs are chosen.
+        max_pairs: at most this many pairs of a scene. Of images in no order all pairs, where there
+            are more an evenly spaced choice; of a sequence as many at each of `FRAME_DISTANCES`.
 
     Raises:
         ImageError: there is no scene, or a file of one is missing or damaged.
@@ -129,7 +128,7 @@ def load_posed_scenes(
             "NNNN.camera files (Strecha), calib.txt and poses.txt (KITTI), or cameras.txt and "
             "images.txt (COLMAP)"
         )
-    return [_load_scene(path, options) for path in folders]
+    return [_load_scene(path, max_pairs) for path in folders]
 
 
 def _reader(folder: Path) -> Callable[[Path], list[PosedImage]] | None:
@@ -145,17 +144,17 @@ def _is_sequence(folder: Path) -> bool:
     return (folder / "calib.txt").is_file() and (folder / "poses.txt").is_file()
 
 
-def _load_scene(folder: Path, options: PairSelectionOptions) -> PosedScene:
+def _load_scene(folder: Path, max_pairs: int) -> PosedScene:
     read = _reader(folder)
     images = read(folder) if read is not None else []
     frames = [int(image.path.stem) for image in images] if read is _read_kitti else None
     if frames is None:
-        chosen = unordered_pairs(len(images), options.max_pairs) if len(images) > 1 else []
+        chosen = unordered_pairs(len(images), max_pairs) if len(images) > 1 else []
     else:
         rows = {frame: row for row, frame in enumerate(frames)}
-        chosen = [(rows[a], rows[b]) for a, b in sequence_pairs(frames, options)]
+        chosen = [(rows[a], rows[b]) for a, b in sequence_pairs(frames, max_pairs, FRAME_DISTANCES)]
     if not chosen:
-        distances = "" if frames is None else f" at the frame distances {options.frame_distances}"
+        distances = "" if frames is None else f" at the frame distances {FRAME_DISTANCES}"
         raise ImageError(
             f"there are no two images with cameras{distances} in {folder}: put more images there"
         )

@@ -9,34 +9,21 @@ from typing import Any
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import ImageError
 from .image_file import open_image
 
-SETTINGS_KEY = "deepdetect-label"
-"""Keyword of the PNG text chunk that holds the settings a mask was made with."""
 
-
-def save_mask(mask: np.ndarray, path: str | Path, settings: str = "") -> None:
-    """Write a (H, W) bool mask as a 1-bit PNG, whole or not at all.
-
-    Args:
-        mask: the mask.
-        path: file ending in .png.
-        settings: text stored in the file, which `load_mask_settings` returns.
-    """
+def save_mask(mask: np.ndarray, path: str | Path) -> None:
+    """Write a (H, W) bool mask as a 1-bit PNG, whole or not at all."""
     with atomic_path(path) as temporary:
-        temporary.write_bytes(encode_mask(mask, settings))
+        temporary.write_bytes(encode_mask(mask))
 
 
-def encode_mask(mask: np.ndarray, settings: str = "") -> bytes:
+def encode_mask(mask: np.ndarray) -> bytes:
     """Encode a (H, W) bool mask as the content of a 1-bit PNG file."""
-    from PIL import Image, PngImagePlugin
+    from PIL import Image
 
-    chunks = PngImagePlugin.PngInfo()
-    if settings:
-        chunks.add_text(SETTINGS_KEY, settings)
     content = io.BytesIO()
-    Image.fromarray(mask).save(content, format="PNG", pnginfo=chunks)
+    Image.fromarray(mask).save(content, format="PNG")
     return content.getvalue()
 
 
@@ -60,12 +47,3 @@ def load_mask(source: Any, *, max_megapixels: float | None = None) -> np.ndarray
         deep = opened.mode.startswith("I")  # 16 bits per pixel
         values = np.asarray(opened if deep else opened.convert("L"))
     return values > (0 if values.max() <= 1 else 32767 if deep else 127)
-
-
-def load_mask_settings(path: str | Path) -> str | None:
-    """Return the settings text stored in a mask file, or None when it has none."""
-    try:
-        with open_image(path, what="mask") as opened:
-            return opened.info.get(SETTINGS_KEY)
-    except ImageError:
-        return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
@@ -11,19 +11,22 @@ from torch.optim import Optimizer
 from .._shared.errors import unknown_name
 from .recipe import OPTIMIZERS
 
+# Of `Soap`; a decay of 0.95 for all three means is that of the paper.
+BETA = 0.95
+EPS = 1e-8
+"""Keeps the division finite."""
+
+PRECONDITION_FREQUENCY = 10
+"""Steps from one update of the basis to the next."""
+
 INITIAL_POWER_ITERATIONS = 3
-"""Steps of the power iteration from the axes to the first eigenbasis of `Soap`."""
-
-Broadcast = Callable[[Tensor], object]
+"""Steps of the power iteration from the axes to the first eigenbasis."""
 
 
-def make_optimizers(
-    name: str, network: nn.Module, broadcast_: Broadcast = lambda tensor: None
-) -> list[Optimizer]:
+def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
     """Make the optimisers that together train a network's parameters, except frozen ones.
 
     They are "adam", or "soap": SOAP for the kernels, Adam for biases and the like.
-    `broadcast_` replaces a tensor, in place, by that of the main process.
 
     Raises:
         OptionError: the name is unknown (the nearest right one is named).
@@ -38,7 +41,7 @@ def make_optimizers(
     if name == "soap":
         kernels = [parameter for parameter in trained if parameter.ndim > 1]
         vectors = [parameter for parameter in trained if parameter.ndim <= 1]
-        return [Soap(kernels, broadcast_=broadcast_), torch.optim.Adam(vectors, fused=True)]
+        return [Soap(kernels), torch.optim.Adam(vectors, fused=True)]
     raise unknown_name("optimizer", name, OPTIMIZERS)
 
 
@@ -61,20 +64,13 @@ class Soap(Optimizer):
     """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
 
     For matrices and convolution kernels: a kernel is a matrix with one row per output channel.
-    (Other implementations keep one basis for each axis of a kernel, 3x3 pixels apart, and lists
-    in their state.) All of the state are tensors, per parameter, so that safetensors can store
-    them. The first step only computes the first basis.
+    All of the state are tensors, per parameter, so that safetensors can store them and a run
+    resumes bit by bit. (pytorch-optimizer's keeps one basis for each axis of a kernel, in lists,
+    beside numbers.) The first step only computes the first basis.
 
     Args:
         parameters: tensors of two or more axes.
         lr: learning rate.
-        betas: decay of the mean gradient, and of its square in the eigenbasis.
-        preconditioner_beta: decay of the two matrices whose eigenvectors are the basis.
-        eps: keeps the division finite.
-        precondition_frequency: steps from one update of the basis to the next.
-        broadcast_: replaces a tensor, in place, by that of the main process. Each process takes
-            the same steps, but bases differ by the rounding of their processors, and more and
-            more so: the eigenvectors of small eigenvalues are rounding noise.
 
     Example:
         >>> weight = nn.Parameter(torch.ones(3, 2))
@@ -87,20 +83,8 @@ class Soap(Optimizer):
         True
     """
 
-    def __init__(
-        self,
-        parameters: Iterable[nn.Parameter],
-        lr: float = 1e-3,
-        betas: tuple[float, float] = (0.95, 0.95),
-        preconditioner_beta: float = 0.95,
-        eps: float = 1e-8,
-        precondition_frequency: int = 10,
-        broadcast_: Broadcast = lambda tensor: None,
-    ) -> None:
+    def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 1e-3) -> None:
         super().__init__(parameters, {"lr": lr})
-        self.betas, self.preconditioner_beta, self.eps = betas, preconditioner_beta, eps
-        self.precondition_frequency = precondition_frequency
-        self.broadcast_ = broadcast_
 
     @torch.no_grad()
     def step(self) -> None:  # type: ignore[override]  # takes no closure
@@ -115,33 +99,30 @@ class Soap(Optimizer):
         state = self.state[parameter]
         if not state:
             state.update(_initial_state(gradient))
-            for side in ("left", "right"):
-                self.broadcast_(state[f"{side}_basis"])
             return
         state["step"] = state["step"].cpu() + 1  # a checkpoint restores it on the GPU
         left, right = state["left_basis"], state["right_basis"]
         mean, square = state["exp_avg"], state["exp_avg_sq"]
-        mean.lerp_(gradient, 1 - self.betas[0])
-        square.lerp_((left.T @ gradient @ right).square_(), 1 - self.betas[1])
+        mean.lerp_(gradient, 1 - BETA)
+        square.lerp_((left.T @ gradient @ right).square_(), 1 - BETA)
         step = int(state["step"])
-        rotated = left.T @ mean @ right / (1 - self.betas[0] ** step)
-        scale = (square / (1 - self.betas[1] ** step)).sqrt_().add_(self.eps)
+        rotated = left.T @ mean @ right / (1 - BETA**step)
+        scale = (square / (1 - BETA**step)).sqrt_().add_(EPS)
         change = left @ (rotated / scale) @ right.T
         parameter.add_(change.reshape(parameter.shape), alpha=-learning_rate)
-        state["left"].lerp_(gradient @ gradient.T, 1 - self.preconditioner_beta)
-        state["right"].lerp_(gradient.T @ gradient, 1 - self.preconditioner_beta)
-        if step % self.precondition_frequency == 0:
+        state["left"].lerp_(gradient @ gradient.T, 1 - BETA)
+        state["right"].lerp_(gradient.T @ gradient, 1 - BETA)
+        if step % PRECONDITION_FREQUENCY == 0:
             for axis, side in enumerate(("left", "right")):
-                self._update_basis(state, side, axis)
+                _update_basis(state, side, axis)
 
-    def _update_basis(self, state: dict[str, Tensor], side: str, axis: int) -> None:
-        """Follow the eigenvectors of one side by a step of the power iteration."""
-        matrix, basis = state[side], state[f"{side}_basis"]
-        order = (basis.T @ matrix @ basis).diagonal().argsort(descending=True)
-        self.broadcast_(order)
-        state["exp_avg_sq"].copy_(state["exp_avg_sq"].index_select(axis, order))
-        basis.copy_(torch.linalg.qr(matrix @ basis[:, order])[0])
-        self.broadcast_(basis)
+
+def _update_basis(state: dict[str, Tensor], side: str, axis: int) -> None:
+    """Follow the eigenvectors of one side by a step of the power iteration."""
+    matrix, basis = state[side], state[f"{side}_basis"]
+    order = (basis.T @ matrix @ basis).diagonal().argsort(descending=True)
+    state["exp_avg_sq"].copy_(state["exp_avg_sq"].index_select(axis, order))
+    basis.copy_(torch.linalg.qr(matrix @ basis[:, order])[0])
 
 
 def _initial_state(gradient: Tensor) -> dict[str, Tensor]:

@@ -8,6 +8,8 @@ sampler reads a few shards at a time, so that a disk or a network delivers each 
 from __future__ import annotations
 
 import bisect
+import contextlib
+import dataclasses
 import functools
 import hashlib
 import io
@@ -178,14 +180,13 @@ def write_shards(
     tasks = []
     for kind, part in zip(files, train_val_split(listed, options.val_fraction), strict=True):
         for number, chosen in enumerate(_deal(part, images, shard_size)):
-            if chosen:
-                task = _ShardTask(images, tuple(chosen), kind == "validation", options.labels)
-                path = output / f"{kind}-{number:06d}-{task.digest}.tar"
-                files[kind].append((path, len(chosen)))
-                if not path.exists():
-                    tasks.append((path, task))
+            task = _ShardTask(output, chosen, kind == "validation", options.labels)
+            path = output / f"{kind}-{number:06d}-{task.digest}.tar"
+            files[kind].append((path, len(chosen)))
+            if not path.exists():
+                tasks.append(dataclasses.replace(task, path=path))
     failures: list[str] = []
-    total = sum(len(task.images) for _, task in tasks)
+    total = sum(len(task.images) for task in tasks)
     with progress(total, "shards", "image", quiet) as bar:
         for count, unread in map_tasks(_write_shard, tasks, workers):
             bar.update(count)
@@ -206,16 +207,12 @@ def write_shards(
 
 @dataclass(frozen=True)
 class _ShardTask:
-    """A shard to be written."""
+    """A shard to be written: its path, and its images by their names in the folder."""
 
-    root: Path
-    images: tuple[SourceImage, ...]
+    path: Path
+    images: Mapping[str, SourceImage]
     for_validation: bool
-    options: LabelOptions
-
-    def name(self, image: SourceImage) -> str:
-        """The path of an image in the folder, from which its views are drawn."""
-        return image.path.relative_to(self.root).as_posix()
+    labels: LabelOptions
 
     def views(self, image: SourceImage) -> tuple[View, ...]:
         """The views whose labels are needed."""
@@ -225,35 +222,32 @@ class _ShardTask:
     def digest(self) -> str:
         """A digest of everything the shard's content depends on."""
         rows = [
-            (self.name(image), image.digest, *(view.name for view in self.views(image)))
-            for image in self.images
+            (name, image.digest, *(view.name for view in self.views(image)))
+            for name, image in self.images.items()
         ]
-        return key(settings_digest(self.options), rows)[:12]
+        return key(settings_digest(self.labels), rows)[:12]
 
 
-def _deal(images: Sequence[SourceImage], root: Path, shard_size: int) -> list[list[SourceImage]]:
+def _deal(
+    images: Sequence[SourceImage], root: Path, shard_size: int
+) -> list[dict[str, SourceImage]]:
     """Deal images by the checksums of their names: most shards stay when an image is added."""
-    shards: list[list[SourceImage]] = [[] for _ in range(-(-len(images) // shard_size))]
+    shards: list[dict[str, SourceImage]] = [{} for _ in range(-(-len(images) // shard_size))]
     for image in images:
         name = image.path.relative_to(root).as_posix()
         checksum = hashlib.sha256(name.encode()).digest()
-        shards[int.from_bytes(checksum[:8], "big") % len(shards)].append(image)
-    return shards
+        shards[int.from_bytes(checksum[:8], "big") % len(shards)][name] = image
+    return [shard for shard in shards if shard]
 
 
-class _UnreadError(Exception):
-    """A shard is not complete."""
-
-
-def _write_shard(job: tuple[Path, _ShardTask]) -> tuple[int, list[str]]:
+def _write_shard(task: _ShardTask) -> tuple[int, list[str]]:
     """Write one shard, if all of its images can be read; return their number, and what fails."""
-    path, task = job
     failures: list[str] = []
-    try:
-        with atomic_path(path) as temporary, tarfile.open(temporary, "w") as tar:
-            for k, image in enumerate(task.images):
+    with contextlib.suppress(_UnreadError), atomic_path(task.path) as temporary:
+        with tarfile.open(temporary, "w") as tar:
+            for k, (name, image) in enumerate(task.images.items()):
                 try:
-                    files = _files_of(image, task)
+                    files = _files_of(name, image, task)
                 except ImageError as error:
                     failures.append(str(error))
                     continue
@@ -262,14 +256,16 @@ def _write_shard(job: tuple[Path, _ShardTask]) -> tuple[int, list[str]]:
                     member = tarfile.TarInfo(f"{k:06d}_{image.digest}.{ending}")
                     member.size = len(content)
                     tar.addfile(member, io.BytesIO(content))
-            if failures:
-                raise _UnreadError
-    except _UnreadError:
-        pass
+        if failures:
+            raise _UnreadError
     return len(task.images), failures
 
 
-def _files_of(image: SourceImage, task: _ShardTask) -> dict[str, bytes]:
+class _UnreadError(Exception):
+    """A shard is not complete."""
+
+
+def _files_of(name: str, image: SourceImage, task: _ShardTask) -> dict[str, bytes]:
     """Return the files of an image by their endings."""
     path = image.path
     try:
@@ -279,9 +275,9 @@ def _files_of(image: SourceImage, task: _ShardTask) -> dict[str, bytes]:
         raise ImageError(f"{path} cannot be read ({error.strerror}): check its rights") from None
     except ImageError as error:
         raise ImageError(str(error).replace("the image", str(path), 1)) from None
-    files = {"name.txt": task.name(image).encode(), f"image{path.suffix.lower()}": content}
+    files = {"name.txt": name.encode(), f"image{path.suffix.lower()}": content}
     for view in task.views(image):
-        mask = label_view(render(rgb, view), view, task.options)
+        mask = label_view(render(rgb, view), view, task.labels)
         files[f"label.{view.name}.png"] = encode_mask(mask)
     return files
 

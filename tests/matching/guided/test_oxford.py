@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, match_images
-from deepdetect.datasets.oxford import find_scene, load_oxford
+from deepdetect.datasets.oxford import load_oxford
 from deepdetect.detector import HeatmapOptions
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.features.keypoints import nearest_keypoints
@@ -31,7 +31,7 @@ BARS = {
 @pytest.mark.parametrize(("scene", "number"), BARS)
 def test_most_of_what_can_be_matched_is(shared: Path, scene: str, number: int) -> None:
     scenes = load_oxford(shared / "data" / "oxford", "refined")
-    pair = list(find_scene(scenes, scene).pairs())[number - 2]
+    pair = list(next(one for one in scenes if one.name == scene).pairs())[number - 2]
     rgb = [load_image(image) for image in (pair.first, pair.second)]
     found = match_images(*rgb, DeepDetect().configured(HeatmapOptions(480)))
     assert found.guided
@@ -53,7 +53,9 @@ def test_hardly_anything_is_matched_under_a_strange_photograph(
 ) -> None:
     """It covers a quarter of the second image, its middle; the bar is 2 %."""
     data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
-    pair = list(find_scene(load_oxford(shared / "data" / "oxford"), scene).pairs())[4]
+    pair = list(
+        next(one for one in load_oxford(shared / "data" / "oxford") if one.name == scene).pairs()
+    )[4]
     first, second = (load_image(image) for image in (pair.first, pair.second))
     height, width = second.shape[0] // 2, second.shape[1] // 2
     top, left = height // 2, width // 2

@@ -13,7 +13,6 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ..._shared.records import Arrays
-from ...datasets.pair_selection import PairSelectionOptions
 from ...datasets.posed_images import PosedPair, PosedScene, load_posed_scenes
 from ...detector.detector import DeepDetect
 from ...matching.options import MatchingOptions
@@ -126,7 +125,7 @@ class PoseMethod:
 
 def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Estimate the poses of all pairs of all scenes by all methods."""
-    scenes = load_posed_scenes(run.folder("pose"), PairSelectionOptions(options.max_pairs))
+    scenes = load_posed_scenes(run.folder("pose"), options.max_pairs)
     methods = pose_methods(run, options)
     items = {
         f"{scene.name} {k}": (scene, pair) for scene in scenes for k, pair in enumerate(scene.pairs)

@@ -14,11 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...detector.detector import DeepDetect
 from ...detector.points.detection import detect_points
 from ...detector.points.ranker import Ranker
-from ...evaluation.baselines.hessian import detect_hessian, detect_hessian_scales
-from ...evaluation.baselines.opencv import STANDARD
 from ...evaluation.metrics.homography import Sizes
 from ...evaluation.metrics.matching import match_accuracy
 from ...evaluation.metrics.repeatability import repeated_fractions
@@ -72,16 +69,6 @@ class ValidationMetric:
         Upright descriptors find nothing in zoomed and turned pairs, so `correct` is half as large.
         """
         return float(0.8 * self.mean.mean() + 0.2 * 2 * self.mean_correct)
-
-    def row(self) -> str:
-        """Return the numbers in one line: of the mean, then of each kind."""
-        cells = [("mean", self.mean, self.mean_correct)]
-        cells += [(kind, self.repeatability[kind], self.correct[kind]) for kind in self.correct]
-        words = [
-            f"{name} " + " ".join(f"{v:.3f}" for v in [*value.ravel(), correct])
-            for name, value, correct in cells
-        ]
-        return f"{self.score:.4f} | " + " | ".join(words)
 
 
 def validation_pairs(
@@ -155,22 +142,3 @@ def _valid(points: Keypoints, valid: np.ndarray) -> Keypoints:
 def points_detector(ranker: Ranker) -> Detect:
     """Return a detector that ranks by a ranker."""
     return partial(detect_points, ranker=ranker)
-
-
-def rivals() -> dict[str, Detect]:
-    """Return the detectors to beat."""
-    network = DeepDetect()
-
-    def color(gray: np.ndarray) -> np.ndarray:
-        return np.repeat(gray[:, :, None], 3, axis=2)
-
-    def ours(gray: np.ndarray) -> Keypoints:
-        return network.detect(color(gray), threshold=0, nms_radius=1, subpixel=True)
-
-    return {
-        "|det H| 3": detect_hessian,
-        "scale space": detect_hessian_scales,
-        "SIFT": lambda gray: STANDARD["sift"].detect(color(gray)),
-        "Harris": lambda gray: STANDARD["harris"].detect(color(gray)),
-        "DeepDetect": ours,
-    }
