@@ -162,24 +162,6 @@ def test_a_download_goes_on_where_it_was_broken_off(
     assert 300_000 < int(second.removeprefix("bytes=").removesuffix("-")) <= 400_000
 
 
-def test_a_server_without_ranges_sends_all_again(
-    dataset: RemoteDataset, server: Server, tmp_path: Path
-) -> None:
-    server.break_after, server.knows_ranges = 300_000, False
-    with pytest.raises(DeepDetectError):
-        get_dataset(dataset, tmp_path / "tiny")
-    server.break_after = None
-    assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
-
-
-def test_a_run_stopped_between_download_and_check_goes_on(
-    dataset: RemoteDataset, server: Server, tmp_path: Path
-) -> None:
-    (tmp_path / "tiny.download").mkdir()
-    (tmp_path / "tiny.download" / "00-train.zip.part").write_bytes(server.content)
-    assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
-
-
 def test_a_wrong_checksum_is_refused_and_nothing_stays(
     dataset: RemoteDataset, server: Server, tmp_path: Path
 ) -> None:
@@ -215,21 +197,10 @@ def test_a_folder_of_something_else_is_refused(
     assert server.ranges == []
 
 
-def test_an_empty_folder_is_filled(dataset: RemoteDataset, tmp_path: Path) -> None:
-    (tmp_path / "tiny").mkdir()
-    assert unpacked(get_dataset(dataset, tmp_path / "tiny")) == NAMES
-
-
 def test_an_archive_with_too_few_images_is_refused(dataset: RemoteDataset, tmp_path: Path) -> None:
     with pytest.raises(DeepDetectError, match="holds 5 images, not the 6"):
         get_dataset(replace(dataset, images=6), tmp_path / "tiny")
     assert not (tmp_path / "tiny").exists()
-
-
-def test_the_servers_answer_is_told(dataset: RemoteDataset, server: Server, tmp_path: Path) -> None:
-    server.status = 404
-    with pytest.raises(DeepDetectError, match="answers 404"):
-        get_dataset(dataset, tmp_path / "tiny")
 
 
 def test_a_server_that_says_no_is_told_in_one_sentence(
@@ -238,14 +209,6 @@ def test_a_server_that_says_no_is_told_in_one_sentence(
     gone = with_file(dataset, urls=("http://127.0.0.1:9/train.zip",))
     with pytest.raises(DeepDetectError, match="cannot be downloaded"):
         get_dataset(gone, tmp_path / "tiny")
-
-
-def test_too_little_room_is_told_before_the_download(
-    dataset: RemoteDataset, server: Server, tmp_path: Path
-) -> None:
-    with pytest.raises(DeepDetectError, match="GB free"):
-        get_dataset(with_file(dataset, size=10**18), tmp_path / "tiny")
-    assert server.ranges == []
 
 
 def other_file(server: Server) -> str:
@@ -270,19 +233,6 @@ def test_a_mirror_is_asked_when_a_host_sends_wrong_bytes(
     two = with_file(dataset, urls=(server.url, other_file(server)))
     assert unpacked(get_dataset(two, tmp_path / "tiny")) == NAMES
     assert server.ranges == [None, None], "nothing of the wrong bytes is kept"
-
-
-def test_a_mirror_goes_on_where_a_slow_host_stopped(
-    dataset: RemoteDataset, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(download, "TIMEOUT_SECONDS", 0.3)
-    server.slow_after = {"/train.zip": 400_000}
-    two = with_file(dataset, urls=(server.url, other_file(server)))
-    assert unpacked(get_dataset(two, tmp_path / "tiny")) == NAMES
-    first, second = server.ranges
-    assert first is None
-    assert second is not None
-    assert int(second.removeprefix("bytes=").removesuffix("-")) > 0
 
 
 def tar_of(names: list[str]) -> bytes:
@@ -331,19 +281,6 @@ def test_archives_and_single_files_are_put_together(server: Server, tmp_path: Pa
         assert not (tmp_path / "wrong.download").exists()
 
 
-def test_a_mirror_begins_anew_where_no_checksum_tells_the_bytes(
-    dataset: RemoteDataset, server: Server, tmp_path: Path
-) -> None:
-    """As a mirror that has the same data in another kind of archive."""
-    other = tar_of(NAMES)
-    server.contents = {"/mirror.zip": other}
-    server.break_after = 400_000  # more than the mirror's whole file
-    assert len(other) < 400_000
-    two = with_file(dataset, urls=(server.url, other_file(server)), checksum=None)
-    assert unpacked(get_dataset(two, tmp_path / "tiny")) == NAMES
-    assert server.ranges == [None, None]
-
-
 def test_a_damaged_tar_is_refused_without_a_checksum(
     dataset: RemoteDataset, server: Server, tmp_path: Path
 ) -> None:
@@ -382,15 +319,6 @@ def test_bytes_that_the_host_did_not_state_are_refused(
         get_dataset(with_file(dataset, urls=(url,), checksum=None), tmp_path / "tiny")
     assert "\n" not in str(refused.value)
     assert not any(tmp_path.iterdir()), "nothing stays"
-
-
-def test_what_is_no_archive_is_refused(
-    dataset: RemoteDataset, server: Server, tmp_path: Path
-) -> None:
-    server.content = b"<html>not found</html>"
-    with pytest.raises(DeepDetectError, match="no archive"):
-        get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")
-    assert list(tmp_path.iterdir()) == []
 
 
 def changed(content: bytes, place: int, value: int) -> bytes:

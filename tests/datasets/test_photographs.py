@@ -100,16 +100,6 @@ def test_crops_replace_the_repositories(unpacked: tuple[Path, list[Crop]]) -> No
             assert image.size == (CROP_SIDE_PX, CROP_SIDE_PX)
 
 
-def test_a_crop_shows_its_place(unpacked: tuple[Path, list[Crop]]) -> None:
-    folder, crops = unpacked
-    write_crops(folder, crops)
-    with Image.open(folder / crops[0].part / "gb82_00000.jpg") as image:
-        middle = np.asarray(image).astype(float)
-    # 960x480 pixels, of which 240 to 719: red runs from a quarter to three quarters.
-    assert middle[240, [0, -1], 0] == pytest.approx([255 / 4, 255 * 3 / 4], abs=3)
-    assert middle[[0, -1], 240, 1] == pytest.approx([0, 255], abs=3)
-
-
 @pytest.mark.parametrize("place", [(480, 240, 0), (960, 1440, 480), (700, 33, 7)])
 def test_a_cut_is_that_of_the_scaled_picture(place: tuple[int, int, int]) -> None:
     picture = smooth_picture(1000, 500)

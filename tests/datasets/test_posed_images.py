@@ -135,14 +135,6 @@ def test_projected_points_lie_on_epipolar_lines(layout: str, tmp_path: Path) -> 
         np.testing.assert_allclose(algebraic / scale, 0, atol=1e-9)
 
 
-def test_frame_distances_are_those_of_sequences_only(tmp_path: Path) -> None:
-    sequence = load(write_kitti(tmp_path / "clip"))
-    assert [pair.frame_distance for pair in sequence.pairs] == [1, 1, 2]
-    assert sequence.pairs[2].name == "clip 000000-000002"
-    unordered = load(write_strecha(tmp_path / "facade"))
-    assert {pair.frame_distance for pair in unordered.pairs} == {None}
-
-
 def test_intrinsics_are_scaled_to_the_image_by_pixels_as_areas(tmp_path: Path) -> None:
     """The left edge, at -0.5, stays there; the principal point is at the same part of the width."""
     scene = load(write_strecha(tmp_path, scale=2))
@@ -153,19 +145,6 @@ def test_intrinsics_are_scaled_to_the_image_by_pixels_as_areas(tmp_path: Path) -
     np.testing.assert_allclose(half[:2, :2], INTRINSICS[:2, :2] / 2)
     np.testing.assert_allclose(half[:2, 2], [15.375, 9.0])  # (31.25 + .5) / 2 - .5
     np.testing.assert_array_equal(first.images[0].intrinsics, second.images[0].intrinsics)
-
-
-def test_strecha_cameras_may_be_named_after_the_file(tmp_path: Path) -> None:
-    write_strecha(tmp_path)
-    for path in list(tmp_path.glob("*.camera")):
-        path.rename(tmp_path / f"{path.stem}.png.camera")
-    assert [image.path.name for image in load(tmp_path).images] == [
-        *("0000.png", "0001.png", "0002.png"),
-    ]
-
-
-def test_kitti_lines_may_have_no_label(tmp_path: Path) -> None:
-    assert len(load(write_kitti(tmp_path, label="")).images) == 3
 
 
 def test_kitti_poses_belong_to_numbers_not_to_the_order(tmp_path: Path) -> None:
@@ -184,13 +163,6 @@ def test_kitti_images_of_another_camera_lie_beside_the_first(tmp_path: Path) -> 
     image = load(folder).images[1]
     own = image.rotation @ (CENTRES[1] + axes(1) @ [0.5, 0, 0]) + image.translation
     np.testing.assert_allclose(own, 0, atol=1e-6)
-
-
-@pytest.mark.parametrize(("model", "images"), [(".", "."), ("sparse", "."), ("sparse/0", "images")])
-def test_colmap_models_are_found_in_their_usual_places(
-    model: str, images: str, tmp_path: Path
-) -> None:
-    assert len(load(write_colmap(tmp_path, model, images)).images) == 3
 
 
 def test_a_simple_pinhole_has_one_focal_length(tmp_path: Path) -> None:

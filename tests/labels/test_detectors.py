@@ -150,38 +150,6 @@ def test_pixels_equals_a_plain_loop(
     np.testing.assert_array_equal(mask, expected)
 
 
-@pytest.mark.parametrize(
-    ("x", "column"),
-    [(0.5, 0), (1.5, 2), (2.5, 2), (3.5, 4), (-0.5, 0), (1.49, 1), (1.51, 2), (4.4, 4)],
-)
-def test_pixels_halves_go_to_the_even_pixel(x: float, column: int) -> None:
-    np.testing.assert_array_equal(
-        np.argwhere(pixels_mask((5, 5), np.array([[x, 1.0]]))), [[1, column]]
-    )
-    np.testing.assert_array_equal(
-        np.argwhere(pixels_mask((5, 5), np.array([[1.0, x]]))), [[column, 1]]
-    )
-
-
-@pytest.mark.parametrize("point", [(-0.6, 1), (1, -0.6), (4.6, 1), (1, 3.6), (5, 4), (-5, -5)])
-def test_pixels_outside_are_left_out(point: tuple[float, float]) -> None:
-    assert not pixels_mask((4, 5), np.array([point])).any()
-
-
-@pytest.mark.parametrize(
-    "points", [[], np.empty((0, 2)), np.empty((0, 1, 2), np.float32)], ids=["list", "2-D", "3-D"]
-)
-def test_pixels_no_point(points: object) -> None:
-    mask = pixels_mask((4, 5), points)
-    assert mask.shape == (4, 5)
-    assert not mask.any()
-
-
-def test_pixels_the_shape_of_opencv_corners() -> None:
-    corners = np.array([[[3.0, 1.0]], [[0.0, 2.0]]], np.float32)
-    assert np.argwhere(pixels_mask((4, 5, 3), corners)).tolist() == [[1, 3], [2, 0]]
-
-
 def test_pixels_opencv_keypoints() -> None:
     gray = np.zeros((6, 9), np.uint8)
     keypoints = [cv2.KeyPoint(x, y, 3) for x, y in [(7.0, 2.0), (2.5, 3.5), (8.7, 1.0)]]

@@ -67,23 +67,6 @@ def test_adding_a_detector_never_removes_a_pixel(
     np.testing.assert_array_equal(both, fewer | alone)
 
 
-def test_visibility_is_found_by_itself(gray: np.ndarray, dark: np.ndarray) -> None:
-    for image, expected in ((gray, "normal"), (dark, "low")):
-        label = fuse(image)
-        assert label.visibility == expected
-        forced = fuse(image, LabelOptions(visibility=expected))
-        np.testing.assert_array_equal(label.mask, forced.mask)
-
-
-@pytest.mark.parametrize("level", [0, 20, 128, 255])
-@pytest.mark.parametrize("visibility", ["auto", "normal", "low"])
-def test_a_constant_image_has_an_empty_label(level: int, visibility: str) -> None:
-    label = fuse(np.full((40, 56), level, np.uint8), LabelOptions(visibility=visibility))
-    assert label.mask.shape == (40, 56)
-    assert not label.mask.any()
-    assert label.density == 0
-
-
 def test_options() -> None:
     assert LabelOptions().detectors == DETECTOR_NAMES
     assert LabelOptions(("sobel", "fast", "sobel")).detectors == ("fast", "sobel")
@@ -101,12 +84,6 @@ def test_options() -> None:
 def test_unknown_options(changes: dict[str, object], words: str) -> None:
     with pytest.raises(OptionError, match=words):
         LabelOptions(**changes)
-
-
-def test_a_label_is_the_or_of_its_halves() -> None:
-    label = Label(np.array([[True, False, False]]), np.array([[True, True, False]]), "low")
-    assert label.mask.tolist() == [[True, True, False]]
-    assert label.density == pytest.approx(2 / 3)
 
 
 def published(shared: Path) -> list[tuple[Path, bool]]:

@@ -11,7 +11,6 @@ from deepdetect import OptionError
 from deepdetect.io.image import luma
 from deepdetect.labels import (
     DETECTORS,
-    LABEL_SETTINGS,
     LabelOptions,
     find_label_settings,
     fuse,
@@ -44,10 +43,6 @@ def test_a_file_chooses_detectors_and_settings(tmp_path: Path, gray: np.ndarray)
     normal, low = (dataclasses.replace(options, visibility=name) for name in ("normal", "low"))
     np.testing.assert_array_equal(fuse(gray, normal).mask, fast_mask(gray, 40, True))
     np.testing.assert_array_equal(fuse(gray, low).mask, fast_mask(gray, 7))
-
-
-def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
-    assert read_label_settings(write(tmp_path, "")) == LabelOptions()
 
 
 def test_a_whole_number_serves_for_a_fraction() -> None:
@@ -88,12 +83,6 @@ def test_mistakes_in_the_file_are_named(tmp_path: Path, text: str, hint: str) ->
     path = write(tmp_path, text)
     with pytest.raises(OptionError, match=hint):
         read_label_settings(path)
-
-
-def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
-    path = tmp_path / "labels.toml"
-    path.write_text('\ufeffdetectors = ["fast"]', encoding="utf-8")
-    assert read_label_settings(path).detectors == ("fast",)
 
 
 NUMBERS = [(name, key) for name, detector in DETECTORS.items() for key in detector.limits]
@@ -150,11 +139,6 @@ def test_what_opencv_refuses_is_one_sentence(
     assert "OpenCV refuses sobel(kernel_size=4)" in one_line(caught.value)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match=r"none\.toml cannot be read"):
-        read_label_settings(tmp_path / "none.toml")
-
-
 def test_the_order_in_the_file_says_nothing(tmp_path: Path) -> None:
     first = read_label_settings(
         write(
@@ -182,15 +166,6 @@ def test_those_for_geometry_mark_more_and_nothing_less(photo: np.ndarray) -> Non
     assert (dense | sparse).sum() == dense.sum()
     assert dense.mean() > 1.1 * sparse.mean()
     assert dense.mean() < 0.95
-
-
-def test_a_file_is_read_and_a_word_is_a_name(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text("[fast]\nnormal = { threshold = 20 }\n")
-    assert find_label_settings(path).parameters("fast", "normal")["threshold"] == 20
-    assert set(LABEL_SETTINGS) == {"paper", "dense"}
-    with pytest.raises(OptionError, match="did you mean 'dense'"):
-        find_label_settings("densee")
 
 
 def test_other_detectors_take_their_settings_along() -> None:

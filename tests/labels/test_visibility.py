@@ -43,23 +43,10 @@ def test_the_rule_at_its_limit(low: int, high: int, expected: str) -> None:
     assert visibility_of(two_levels(low, high)) == expected
 
 
-@pytest.mark.parametrize(("bright", "expected"), [(3, "low"), (5, "normal")])
-def test_a_hundredth_of_the_pixels_does_not_count(bright: int, expected: str) -> None:
-    gray = np.zeros((20, 20), np.uint8)
-    gray.ravel()[:bright] = 255
-    assert visibility_of(gray) == expected
-
-
 @given(arrays(np.uint8, st.tuples(st.integers(1, 30), st.integers(1, 30))))
 def test_the_range_is_that_of_two_percentiles(gray: np.ndarray) -> None:
     low, high = np.percentile(gray, [1, 99], method="inverted_cdf")
     assert luma_range(gray) == float(high) - float(low)
-
-
-@pytest.mark.parametrize("choice", ["normal", "low"])
-@pytest.mark.parametrize("high", [5, 255])
-def test_a_choice_overrides_the_rule(choice: str, high: int) -> None:
-    assert visibility_of(two_levels(0, high), choice) == choice
 
 
 @pytest.mark.parametrize(

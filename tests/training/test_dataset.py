@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader  # noqa: E402
 
 from deepdetect import ImageError  # noqa: E402
 from deepdetect.io.image import luma  # noqa: E402
-from deepdetect.labels import LabelOptions, visibility_of  # noqa: E402
+from deepdetect.labels import LabelOptions  # noqa: E402
 from deepdetect.training.dataset import (  # noqa: E402
     CropDataset,
     FolderSource,
@@ -80,21 +80,6 @@ def test_a_batch_is_a_pure_function_of_the_step(source: FolderSource) -> None:
     for first, last in ((7, 8), (0, 1), (5, None)):
         same(batches(fresh, first=first, last=last), whole[first:last])
     assert not np.array_equal(whole[0][0], whole[1][0])
-
-
-def test_shapes_follow_the_stage(source: FolderSource) -> None:
-    images, masks = batches(source, last=1)[0]
-    assert images.shape == (4, 64, 64, 3)
-    assert (images.dtype, masks.dtype) == (np.uint8, np.bool_)
-    images, masks = batches(source)[-1]
-    assert images.shape == (2, 96, 96, 3)
-    assert masks.shape == (2, 96, 96)
-
-
-def test_about_a_quarter_is_dark(source: FolderSource) -> None:
-    made = [image for images, _ in batches(source, last=18) for image in images]
-    dark = [visibility_of(luma(image)) == "low" for image in made]
-    assert 0.1 < np.mean(dark) < 0.45
 
 
 def test_crops_and_labels_belong_together(source: FolderSource) -> None:
@@ -189,34 +174,6 @@ def test_colors_change_and_labels_do_not(source: FolderSource) -> None:
             assert np.abs(luma(other).astype(int) - luma(image)).max() <= 1
             gray += int((other == other[..., :1]).all())
     assert 4 < gray < 16
-
-
-def test_a_stage_can_take_some_views_only(source: FolderSource) -> None:
-    options = dataclasses.replace(OPTIONS, stages=(Stage(64, 12, 1, sides=(64,)),))
-    small = [view for view, _ in all_views(source) if min(view.shape[:2]) == 64]
-    for image in batches(source, options)[0][0]:
-        turned = (image, image.transpose(1, 0, 2))
-        crops = [each[::a, ::b] for each in turned for a in (1, -1) for b in (1, -1)]
-        assert any(
-            np.array_equal(view[:64, left : left + 64], crop)
-            for view in small
-            for crop in crops
-            for left in range(view.shape[1] - 63)
-        )
-
-
-def test_interleaved_batches_are_those_of_the_stages_in_turn(source: FolderSource) -> None:
-    mixed = batches(source, dataclasses.replace(OPTIONS, interleave=True))
-    sums = sorted(int(images.sum()) for images, _ in mixed)
-    assert sums == sorted(int(images.sum()) for images, _ in batches(source))
-    sizes = [len(masks[0]) for _, masks in mixed]
-    assert set(sizes[:6]) == set(sizes[-6:]) == {64, 96}
-
-
-def test_processes_share_each_batch(source: FolderSource) -> None:
-    parts = [loader(source, rank=rank, world_size=2, last_step=3) for rank in range(2)]
-    for (images, _), *halves in zip(batches(source, last=3), *parts, strict=True):
-        np.testing.assert_array_equal(images, np.concatenate([half[0] for half in halves]))
 
 
 def test_a_limit_of_the_memory_changes_nothing_but_the_time(source: FolderSource) -> None:

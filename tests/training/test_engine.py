@@ -77,15 +77,6 @@ def test_compiled_training_gives_the_eager_gradients() -> None:
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-3)
 
 
-def test_images_become_floats() -> None:
-    engine = make_engine(torch.nn.Conv2d(3, 1, 1), DeviceOptions("cpu", "float32", compile=False))
-    rgb = torch.randint(0, 256, (2, 8, 6, 3), dtype=torch.uint8)
-    found = engine.to_float(rgb)
-    assert found.is_contiguous(memory_format=torch.channels_last)
-    torch.testing.assert_close(found, rgb.permute(0, 3, 1, 2) / 255)
-    assert engine.describe() == "cpu, float32, eager"
-
-
 def test_frozen_batch_norm_keeps_its_statistics() -> None:
     network = torch.nn.Sequential(torch.nn.BatchNorm2d(3), torch.nn.Dropout(0.5)).train()
     freeze_batch_norm(network)

@@ -68,15 +68,3 @@ def test_photographs_of_one_name_have_their_own_labels(photographs: Path, tmp_pa
     (first,), (second,) = (list_images(tmp_path / part, OPTIONS) for part in ("train", "val"))
     assert cache.path(first, first.normal[0]) != cache.path(second, second.normal[0])
     assert digest_images([first], [second]) != digest_images([second], [first])
-
-
-def test_a_replaced_photograph_gets_a_new_label(photographs: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    cache = LabelCache(tmp_path / "labels", LabelOptions(("fast",)))
-    paths = []
-    for source in ("photo00.png", "photo01.png"):
-        (folder / "a.png").write_bytes((photographs / source).read_bytes())
-        (image,) = list_images(folder, OPTIONS)
-        paths.append(cache.path(image, image.normal[0]))
-    assert paths[0] != paths[1]

@@ -33,25 +33,6 @@ def test_the_warm_up_rises_evenly_into_the_cosine() -> None:
     assert shares == pytest.approx([k / 10 for k in range(1, 11)] + [1, 1])
 
 
-@given(
-    photos=st.integers(1, 50),
-    stages=st.lists(st.tuples(st.integers(1, 8), st.integers(1, 4)), min_size=1, max_size=3),
-)
-def test_positions_run_through_the_stages(photos: int, stages: list[tuple[int, int]]) -> None:
-    made = tuple(Stage(16, batch, epochs) for batch, epochs in stages)
-    schedule = Schedule(TrainingOptions(stages=made, short_sides=(16,)), photos)
-    step = 0
-    for k, stage in enumerate(made):
-        for within in range(schedule.steps_of_stage[k]):
-            position = schedule.position(step)
-            assert position.stage == stage
-            assert position.sample == within * stage.batch
-            step += 1
-    assert step == schedule.steps
-    with pytest.raises(IndexError):
-        schedule.position(step)
-
-
 @given(steps=st.integers(1, 40), count=st.integers(1, 60))
 def test_the_last_step_is_a_milestone(steps: int, count: int) -> None:
     options = TrainingOptions(stages=(Stage(16, 1, 1),), short_sides=(16,))
@@ -134,9 +115,3 @@ def test_few_shards_are_read_at_a_time(sizes: list[int], epoch: int) -> None:
     places = [np.flatnonzero(shard_of == shard) for shard in range(len(sizes))]
     for step in range(count):  # shards that have been begun and not finished
         assert sum(place[0] <= step < place[-1] for place in places) <= 4
-
-
-def test_images_of_several_shards_are_mixed() -> None:
-    shard_of = epoch_order(0, 0, 40, (10,) * 4) // 10
-    assert np.count_nonzero(np.diff(shard_of)) > 20
-    assert not np.array_equal(epoch_order(0, 1, 40, (10,) * 4) // 10, shard_of)

@@ -116,12 +116,6 @@ def test_other_options_are_refused(photographs: Path, shards: Shards) -> None:
         write_shards(photographs, photographs, OPTIONS)
 
 
-def test_other_packing_is_another_set(photographs: Path, shards: Shards, tmp_path: Path) -> None:
-    """The order of the photographs depends on it, so a run must not go on with it."""
-    other = write_shards(photographs, tmp_path, OPTIONS, shard_size=3, workers=1)
-    assert other.digest != shards.digest
-
-
 def copies(photographs: Path, folder: Path) -> Path:
     folder.mkdir()
     for path in photographs.iterdir():
@@ -154,14 +148,6 @@ def test_an_unreadable_photograph_can_be_mended(photographs: Path, tmp_path: Pat
     for path, written in left.items():
         assert path.stat().st_mtime_ns == written, "what was done is not done again"
     assert len(made.training) + len(made.validation) == len(left) + 1
-
-
-def test_few_shards_change_when_a_photograph_goes(photographs: Path, tmp_path: Path) -> None:
-    folder = copies(photographs, tmp_path / "photos")
-    before = write_shards(folder, tmp_path / "out", OPTIONS, shard_size=2, workers=1)
-    (folder / ShardSource(before.training, OPTIONS)[0].path).unlink()
-    after = write_shards(folder, tmp_path / "out", OPTIONS, shard_size=2, workers=1)
-    assert len(set(before.training) - set(after.training)) == 1
 
 
 @pytest.mark.parametrize("kind", ["training", "validation"])
@@ -241,11 +227,3 @@ def test_an_index_that_is_none_is_one_sentence(
     with pytest.raises(ImageError) as caught:
         Shards.open(tmp_path, OPTIONS)
     assert "shards.json is damaged" in one_line(caught.value)
-
-
-def test_an_index_with_endless_counts_is_damaged(shards: Shards, tmp_path: Path) -> None:
-    index = json.loads((shards.folder / "shards.json").read_text())
-    index["training"][0]["images"] = float("inf")
-    (tmp_path / "shards.json").write_text(json.dumps(index))
-    with pytest.raises(ImageError, match="damaged"):
-        Shards.open(tmp_path, OPTIONS)

@@ -150,16 +150,6 @@ def test_where_weights_come_from_is_written_into_them(run: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_seed_gives_one_result(run: Path, tmp_path: Path, fit) -> None:
-    lines: list[str] = []
-    result = fit(tmp_path, log=lines.append)
-    assert same_run(tmp_path, run)
-    assert lines == ["training on cpu, float32, eager"]
-    assert result.best in result.points
-    assert result.images_per_second > 0
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "count"), [("training_step", 6), pytest.param("heatmap", 5, marks=pytest.mark.slow)]
 )
@@ -219,19 +209,6 @@ def test_an_altered_checkpoint_is_refused(
     with pytest.raises(WeightsError, match="delete it, or train into another folder") as caught:
         fit(tmp_path)
     one_line(caught.value)
-
-
-@pytest.mark.slow
-def test_damaged_best_weights_do_not_stop_a_run(
-    run: Path, tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The next validation writes them again."""
-    with monkeypatch.context() as patch, interrupted(patch, "training_step", 6):
-        fit(tmp_path)
-    (tmp_path / "best.safetensors").write_bytes(b"damaged")
-    fit(tmp_path)
-    assert tensors_equal(tmp_path / "checkpoint.safetensors", run / "checkpoint.safetensors")
-    load_network(tmp_path / "best.safetensors")
 
 
 def _damaged(path: Path) -> None:
@@ -351,11 +328,6 @@ def test_a_missing_or_empty_folder_is_refused(tmp_path: Path, make) -> None:
     make(tmp_path / "photos")
     with pytest.raises(ImageError):
         train(tmp_path / "photos", tmp_path / "run", device=PLAIN)
-
-
-def test_unknown_keywords_name_the_right_one(tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="did you mean 'init_weights'"):
-        train(tmp_path, tmp_path, init_weight="default")
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect import ImageError
-from deepdetect.io.image import scale_short_side
 from deepdetect.training.augmentation import (
     BRIGHTNESS,
     CONTRAST,
@@ -87,25 +86,6 @@ def test_an_augmented_view_is_darkened_last(photo: np.ndarray) -> None:
     np.testing.assert_array_equal(dark, darken(bright, Darkening(0.3, 0.4)))
 
 
-def test_photographs_differ_in_their_dark_views() -> None:
-    names = [f"photo{number}.jpg" for number in range(30)]
-    dark = [views_of(name, OPTIONS)[1] for name in names]
-    assert len({view.darkening for views in dark for view in views}) > 55
-
-
-@pytest.mark.parametrize("kind", ["array", "path", "float"])
-@pytest.mark.parametrize("darkening", [None, Darkening(0.3, 0.4)])
-def test_rendering(
-    kind: str, darkening: Darkening | None, photo: np.ndarray, photo_path: Path
-) -> None:
-    given = {"array": photo, "path": photo_path, "float": photo / 255}[kind]
-    view = render(given, View(100, darkening))
-    small = scale_short_side(photo, 100)
-    expected = small if darkening is None else darken(small, darkening)
-    assert view.dtype == np.uint8
-    np.testing.assert_array_equal(view, expected)
-
-
 def test_a_square_view_is_squashed(photo: np.ndarray) -> None:
     wide = photo[:128]
     expected = cv2.resize(wide, (64, 64), interpolation=cv2.INTER_CUBIC)
@@ -142,11 +122,3 @@ def test_few_photographs_still_give_one_for_validation() -> None:
     assert (len(kept), len(held)) == (1, 1)
     with pytest.raises(ImageError, match="too few"):
         train_val_split(images(1))
-
-
-def test_results_below_the_photographs_are_left_out(photographs: Path, tmp_path: Path) -> None:
-    (tmp_path / "run" / "labels").mkdir(parents=True)
-    for place in ("a.png", "run/curves.png", "run/labels/b.png"):
-        (tmp_path / place).write_bytes((photographs / "photo00.png").read_bytes())
-    listed = list_images(tmp_path, OPTIONS, exclude=(tmp_path / "run",))
-    assert [image.path.name for image in listed] == ["a.png"]

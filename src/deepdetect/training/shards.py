@@ -180,6 +180,8 @@ def write_shards(
     tasks = []
     for kind, part in zip(files, train_val_split(listed, options.val_fraction), strict=True):
         for number, chosen in enumerate(_deal(part, images, shard_size)):
+            if not chosen:
+                continue
             task = _ShardTask(output, chosen, kind == "validation", options.labels)
             path = output / f"{kind}-{number:06d}-{task.digest}.tar"
             files[kind].append((path, len(chosen)))
@@ -237,7 +239,7 @@ def _deal(
         name = image.path.relative_to(root).as_posix()
         checksum = hashlib.sha256(name.encode()).digest()
         shards[int.from_bytes(checksum[:8], "big") % len(shards)][name] = image
-    return [shard for shard in shards if shard]
+    return shards
 
 
 def _write_shard(task: _ShardTask) -> tuple[int, list[str]]:
